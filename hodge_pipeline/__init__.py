@@ -1,0 +1,1 @@
+"""Globally consistent registration of many scans by Hodge decomposition on the viewing graph."""

@@ -1,0 +1,1 @@
+"""Topology of the viewing graph: complexes, coboundaries, embedding, forms, Hodge decomposition, cycles."""

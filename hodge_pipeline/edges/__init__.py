@@ -1,0 +1,1 @@
+"""Edge builders: which pairs of frames to register."""

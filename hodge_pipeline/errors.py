@@ -1,0 +1,35 @@
+"""Errors that a user can mend: each is one line that says what, where, and what to do."""
+
+from __future__ import annotations
+
+
+class HodgeError(Exception):
+    """Root of every error that the command line prints as one line. `exit_code` is 1: the user's input."""
+
+    exit_code = 1
+
+
+class RecipeError(HodgeError):
+    """A recipe, an override or a stage's option is wrong: names file, line, key and what was expected."""
+
+
+class SourceError(HodgeError):
+    """The input cannot be read: names the file, the frame or record, and the remedy."""
+
+
+class GraphError(HodgeError):
+    """A viewing graph, or the numbers in it, cannot be used as given."""
+
+
+class WorkspaceError(HodgeError):
+    """The run folder belongs to another recipe, is in use, or cannot be written."""
+
+
+class WorkerError(HodgeError):
+    """A worker process or cluster was lost more often than its edges may be retried."""
+
+
+class CheckError(HodgeError):
+    """A result failed its own checks. `exit_code` is 3."""
+
+    exit_code = 3

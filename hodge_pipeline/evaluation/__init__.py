@@ -1,0 +1,1 @@
+"""Evaluation: scores, trajectory errors, the report."""

@@ -1,0 +1,1 @@
+"""Executors: where edges are registered."""

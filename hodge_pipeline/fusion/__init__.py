@@ -1,0 +1,1 @@
+"""Fusers: one model from all frames."""

@@ -1,0 +1,1 @@
+"""The Rerun recording of a run: the only place that imports rerun."""

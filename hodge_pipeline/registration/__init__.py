@@ -1,0 +1,1 @@
+"""Registrars: the relative motion of a pair of clouds, and the clouds themselves."""

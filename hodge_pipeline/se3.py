@@ -1,0 +1,172 @@
+"""Rigid motions in batches: the only place where conventions meet.
+
+A motion `b_from_a` is a 4x4 matrix that maps a point given in a to b. A twist is ξ = (φ, ρ): rotation first, radians
+and metres; `exp(ξ)` has the rotation exp(φ^) and the translation V(φ) ρ. Quaternions are xyzw. Every function takes
+any leading batch shape.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hodge_pipeline.types import Bools, Floats
+
+SMALL_ANGLE = 1e-4
+
+
+def hat(v: Floats) -> Floats:
+    """The skew matrices v^ (..., 3, 3) of vectors (..., 3): `hat(v) @ u == cross(v, u)`."""
+    v = np.asarray(v, float)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def so3_exp(phi: Floats) -> Floats:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians (paper, Section 3.3)."""
+    phi = np.asarray(phi, float)
+    return np.asarray(Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix()).reshape(*phi.shape[:-1], 3, 3)
+
+
+def so3_log(rotation: Floats) -> Floats:
+    """Rotation vectors (..., 3) of rotation matrices (..., 3, 3), of length at most π.
+
+    At exactly π the axis has two signs; the one that scipy's quaternion gives is taken: see `is_half_turn`.
+    """
+    rotation = np.asarray(rotation, float)
+    return np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()).reshape(
+        *rotation.shape[:-2], 3
+    )
+
+
+def is_half_turn(rotation: Floats, tolerance_rad: float = 1e-6) -> Bools:
+    """Where (...,) a rotation is within the tolerance of π, so that the sign of its logarithm is arbitrary."""
+    return np.asarray(np.linalg.norm(so3_log(rotation), axis=-1) > np.pi - tolerance_rad)
+
+
+def _series(angle: Floats) -> tuple[Floats, Floats]:
+    """(1 − cos θ)/θ² and (θ − sin θ)/θ³ (...,), by their series where θ is small."""
+    small = angle < SMALL_ANGLE
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    return a, b
+
+
+def left_jacobian(phi: Floats) -> Floats:
+    """V(φ) (..., 3, 3), the left Jacobian of SO(3): the translation of exp(φ, ρ) is V(φ) ρ."""
+    phi = np.asarray(phi, float)
+    a, b = _series(np.linalg.norm(phi, axis=-1))
+    k = hat(phi)
+    return np.asarray(np.eye(3) + a[..., None, None] * k + b[..., None, None] * (k @ k))
+
+
+def left_jacobian_inverse(phi: Floats) -> Floats:
+    """V(φ)⁻¹ (..., 3, 3)."""
+    phi = np.asarray(phi, float)
+    angle = np.linalg.norm(phi, axis=-1)
+    small = angle < SMALL_ANGLE
+    half = np.where(small, 1.0, angle) / 2
+    c = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / (4 * half**2))
+    k = hat(phi)
+    return np.asarray(np.eye(3) - 0.5 * k + c[..., None, None] * (k @ k))
+
+
+def from_parts(rotation: Floats, translation: Floats) -> Floats:
+    """Motions (..., 4, 4) from rotation matrices (..., 3, 3) and translations (..., 3)."""
+    rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
+    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    out = np.zeros((*batch, 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
+    return out
+
+
+def exp(xi: Floats) -> Floats:
+    """Motions (..., 4, 4) of twists (..., 6) = (φ, ρ)."""
+    xi = np.asarray(xi, float)
+    phi, rho = xi[..., :3], xi[..., 3:]
+    return from_parts(so3_exp(phi), np.einsum("...ij,...j->...i", left_jacobian(phi), rho))
+
+
+def log(b_from_a: Floats) -> Floats:
+    """Twists (..., 6) = (φ, ρ) of motions (..., 4, 4); `log(inverse(T)) == -log(T)`."""
+    phi = so3_log(b_from_a[..., :3, :3])
+    rho = np.einsum("...ij,...j->...i", left_jacobian_inverse(phi), b_from_a[..., :3, 3])
+    return np.concatenate([phi, rho], axis=-1)
+
+
+def pairing_exp(xi: Floats) -> Floats:
+    """Motions (..., 4, 4) with rotation exp(φ^) and translation t of the paper's own pairs (φ, t) (Section 3.3)."""
+    xi = np.asarray(xi, float)
+    return from_parts(so3_exp(xi[..., :3]), xi[..., 3:])
+
+
+def pairing_log(b_from_a: Floats) -> Floats:
+    """The paper's pairs (φ, t) (..., 6) (Section 3.3): not antisymmetric, since an inverse has −Rᵀt."""
+    return np.concatenate([so3_log(b_from_a[..., :3, :3]), b_from_a[..., :3, 3]], axis=-1)
+
+
+def inverse(b_from_a: Floats) -> Floats:
+    """`a_from_b` (..., 4, 4)."""
+    rotation = np.swapaxes(b_from_a[..., :3, :3], -1, -2)
+    return from_parts(rotation, -np.einsum("...ij,...j->...i", rotation, b_from_a[..., :3, 3]))
+
+
+def adjoint(b_from_a: Floats) -> Floats:
+    """Ad (..., 6, 6) with `b_from_a exp(ξ) = exp(Ad ξ) b_from_a`, order (rotation, translation)."""
+    rotation, translation = b_from_a[..., :3, :3], b_from_a[..., :3, 3]
+    out = np.zeros((*b_from_a.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = rotation
+    out[..., 3:, :3] = hat(translation) @ rotation
+    return out
+
+
+def transform(b_from_a: Floats, points_in_a: Floats) -> Floats:
+    """Points (..., N, 3) in b; the batch shapes broadcast."""
+    rotated = np.asarray(points_in_a) @ np.swapaxes(b_from_a[..., :3, :3], -1, -2)
+    return np.asarray(rotated + b_from_a[..., None, :3, 3])
+
+
+def from_quat_xyzw(translation: Floats, quat_xyzw: Floats) -> Floats:
+    """Motions (..., 4, 4); quaternions (..., 4) of any length but zero are normalised."""
+    quat_xyzw = np.asarray(quat_xyzw, float)
+    rotation = np.asarray(Rotation.from_quat(quat_xyzw.reshape(-1, 4)).as_matrix())
+    return from_parts(rotation.reshape(*quat_xyzw.shape[:-1], 3, 3), translation)
+
+
+def to_quat_xyzw(b_from_a: Floats) -> Floats:
+    """Unit quaternions (..., 4) of the rotations, w not negative."""
+    rotation = np.asarray(b_from_a)[..., :3, :3]
+    quat = np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()).reshape(
+        *rotation.shape[:-2], 4
+    )
+    return np.where(quat[..., 3:] < 0, -quat, quat)
+
+
+def project_to_so3(matrix: Floats) -> Floats:
+    """The nearest rotations (..., 3, 3) in the Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrix)
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)
+
+
+def interpolate(world_from_a: Floats, world_from_b: Floats, share: Floats) -> Floats:
+    """Motions (..., 4, 4) on the geodesic from a (share 0) to b (share 1), `a exp(share · log(a⁻¹ b))`."""
+    return np.asarray(
+        world_from_a @ exp(np.asarray(share)[..., None] * log(inverse(world_from_a) @ world_from_b))
+    )
+
+
+def is_motion(matrix: Floats, tolerance: float = 1e-2) -> Bools:
+    """Where (...,) a matrix (..., 4, 4) is finite, its last row is (0, 0, 0, 1) and RᵀR is I within the tolerance."""
+    matrix = np.asarray(matrix, float)
+    finite = np.isfinite(matrix).all(axis=(-1, -2))
+    safe = np.where(finite[..., None, None], matrix, 0.0)
+    rotation = safe[..., :3, :3]
+    gram_error = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(-1, -2))
+    row_error = np.abs(safe[..., 3, :] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=-1)
+    return np.asarray(
+        finite & (gram_error < tolerance) & (row_error < tolerance) & (np.linalg.det(rotation) > 0)
+    )

@@ -1,0 +1,1 @@
+"""Consistency solvers: from measured edges to poses."""

@@ -1,0 +1,129 @@
+"""What a stage must do. A stage is a frozen pydantic dataclass: its fields are its recipe options, its one method does
+the work. There is no base class to inherit: whoever has the method is the stage.
+
+A stage is found by name through the entry points `hodge_pipeline.<kind>` (see `registry.KINDS`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+from hodge_pipeline.types import (
+    Candidates,
+    CloudSet,
+    Floats,
+    Frame,
+    Model,
+    PointCloud,
+    Registration,
+    Solution,
+    Source,
+    Trajectory,
+    ViewGraph,
+)
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+Advance = Callable[[int], None]
+"""Called with the number of units just finished; a stage's one duty towards a progress bar."""
+
+
+def no_progress(done: int) -> None:
+    """Where nobody watches."""
+
+
+@dataclass(frozen=True)
+class Sniff:
+    """How sure a reader is that a path is its format: `confidence` in [0, 1], and why, in a few words."""
+
+    confidence: float
+    reason: str
+
+
+@runtime_checkable
+class FrameReader(Protocol):
+    """Opens a path of one format."""
+
+    def sniff(self, path: Path) -> Sniff:
+        """How sure it is that this path is its format; reads no more than names and a header, never raises."""
+        ...
+
+    def open(self, path: Path) -> Source:
+        """What is there, lazily. Raises `SourceError` that names file, record and remedy."""
+        ...
+
+
+@runtime_checkable
+class EdgeBuilder(Protocol):
+    """Proposes pairs of frames to register."""
+
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+        """Pairs, given the current poses (N, 4, 4). Frames without points get none."""
+        ...
+
+
+@runtime_checkable
+class Registrar(Protocol):
+    """Registers one pair of clouds."""
+
+    def prepare(self, cloud: PointCloud) -> Any:
+        """What it needs of one cloud (trees, covariances): made once in each worker, never pickled."""
+        ...
+
+    def register(self, target: Any, source: Any, i_from_j: Floats) -> Registration:
+        """Moves the prepared cloud j (source) onto i (target), from the guess `i_from_j` (4, 4)."""
+        ...
+
+
+@runtime_checkable
+class Executor(Protocol):
+    """Runs the same task on many blocks, in worker processes or on a cluster."""
+
+    def map(self, task: Callable[[Task], Result], blocks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
+        """(index, result) of each block as it finishes, in any order.
+
+        The task is a module-level function or a partial of one. A worker that dies costs its blocks a retry;
+        `WorkerError` after several. An error that the task raises is raised here.
+        """
+        ...
+
+
+@runtime_checkable
+class ConsistencySolver(Protocol):
+    """Makes the poses consistent with all edges at once."""
+
+    def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
+        """Poses from the start (V, 4, 4); each connected component keeps its own gauge."""
+        ...
+
+
+@runtime_checkable
+class Refiner(Protocol):
+    """Improves the poses of all frames after the solve."""
+
+    def refine(
+        self, frames: Sequence[Frame], world_from_cam: Floats, advance: Advance = no_progress
+    ) -> Floats:
+        """Poses (N, 4, 4)."""
+        ...
+
+
+@runtime_checkable
+class Fuser(Protocol):
+    """Fuses the frames into one model."""
+
+    def fuse(self, frames: Sequence[Frame], world_from_cam: Floats, advance: Advance = no_progress) -> Model:
+        """The scene in the world frame."""
+        ...
+
+
+@runtime_checkable
+class Writer(Protocol):
+    """Writes what another program reads."""
+
+    def write(self, path: Path, trajectory: Trajectory) -> None:
+        """One file, written atomically."""
+        ...

@@ -1,0 +1,306 @@
+"""The data that flows between stages. Poses are `world_from_cam`, float64; metres, radians, seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+Floats32: TypeAlias = NDArray[np.float32]
+Ints: TypeAlias = NDArray[np.int64]
+Bools: TypeAlias = NDArray[np.bool_]
+Bytes: TypeAlias = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: `u = fx x / z + cx`, `v = fy y / z + cy`, in pixels; `fy` is negative where y points up."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @property
+    def matrix(self) -> Floats:
+        """The 3x3 intrinsic matrix K, `(u, v, 1) ~ K p_cam`."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class EncodedImage:
+    """An image as its file holds it, to be passed through undecoded.
+
+    `units_per_metre` is set for depth images only.
+    """
+
+    contents: bytes
+    media_type: str
+    units_per_metre: float | None = None
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points of one frame, in its camera's axes: `points_in_cam (N, 3)` metres, unit normals, 8-bit RGB."""
+
+    points_in_cam: Floats32
+    normals_in_cam: Floats32 | None = None
+    colours: Bytes | None = None
+
+    def __len__(self) -> int:
+        return len(self.points_in_cam)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One view, lazily read and re-readable.
+
+    The `read_*` callables decode a file each time they are called and pickle by reference (partials of module-level
+    functions), so a worker process can read what it needs. A source without images gives `read_points` alone.
+
+    - `read_depth()` gives (H, W) float32 metres, 0 where there is no measurement.
+    - `read_colour()` gives (H, W, 3) uint8 RGB.
+    - `world_from_cam` is the pose that the source gives (a benchmark's truth, a SLAM estimate); None where it has
+      none. The pipeline evaluates against it and never starts from it unless a recipe says so.
+    """
+
+    frame_id: int | str
+    stamp_s: float
+    camera: Camera | None = None
+    read_depth: Callable[[], Floats32] | None = None
+    read_colour: Callable[[], Bytes] | None = None
+    read_points: Callable[[], PointCloud] | None = None
+    encoded_depth: Callable[[], EncodedImage] | None = None
+    encoded_colour: Callable[[], EncodedImage] | None = None
+    world_from_cam: Floats | None = None
+    sequence: str = ""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses in time: `stamps_s (N,)` seconds, ascending; `world_from_cam (N, 4, 4)`."""
+
+    stamps_s: Floats
+    world_from_cam: Floats
+
+    def __len__(self) -> int:
+        return len(self.stamps_s)
+
+
+@dataclass(frozen=True)
+class ViewGraph:
+    """The viewing graph, in columns. A million edges are arrays, not a million objects.
+
+    - `vertex_ids (V,)` int64 or str, as the source names them; `edges (E, 2)` hold *rows* of it.
+    - `i_from_j (E, 4, 4)`: moves points of vertex j into vertex i, for the edge (i, j) in the direction measured.
+      Parallel edges are legal.
+    - `information (E, 6, 6)`: inverse covariance of ξ = (rotation, translation) in `i_from_j · exp(ξ)`, radians and
+      metres in j's axes.
+    - `fitness (E,)`: share of cloud j with a correspondence; `rmse_m (E,)`: their RMS distance; NaN where unknown.
+    - `source (E,)`: where the edge comes from (sequential, overlap, sift, colmap, g2o, …).
+    - `correspondences (E,)`: how many; 0 where unknown.
+    """
+
+    vertex_ids: NDArray[np.generic]
+    edges: Ints
+    i_from_j: Floats
+    information: Floats
+    fitness: Floats
+    rmse_m: Floats
+    source: NDArray[np.str_]
+    correspondences: Ints
+
+    @property
+    def vertex_count(self) -> int:
+        """How many vertices there are, isolated ones included."""
+        return len(self.vertex_ids)
+
+    @property
+    def edge_count(self) -> int:
+        """How many edges there are, parallel ones each."""
+        return len(self.edges)
+
+    @classmethod
+    def from_edges(
+        cls,
+        vertex_ids: NDArray[np.generic],
+        edges: Ints,
+        i_from_j: Floats,
+        information: Floats | None = None,
+        source: str = "given",
+    ) -> ViewGraph:
+        """A graph of measured edges; the information defaults to the identity, what was not seen to NaN or 0."""
+        count = len(edges)
+        return cls(
+            vertex_ids=np.asarray(vertex_ids),
+            edges=np.asarray(edges, np.int64).reshape(-1, 2),
+            i_from_j=np.asarray(i_from_j, float).reshape(-1, 4, 4),
+            information=np.broadcast_to(np.eye(6), (count, 6, 6)).copy()
+            if information is None
+            else information,
+            fitness=np.full(count, np.nan),
+            rmse_m=np.full(count, np.nan),
+            source=np.full(count, source),
+            correspondences=np.zeros(count, np.int64),
+        )
+
+    def select(self, rows: Ints | Bools) -> ViewGraph:
+        """The graph with these edges only, in this order; every vertex is kept."""
+        return ViewGraph(
+            vertex_ids=self.vertex_ids,
+            edges=self.edges[rows],
+            i_from_j=self.i_from_j[rows],
+            information=self.information[rows],
+            fitness=self.fitness[rows],
+            rmse_m=self.rmse_m[rows],
+            source=self.source[rows],
+            correspondences=self.correspondences[rows],
+        )
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a reader's `open` gives: any of lazy frames, a trajectory, a measured graph.
+
+    - `trajectory` is the whole reference trajectory on its own stamps, where there is one.
+    - `notes` say what was skipped or repaired, with counts: one line each.
+    - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
+    """
+
+    name: str
+    path: Path
+    frames: Sequence[Frame] = ()
+    trajectory: Trajectory | None = None
+    graph: ViewGraph | None = None
+    notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Pairs that an edge builder proposes, not yet edges.
+
+    `pairs (P, 2)` rows with i < j, sorted and unique; `source (P,)` the reason; `overlap (P,)` its score in [0, 1],
+    NaN where the reason has none.
+    """
+
+    pairs: Ints
+    source: NDArray[np.str_]
+    overlap: Floats
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What a registrar found for one pair; see `ViewGraph` for the meaning and units of each field."""
+
+    i_from_j: Floats
+    information: Floats
+    fitness: float
+    rmse_m: float
+    correspondences: int
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class SolverIteration:
+    """One step of a solver: the poses after it, the objective at them, and what else it measured."""
+
+    world_from_cam: Floats
+    objective: float
+    metrics: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Consistent poses, and how they were reached.
+
+    - `component (V,)`: the connected component of each vertex, 0 the largest.
+    - `weights (E,)`: the final weight of each edge relative to its own information, 0 for one that was ignored.
+    """
+
+    world_from_cam: Floats
+    component: Ints
+    weights: Floats
+    history: tuple[SolverIteration, ...] = ()
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Model:
+    """A fused scene in the world frame: points (N, 3), normals, 8-bit RGB, and triangles (T, 3) where it is a mesh."""
+
+    name: str
+    points_in_world: Floats32
+    normals_in_world: Floats32 | None = None
+    colours: Bytes | None = None
+    triangles: NDArray[np.int32] | None = None
+    notes: tuple[str, ...] = ()
+
+
+class CloudSet(Sequence[PointCloud]):
+    """The down-sampled cloud of every frame, as memory-mapped columns: opening one costs no copy.
+
+    `offsets (N + 1,)` cut `points (P, 3)`, `normals (P, 3)`, `colours (P, 3)` into frames; an empty slice is a frame
+    without a valid measurement.
+    """
+
+    FILES = ("offsets", "points", "normals", "colours")
+
+    def __init__(self, offsets: Ints, points: Floats32, normals: Floats32, colours: Bytes) -> None:
+        self.offsets, self.points, self.normals, self.colours = offsets, points, normals, colours
+
+    @classmethod
+    def open(cls, folder: Path) -> CloudSet:
+        """The clouds that `save` wrote to this folder, mapped read-only."""
+        return cls(*(np.load(folder / f"{name}.npy", mmap_mode="r") for name in cls.FILES))
+
+    @classmethod
+    def from_clouds(cls, clouds: Sequence[PointCloud]) -> CloudSet:
+        """One set of these clouds, in order; missing normals and colours become zeros."""
+        sizes = np.array([len(cloud) for cloud in clouds], np.int64)
+        empty = np.zeros((0, 3), np.float32)
+
+        def zeros(cloud: PointCloud) -> Floats32:
+            return np.zeros((len(cloud), 3), np.float32)
+
+        normals = [zeros(c) if c.normals_in_cam is None else c.normals_in_cam for c in clouds]
+        colours = [zeros(c) if c.colours is None else c.colours for c in clouds]
+        return cls(
+            np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+            np.concatenate([empty, *(c.points_in_cam for c in clouds)]).astype(np.float32),
+            np.concatenate([empty, *normals]).astype(np.float32),
+            np.concatenate([empty, *colours]).astype(np.uint8),
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write the columns into a folder that exists, one `.npy` each."""
+        for name in self.FILES:
+            np.save(folder / f"{name}.npy", getattr(self, name))
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def __getitem__(self, row: int) -> PointCloud:  # type: ignore[override]
+        """The cloud of one frame (a view, not a copy)."""
+        if not -len(self) <= row < len(self):
+            raise IndexError(row)
+        row %= len(self)
+        cut = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
+        return PointCloud(self.points[cut], self.normals[cut], self.colours[cut])
+
+    def __iter__(self) -> Iterator[PointCloud]:
+        return (self[row] for row in range(len(self)))
+
+    @property
+    def sizes(self) -> Ints:
+        """Points of each cloud, (N,)."""
+        return np.diff(self.offsets)
