@@ -36,14 +36,12 @@ def so3_log(rotation: Floats) -> Floats:
     At exactly π the axis has two signs; the one that scipy's quaternion gives is taken: see `is_half_turn`.
     """
     rotation = np.asarray(rotation, float)
-    return np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()).reshape(
-        *rotation.shape[:-2], 3
-    )
+    return np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()).reshape(*rotation.shape[:-2], 3)
 
 
 def is_half_turn(rotation: Floats, tolerance_rad: float = 1e-6) -> Bools:
     """Where (...,) a rotation is within the tolerance of π, so that the sign of its logarithm is arbitrary."""
-    return np.asarray(np.linalg.norm(so3_log(rotation), axis=-1) > np.pi - tolerance_rad)
+    return np.asarray(np.linalg.norm(so3_log(rotation), axis=-1) > np.pi - tolerance_rad, bool)
 
 
 def _series(angle: Floats) -> tuple[Floats, Floats]:
@@ -139,9 +137,7 @@ def from_quat_xyzw(translation: Floats, quat_xyzw: Floats) -> Floats:
 def to_quat_xyzw(b_from_a: Floats) -> Floats:
     """Unit quaternions (..., 4) of the rotations, w not negative."""
     rotation = np.asarray(b_from_a)[..., :3, :3]
-    quat = np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()).reshape(
-        *rotation.shape[:-2], 4
-    )
+    quat = np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()).reshape(*rotation.shape[:-2], 4)
     return np.where(quat[..., 3:] < 0, -quat, quat)
 
 
@@ -154,19 +150,15 @@ def project_to_so3(matrix: Floats) -> Floats:
 
 def interpolate(world_from_a: Floats, world_from_b: Floats, share: Floats) -> Floats:
     """Motions (..., 4, 4) on the geodesic from a (share 0) to b (share 1), `a exp(share · log(a⁻¹ b))`."""
-    return np.asarray(
-        world_from_a @ exp(np.asarray(share)[..., None] * log(inverse(world_from_a) @ world_from_b))
-    )
+    return np.asarray(world_from_a @ exp(np.asarray(share)[..., None] * log(inverse(world_from_a) @ world_from_b)))
 
 
 def is_motion(matrix: Floats, tolerance: float = 1e-2) -> Bools:
     """Where (...,) a matrix (..., 4, 4) is finite, its last row is (0, 0, 0, 1) and RᵀR is I within the tolerance."""
     matrix = np.asarray(matrix, float)
-    finite = np.isfinite(matrix).all(axis=(-1, -2))
+    finite = np.asarray(np.isfinite(matrix).all(axis=(-1, -2)))
     safe = np.where(finite[..., None, None], matrix, 0.0)
     rotation = safe[..., :3, :3]
     gram_error = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(-1, -2))
     row_error = np.abs(safe[..., 3, :] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=-1)
-    return np.asarray(
-        finite & (gram_error < tolerance) & (row_error < tolerance) & (np.linalg.det(rotation) > 0)
-    )
+    return np.asarray(finite & (gram_error < tolerance) & (row_error < tolerance) & (np.linalg.det(rotation) > 0))

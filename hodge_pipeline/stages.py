@@ -104,9 +104,7 @@ class ConsistencySolver(Protocol):
 class Refiner(Protocol):
     """Improves the poses of all frames after the solve."""
 
-    def refine(
-        self, frames: Sequence[Frame], world_from_cam: Floats, advance: Advance = no_progress
-    ) -> Floats:
+    def refine(self, frames: Sequence[Frame], world_from_cam: Floats, advance: Advance = no_progress) -> Floats:
         """Poses (N, 4, 4)."""
         ...
 

@@ -142,9 +142,7 @@ class ViewGraph:
             vertex_ids=np.asarray(vertex_ids),
             edges=np.asarray(edges, np.int64).reshape(-1, 2),
             i_from_j=np.asarray(i_from_j, float).reshape(-1, 4, 4),
-            information=np.broadcast_to(np.eye(6), (count, 6, 6)).copy()
-            if information is None
-            else information,
+            information=np.broadcast_to(np.eye(6), (count, 6, 6)).copy() if information is None else information,
             fitness=np.full(count, np.nan),
             rmse_m=np.full(count, np.nan),
             source=np.full(count, source),
