@@ -1,0 +1,127 @@
+"""Dataclasses of arrays to files and back, without pickle, written atomically."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import IO, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline.types import Solution, SolverIteration
+
+T = TypeVar("T")
+
+
+def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+    """Write through a temporary file beside `path` and rename it: a reader sees all of it or none."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            write(stream)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text atomically."""
+    write_atomically(path, lambda stream: stream.write(text.encode()))
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write JSON atomically; a number that is not finite becomes null."""
+    write_text(path, json.dumps(_finite(data), indent=1, allow_nan=False) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    """The value with numpy scalars as Python ones and every number that is not finite as None."""
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _finite(value.tolist())
+    if isinstance(value, np.generic):
+        return _finite(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def read_json(path: Path) -> Any:
+    """The value of a JSON file."""
+    return json.loads(path.read_text("utf-8"))
+
+
+def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write named arrays as one uncompressed `.npz`, atomically."""
+    write_atomically(path, lambda stream: np.savez(stream, **arrays))  # type: ignore[arg-type]
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an `.npz`; nothing in it is executed."""
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def save(path: Path, value: Any) -> None:
+    """Write a dataclass whose fields are all arrays or scalars."""
+    save_arrays(path, {field.name: np.asarray(getattr(value, field.name)) for field in fields(value)})
+
+
+def load(path: Path, cls: type[T]) -> T:
+    """The dataclass that `save` wrote; a scalar field comes back as a Python scalar."""
+    arrays = load_arrays(path)
+    return cls(**{name: array.item() if array.ndim == 0 else array for name, array in arrays.items()})
+
+
+def save_solution(path: Path, solution: Solution) -> None:
+    """Write a solution with its history."""
+    history = solution.history
+    text = {
+        "metrics": dict(solution.metrics),
+        "notes": list(solution.notes),
+        "history": [{"objective": step.objective, "metrics": dict(step.metrics)} for step in history],
+    }
+    poses = np.array([step.world_from_cam for step in history]).reshape(-1, *solution.world_from_cam.shape)
+    save_arrays(
+        path,
+        {
+            "world_from_cam": solution.world_from_cam,
+            "component": solution.component,
+            "weights": solution.weights,
+            "history": poses,
+            "text": np.array(json.dumps(_finite(text))),
+        },
+    )
+
+
+def load_solution(path: Path) -> Solution:
+    """The solution that `save_solution` wrote."""
+    arrays = load_arrays(path)
+    text = json.loads(arrays["text"].item())
+    steps = zip(arrays["history"], text["history"], strict=True)
+    return Solution(
+        world_from_cam=arrays["world_from_cam"],
+        component=arrays["component"],
+        weights=arrays["weights"],
+        history=tuple(
+            SolverIteration(poses, _number(step["objective"]), {k: _number(v) for k, v in step["metrics"].items()})
+            for poses, step in steps
+        ),
+        metrics={name: _number(value) for name, value in text["metrics"].items()},
+        notes=tuple(text["notes"]),
+    )
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -1,0 +1,134 @@
+"""Plain data to typed options and back: stages by name inside typed sections, every error with its file and line."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+
+from hodge_pipeline import registry
+from hodge_pipeline.errors import RecipeError
+
+T = TypeVar("T")
+Keys = tuple[str | int, ...]
+Where = Callable[[Keys], str]
+"""Gives `file:line` of a key path."""
+
+
+def bind(cls: type[T], data: Any, where: Where, keys: Keys = ()) -> T:
+    """An instance of a pydantic dataclass from a mapping; nested sections and stages included.
+
+    Raises `RecipeError`: `file:line: key: what was expected`, with the nearest known name for an unknown key.
+    """
+    if not isinstance(data, Mapping):
+        raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected a mapping of options, got {data!r}")
+    hints = get_type_hints(cls)
+    known = {field.name: hints[field.name] for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    for key in data:
+        if key not in known:
+            here = (*keys, key)
+            raise RecipeError(f"{where(here)}: {_dotted(here)}: unknown option{registry.suggestion(key, list(known))}")
+    values = {key: _value(known[key], value, where, (*keys, key)) for key, value in data.items()}
+    try:
+        return cls(**values)
+    except ValidationError as error:
+        raise _first_error(error, where, keys) from error
+
+
+def _value(annotation: Any, value: Any, where: Where, keys: Keys) -> Any:
+    """A field's value with its stages and sections built; anything else is left to pydantic."""
+    if value is None:
+        return None
+    if get_origin(annotation) in (typing.Union, types.UnionType):
+        inner = [arg for arg in get_args(annotation) if registry.kind_of(arg) or _is_section(arg)]
+        return _value(inner[0], value, where, keys) if inner else value
+    kind = registry.kind_of(annotation)
+    if kind:
+        return bind_stage(kind.name, value, where, keys)
+    if get_origin(annotation) is tuple and isinstance(value, list):
+        return tuple(_value(get_args(annotation)[0], item, where, (*keys, row)) for row, item in enumerate(value))
+    return bind(annotation, value, where, keys) if _is_section(annotation) else value
+
+
+def bind_stage(kind: str, value: Any, where: Where, keys: Keys) -> Any:
+    """The stage that `{stage: name, option: …}`, or the name alone, stands for."""
+    options = {"stage": value} if isinstance(value, str) else value
+    if not isinstance(options, Mapping) or not isinstance(options.get("stage"), str):
+        known = ", ".join(registry.names(kind))
+        raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected {{stage: NAME, …}} with a NAME of: {known}")
+    try:
+        cls = registry.load(kind, options["stage"])
+    except RecipeError as error:
+        raise RecipeError(f"{where((*keys, 'stage'))}: {_dotted(keys)}: {error}") from error
+    return bind(cls, {key: item for key, item in options.items() if key != "stage"}, where, keys)
+
+
+def unbind(value: Any) -> Any:
+    """Options as plain data that `bind` reads back: every default written out, a stage as `{stage: name, …}`."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: unbind(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        is_stage = any(isinstance(value, kind.protocol) for kind in registry.KINDS.values())
+        return {"stage": registry.name_of(value), **fields} if is_stage else fields
+    if isinstance(value, Mapping):
+        return {str(key): unbind(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [unbind(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _is_section(annotation: Any) -> bool:
+    return isinstance(annotation, type) and dataclasses.is_dataclass(annotation)
+
+
+def _dotted(keys: Keys) -> str:
+    return ".".join(map(str, keys)) or "recipe"
+
+
+def _first_error(error: ValidationError, where: Where, keys: Keys) -> RecipeError:
+    """The first of pydantic's complaints as one line at its own key."""
+    first = error.errors()[0]
+    here = (*keys, *(key for key in first["loc"] if isinstance(key, (str, int))))
+    while len(here) > len(keys) and isinstance(here[-1], str) and "-" in here[-1]:
+        here = here[:-1]
+    what = first["msg"][0].lower() + first["msg"][1:]
+    if first["type"] == "missing":
+        return RecipeError(f"{where(keys)}: {_dotted(here)}: this option is required")
+    return RecipeError(f"{where(here)}: {_dotted(here)}: {what.rstrip('.')}, got {first['input']!r}")
+
+
+class _StageSchema(GenerateJsonSchema):
+    """JSON schema in which a field typed by a stage Protocol refers to that kind."""
+
+    def is_instance_schema(self, schema: Any) -> JsonSchemaValue:
+        """A reference to the kind's definition, which `json_schema` adds."""
+        kind = registry.kind_of(schema["cls"])
+        return {"$ref": f"#/$defs/kind-{kind.name}"} if kind else super().is_instance_schema(schema)
+
+
+def json_schema(cls: type) -> dict[str, Any]:
+    """JSON schema (draft 2020-12) of a recipe with every installed stage, for editors; a broken plugin is left out."""
+    schema: dict[str, Any] = TypeAdapter(cls).json_schema(schema_generator=_StageSchema)
+    definitions = schema.setdefault("$defs", {})
+    for kind in registry.KINDS:
+        options = []
+        for name in registry.names(kind):
+            try:
+                options.append(_stage_schema(kind, name, definitions))
+            except RecipeError:
+                continue
+        definitions[f"kind-{kind}"] = {"anyOf": options} if options else {"type": "object"}
+    return schema
+
+
+def _stage_schema(kind: str, name: str, definitions: dict[str, Any]) -> dict[str, Any]:
+    stage = TypeAdapter(registry.load(kind, name)).json_schema(schema_generator=_StageSchema)
+    definitions.update(stage.pop("$defs", {}))
+    stage["properties"] = {"stage": {"const": name}, **stage.get("properties", {})}
+    stage["required"] = ["stage", *stage.get("required", [])]
+    return {"anyOf": [{"const": name}, stage]}

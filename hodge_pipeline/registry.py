@@ -1,0 +1,102 @@
+"""Names to stages, by entry points. Listing imports nothing; a broken plugin harms nobody but its own user."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from hodge_pipeline import stages
+from hodge_pipeline.errors import RecipeError
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of stage: its name in messages, the entry-point group is `hodge_pipeline.<name>`, and its Protocol."""
+
+    name: str
+    protocol: type
+    summary: str
+
+    @property
+    def group(self) -> str:
+        """The entry-point group in which a package registers stages of this kind."""
+        return f"hodge_pipeline.{self.name}"
+
+
+KINDS = {
+    kind.name: kind
+    for kind in (
+        Kind("readers", stages.FrameReader, "open a path of one format"),
+        Kind("edges", stages.EdgeBuilder, "propose pairs of frames to register"),
+        Kind("registration", stages.Registrar, "register one pair"),
+        Kind("executors", stages.Executor, "where pairs are registered"),
+        Kind("solvers", stages.ConsistencySolver, "make all poses consistent"),
+        Kind("refiners", stages.Refiner, "improve the poses after the solve"),
+        Kind("fusion", stages.Fuser, "fuse all frames into one model"),
+        Kind("writers", stages.Writer, "write what another program reads"),
+    )
+}
+
+
+def kind_of(annotation: object) -> Kind | None:
+    """The kind whose Protocol this type annotation is, or None."""
+    return next((kind for kind in KINDS.values() if kind.protocol is annotation), None)
+
+
+@cache
+def _entries(group: str) -> dict[str, EntryPoint]:
+    """Entry points by name; of two with one name, the one of this project wins, else the first by package name."""
+
+    def rank(entry: EntryPoint) -> tuple[bool, str]:
+        package = entry.dist.name if entry.dist else ""
+        return package == "hodge-pipeline", package
+
+    found: dict[str, EntryPoint] = {}
+    for entry in sorted(entry_points(group=group), key=rank):
+        found[entry.name] = entry
+    return found
+
+
+def names(kind: str) -> list[str]:
+    """The registered names of one kind, sorted; imports no stage."""
+    return sorted(_entries(KINDS[kind].group))
+
+
+def origin(kind: str, name: str) -> str:
+    """The package and version that registered a stage, as `package 1.2.3`."""
+    dist = _entries(KINDS[kind].group)[name].dist
+    return f"{dist.name} {dist.version}" if dist else "unknown package"
+
+
+def suggestion(given: str, known: list[str]) -> str:
+    """`" (did you mean 'x'?)"`, or the known names where nothing is close."""
+    close = difflib.get_close_matches(given, known, n=1)
+    return f" (did you mean '{close[0]}'?)" if close else f" (known: {', '.join(known) or 'none'})"
+
+
+def load(kind: str, name: str) -> Any:
+    """The class of a stage. Raises `RecipeError` for an unknown name, or for a plugin that does not import."""
+    known = _entries(KINDS[kind].group)
+    if name not in known:
+        raise RecipeError(f"no stage '{name}' of kind '{kind}'{suggestion(name, sorted(known))}")
+    try:
+        return known[name].load()
+    except Exception as error:  # a plugin can fail in any way
+        reason = f"{type(error).__name__}: {error}"
+        raise RecipeError(
+            f"stage '{name}' of kind '{kind}' ({origin(kind, name)}) does not load: {reason}; repair or remove it"
+        ) from error
+
+
+def name_of(stage: object) -> str:
+    """The registered name of a stage instance, else its `module:Class`."""
+    cls = type(stage)
+    path = f"{cls.__module__}:{cls.__qualname__}"
+    for kind in KINDS.values():
+        for name, entry in _entries(kind.group).items():
+            if entry.value == path:
+                return name
+    return path

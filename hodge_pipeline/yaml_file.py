@@ -1,0 +1,113 @@
+"""YAML as data: plain values and where each came from. No tag constructs anything, sizes are bounded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq, TaggedScalar
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+from hodge_pipeline.errors import RecipeError
+
+MAX_BYTES = 1_000_000
+MAX_NODES = 20_000
+
+Path_ = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class Document:
+    """Plain data, and the origin (`file:line` or the override) of each key, by its path from the root."""
+
+    data: dict[str, Any]
+    origins: dict[Path_, str]
+
+
+def read(path: Path) -> Document:
+    """The mapping in a YAML file. Raises `RecipeError` with file and line."""
+    try:
+        size = path.stat().st_size
+        text = path.read_text("utf-8") if size <= MAX_BYTES else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecipeError(f"{path}: cannot be read: {error}") from error
+    if size > MAX_BYTES:
+        raise RecipeError(f"{path}: {size} bytes is no recipe; the limit is {MAX_BYTES}")
+    return parse(text, str(path))
+
+
+def parse(text: str, name: str) -> Document:
+    """The mapping in a YAML text; `name` stands for the file in origins and errors."""
+    try:
+        root = YAML(typ="rt", pure=True).load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = mark.line + 1 if mark else 1
+        raise RecipeError(f"{name}:{line}: {str(error.problem).splitlines()[0]}") from error
+    except (YAMLError, ValueError, RecursionError) as error:
+        raise RecipeError(f"{name}: not YAML: {error}") from error
+    if root is None:
+        root = CommentedMap()
+    if not isinstance(root, CommentedMap):
+        raise RecipeError(f"{name}:1: a recipe is a mapping of keys to values, found {type(root).__name__}")
+    origins: dict[Path_, str] = {(): f"{name}:1"}
+    budget = iter(range(MAX_NODES))
+    data = _plain(root, (), 1, name, origins, budget)
+    return Document(data, origins)
+
+
+def parse_value(text: str, name: str) -> Any:
+    """The plain value of an override such as `--set a.b=[1, 2]`."""
+    return parse(f"value: {text}", name).data["value"]
+
+
+def dump(data: dict[str, Any]) -> str:
+    """The YAML text of plain data, block style, keys in their order."""
+    from io import StringIO
+
+    out = StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.width = 120
+    yaml.dump(data, out)
+    return out.getvalue()
+
+
+def _plain(node: Any, path: Path_, line: int, name: str, origins: dict[Path_, str], budget: Iterator[int]) -> Any:
+    """A node as dict, list or scalar; refuses tags, and more nodes than any recipe has (aliases multiply)."""
+    if next(budget, None) is None:
+        raise RecipeError(f"{name}:{line}: more than {MAX_NODES} values: this is no recipe")
+    origins[path] = f"{name}:{line}"
+    tag = getattr(getattr(node, "tag", None), "value", None)
+    if isinstance(node, TaggedScalar) or tag is not None:
+        raise RecipeError(f"{name}:{line}: the tag '{tag}' is not allowed: a recipe is data and constructs nothing")
+    if isinstance(node, CommentedMap):
+        return {
+            _key(key, name, line): _plain(value, (*path, str(key)), node.lc.key(key)[0] + 1, name, origins, budget)
+            for key, value in node.items()
+        }
+    if isinstance(node, CommentedSeq):
+        return [
+            _plain(value, (*path, row), node.lc.item(row)[0] + 1, name, origins, budget)
+            for row, value in enumerate(node)
+        ]
+    return _scalar(node, name, line)
+
+
+def _key(key: Any, name: str, line: int) -> str:
+    if not isinstance(key, str):
+        raise RecipeError(f"{name}:{line}: the key {key!r} is not a name")
+    return str(key)
+
+
+def _scalar(node: Any, name: str, line: int) -> Any:
+    for kind in (bool, int, float, str):
+        if isinstance(node, kind):
+            return kind(node)
+    if node is None:
+        return None
+    raise RecipeError(f"{name}:{line}: a value of type {type(node).__name__} has no use in a recipe")
