@@ -1,0 +1,110 @@
+"""Pinhole intrinsics from the small files that lie beside image sequences."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hodge_adapters.text_rows import read_rows, read_text, to_floats
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Camera
+
+_ENTRY = re.compile(r"^\s*\"?(?:Camera\d?\.)?(\w+)\"?\s*[:=]\s*([-+0-9.eE]+)\s*[,;]?\s*(?:#.*)?$", re.MULTILINE)
+_DISTORTION = ("k1", "k2", "k3", "p1", "p2")
+_SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Intrinsics in pixels; `size` (width, height) and `units_per_metre` of depth where the file says so."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    size: tuple[int, int] | None = None
+    units_per_metre: float | None = None
+    distorted: bool = False
+
+    def camera(self, size: tuple[int, int]) -> Camera:
+        """The camera, of the file's own size if it gives one, else of this one."""
+        width, height = self.size or size
+        return Camera(width, height, self.fx, self.fy, self.cx, self.cy)
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """The intrinsics in a file: one line `fx fy cx cy [width height]`, a 3x3 or 4x4 matrix K, `fx: …` lines as in
+    ORB-SLAM's YAML, or Open3D's JSON.
+
+    Raises `SourceError` for anything else, and for numbers that are no camera.
+    """
+    text = read_text(path)
+    found = _from_json(text) if path.suffix == ".json" else _from_entries(text) or _from_numbers(path)
+    if found is None:
+        raise SourceError(f"{path}: no intrinsics found: write {_SUPPORTED}")
+    return checked(found, str(path))
+
+
+def checked(found: Intrinsics, where: str) -> Intrinsics:
+    """The same, if it is a camera: finite, focal lengths not zero. Raises `SourceError`."""
+    numbers = (found.fx, found.fy, found.cx, found.cy)
+    scale = found.units_per_metre
+    bad_size = found.size is not None and min(found.size) <= 0
+    if not all(map(math.isfinite, numbers)) or found.fx <= 0 or found.fy == 0 or bad_size or (scale and scale <= 0):
+        raise SourceError(f"{where}: fx fy cx cy = {numbers} is no pinhole camera: write {_SUPPORTED}")
+    return found
+
+
+def fit_note(camera: Camera) -> str | None:
+    """A complaint where the principal point lies outside the image, a sign of intrinsics of another size."""
+    if 0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height:
+        return None
+    centre = f"({camera.cx:g}, {camera.cy:g})"
+    return f"the principal point {centre} lies outside the {camera.width}x{camera.height} image: check the intrinsics"
+
+
+def _from_numbers(path: Path) -> Intrinsics | None:
+    rows = [to_floats(row.fields) for row in read_rows(path)]
+    if len(rows) == 1 and rows[0] and len(rows[0]) in (4, 6):
+        fx, fy, cx, cy, *size = rows[0]
+        if not size:
+            return Intrinsics(fx, fy, cx, cy)
+        # Two more numbers may be distortion coefficients instead: those are never whole.
+        whole = all(value.is_integer() and value >= 1 for value in size)
+        return Intrinsics(fx, fy, cx, cy, (int(size[0]), int(size[1]))) if whole else None
+    if len(rows) in (3, 4) and all(row and len(row) == len(rows) for row in rows):
+        k = [row for row in rows if row]
+        return Intrinsics(k[0][0], k[1][1], k[0][2], k[1][2])
+    return None
+
+
+def _from_entries(text: str) -> Intrinsics | None:
+    entries = {name: to_floats([value]) for name, value in _ENTRY.findall(text)}
+    values = {name: value[0] for name, value in entries.items() if value}
+    if not {"fx", "fy", "cx", "cy"} <= values.keys():
+        return None
+    found = Intrinsics(
+        values["fx"],
+        values["fy"],
+        values["cx"],
+        values["cy"],
+        units_per_metre=values.get("DepthMapFactor"),
+        distorted=any(values.get(name) for name in _DISTORTION),
+    )
+    if {"width", "height"} <= values.keys():
+        return replace(found, size=(int(values["width"]), int(values["height"])))
+    return found
+
+
+def _from_json(text: str) -> Intrinsics | None:
+    """Open3D's `camera_intrinsic.json`: the matrix is stored by columns."""
+    try:
+        content = json.loads(text)
+        matrix = [float(value) for value in content["intrinsic_matrix"]]
+        size = int(content["width"]), int(content["height"])
+    except (ValueError, KeyError, TypeError):
+        return None
+    return Intrinsics(matrix[0], matrix[4], matrix[6], matrix[7], size) if len(matrix) == 9 else None

@@ -1,0 +1,75 @@
+"""Rows of numbers and names in text files, with their line numbers, so that a complaint can name the line."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from hodge_pipeline.errors import SourceError, WorkspaceError
+
+SHOWN = 5
+"""How many records a note names before it only counts them."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """The fields of one line, and its number from 1."""
+
+    line: int
+    fields: list[str]
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, whatever its bytes; raises `SourceError` where it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The lines that hold anything but a `#` comment, cut at blanks, tabs and commas."""
+    lines = read_text(path).splitlines()
+    cut = (Row(number, line.split("#", 1)[0].replace(",", " ").split()) for number, line in enumerate(lines, 1))
+    return [row for row in cut if row.fields]
+
+
+def to_floats(fields: Sequence[str]) -> list[float] | None:
+    """The numbers, or None where a field is not one."""
+    try:
+        return [float(field) for field in fields]
+    except ValueError:
+        return None
+
+
+def listed(items: Sequence[object]) -> str:
+    """The first few items by name, and how many more there are."""
+    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
+    return ", ".join(str(item) for item in items[:SHOWN]) + more
+
+
+def inside(folder: Path, name: str) -> Path | None:
+    """The path of a file named in a list, or None for one that leaves the folder by `..` or an absolute path.
+
+    Links inside the folder are the user's own and are followed.
+    """
+    pure = PurePosixPath(name.replace("\\", "/"))
+    if pure.is_absolute() or ".." in pure.parts:
+        return None
+    return folder / pure
+
+
+def write_text_atomically(path: Path, text: str) -> None:
+    """Write the file in one step: a reader sees the old one or the whole new one. Raises `WorkspaceError`."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "w", encoding="ascii", newline="\n") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise WorkspaceError(f"{path}: cannot be written ({error.strerror}): is its folder there?") from error
