@@ -1,0 +1,160 @@
+"""Lists of stamped images: TUM's `rgb.txt` and `depth.txt`, and association files with both on one line."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from hodge_adapters.association import nearest_pairs
+from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats
+
+ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
+_DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class StampedImages:
+    """Depth images in order of their stamps, each with its colour image where there is one."""
+
+    stamps_s: Floats
+    depth: list[Path]
+    colour: list[Path | None]
+    files: tuple[Path, ...]
+
+
+@dataclass
+class Notes:
+    """Collects what was left out, by reason, so that each reason makes one line."""
+
+    lines: list[str] = field(default_factory=list)
+
+    def leave_out(self, where: str, reason: str, items: list[int]) -> None:
+        """Note the items, if any."""
+        if items:
+            self.lines.append(f"{where}: {len(items)} lines {reason} left out: {listed(items)}")
+
+
+def find_association_file(folder: Path) -> Path | None:
+    """The association file of a folder, by its usual names."""
+    return next((folder / name for name in ASSOCIATION_FILES if (folder / name).is_file()), None)
+
+
+def read_pairs(folder: Path, max_difference_s: float, notes: list[str]) -> StampedImages:
+    """The images of a folder: by its association file if it has one, else by `depth.txt` and `rgb.txt`.
+
+    Lines that cannot be used are left out and noted with their numbers; `SourceError` where nothing is left.
+    """
+    association = find_association_file(folder)
+    found = _from_association(association, notes) if association else _from_lists(folder, max_difference_s, notes)
+    there = [path.is_file() for path in found.depth]
+    if not any(there):
+        raise SourceError(f"{found.depth[0]}: not there, nor any other depth image listed: unpack the whole sequence")
+    if not all(there):
+        missing = [path.name for path, is_there in zip(found.depth, there, strict=True) if not is_there]
+        notes.append(f"{len(missing)} depth images listed but not there left out: {listed(missing)}")
+    colour = [path if path and path.is_file() else None for path in found.colour]
+    lost = [path.name for path, kept in zip(found.colour, colour, strict=True) if path and not kept]
+    if lost:
+        notes.append(f"{len(lost)} colour images listed but not there: {listed(lost)}")
+    rows = np.flatnonzero(there).tolist()
+    return StampedImages(
+        found.stamps_s[rows], [found.depth[row] for row in rows], [colour[row] for row in rows], found.files
+    )
+
+
+def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> StampedImages:
+    depth_list, colour_list = folder / "depth.txt", folder / "rgb.txt"
+    if not depth_list.is_file():
+        raise SourceError(f"{folder}: no depth.txt and no associations.txt in it: give the folder that holds one")
+    depth_stamps_s, depth = _read_list(depth_list, notes)
+    if not depth:
+        raise SourceError(f"{depth_list}: no line `stamp file` that can be used in it: write one for each depth image")
+    if not colour_list.is_file():
+        notes.append("no rgb.txt: frames have no colour")
+        return StampedImages(depth_stamps_s, depth, [None] * len(depth), (depth_list,))
+    colour_stamps_s, colour = _read_list(colour_list, notes)
+    columns = nearest_pairs(depth_stamps_s, colour_stamps_s, max_difference_s)
+    alone = int((columns < 0).sum())
+    if alone:
+        notes.append(f"{alone} depth images have no colour image within {max_difference_s:g} s")
+    paired = [colour[column] if column >= 0 else None for column in columns.tolist()]
+    return StampedImages(depth_stamps_s, depth, paired, (depth_list, colour_list))
+
+
+def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path]]:
+    """Stamps, ascending and unique, and paths of a list `stamp file`."""
+    found: list[tuple[float, Path]] = []
+    unreadable: list[int] = []
+    outside: list[int] = []
+    for row in read_rows(path):
+        stamp_s = _stamp(row, 0)
+        image = inside(path.parent, row.fields[1]) if len(row.fields) > 1 else None
+        if stamp_s is None or len(row.fields) != 2:
+            unreadable.append(row.line)
+        elif image is None:
+            outside.append(row.line)
+        else:
+            found.append((stamp_s, image))
+    collected = Notes(notes)
+    collected.leave_out(path.name, "that are not `stamp file`", unreadable)
+    collected.leave_out(path.name, "that point out of the folder", outside)
+    stamps_s, rows = _in_order(np.array([stamp for stamp, _ in found]), path.name, notes)
+    return stamps_s, [found[row][1] for row in rows]
+
+
+def _from_association(path: Path, notes: list[str]) -> StampedImages:
+    """Lines `stamp depth stamp rgb` or `stamp rgb stamp depth`: the order is seen from the names."""
+    found: list[tuple[float, Path, Path]] = []
+    unreadable: list[int] = []
+    outside: list[int] = []
+    rows = read_rows(path)
+    depth_at = _depth_column(rows, path)
+    for row in rows:
+        if len(row.fields) != 4 or _stamp(row, 0) is None or _stamp(row, 2) is None:
+            unreadable.append(row.line)
+            continue
+        stamp_s = _stamp(row, depth_at - 1)
+        depth, colour = (inside(path.parent, row.fields[column]) for column in (depth_at, 4 - depth_at))
+        if stamp_s is None or depth is None or colour is None:
+            outside.append(row.line)
+        else:
+            found.append((stamp_s, depth, colour))
+    collected = Notes(notes)
+    collected.leave_out(path.name, "that are not `stamp file stamp file`", unreadable)
+    collected.leave_out(path.name, "that point out of the folder", outside)
+    if not found:
+        raise SourceError(f"{path}: no line `stamp file stamp file` that can be used in it: mend or remove the file")
+    stamps_s, order = _in_order(np.array([stamp for stamp, _, _ in found]), path.name, notes)
+    return StampedImages(stamps_s, [found[row][1] for row in order], [found[row][2] for row in order], (path,))
+
+
+def _depth_column(rows: list[Row], path: Path) -> int:
+    """1 or 3: the column whose file names say depth in (nearly) all lines."""
+    whole = [row for row in rows if len(row.fields) == 4]
+    first = sum(bool(_DEPTH_NAME.search(row.fields[1])) for row in whole)
+    second = sum(bool(_DEPTH_NAME.search(row.fields[3])) for row in whole)
+    if whole and first == second:
+        where = f"{path}:{whole[0].line}"
+        raise SourceError(f"{where}: neither or both file names say depth: keep depth images in a folder named depth")
+    return 1 if first > second else 3
+
+
+def _stamp(row: Row, column: int) -> float | None:
+    values = to_floats(row.fields[column : column + 1])
+    return values[0] if values and math.isfinite(values[0]) else None
+
+
+def _in_order(stamps_s: Floats, name: str, notes: list[str]) -> tuple[Floats, list[int]]:
+    """Ascending unique stamps and their rows; of equal ones the first is kept."""
+    unique, rows = np.unique(stamps_s, return_index=True)
+    if len(unique) < len(stamps_s):
+        notes.append(f"{name}: {len(stamps_s) - len(unique)} lines with the stamp of an earlier one left out")
+    if (np.diff(stamps_s) < 0).any():
+        notes.append(f"{name}: lines were not in order of time: sorted")
+    return unique, rows.tolist()
