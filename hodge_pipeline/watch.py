@@ -1,0 +1,31 @@
+"""Who watches a run: the pipeline tells, the command line shows. Nobody watching is the default."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Protocol
+
+from hodge_pipeline.stages import Advance, no_progress
+
+
+class Watcher(Protocol):
+    """Is told of each stage as it begins, moves and ends."""
+
+    def stage(self, title: str, total: int) -> AbstractContextManager[Advance]:
+        """A context whose value is called with the units just finished, of `total` in all."""
+        ...
+
+    def say(self, message: str) -> None:
+        """One line for the user: a note or a warning."""
+        ...
+
+
+class Nobody:
+    """Watches nothing."""
+
+    def stage(self, title: str, total: int) -> AbstractContextManager[Advance]:
+        """A context that shows nothing."""
+        return nullcontext(no_progress)
+
+    def say(self, message: str) -> None:
+        """Nothing."""

@@ -1,0 +1,127 @@
+"""Group laws of se3 over every batch shape, and hand-derived answers."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from hodge_pipeline import se3
+
+SHAPES = st.sampled_from([(), (1,), (5,), (2, 3), (0,)])
+
+
+@st.composite
+def twists(draw: st.DrawFn, max_angle: float = 3.0) -> np.ndarray:
+    """Twists of any batch shape with rotations below `max_angle`, tiny ones and zeros among them."""
+    shape = draw(SHAPES)
+    elements = st.one_of(st.just(0.0), st.floats(-1e-7, 1e-7), st.floats(-1, 1))
+    xi = draw(hnp.arrays(float, (*shape, 6), elements=elements))
+    xi[..., :3] *= max_angle / np.sqrt(3)
+    xi[..., 3:] *= 10
+    return xi
+
+
+@settings(deadline=None)
+@given(twists())
+def test_log_inverts_exp(xi: np.ndarray) -> None:
+    np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(twists())
+def test_pairing_log_inverts_pairing_exp(xi: np.ndarray) -> None:
+    np.testing.assert_allclose(se3.pairing_log(se3.pairing_exp(xi)), xi, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(twists())
+def test_log_is_antisymmetric(xi: np.ndarray) -> None:
+    motion = se3.exp(xi)
+    np.testing.assert_allclose(se3.log(se3.inverse(motion)), -se3.log(motion), atol=1e-9)
+
+
+@settings(deadline=None)
+@given(twists())
+def test_inverse(xi: np.ndarray) -> None:
+    motion = se3.exp(xi)
+    eye = np.broadcast_to(np.eye(4), motion.shape)
+    np.testing.assert_allclose(se3.inverse(motion) @ motion, eye, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(twists())
+def test_adjoint_moves_a_twist_to_the_left(xi: np.ndarray) -> None:
+    motion, small = se3.exp(xi), np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
+    left = se3.exp(np.einsum("...ij,j->...i", se3.adjoint(motion), small)) @ motion
+    np.testing.assert_allclose(motion @ se3.exp(small), left, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(twists())
+def test_quaternions_round_trip(xi: np.ndarray) -> None:
+    motion = se3.exp(xi)
+    quat = se3.to_quat_xyzw(motion)
+    np.testing.assert_allclose(se3.from_quat_xyzw(motion[..., :3, 3], 7.0 * quat), motion, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(twists(max_angle=1.0))
+def test_left_jacobian_inverse(xi: np.ndarray) -> None:
+    phi = xi[..., :3]
+    product = se3.left_jacobian(phi) @ se3.left_jacobian_inverse(phi)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-10)
+
+
+def test_quarter_turn_about_z_by_hand() -> None:
+    motion = se3.exp(np.array([0, 0, np.pi / 2, 1, 0, 0]))
+    np.testing.assert_allclose(motion[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+    # V(φ) x for a quarter turn: the chord of the circle that is begun along x
+    np.testing.assert_allclose(motion[:3, 3], [2 / np.pi, 2 / np.pi, 0], atol=1e-15)
+    np.testing.assert_allclose(se3.transform(motion, np.array([[1.0, 0, 0]])), [[2 / np.pi, 1 + 2 / np.pi, 0]])
+
+
+def test_pairing_log_is_not_antisymmetric() -> None:
+    motion = se3.exp(np.array([0, 0, 1.0, 1, 0, 0]))
+    assert np.abs(se3.pairing_log(se3.inverse(motion)) + se3.pairing_log(motion)).max() > 0.1
+
+
+@pytest.mark.parametrize("angle", [1e-12, 1e-5, 9.9e-5, 1.01e-4, 1e-3])
+def test_series_meets_closed_form(angle: float) -> None:
+    phi = angle * np.array([0.6, 0.0, 0.8])
+    step = 1e-3
+    # V(φ) is the mean of exp(sφ) for s in [0, 1]
+    shares = (np.arange(0, 1, step) + step / 2)[:, None]
+    np.testing.assert_allclose(se3.left_jacobian(phi), se3.so3_exp(shares * phi).mean(axis=0), atol=1e-9)
+
+
+def test_half_turns_are_told() -> None:
+    rotations = se3.so3_exp(np.array([[np.pi, 0, 0], [3.0, 0, 0], [0, 0, 0]]))
+    assert se3.is_half_turn(rotations).tolist() == [True, False, False]
+    assert se3.log(se3.from_parts(rotations, np.zeros((3, 3)))).shape == (3, 6)
+
+
+def test_projection_gives_the_nearest_rotation() -> None:
+    rotation = se3.so3_exp(np.array([0.3, -0.2, 0.9]))
+    np.testing.assert_allclose(se3.project_to_so3(0.9995 * rotation), rotation, atol=1e-12)
+    mirrored = se3.project_to_so3(np.diag([1.0, 1.0, -1.0]))
+    assert np.isclose(np.linalg.det(mirrored), 1.0)
+
+
+def test_interpolation_ends_and_middle() -> None:
+    a, b = se3.exp(np.array([0.1, 0, 0, 1, 2, 3.0])), se3.exp(np.array([0.5, 0.2, 0, 0, 2, 3.0]))
+    ends = se3.interpolate(a, b, np.array([0.0, 1.0]))
+    np.testing.assert_allclose(ends, [a, b], atol=1e-12)
+    middle = se3.interpolate(a, b, np.array(0.5))
+    np.testing.assert_allclose(se3.log(se3.inverse(a) @ middle), se3.log(se3.inverse(middle) @ b), atol=1e-12)
+
+
+def test_is_motion_tells_bad_matrices() -> None:
+    good = se3.exp(np.array([0.1, 0.2, 0.3, 4, 5, 6]))
+    nan, singular, mirror, row = good.copy(), good.copy(), good.copy(), good.copy()
+    nan[0, 3], singular[:3, 0], row[3, 0] = np.nan, 0, 1
+    mirror[:3, :3] = np.diag([1.0, 1.0, -1.0])
+    loose = good.copy()
+    loose[:3, :3] *= 0.9998
+    verdict = se3.is_motion(np.array([good, loose, nan, singular, mirror, row]))
+    assert verdict.tolist() == [True, True, False, False, False, False]
