@@ -14,9 +14,9 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.yaml_file import Keys
 
 T = TypeVar("T")
-Keys = tuple[str | int, ...]
 Where = Callable[[Keys], str]
 """Gives `file:line` of a key path."""
 

@@ -16,7 +16,7 @@ from hodge_pipeline.errors import RecipeError
 MAX_BYTES = 1_000_000
 MAX_NODES = 20_000
 
-Path_ = tuple[str | int, ...]
+Keys = tuple[str | int, ...]
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Document:
     """Plain data, and the origin (`file:line` or the override) of each key, by its path from the root."""
 
     data: dict[str, Any]
-    origins: dict[Path_, str]
+    origins: dict[Keys, str]
 
 
 def read(path: Path) -> Document:
@@ -53,7 +53,7 @@ def parse(text: str, name: str) -> Document:
         root = CommentedMap()
     if not isinstance(root, CommentedMap):
         raise RecipeError(f"{name}:1: a recipe is a mapping of keys to values, found {type(root).__name__}")
-    origins: dict[Path_, str] = {(): f"{name}:1"}
+    origins: dict[Keys, str] = {(): f"{name}:1"}
     budget = iter(range(MAX_NODES))
     data = _plain(root, (), 1, name, origins, budget)
     return Document(data, origins)
@@ -77,7 +77,7 @@ def dump(data: dict[str, Any]) -> str:
     return out.getvalue()
 
 
-def _plain(node: Any, path: Path_, line: int, name: str, origins: dict[Path_, str], budget: Iterator[int]) -> Any:
+def _plain(node: Any, path: Keys, line: int, name: str, origins: dict[Keys, str], budget: Iterator[int]) -> Any:
     """A node as dict, list or scalar; refuses tags, and more nodes than any recipe has (aliases multiply)."""
     if next(budget, None) is None:
         raise RecipeError(f"{name}:{line}: more than {MAX_NODES} values: this is no recipe")
