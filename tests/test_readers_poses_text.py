@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hodge_adapters.poses_text import KittiWriter, TumWriter, parse_tum, read_kitti, read_tum, write_kitti, write_tum
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError, WorkspaceError
+from hodge_pipeline.stages import Writer
+from hodge_pipeline.types import Trajectory
+
+IDENTITY = "0 0 0 0 0 0 1"
+
+
+def trajectory(count: int, seed: int, start_s: float = 1305031229.528784) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    stamps = start_s + np.cumsum(rng.uniform(0.01, 0.1, count))
+    return Trajectory(stamps, se3.exp(rng.normal(0, 1.0, (count, 6)) * [1, 1, 1, 100, 100, 100]))
+
+
+@given(seed=st.integers(0, 1000), count=st.integers(1, 20))
+@settings(max_examples=20, deadline=None)
+def test_what_is_written_reads_back(tmp_path_factory: pytest.TempPathFactory, seed: int, count: int) -> None:
+    folder, written = tmp_path_factory.mktemp("poses"), trajectory(count, seed)
+    write_tum(folder / "poses.tum", written)
+    back = read_tum(folder / "poses.tum")
+    np.testing.assert_array_equal(back.stamps_s, written.stamps_s)
+    np.testing.assert_array_equal(back.world_from_cam[:, :3, 3], written.world_from_cam[:, :3, 3])
+    np.testing.assert_allclose(back.world_from_cam, written.world_from_cam, atol=1e-14)
+    write_kitti(folder / "poses.kitti", written)
+    np.testing.assert_allclose(read_kitti(folder / "poses.kitti").world_from_cam, written.world_from_cam, atol=1e-14)
+    assert [path.name for path in sorted(folder.iterdir())] == ["poses.kitti", "poses.tum"], "no temporary file is left"
+
+
+def test_a_quarter_turn_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text("# comment\r\n5.5, 1 2 3\t0 0 0.70710678118654752 0.70710678118654752\r\n\r\n")
+    found = read_tum(path)
+    expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(found.world_from_cam, [expected], atol=1e-15)
+    assert found.stamps_s.tolist() == [5.5]
+
+
+def test_the_writers_are_stages(tmp_path: Path) -> None:
+    for writer in (TumWriter(), KittiWriter()):
+        assert isinstance(writer, Writer)
+        writer.write(tmp_path / "poses", trajectory(3, 0))
+        first = (tmp_path / "poses").read_bytes()
+        writer.write(tmp_path / "poses", trajectory(3, 0))
+        assert (tmp_path / "poses").read_bytes() == first
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="nowhere"):
+        write_tum(tmp_path / "nowhere" / "poses.tum", trajectory(1, 0))
+
+
+@pytest.mark.parametrize(
+    "line", ["1 0 0 0 0 0 0 0", "1 0 0 0 0 0 1", "x 0 0 0 0 0 0 1", "nan 0 0 0 0 0 0 1", "1 inf 0 0 0 0 0 1", "1 1 1"]
+)
+def test_a_line_that_is_no_pose_is_named_or_noted(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text(f"# header\n0 {IDENTITY}\n{line}\n2 {IDENTITY}\n")
+    with pytest.raises(SourceError, match=r"a\.tum:3: "):
+        read_tum(path)
+    parsed = parse_tum(path)
+    assert parsed.trajectory.stamps_s.tolist() == [0, 2]
+    assert parsed.notes == ("a.tum: 1 lines that are no pose left out: 3",)
+    path.write_text(line)
+    with pytest.raises(SourceError, match=r"a\.tum:1: "):
+        parse_tum(path)
+
+
+def test_unsorted_and_repeated_stamps_are_put_in_order_and_noted(tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text("2 2 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 9 0 0 0 0 0 1\n")
+    parsed = parse_tum(path)
+    assert parsed.trajectory.world_from_cam[:, 0, 3].tolist() == [1, 2], "of equal stamps the first is kept"
+    assert len(parsed.notes) == 2
+
+
+@pytest.mark.parametrize("reader", [read_tum, parse_tum, read_kitti])
+def test_an_empty_or_missing_or_binary_file_is_an_error(tmp_path: Path, reader) -> None:
+    path = tmp_path / "a.txt"
+    with pytest.raises(SourceError, match=r"a\.txt: cannot be read"):
+        reader(path)
+    for contents in (b"", b"# only a comment\n", b"\x89PNG\r\n\x1a\n\x00\xff"):
+        path.write_bytes(contents)
+        with pytest.raises(SourceError, match=r"a\.txt"):
+            reader(path)
+
+
+def test_kitti_refuses_what_is_no_rigid_motion(tmp_path: Path) -> None:
+    path = tmp_path / "00.txt"
+    path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(SourceError, match=r"00\.txt:2: not a rigid motion"):
+        read_kitti(path)
+
+
+def test_kitti_times_must_fit(tmp_path: Path) -> None:
+    poses, times = tmp_path / "00.txt", tmp_path / "times.txt"
+    poses.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    times.write_text("0.0\n0.1\n")
+    assert read_kitti(poses, times).stamps_s.tolist() == [0.0, 0.1]
+    times.write_text("0.1\n0.0\n")
+    with pytest.raises(SourceError, match="times.txt"):
+        read_kitti(poses, times)
+
+
+def test_real_trajectories(data_dir: Path) -> None:
+    folder = data_dir / "trajectories/evo"
+    truth = parse_tum(folder / "fr2_desk_groundtruth.txt")
+    assert len(truth.trajectory) == 20956 and "stamp of an earlier one" in truth.notes[0]
+    assert len(read_kitti(folder / "KITTI_00_gt.txt", folder / "KITTI_00_gt_times.txt")) == 4541
+    assert len(read_tum(folder / "freiburg1_xyz-rgbdslam.txt")) == 788

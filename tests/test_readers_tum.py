@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hodge_adapters.association import interpolated_poses, nearest_pairs
+from hodge_adapters.tum import TumReader
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from readers_data import HEIGHT, WIDTH, agreement, some_poses, tum_folder, tum_line
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.testing import check_reader
+from hodge_pipeline.types import Camera, Source, Trajectory
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tum_folder(tmp_path / "sequence")
+
+
+def colour_names(source: Source) -> list[str | None]:
+    return [frame.read_colour.args[0].name if frame.read_colour else None for frame in source.frames]
+
+
+def test_the_contract(folder: Path) -> None:
+    poses = some_poses(30)
+    truth = "".join(tum_line(9.9 + 0.05 * row, pose) for row, pose in enumerate(poses))
+    (folder / "groundtruth.txt").write_text("# truth\n" + truth)
+    source = check_reader(TumReader(), folder)
+    assert len(source.trajectory) == 30
+    check_reader(TumReader(every=2), folder)
+
+
+def test_frames_of_a_folder(folder: Path) -> None:
+    source = TumReader(no_depth=(0, 65535)).open(folder)
+    assert [(f.frame_id, f.stamp_s) for f in source.frames] == [(0, 10.0), (1, 10.5), (2, 11.25)]
+    assert colour_names(source) == ["10.010000.png", "10.510000.png", "11.260000.png"]
+    assert source.frames[0].camera == Camera(WIDTH, HEIGHT, 10, 10, 4, 3)
+    assert source.frames[0].read_depth().max() < 0.8, "5000 units a metre"
+    assert TumReader(depth_scale=1000).open(folder).frames[0].read_depth().max() > 3
+    assert source.notes == ("intrinsics from intrinsics.txt", "no ground truth")
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("rgbd_dataset_freiburg1_desk", 517.3),
+        ("rgbd_dataset_freiburg2_xyz", 520.9),
+        ("fr3_office", 535.4),
+        ("office", 525.0),
+        ("afr1ca", 525.0),
+    ],
+)
+def test_the_camera_by_the_folder_name(folder: Path, name: str, expected: float) -> None:
+    (folder / "intrinsics.txt").unlink()
+    renamed = folder.rename(folder.with_name(name))
+    source = TumReader().open(renamed)
+    assert source.frames[0].camera.fx == expected
+    assert any(note.startswith("intrinsics of") for note in source.notes)
+
+
+def test_the_camera_by_option(folder: Path) -> None:
+    assert TumReader(camera="fr2").open(folder).frames[0].camera == Camera(640, 480, 520.9, 521.0, 325.1, 249.7)
+    assert TumReader(camera=(9, 8, 4, 3)).open(folder).frames[0].camera == Camera(WIDTH, HEIGHT, 9, 8, 4, 3)
+    (folder / "mine.yaml").write_text(
+        "Camera.fx: 7.5\nCamera.fy: 7.5\nCamera.cx: 4\nCamera.cy: 3\nDepthMapFactor: 1000.0\n"
+    )
+    source = TumReader(camera="mine.yaml").open(folder)
+    assert source.frames[0].camera.fx == 7.5 and source.frames[0].read_depth().max() > 1
+    with pytest.raises(SourceError, match=r"gone\.yaml"):
+        TumReader(camera="gone.yaml").open(folder)
+
+
+@pytest.mark.parametrize("depth_first", [True, False])
+def test_association_files_in_both_orders(folder: Path, depth_first: bool) -> None:
+    lines = []
+    for stamp_s in (11.25, 10.0):
+        depth = f"{stamp_s:.6f} depth/{stamp_s:.6f}.png"
+        colour = f"{stamp_s + 0.01:.6f} rgb/{stamp_s + 0.01:.6f}.png"
+        lines.append(f"{depth} {colour}\n" if depth_first else f"{colour} {depth}\n")
+    (folder / "associations.txt").write_text("".join(lines))
+    source = check_reader(TumReader(), folder)
+    assert [frame.stamp_s for frame in source.frames] == [10.0, 11.25], "the depth image's stamp, in order"
+    assert colour_names(source) == ["10.010000.png", "11.260000.png"]
+    assert any("not in order" in note for note in source.notes)
+
+
+def test_an_association_file_that_does_not_say_which_is_depth(folder: Path) -> None:
+    (folder / "associations.txt").write_text("1 a/1.png 1 b/1.png\n")
+    with pytest.raises(SourceError, match=r"associations\.txt:1: neither or both"):
+        TumReader().open(folder)
+
+
+def test_bad_lines_are_left_out_and_noted(folder: Path) -> None:
+    with open(folder / "depth.txt", "a") as file:
+        file.write("abc depth/1.png\n12.0\nnan depth/1.png\n10.0 depth/10.500000.png\n")
+        file.write("13 ../secret.png\n14 /etc/secret.png\n15 depth/../../secret.png\n16 depth/gone.png\n")
+    source = check_reader(TumReader(), folder)
+    assert len(source.frames) == 3
+    assert "depth.txt: 3 lines that are not `stamp file` left out: 5, 6, 7" in source.notes
+    assert "depth.txt: 3 lines that point out of the folder left out: 9, 10, 11" in source.notes
+    assert "depth.txt: 1 lines with the stamp of an earlier one left out" in source.notes
+    assert "1 depth images listed but not there left out: gone.png" in source.notes
+    assert not any("secret" in str(file) for file in source.files)
+
+
+def test_an_association_may_not_leave_the_folder(folder: Path) -> None:
+    (folder / "associations.txt").write_text("1 ../depth/1.png 1 rgb/1.png\n")
+    with pytest.raises(SourceError, match=r"associations\.txt: no line"):
+        TumReader().open(folder)
+
+
+def test_colour_that_is_absent_or_too_late(folder: Path) -> None:
+    (folder / "rgb/10.510000.png").unlink()
+    source = check_reader(TumReader(), folder)
+    assert colour_names(source) == ["10.010000.png", None, "11.260000.png"]
+    assert "1 colour images listed but not there: 10.510000.png" in source.notes
+    source = TumReader(max_difference_s=0.005).open(folder)
+    assert colour_names(source) == [None] * 3
+    assert "3 depth images have no colour image within 0.005 s" in source.notes
+    (folder / "rgb.txt").unlink()
+    assert "no rgb.txt: frames have no colour" in TumReader().open(folder).notes
+
+
+@pytest.mark.parametrize("contents", ["", "# only a comment\n", "x y\n"])
+def test_a_list_without_images_is_an_error(folder: Path, contents: str) -> None:
+    (folder / "depth.txt").write_text(contents)
+    with pytest.raises(SourceError, match=r"depth\.txt: no line"):
+        TumReader().open(folder)
+
+
+def test_what_is_no_tum_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "empty").mkdir()
+    for name in ("file", "loop", "empty", "absent"):
+        assert TumReader().sniff(tmp_path / name).confidence == 0
+        with pytest.raises(SourceError, match=name):
+            TumReader().open(tmp_path / name)
+
+
+def test_truth_is_interpolated_only_between_near_neighbours(folder: Path) -> None:
+    a, b = some_poses(2)
+    (folder / "groundtruth.txt").write_text(
+        tum_line(9.98, a) + "9.99 bad line\n" + tum_line(10.06, b) + tum_line(10.5, a) + tum_line(11.0, b)
+    )
+    source = check_reader(TumReader(), folder)
+    quarter, exact, none = (frame.world_from_cam for frame in source.frames)
+    np.testing.assert_allclose(quarter, se3.interpolate(a, b, np.array(0.25)), atol=1e-6)
+    np.testing.assert_allclose(exact, a, atol=1e-6)
+    assert none is None
+    assert "1 of 3 frames have no truth within 0.1 s" in source.notes
+    assert "groundtruth.txt: 1 lines that are no pose left out: 2" in source.notes
+
+
+def test_truth_by_row(folder: Path) -> None:
+    (folder / "truth.txt").write_text("".join(tum_line(100.0 + row, pose) for row, pose in enumerate(some_poses(3))))
+    by_stamp = TumReader(truth="truth.txt").open(folder)
+    assert any("another clock" in note for note in by_stamp.notes)
+    by_row = check_reader(TumReader(truth="truth.txt", truth_match="row"), folder)
+    np.testing.assert_allclose(by_row.frames[2].world_from_cam, some_poses(3)[2], atol=1e-6)
+    assert by_row.trajectory.stamps_s.tolist() == [10.0, 10.5, 11.25]
+    (folder / "truth.txt").write_text(tum_line(1.0, np.eye(4)))
+    with pytest.raises(SourceError, match="1 poses for 3 frames"):
+        TumReader(truth="truth.txt", truth_match="row").open(folder)
+    with pytest.raises(SourceError, match=r"gone\.txt"):
+        TumReader(truth="gone.txt").open(folder)
+
+
+@given(
+    depth=st.lists(st.integers(0, 400), unique=True, max_size=40).map(sorted),
+    colour=st.lists(st.integers(0, 400), unique=True, max_size=40).map(sorted),
+)
+@settings(deadline=None)
+def test_pairs_are_near_unique_and_none_is_missed(depth: list[int], colour: list[int]) -> None:
+    depth_s, colour_s = np.array(depth) / 100, np.array(colour) / 100
+    pairs = nearest_pairs(depth_s, colour_s, 0.0201)
+    found = [(row, column) for row, column in enumerate(pairs.tolist()) if column >= 0]
+    assert len({column for _, column in found}) == len(found)
+    assert all(abs(depth[row] - colour[column]) <= 2 for row, column in found)
+    # A pair left over on both sides would be one that the greedy choice should have made.
+    free_depth = {row for row, column in enumerate(pairs) if column < 0}
+    free_colour = set(range(len(colour))) - {column for _, column in found}
+    assert not any(abs(depth[row] - colour[column]) <= 2 for row in free_depth for column in free_colour)
+
+
+def test_the_nearer_depth_gets_the_colour_image() -> None:
+    assert nearest_pairs(np.array([1.0, 1.01]), np.array([1.012]), 0.02).tolist() == [-1, 0]
+
+
+def test_outside_the_trajectory_there_is_no_pose() -> None:
+    trajectory = Trajectory(np.array([1.0, 2.0]), some_poses(2))
+    poses = interpolated_poses(trajectory, np.array([0.99, 1.0, 1.5, 2.0, 2.01]), 1.0)
+    assert np.isnan(poses[:, 0, 0]).tolist() == [True, False, False, False, True]
+    np.testing.assert_allclose(poses[[1, 3]], trajectory.world_from_cam, atol=1e-12)
+
+
+def test_fr1_by_contract_and_convention(data_dir: Path) -> None:
+    source = check_reader(TumReader(), data_dir / "tum/fr1_rpy_part")
+    assert len(source.frames) == 60 and len(source.trajectory) == 2742
+    assert all(frame.world_from_cam is not None and frame.read_colour is not None for frame in source.frames)
+    assert source.frames[0].stamp_s == 1305031229.528784 and source.frames[0].camera.fx == 517.3
+    first, later = source.frames[0], source.frames[6]
+    right = se3.inverse(first.world_from_cam) @ later.world_from_cam
+    wrong = first.world_from_cam @ se3.inverse(later.world_from_cam)
+    assert agreement(first, later, right) > 1.5 * agreement(first, later, wrong)
+
+
+def test_frame_numbers_for_stamps(data_dir: Path) -> None:
+    reader = TumReader(truth="truth_cam_poses.txt", truth_match="row")
+    source = check_reader(reader, data_dir / "tum/fr3_cabinet_58keyframes")
+    assert [frame.frame_id for frame in source.frames] == list(range(58))
+    assert source.frames[0].camera == Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
+    np.testing.assert_allclose(source.frames[1].world_from_cam[:3, 3], [-2.4691, 1.0757, 1.0996])
