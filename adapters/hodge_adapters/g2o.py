@@ -1,0 +1,239 @@
+"""g2o pose graphs, 2-D and 3-D: vertices, edges, FIX, 64-bit keys. Its conventions are met here and nowhere else.
+
+A g2o information matrix is over (translation, q_vec): half an angle. Ours is over (rotation, translation) in radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass as stage
+
+from hodge_adapters.pose_graph_text import Records, count_tags, read_records, write_lines
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.stages import Sniff
+from hodge_pipeline.types import Floats, Ints, Source, Trajectory, ViewGraph
+
+HALF_ANGLE = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
+"""d(q_vec, t) / d(φ, ρ) at the identity."""
+PLANAR_TWIST = np.array([3, 4, 2])
+"""Where (x, y, θ) lie in (φ, ρ)."""
+SKIPPED_TAGS_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class PoseGraphFile:
+    """A pose graph as its file has it, and what `ViewGraph` has no place for.
+
+    - `world_from_vertex (V, 4, 4)`: the file's own vertex poses; None unless every vertex has one.
+    - `fixed`: rows of the vertices that the file fixes.
+    - `dimension`: 2 where the file is planar; the graph is then lifted, with no information out of the plane.
+    """
+
+    graph: ViewGraph
+    world_from_vertex: Floats | None = None
+    fixed: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    dimension: int = 3
+    notes: tuple[str, ...] = ()
+
+
+def upper_triangle(values: Floats, size: int) -> Floats:
+    """Symmetric matrices (N, size, size) of their upper triangles (N, size (size + 1) / 2), row by row."""
+    rows, columns = np.triu_indices(size)
+    out = np.zeros((len(values), size, size))
+    out[:, rows, columns] = out[:, columns, rows] = values
+    return out
+
+
+def information_of_file(information: Floats) -> Floats:
+    """Matrices over ξ = (φ, ρ) (E, 6, 6) of a g2o file's over (t, q_vec): q_vec = φ / 2."""
+    swapped = np.roll(information, (3, 3), axis=(-2, -1))
+    return np.asarray(swapped * np.outer(HALF_ANGLE, HALF_ANGLE))
+
+
+def information_for_file(information: Floats) -> Floats:
+    """A g2o file's matrices over (t, q_vec) (E, 6, 6) of ours over ξ = (φ, ρ)."""
+    return np.roll(information / np.outer(HALF_ANGLE, HALF_ANGLE), (-3, -3), axis=(-2, -1))
+
+
+def lift_poses(poses: Floats) -> Floats:
+    """Motions (N, 4, 4) about z of planar poses (N, 3) = (x, y, θ)."""
+    rotation = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    rotation[:, 0, 0] = rotation[:, 1, 1] = cosine
+    rotation[:, 1, 0], rotation[:, 0, 1] = sine, -sine
+    return se3.from_parts(rotation, np.pad(poses[:, :2], ((0, 0), (0, 1))))
+
+
+def flatten_poses(motions: Floats) -> Floats:
+    """Planar poses (N, 3) = (x, y, θ) of motions about z (N, 4, 4)."""
+    angle = np.arctan2(motions[:, 1, 0], motions[:, 0, 0])
+    return np.column_stack([motions[:, :2, 3], angle])
+
+
+def lift_information(information: Floats) -> Floats:
+    """6x6 matrices over (φ, ρ) of planar ones (E, 3, 3) over (x, y, θ), zero out of the plane."""
+    out = np.zeros((len(information), 6, 6))
+    out[:, PLANAR_TWIST[:, None], PLANAR_TWIST] = information
+    return out
+
+
+def spatial_poses(records: Records) -> Floats:
+    """Motions (N, 4, 4) of x y z qx qy qz qw; a zero quaternion is refused with its line."""
+    quat = records.values[:, 3:7]
+    records.refuse(np.linalg.norm(quat, axis=1) < 1e-9, "its quaternion is zero")
+    return se3.from_quat_xyzw(records.values[:, :3], quat)
+
+
+@dataclass(frozen=True)
+class _Half:
+    """The vertices and edges of one dimension."""
+
+    vertex_keys: Ints
+    poses: Floats
+    edge_keys: Ints
+    motions: Floats
+    information: Floats
+
+
+def _spatial(records: dict[str, Records]) -> _Half:
+    vertices, edges = records["VERTEX_SE3:QUAT"], records["EDGE_SE3:QUAT"]
+    information = information_of_file(upper_triangle(edges.values[:, 7:], 6))
+    return _Half(vertices.keys[:, 0], spatial_poses(vertices), edges.keys, spatial_poses(edges), information)
+
+
+def _planar(records: dict[str, Records]) -> _Half:
+    vertices, edges = records["VERTEX_SE2"], records["EDGE_SE2"]
+    information = lift_information(upper_triangle(edges.values[:, 3:], 3))
+    poses, motions = lift_poses(vertices.values), lift_poses(edges.values[:, :3])
+    return _Half(vertices.keys[:, 0], poses, edges.keys, motions, information)
+
+
+def rows_of_keys(path: Path, vertex_keys: Ints, edge_keys: Ints) -> tuple[Ints, Ints]:
+    """The vertex ids in the file's order, then those that only edges name, and the edges as rows of them (E, 2)."""
+    if len(np.unique(vertex_keys)) != len(vertex_keys):
+        keys, counts = np.unique(vertex_keys, return_counts=True)
+        raise SourceError(f"{path}: vertex {keys[counts > 1][0]} is given twice: remove one of its lines")
+    every = np.concatenate([vertex_keys, edge_keys.reshape(-1)])
+    unique, first, inverse = np.unique(every, return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")
+    rank = np.empty(len(unique), np.int64)
+    rank[order] = np.arange(len(unique))
+    return unique[order], rank[inverse.reshape(-1)[len(vertex_keys) :]].reshape(-1, 2)
+
+
+def assemble(path: Path, half: _Half, source: str, fixed_keys: Ints, dimension: int, notes: list[str]) -> PoseGraphFile:
+    """The graph of what the file holds; notes what was incomplete."""
+    ids, edges = rows_of_keys(path, half.vertex_keys, half.edge_keys)
+    poses: Floats | None = half.poses
+    if len(ids) > len(half.vertex_keys):
+        poses = None
+        if len(half.vertex_keys):
+            missing = len(ids) - len(half.vertex_keys)
+            notes.append(f"{missing} of {len(ids)} vertices are named by edges only: no initial poses")
+    fixed = np.flatnonzero(np.isin(ids, fixed_keys)).astype(np.int64)
+    graph = ViewGraph.from_edges(ids, edges, half.motions, half.information, source)
+    return PoseGraphFile(graph, poses, fixed, dimension, tuple(notes))
+
+
+def skipped(records: dict[str, Records], other: dict[str, int]) -> list[str]:
+    """A note for each kind of line that is not read, with its count."""
+    shown = sorted(other.items(), key=lambda item: -item[1])
+    notes = [f"{count} lines of kind {tag} are not read" for tag, count in shown[:SKIPPED_TAGS_SHOWN]]
+    if len(shown) > SKIPPED_TAGS_SHOWN:
+        rest = shown[SKIPPED_TAGS_SHOWN:]
+        notes.append(f"{sum(count for _, count in rest)} lines of {len(rest)} more kinds are not read")
+    return notes
+
+
+KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1}
+COLUMNS = {"VERTEX_SE3:QUAT": (7,), "EDGE_SE3:QUAT": (28,), "VERTEX_SE2": (3,), "EDGE_SE2": (9,), "FIX": None}
+
+
+def load_g2o(path: Path | str) -> PoseGraphFile:
+    """The pose graph of a g2o file. Raises `SourceError` with file and line where one is malformed."""
+    path = Path(path)
+    records, other = read_records(path, KEYS, COLUMNS)
+    spatial, planar = len(records["EDGE_SE3:QUAT"]), len(records["EDGE_SE2"])
+    if spatial and planar:
+        raise SourceError(f"{path}: holds both EDGE_SE3:QUAT and EDGE_SE2: split it, one dimension to a file")
+    if not spatial and not planar and not len(records["VERTEX_SE3:QUAT"]) and not len(records["VERTEX_SE2"]):
+        raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
+    dimension = 2 if planar or len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"]) else 3
+    half = _planar(records) if dimension == 2 else _spatial(records)
+    return assemble(path, half, "g2o", records["FIX"].keys.reshape(-1), dimension, skipped(records, other))
+
+
+def as_source(file: PoseGraphFile, path: Path) -> Source:
+    """The file as a `Source`: the graph, and the vertex poses as a trajectory whose stamps are row numbers."""
+    poses = file.world_from_vertex
+    trajectory = None if poses is None else Trajectory(np.arange(len(poses), dtype=float), poses)
+    notes = list(file.notes)
+    if len(file.fixed):
+        notes.append(f"{len(file.fixed)} vertices are marked FIX")
+    return Source(path.stem, path, trajectory=trajectory, graph=file.graph, notes=tuple(notes), files=(path,))
+
+
+@stage(frozen=True, config=ConfigDict(extra="forbid"))
+class G2oReader:
+    """Opens a g2o file as a measured graph; 2-D graphs are lifted into the plane z = 0."""
+
+    def sniff(self, path: Path) -> Sniff:
+        """How sure it is: by the tags of the first lines."""
+        tags = count_tags(path)
+        known = sum(count for tag, count in tags.items() if tag in KEYS)
+        if known:
+            return Sniff(0.95, f"lines of kind {next(tag for tag in tags if tag in KEYS)}")
+        return Sniff(0.2 if path.suffix == ".g2o" else 0.0, "no g2o line at its beginning")
+
+    def open(self, path: Path) -> Source:
+        """The graph, and the vertices as a trajectory whose stamps are row numbers, where the file has them all."""
+        return as_source(load_g2o(path), Path(path))
+
+
+def write_g2o(
+    path: Path | str,
+    graph: ViewGraph,
+    world_from_vertex: Floats | None = None,
+    *,
+    dimension: int = 3,
+    fixed: Ints | None = None,
+) -> None:
+    """One g2o file, written atomically: ids, order and values survive a round trip to the last bit of a float64.
+
+    `dimension=2` writes SE2 lines of a graph in the plane. Raises `SourceError` where ids are no integers.
+    """
+    path = Path(path)
+    if not np.issubdtype(graph.vertex_ids.dtype, np.integer):
+        raise SourceError(f"{path}: g2o vertices need integer ids, not {graph.vertex_ids.dtype}: number them first")
+    ids = graph.vertex_ids.astype(np.int64)
+    lines: list[str] = []
+    vertex_tag, edge_tag = ("VERTEX_SE2", "EDGE_SE2") if dimension == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+    if world_from_vertex is not None:
+        write_lines(lines, vertex_tag, ids[:, None], _pose_columns(world_from_vertex, dimension))
+    if fixed is not None and len(fixed):
+        write_lines(lines, "FIX", ids[fixed][:, None], np.zeros((len(fixed), 0)))
+    poses, information = _pose_columns(graph.i_from_j, dimension), _information_columns(graph.information, dimension)
+    write_lines(lines, edge_tag, ids[graph.edges], np.hstack([poses, information]))
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
+    temporary.replace(path)
+
+
+def _pose_columns(motions: Floats, dimension: int) -> Floats:
+    if dimension == 2:
+        return flatten_poses(motions)
+    return np.hstack([motions[:, :3, 3], se3.to_quat_xyzw(motions)]) if len(motions) else np.zeros((0, 7))
+
+
+def _information_columns(information: Floats, dimension: int) -> Floats:
+    if dimension == 2:
+        planar = information[:, PLANAR_TWIST[:, None], PLANAR_TWIST]
+        rows, columns = np.triu_indices(3)
+        return np.asarray(planar[:, rows, columns])
+    rows, columns = np.triu_indices(6)
+    return np.asarray(information_for_file(information)[:, rows, columns])

@@ -1,0 +1,148 @@
+"""Lines of the pose-graph text formats: a tag, integer keys, numbers. Parsed in columns, a million lines in seconds."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Bools, Floats, Ints
+
+SNIFFED_LINES = 20
+Columns = Mapping[str, tuple[int, ...] | None]
+"""How many numbers may follow the keys of a tag; None: those that follow are more keys."""
+
+
+@dataclass(frozen=True)
+class Records:
+    """All lines of one tag: `keys (N, k)`, `values (N, c)`, and where they stood, for messages."""
+
+    path: Path
+    line_numbers: Ints
+    keys: Ints
+    values: Floats
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def refuse(self, wrong: Bools, why: str) -> None:
+        """Raise `SourceError` for the first line that is wrong."""
+        if wrong.any():
+            raise SourceError(f"{self.path}:{self.line_numbers[np.argmax(wrong)]}: {why}")
+
+
+def count_tags(path: Path) -> Counter[str]:
+    """How often each first word occurs in the first lines; empty where the path is no readable text."""
+    try:
+        with Path(path).open(encoding="ascii") as file:
+            lines = list(islice(file, SNIFFED_LINES))
+    except (OSError, UnicodeDecodeError):
+        return Counter()
+    return Counter(line.split(None, 1)[0] for line in lines if line.strip() and not line.startswith("#"))
+
+
+def read_records(path: Path, keys: Mapping[str, int], columns: Columns) -> tuple[dict[str, Records], dict[str, int]]:
+    """The records of each known tag (all tags present, empty where the file has none) and counts of other tags."""
+    try:
+        lines = Path(path).read_text(encoding="ascii").split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: cannot be read as text ({error}): expected a pose-graph file") from error
+    numbers: dict[str, list[int]] = {tag: [] for tag in keys}
+    rests: dict[str, list[str]] = {tag: [] for tag in keys}
+    other: Counter[str] = Counter()
+    for number, line in enumerate(lines, 1):
+        parts = line.split(None, 1)
+        if not parts or parts[0].startswith("#"):
+            continue
+        tag = parts[0]
+        if tag in numbers:
+            numbers[tag].append(number)
+            rests[tag].append(parts[1] if len(parts) > 1 else "")
+        else:
+            other[tag] += 1
+    records = {tag: _parse(path, tag, numbers[tag], rests[tag], keys[tag], columns[tag]) for tag in keys}
+    return records, dict(other)
+
+
+def _parse(
+    path: Path, tag: str, numbers: list[int], rests: list[str], keys: int, columns: tuple[int, ...] | None
+) -> Records:
+    if columns is None:
+        fixed = [(number, key) for number, rest in zip(numbers, rests, strict=True) for key in rest.split()]
+        lines = np.array([number for number, _ in fixed], np.int64)
+        ints = _integers(path, tag, [number for number, _ in fixed], [[key] for _, key in fixed])
+        return Records(path, lines, ints, np.zeros((len(fixed), 0)))
+    split = [rest.split(None, keys) for rest in rests]
+    for number, parts in zip(numbers, split, strict=True):
+        if len(parts) != keys + 1:
+            raise SourceError(f"{path}:{number}: {tag} needs {keys} ids and {columns[0]} numbers")
+    ints = _integers(path, tag, numbers, [parts[:keys] for parts in split], keys)
+    values = _numbers(path, tag, numbers, [parts[keys] for parts in split], columns)
+    records = Records(path, np.array(numbers, np.int64), ints, values)
+    records.refuse(np.isnan(values[:, : columns[0]]).any(axis=1), f"{tag} holds a nan: remove or mend that line")
+    return records
+
+
+def _integers(path: Path, tag: str, numbers: Sequence[int], keys: list[list[str]], width: int = 1) -> Ints:
+    try:
+        flat = np.fromiter((int(key) for row in keys for key in row), np.int64, count=width * len(keys))
+    except (ValueError, OverflowError):
+        for number, row in zip(numbers, keys, strict=True):
+            for key in row:
+                if not _is_int64(key):
+                    raise SourceError(f"{path}:{number}: {key!r} is no 64-bit integer id of a {tag}") from None
+        raise
+    return flat.reshape(-1, width)
+
+
+def _is_int64(key: str) -> bool:
+    try:
+        return -(2**63) <= int(key) < 2**63
+    except ValueError:
+        return False
+
+
+def _numbers(path: Path, tag: str, numbers: list[int], rests: list[str], columns: tuple[int, ...]) -> Floats:
+    if not rests:
+        return np.zeros((0, columns[0]))
+    try:
+        values = np.loadtxt(rests, ndmin=2, comments=None)
+    except ValueError:
+        values = None
+    if values is None or values.shape[1] not in columns:
+        raise _first_malformed(path, tag, numbers, rests, columns)
+    return values
+
+
+def _first_malformed(
+    path: Path, tag: str, numbers: list[int], rests: list[str], columns: tuple[int, ...]
+) -> SourceError:
+    """The error of the first line whose numbers are too few, too many, or no numbers."""
+    wanted = len(rests[0].split()) if len(rests[0].split()) in columns else columns[0]
+    for number, rest in zip(numbers, rests, strict=True):
+        words = rest.split()
+        if len(words) != wanted:
+            return SourceError(f"{path}:{number}: {tag} needs {wanted} numbers after its ids, has {len(words)}")
+        for word in words:
+            if not _is_float(word):
+                return SourceError(f"{path}:{number}: {word!r} is no number")
+    return SourceError(f"{path}: the {tag} lines cannot be parsed")
+
+
+def _is_float(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def write_lines(lines: list[str], tag: str, keys: Ints, values: Floats) -> None:
+    """Append one line for each row: the tag, its keys, its numbers in the fewest digits that give the same float64."""
+    for row_keys, row in zip(keys.tolist(), values.tolist(), strict=True):
+        lines.append(" ".join([tag, *map(str, row_keys), *map(repr, row)]))
