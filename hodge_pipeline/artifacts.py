@@ -37,9 +37,14 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda stream: stream.write(text.encode()))
 
 
+def json_text(data: Any) -> str:
+    """JSON with a line for each value; a number that is not finite becomes null."""
+    return json.dumps(_finite(data), indent=1, allow_nan=False) + "\n"
+
+
 def write_json(path: Path, data: Any) -> None:
-    """Write JSON atomically; a number that is not finite becomes null."""
-    write_text(path, json.dumps(_finite(data), indent=1, allow_nan=False) + "\n")
+    """Write JSON atomically (see `json_text`)."""
+    write_text(path, json_text(data))
 
 
 def _finite(value: Any) -> Any:

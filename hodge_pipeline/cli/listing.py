@@ -1,0 +1,90 @@
+"""The commands that only look: inspect, stages, recipes, view."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from hodge_pipeline import registry
+from hodge_pipeline.errors import HodgeError, RecipeError, WorkspaceError
+
+
+def inspect(path: Path, *, as_json: bool) -> None:
+    """Print what a path is."""
+    from hodge_pipeline.inspection import inspect as facts_of
+
+    facts = facts_of(path)
+    if as_json:
+        from hodge_pipeline.artifacts import json_text
+
+        print(json_text(facts), end="")
+        return
+    for name, value in facts.items():
+        rows = value if isinstance(value, list) else [value]
+        for row, item in enumerate(rows):
+            print(f"{name if row == 0 else '':<24}{_words(item)}")
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_words(item)}" for key, item in value.items())
+    return f"{value:.6g}" if isinstance(value, float) and abs(value) < 1e6 else str(value)
+
+
+def stages(kind: str | None) -> None:
+    """Print the stages, of one kind with all options; a broken plugin is named as such."""
+    if kind is not None and kind not in registry.KINDS:
+        raise RecipeError(f"no kind of stage '{kind}'{registry.suggestion(kind, list(registry.KINDS))}")
+    for known in registry.KINDS.values():
+        if kind in (None, known.name):
+            print(f"{known.name}: {known.summary}")
+            for name in registry.names(known.name):
+                _print_stage(known.name, name, with_options=kind is not None)
+
+
+def _print_stage(kind: str, name: str, *, with_options: bool) -> None:
+    try:
+        cls = registry.load(kind, name)
+    except HodgeError as error:
+        print(f"  {name:<16} broken: {error}")
+        return
+    summary = (cls.__doc__ or "").strip().splitlines()[:1]
+    print(f"  {name:<16} {summary[0] if summary else ''} [{registry.origin(kind, name)}]")
+    if with_options and dataclasses.is_dataclass(cls):
+        for field in cls.__pydantic_fields__.items() if hasattr(cls, "__pydantic_fields__") else ():
+            print(f"      {field[0]} = {field[1].default!r}: {field[1].description or ''}")
+
+
+def recipes(name: str | None, *, schema: bool) -> None:
+    """Print the recipes' names and first words, one recipe with its defaults, or the JSON schema."""
+    from hodge_pipeline import binding, recipe_file, yaml_file
+
+    if schema:
+        from hodge_pipeline.recipe import Recipe
+
+        print(json.dumps(binding.json_schema(Recipe), indent=1))
+    elif name is not None:
+        from hodge_pipeline.recipe import load_recipe
+
+        print(yaml_file.dump(binding.unbind(load_recipe(name))), end="")
+    else:
+        for known in recipe_file.recipe_names():
+            print(f"{known:<24}{recipe_file.load(known).data.get('description', '')}")
+
+
+def view(run_folder: Path) -> None:
+    """Open the recording in the native viewer, and wait for it."""
+    recording = run_folder / "recording.rrd" if run_folder.is_dir() else run_folder
+    if not recording.is_file():
+        raise WorkspaceError(f"{recording}: no recording here: run with --set recording.level=normal")
+    beside = Path(sys.executable).with_name("rerun")
+    program = str(beside) if beside.is_file() else shutil.which("rerun")
+    if program is None:
+        raise WorkspaceError("the program 'rerun' is not installed: pip install rerun-sdk")
+    if subprocess.run([program, str(recording)], check=False).returncode:
+        raise WorkspaceError(f"{recording}: the viewer ended with an error: is there a screen?")

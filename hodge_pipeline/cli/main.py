@@ -1,0 +1,115 @@
+"""The `hodge` command. Only parsing happens here; each command imports what it needs when it runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+HELP = """Globally consistent poses from many scans.
+
+Examples:
+
+\b
+  hodge demo --out runs/demo                     a room made in code, start to end
+  hodge run seven_scenes --source redkitchen --out runs/kitchen
+  hodge run tum --source rgbd_dataset_freiburg1_desk --out runs/desk
+  hodge run tum --source DIR --set registration=ndt --out runs/ndt
+  hodge inspect redkitchen                       what is this folder?
+  hodge view runs/kitchen                        open the recording in Rerun
+"""
+
+app = typer.Typer(
+    help=HELP, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+)
+
+Overrides = Annotated[
+    Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
+    typer.Option("--set", metavar="KEY=VALUE", help="Change an option, such as edges.max_edges_per_frame=6."),
+]
+Out = Annotated[Path, typer.Option("--out", help="The run folder; the same command goes on where it stopped.")]
+Overwrite = Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+@app.command()
+def run(
+    recipe: Annotated[str, typer.Argument(help="A recipe by name (see `hodge recipes`) or a .yaml file.")],
+    out: Out,
+    source: Annotated[Optional[Path], typer.Option(help="What to read; overrides source.path.")] = None,  # noqa: UP045
+    overrides: Overrides = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Run a recipe on a source: poses, fused model, report and recording in --out."""
+    from hodge_pipeline.cli import running
+
+    running.run(recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json)
+
+
+@app.command()
+def demo(out: Out, overrides: Overrides = None, overwrite: Overwrite = False, quiet: Quiet = False) -> None:
+    """Make a furnished room with Kinect-like noise and run the recipe `demo` on it."""
+    from hodge_pipeline.cli import running
+
+    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet)
+
+
+@app.command()
+def inspect(source: Path, json: Json = False) -> None:
+    """Say what a path is: format, frames, stamps, depth range, intrinsics, oddities."""
+    from hodge_pipeline.cli import listing
+
+    listing.inspect(source, as_json=json)
+
+
+@app.command()
+def stages(
+    kind: Annotated[Optional[str], typer.Argument(help="Only this kind, with every option.")] = None,  # noqa: UP045
+) -> None:
+    """List the stages that are installed, and their options."""
+    from hodge_pipeline.cli import listing
+
+    listing.stages(kind)
+
+
+@app.command()
+def recipes(
+    name: Annotated[Optional[str], typer.Argument(help="Print this recipe with every default.")] = None,  # noqa: UP045
+    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema for editors.")] = False,
+) -> None:
+    """List the recipes that come with the package."""
+    from hodge_pipeline.cli import listing
+
+    listing.recipes(name, schema=schema)
+
+
+@app.command()
+def view(run_folder: Path) -> None:
+    """Open a run's recording in the Rerun viewer."""
+    from hodge_pipeline.cli import listing
+
+    listing.view(run_folder)
+
+
+def main() -> None:
+    """Run the command; what a user can mend is one line and exit code 1 (3: a result that failed its checks)."""
+    try:
+        app(standalone_mode=True)
+    except KeyboardInterrupt:
+        sys.exit("stopped; the same command goes on where it stopped")
+    except Exception as error:
+        from hodge_pipeline.errors import HodgeError
+
+        if not isinstance(error, HodgeError):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""YAML as data, recipe files, overrides."""
+
+from pathlib import Path
+
+import pytest
+
+from hodge_pipeline import recipe_file, yaml_file
+from hodge_pipeline.errors import RecipeError
+
+
+def test_plain_values_and_their_lines() -> None:
+    document = yaml_file.parse("a: 1e-2\nb:\n  c: on\n  d: [1, {e: null}]\n", "x.yaml")
+    assert document.data == {"a": 0.01, "b": {"c": "on", "d": [1, {"e": None}]}}
+    assert document.origins[("b", "c")] == "x.yaml:3"
+    assert document.origins[("b", "d", 1, "e")] == "x.yaml:4"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a: !!python/object/apply:os.system [ls]", "bad.yaml:1: the tag"),
+        ("x: 1\na: !!python/name:os.system ''", "bad.yaml:2: the tag"),
+        ("a: !env HOME", "the tag '!env' is not allowed"),
+        ("a: 1\na: 2", "bad.yaml:2: found duplicate key"),
+        ("a: [1", "bad.yaml:1"),
+        ("- 1", "a recipe is a mapping"),
+        ("1: 2", "the key 1 is not a name"),
+        ("a: 2026-01-01", "a value of type date"),
+    ],
+)
+def test_what_is_not_plain_data_is_refused(text: str, expected: str) -> None:
+    with pytest.raises(RecipeError, match="^bad.yaml") as caught:
+        yaml_file.parse(text, "bad.yaml")
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_aliases_cannot_multiply_without_bound() -> None:
+    levels = "".join(f"{chr(98 + k)}: &{chr(98 + k)} [{', '.join([f'*{chr(97 + k)}'] * 9)}]\n" for k in range(9))
+    with pytest.raises(RecipeError, match="this is no recipe"):
+        yaml_file.parse("a: &a [1, 2, 3]\n" + levels, "bomb.yaml")
+
+
+def test_a_huge_file_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "huge.yaml"
+    path.write_text("a: " + "x" * yaml_file.MAX_BYTES)
+    with pytest.raises(RecipeError, match="the limit is"):
+        yaml_file.read(path)
+
+
+def test_dump_reads_back_in_order() -> None:
+    data = {"z": 1, "a": {"y": [1, 2.5, "on", "1e-2"], "b": None}, "t": True}
+    again = yaml_file.parse(yaml_file.dump(data), "again").data
+    assert again == data
+    assert list(again) == list(data)
+
+
+@pytest.fixture
+def recipes(tmp_path: Path) -> Path:
+    (tmp_path / "base.yaml").write_text(
+        "seed: 1\nregistration: {stage: gicp, max_iterations: 20}\nedges: {builders: [{stage: a}, {stage: b, x: 1}]}\n"
+    )
+    (tmp_path / "child.yaml").write_text("extends: base.yaml\nseed: 2\nregistration: {max_iterations: 5}\n")
+    return tmp_path
+
+
+def test_extends_merges_key_by_key(recipes: Path) -> None:
+    document = recipe_file.load(str(recipes / "child.yaml"))
+    assert document.data["registration"] == {"stage": "gicp", "max_iterations": 5}
+    assert document.data["seed"] == 2
+    assert document.origins[("seed",)].endswith("child.yaml:2")
+    assert document.origins[("registration", "stage")].endswith("base.yaml:2")
+
+
+def test_another_stage_drops_the_options_of_the_first(recipes: Path) -> None:
+    path = recipes / "other.yaml"
+    path.write_text("extends: base.yaml\nregistration: {stage: ndt}\n")
+    assert recipe_file.load(str(path)).data["registration"] == {"stage": "ndt"}
+
+
+def test_extends_in_a_circle_is_refused(recipes: Path) -> None:
+    (recipes / "a.yaml").write_text("extends: b.yaml\n")
+    (recipes / "b.yaml").write_text("extends: a.yaml\n")
+    with pytest.raises(RecipeError, match="extends"):
+        recipe_file.load(str(recipes / "a.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "expected"),
+    [
+        ("seed=7", "seed", 7),
+        ("registration.max_iterations=3", "registration", {"stage": "gicp", "max_iterations": 3}),
+        ("registration=ndt", "registration", "ndt"),
+        ("registration.stage=ndt", "registration", {"stage": "ndt"}),
+        ("registration={max_iterations: 9}", "registration", {"stage": "gicp", "max_iterations": 9}),
+        ("new.a=[1, 2]", "new", {"a": [1, 2]}),
+        ("edges.builders.1.x=5", "edges", {"builders": [{"stage": "a"}, {"stage": "b", "x": 5}]}),
+    ],
+)
+def test_overrides(recipes: Path, override: str, key: str, expected: object) -> None:
+    document = recipe_file.load(str(recipes / "base.yaml"), [override])
+    assert document.data[key] == expected
+
+
+@pytest.mark.parametrize("override", ["seed", "=1", "a..b=1", "edges.builders.7.x=1", "seed.x=1", "a=!tag 1"])
+def test_overrides_that_make_no_sense(recipes: Path, override: str) -> None:
+    with pytest.raises(RecipeError, match="^--set"):
+        recipe_file.load(str(recipes / "base.yaml"), [override])
+
+
+def test_names_and_suggestions(tmp_path: Path) -> None:
+    assert "demo" in recipe_file.recipe_names()
+    with pytest.raises(RecipeError, match="did you mean 'demo'"):
+        recipe_file.find("dmeo")
+    with pytest.raises(RecipeError, match="no such recipe file"):
+        recipe_file.find(str(tmp_path / "none.yaml"))
+    with pytest.raises(RecipeError, match="no recipe"):
+        recipe_file.find("../recipes/demo")
