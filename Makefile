@@ -1,0 +1,41 @@
+# Everything a new machine needs: `make demo` and `make test` set up what they use.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: help setup demo test lint format clean
+help:
+	@echo "make setup   system libraries, $(VENV) and everything in it"
+	@echo "make demo    make a room, reconstruct it: runs/demo"
+	@echo "make test    the tests"
+	@echo "make lint    ruff, mypy, import directions"
+
+$(STAMP): pyproject.toml constraints.txt tools/system-libraries.sh
+	sh tools/system-libraries.sh
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "no venv: apt-get install python3-venv"; exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+setup: $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/hodge demo --out runs/demo
+	@echo "open runs/demo/report.html, or: $(BIN)/hodge view runs/demo"
+
+test: $(STAMP)
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) runs dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
