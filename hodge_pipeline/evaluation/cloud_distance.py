@@ -1,0 +1,80 @@
+"""The point-to-plane distance of two clouds under given poses, for a block of pairs in a worker process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import small_gicp
+
+from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud
+
+REACH_M = 0.1
+"""A point further from the other cloud than this shows what the other does not see."""
+
+NO_NEIGHBOUR_M = 0.1
+"""The distance of two clouds without a single point in reach."""
+
+
+@dataclass(frozen=True)
+class DistanceBlock:
+    """Pairs (P, 2) sorted by their first cloud, and their motions `i_from_j (S, P, 4, 4)` in S sets of poses."""
+
+    clouds_folder: Path
+    pairs: Ints
+    i_from_j: Floats
+
+
+def block_distances(block: DistanceBlock) -> Floats:
+    """The distances d (S, P) in metres of a block's pairs; NaN where a motion is not finite.
+
+    The tree of cloud i lies in its own camera's axes, so one tree serves all its pairs and all sets of poses.
+    """
+    clouds = CloudSet.open(block.clouds_folder)
+    out = np.full(block.i_from_j.shape[:2], np.nan)
+    for i, columns in _columns_by_target(block.pairs):
+        plane = TargetPlanes(clouds[i])
+        for column in columns:
+            points_in_j = clouds[int(block.pairs[column, 1])].points_in_cam.astype(np.float64)
+            out[:, column] = [plane.distance(points_in_j, motion) for motion in block.i_from_j[:, column]]
+    return out
+
+
+def _columns_by_target(pairs: Ints) -> Iterator[tuple[int, list[int]]]:
+    for i, columns in groupby(range(len(pairs)), key=lambda column: int(pairs[column, 0])):
+        yield i, list(columns)
+
+
+class TargetPlanes:
+    """Cloud i with its search tree, ready to be measured against many clouds."""
+
+    def __init__(self, cloud: PointCloud) -> None:
+        if cloud.normals_in_cam is None:
+            raise ValueError("the cloud has no normals, and the distance is measured along them")
+        self.points: Floats = cloud.points_in_cam.astype(np.float64)
+        self.normals: Floats = cloud.normals_in_cam.astype(np.float64)
+        # small_gicp takes 2.9 ms for a pair of clouds of 7500 points, scipy's tree 4.0 ms.
+        self.tree = small_gicp.KdTree(self.points) if len(self.points) else None
+        if len(self.points):
+            self.low, self.high = self.points.min(axis=0) - REACH_M, self.points.max(axis=0) + REACH_M
+
+    def distance(self, points_in_j: Floats, i_from_j: Floats) -> float:
+        """Mean |n·(p − q)| in metres over the points within reach; 0.1 m when there is none."""
+        if not np.isfinite(i_from_j).all():
+            return float("nan")
+        if self.tree is None or not len(points_in_j):
+            return NO_NEIGHBOUR_M
+        points = points_in_j @ i_from_j[:3, :3].T + i_from_j[:3, 3]
+        points = points[((points >= self.low) & (points <= self.high)).all(axis=1)]
+        if not len(points):
+            return NO_NEIGHBOUR_M
+        nearest, squared = self.tree.batch_knn_search(points, 1)
+        reached = squared[:, 0] <= REACH_M**2
+        if not reached.any():
+            return NO_NEIGHBOUR_M
+        rows = nearest[reached, 0].astype(np.intp)
+        along_normal = np.einsum("ij,ij->i", self.normals[rows], points[reached] - self.points[rows])
+        return float(np.abs(along_normal).mean())

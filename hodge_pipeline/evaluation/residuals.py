@@ -1,0 +1,22 @@
+"""How far each measured edge is from the poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.types import Floats, ViewGraph
+
+
+def edge_residuals(graph: ViewGraph, world_from_cam: Floats) -> tuple[Floats, Floats]:
+    """Translation (E,) in metres and angle (E,) in radians of `Z_ij⁻¹ T_i⁻¹ T_j`, the motion left over in j's axes.
+
+    `world_from_cam (V, 4, 4)`; NaN where either pose is not finite.
+    """
+    first, second = world_from_cam[graph.edges[:, 0]], world_from_cam[graph.edges[:, 1]]
+    left_over = se3.inverse(graph.i_from_j) @ se3.inverse(first) @ second
+    known = np.asarray(np.isfinite(left_over).all(axis=(-1, -2)))
+    translation_m, angle_rad = np.full(len(known), np.nan), np.full(len(known), np.nan)
+    translation_m[known] = np.linalg.norm(left_over[known, :3, 3], axis=-1)
+    angle_rad[known] = np.linalg.norm(se3.so3_log(left_over[known, :3, :3]), axis=-1)
+    return translation_m, angle_rad

@@ -1,0 +1,179 @@
+"""How far an estimated trajectory is from a reference: absolute (ATE) and relative (RPE) error.
+
+Frames whose estimate or reference is not finite (NaN: no truth) are left out and counted. Parts of a trajectory that
+nothing connects have a gauge each, so each is aligned apart, and no relative motion is taken across them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.types import Bools, Floats, Ints
+
+COLLINEAR = 1e-6
+"""Second singular value over the first of the positions' covariance, below which they determine no roll."""
+
+ORIENTATION_SHARE = 1e-6
+"""Weight of the orientations where positions leave a rotation open: small, so that positions decide where they can."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The similarity `p_reference = scale · R p_estimate + t`, and whether orientations had to settle its rotation."""
+
+    reference_from_estimate: Floats
+    scale: float
+    degenerate: bool
+
+    def apply(self, world_from_cam: Floats) -> Floats:
+        """Poses (..., 4, 4) of the estimate, in the reference's world."""
+        scaled = np.array(world_from_cam, float)
+        scaled[..., :3, 3] *= self.scale
+        return np.asarray(self.reference_from_estimate @ scaled)
+
+
+def align(estimate: Floats, reference: Floats, with_scale: bool = False) -> Alignment:
+    """The similarity that brings the positions of poses (N, 4, 4) nearest to the reference's (Umeyama 1991).
+
+    Fewer than three poses, or positions on a line, leave a rotation open: the orientations of the poses then decide
+    it, and the alignment says that it is `degenerate`.
+    """
+    x, y = estimate[:, :3, 3], reference[:, :3, 3]
+    centre_x, centre_y = x.mean(axis=0), y.mean(axis=0)
+    covariance = (y - centre_y).T @ (x - centre_x) / len(x)
+    singular = np.linalg.svd(covariance, compute_uv=False)
+    degenerate = bool(singular[1] <= COLLINEAR * singular[0])
+    mixed = covariance + _orientation_term(estimate, reference, singular[0]) if degenerate else covariance
+    rotation = se3.project_to_so3(mixed)
+    variance = np.sum((x - centre_x) ** 2) / len(x)
+    scale = float(np.trace(rotation.T @ covariance) / variance) if with_scale and variance > 0 else 1.0
+    return Alignment(se3.from_parts(rotation, centre_y - scale * rotation @ centre_x), scale, degenerate)
+
+
+def _orientation_term(estimate: Floats, reference: Floats, size: float) -> Floats:
+    turns = reference[:, :3, :3] @ np.swapaxes(estimate[:, :3, :3], -1, -2)
+    return np.asarray(ORIENTATION_SHARE * (size if size > 0 else 1.0) * turns.mean(axis=0))
+
+
+@dataclass(frozen=True)
+class AbsoluteError:
+    """Absolute trajectory error, after alignment. `per_frame_m (N,)` and `aligned (N, 4, 4)` are NaN where left out."""
+
+    rmse_m: float
+    mean_m: float
+    median_m: float
+    max_m: float
+    frames: int
+    left_out: int
+    per_frame_m: Floats
+    aligned: Floats
+    alignments: tuple[Alignment, ...]
+
+
+def absolute_error(
+    estimate: Floats, reference: Floats, component: Ints | None = None, *, with_scale: bool = False
+) -> AbsoluteError:
+    """The distance of each position (N, 4, 4) from its reference, each component aligned apart.
+
+    `component (N,)` labels the frames that share a gauge; one component by default.
+    """
+    usable = _usable(estimate, reference)
+    labels = np.zeros(len(estimate), np.int64) if component is None else np.asarray(component)
+    aligned = np.full((len(estimate), 4, 4), np.nan)
+    alignments = []
+    for label in np.unique(labels[usable]):
+        rows = np.flatnonzero(usable & (labels == label))
+        alignments.append(align(estimate[rows], reference[rows], with_scale))
+        aligned[rows] = alignments[-1].apply(estimate[rows])
+    per_frame_m = np.linalg.norm(aligned[:, :3, 3] - reference[:, :3, 3], axis=-1)
+    known = per_frame_m[usable]
+    mean, median, largest = (known.mean(), np.median(known), known.max()) if len(known) else (np.nan,) * 3
+    return AbsoluteError(
+        rmse_m=_rms(known),
+        mean_m=float(mean),
+        median_m=float(median),
+        max_m=float(largest),
+        frames=int(usable.sum()),
+        left_out=int((~usable).sum()),
+        per_frame_m=per_frame_m,
+        aligned=aligned,
+        alignments=tuple(alignments),
+    )
+
+
+def _usable(estimate: Floats, reference: Floats) -> Bools:
+    if estimate.shape != reference.shape:
+        raise GraphError(f"{len(estimate)} poses against {len(reference)} reference poses: associate them first")
+    return np.asarray(np.isfinite(estimate).all(axis=(-1, -2)) & np.isfinite(reference).all(axis=(-1, -2)))
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """Relative pose error over `delta_frames`, one entry for each pair of frames (M,) that could be compared."""
+
+    delta_frames: int
+    translation_rmse_m: float
+    rotation_rmse_deg: float
+    start: Ints
+    translation_m: Floats
+    rotation_deg: Floats
+    left_out: int
+
+
+def relative_error(
+    estimate: Floats, reference: Floats, delta_frames: int = 1, component: Ints | None = None
+) -> RelativeError:
+    """The error of the motion from each frame k to k + delta: `(B_k⁻¹ B_l)⁻¹ (A_k⁻¹ A_l)`, B the reference.
+
+    `component (N,)` labels frames that share a gauge (or a sequence): no motion is taken across two labels. `start`
+    holds the rows k.
+    """
+    if delta_frames < 1:
+        raise ValueError(f"delta_frames is {delta_frames}: a motion needs at least one frame")
+    usable = _usable(estimate, reference)
+    start = np.arange(max(len(estimate) - delta_frames, 0))
+    same = np.ones(len(start), bool) if component is None else component[start] == component[start + delta_frames]
+    chosen = start[usable[start] & usable[start + delta_frames] & same]
+    motion = se3.inverse(estimate[chosen]) @ estimate[chosen + delta_frames]
+    true_motion = se3.inverse(reference[chosen]) @ reference[chosen + delta_frames]
+    error = se3.inverse(true_motion) @ motion
+    translation_m = np.linalg.norm(error[:, :3, 3], axis=-1)
+    rotation_deg = np.rad2deg(np.linalg.norm(se3.so3_log(error[:, :3, :3]), axis=-1))
+    return RelativeError(
+        delta_frames,
+        _rms(translation_m),
+        _rms(rotation_deg),
+        chosen,
+        translation_m,
+        rotation_deg,
+        len(start) - len(chosen),
+    )
+
+
+def associate(stamps_a: Floats, stamps_b: Floats, max_difference_s: float = 0.01) -> tuple[Ints, Ints]:
+    """Rows (M,) of each list of ascending stamps that belong together: each is the other's nearest, within the limit.
+
+    Mutual nearness keeps the match one to one; what has no partner is in neither list.
+    """
+    if not len(stamps_a) or not len(stamps_b):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    nearest_b, nearest_a = _nearest(stamps_a, stamps_b), _nearest(stamps_b, stamps_a)
+    rows_a = np.arange(len(stamps_a))
+    mutual = nearest_a[nearest_b] == rows_a
+    near = np.abs(stamps_a - stamps_b[nearest_b]) <= max_difference_s
+    return rows_a[mutual & near], nearest_b[mutual & near]
+
+
+def _nearest(stamps: Floats, among: Floats) -> Ints:
+    after = np.clip(np.searchsorted(among, stamps), 1, max(len(among) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(among) - 1)
+    return np.asarray(np.where(stamps - among[before] <= among[after] - stamps, before, after), np.int64)
