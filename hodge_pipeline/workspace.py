@@ -117,9 +117,7 @@ def _hold(lock: IO[str], folder: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         lock.close()
-        raise WorkspaceError(
-            f"{folder}: another run is using this folder: wait for it, or give another --out"
-        ) from error
+        raise WorkspaceError(f"{folder}: another run uses this folder: wait for it, or give another --out") from error
 
 
 def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool) -> None:

@@ -1,0 +1,22 @@
+"""A third party's edge builder: each frame with the next, and the last with the first."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class RingEdges:
+    """Pairs each frame with the one `reach` after it, round the ring."""
+
+    reach: int = Field(1, ge=1, description="frames from one end of a pair to the other")
+
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+        """The pairs of the ring."""
+        rows = np.arange(len(frames))
+        pairs = np.unique(np.sort(np.stack([rows, (rows + self.reach) % len(rows)], axis=1), axis=1), axis=0)
+        return Candidates(pairs, np.full(len(pairs), "ring"), np.full(len(pairs), np.nan))

@@ -1,0 +1,138 @@
+"""The run folder: keys, commits, resume, refusal."""
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import artifacts
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.types import Solution, SolverIteration, ViewGraph
+from hodge_pipeline.workspace import Workspace, key_of
+
+RECIPE = {"seed": 0, "edges": {"stage": "overlap", "min_iou": 0.3}}
+
+
+def write_stage(workspace: Workspace, name: str, key: str, text: str) -> bool:
+    """True where the stage had to be computed."""
+    with workspace.stage(name, key) as folder:
+        if not folder.finished:
+            (folder.path / "result.txt").write_text(text)
+    return not folder.finished
+
+
+def read_stage(folder: Path, name: str) -> str:
+    return (folder / "stages" / name / "result.txt").read_text()
+
+
+def test_a_finished_stage_is_not_repeated(tmp_path: Path) -> None:
+    with Workspace.open(tmp_path / "run", RECIPE) as workspace:
+        assert write_stage(workspace, "a", "1", "first")
+    with Workspace.open(tmp_path / "run", RECIPE) as workspace:
+        assert not write_stage(workspace, "a", "1", "second")
+        assert read_stage(workspace.folder, "a") == "first"
+        assert write_stage(workspace, "a", "2", "third")
+        assert read_stage(workspace.folder, "a") == "third"
+
+
+def test_a_stage_that_failed_is_continued_under_its_key_only(tmp_path: Path) -> None:
+    with Workspace.open(tmp_path / "run", RECIPE) as workspace:
+        with pytest.raises(RuntimeError), workspace.stage("a", "1") as folder:
+            (folder.path / "chunk").write_text("half")
+            raise RuntimeError
+        with workspace.stage("a", "1") as folder:
+            assert not folder.finished
+            assert (folder.path / "chunk").read_text() == "half"
+        with workspace.stage("a", "2") as folder:
+            assert not (folder.path / "chunk").exists()
+
+
+def test_the_old_result_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
+    with Workspace.open(tmp_path / "run", RECIPE) as workspace:
+        write_stage(workspace, "a", "1", "old")
+        with pytest.raises(RuntimeError), workspace.stage("a", "2"):
+            raise RuntimeError
+        assert read_stage(workspace.folder, "a") == "old"
+
+
+def test_another_recipe_is_refused_and_says_what_differs(tmp_path: Path) -> None:
+    other = {"seed": 0, "edges": {"stage": "overlap", "min_iou": 0.5}}
+    Workspace.open(tmp_path / "run", RECIPE).close()
+    with pytest.raises(WorkspaceError, match=r"edges.min_iou was 0.3, is 0.5.*--overwrite"):
+        Workspace.open(tmp_path / "run", other)
+    Workspace.open(tmp_path / "run", other, overwrite=True).close()
+    Workspace.open(tmp_path / "run", other).close()
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_with_other_things_is_never_taken(tmp_path: Path, overwrite: bool) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(WorkspaceError, match="not empty and not a run folder"):
+        Workspace.open(tmp_path, RECIPE, overwrite=overwrite)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
+    with Workspace.open(tmp_path / "run", RECIPE), pytest.raises(WorkspaceError, match="another run uses"):
+        Workspace.open(tmp_path / "run", RECIPE)
+    Workspace.open(tmp_path / "run", RECIPE).close()
+
+
+def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("a file")
+    with pytest.raises(WorkspaceError, match="cannot be written"):
+        Workspace.open(tmp_path / "run", RECIPE)
+
+
+def test_a_full_disk_keeps_what_was_finished(tmp_path: Path) -> None:
+    with Workspace.open(tmp_path / "run", RECIPE) as workspace:
+        write_stage(workspace, "a", "1", "kept")
+        with pytest.raises(WorkspaceError, match="make room"), workspace.stage("b", "1"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        assert read_stage(workspace.folder, "a") == "kept"
+
+
+def test_keys_depend_on_every_part() -> None:
+    assert key_of("a", {"x": 1, "y": 2}) == key_of("a", {"y": 2, "x": 1})
+    assert len({key_of("a", {"x": 1}), key_of("a", {"x": 2}), key_of("b", {"x": 1}), key_of("a", 1.0)}) == 4
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    artifacts.write_json(path, {"a": 1})
+
+    def fail(stream: object) -> None:
+        raise OSError("no")
+
+    with pytest.raises(OSError, match="no"):
+        artifacts.write_atomically(path, fail)
+    assert artifacts.read_json(path) == {"a": 1}
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
+    artifacts.write_json(tmp_path / "x.json", {"a": float("nan"), "b": np.array([1.0, np.inf]), "c": np.int64(3)})
+    assert artifacts.read_json(tmp_path / "x.json") == {"a": None, "b": [1.0, None], "c": 3}
+
+
+def test_graph_round_trip(tmp_path: Path) -> None:
+    graph = ViewGraph.from_edges(np.array(["a", "b"]), np.array([[0, 1]]), np.eye(4)[None], source="sift")
+    artifacts.save(tmp_path / "graph.npz", graph)
+    again = artifacts.load(tmp_path / "graph.npz", ViewGraph)
+    assert again.vertex_ids.tolist() == ["a", "b"]
+    assert again.source.tolist() == ["sift"]
+    np.testing.assert_array_equal(again.i_from_j, graph.i_from_j)
+
+
+def test_solution_round_trip(tmp_path: Path) -> None:
+    poses = np.stack([np.eye(4)] * 3)
+    step = SolverIteration(poses, 0.5, {"mean_deviation": float("nan"), "step": 1e-9})
+    solution = Solution(poses, np.zeros(3, np.int64), np.ones(2), (step, step), {"cost": 1.0}, ("one piece",))
+    artifacts.save_solution(tmp_path / "solution.npz", solution)
+    again = artifacts.load_solution(tmp_path / "solution.npz")
+    np.testing.assert_array_equal(again.history[1].world_from_cam, poses)
+    assert again.notes == ("one piece",)
+    assert again.history[0].metrics["step"] == 1e-9
+    assert np.isnan(again.history[0].metrics["mean_deviation"])
