@@ -1,0 +1,112 @@
+"""Depth, colour and angle of incidence of the room as an ideal camera sees it, by ray casting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+
+from hodge_pipeline import se3
+from hodge_pipeline.demo.room import Room
+from hodge_pipeline.types import Camera, Floats, Floats32, Ints
+
+SHADOW_GAP_M = 0.01
+AMBIENT, SKYLIGHT, LAMPLIGHT = 0.42, 0.16, 0.62
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What the rays of one image meet first, for the pixels that meet anything.
+
+    `pixel (P,)` flat pixel numbers; `depth_m (P,)` along the optical axis; `points_in_room (P, 3)`; unit
+    `normals (P, 3)` towards the camera; `facing (P,)` the cosine between normal and ray; `part (P,)` rows of the room.
+    """
+
+    pixel: Ints
+    depth_m: Floats32
+    points_in_room: Floats
+    normals: Floats
+    facing: Floats
+    part: Ints
+
+
+class Renderer:
+    """Renders one room with one camera."""
+
+    def __init__(self, room: Room, camera: Camera) -> None:
+        self.room, self.camera = room, camera
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            o3d.core.Tensor.from_numpy(room.vertices.astype(np.float32)),
+            o3d.core.Tensor.from_numpy(room.triangles.astype(np.uint32)),
+        )
+
+    def depth(self, world_from_cam: Floats) -> tuple[Floats32, Floats32]:
+        """Depth (H, W) in metres, 0 where a depth camera sees nothing, and the cosine of incidence (H, W)."""
+        hits = self._cast(world_from_cam)
+        seen = self.room.measurable[hits.part]
+        shape = (self.camera.height, self.camera.width)
+        depth_m, facing = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        depth_m.ravel()[hits.pixel[seen]] = hits.depth_m[seen]
+        facing.ravel()[hits.pixel] = hits.facing
+        return depth_m, facing
+
+    def colour(self, world_from_cam: Floats) -> Floats32:
+        """The lit image (H, W, 3), RGB in 0..1."""
+        hits = self._cast(world_from_cam)
+        room, image = self.room, np.zeros((self.camera.height * self.camera.width, 3), np.float32)
+        albedo = self._texture(hits) * room.tint[hits.part]
+        glow = room.glow[hits.part][:, None]
+        image[hits.pixel] = albedo * (glow + (1 - glow) * self._light(hits)[:, None])
+        return np.clip(image, 0, 1).reshape(self.camera.height, self.camera.width, 3)
+
+    def _cast(self, world_from_cam: Floats) -> Hits:
+        rays = self._scene.create_rays_pinhole(
+            intrinsic_matrix=o3d.core.Tensor.from_numpy(self.camera.matrix),
+            extrinsic_matrix=o3d.core.Tensor.from_numpy(se3.inverse(world_from_cam)),
+            width_px=self.camera.width,
+            height_px=self.camera.height,
+        )
+        found = self._scene.cast_rays(rays)
+        depth_m = found["t_hit"].numpy().ravel()
+        pixel = np.flatnonzero(np.isfinite(depth_m))
+        direction = rays.numpy().reshape(-1, 6)[pixel, 3:].astype(float)
+        triangle = found["primitive_ids"].numpy().ravel()[pixel].astype(np.int64)
+        normals = self._normals(triangle, found["primitive_uvs"].numpy().reshape(-1, 2)[pixel])
+        facing = -np.einsum("ij,ij->i", normals, direction) / np.linalg.norm(direction, axis=1)
+        normals *= np.sign(facing)[:, None]
+        points = world_from_cam[:3, 3] + depth_m[pixel, None] * direction
+        return Hits(pixel, depth_m[pixel], points, normals, np.abs(facing), self.room.part_of_triangle[triangle])
+
+    def _normals(self, triangle: Ints, uv: Floats32) -> Floats:
+        """Unit normals (P, 3), interpolated between the corners so that round bodies look round."""
+        corners = self.room.normals[self.room.triangles[triangle]]
+        shares = np.stack([1 - uv[:, 0] - uv[:, 1], uv[:, 0], uv[:, 1]], axis=1)
+        normals = np.einsum("pc,pcd->pd", shares, corners)
+        return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+    def _texture(self, hits: Hits) -> Floats32:
+        """Texture colours (P, 3): each part's own x, y or z face, whichever the surface faces most, carries it."""
+        part_from_room = self.room.part_from_room[hits.part]
+        local = np.einsum("pij,pj->pi", part_from_room[:, :3, :3], hits.points_in_room) + part_from_room[:, :3, 3]
+        faces = np.abs(np.einsum("pij,pj->pi", part_from_room[:, :3, :3], hits.normals)).argmax(axis=1)
+        across, up = np.array([1, 0, 0])[faces], np.array([2, 2, 1])[faces]
+        row, tile_m = np.arange(len(faces)), self.room.tile_m[hits.part]
+        u = local[row, across] / tile_m[row, across] + 0.5
+        v = -local[row, up] / tile_m[row, up] + np.where(up == 1, 0.5, 0.0)
+        pixel_m = hits.depth_m / self.camera.fx / np.sqrt(np.maximum(hits.facing, 0.05))
+        footprint = pixel_m / np.minimum(tile_m[row, across], tile_m[row, up])
+        return self.room.textures.sample(self.room.texture[hits.part], np.stack([u, v], axis=1), footprint)
+
+    def _light(self, hits: Hits) -> Floats32:
+        """The light (P,) that falls on each point: ambient, from the sky, and from the lamp where nothing shades it."""
+        start = hits.points_in_room + SHADOW_GAP_M * hits.normals
+        towards = self.room.lamp - start
+        distance = np.linalg.norm(towards, axis=1)
+        rays = np.concatenate([start, towards], axis=1).astype(np.float32)
+        shaded = self._scene.test_occlusions(o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0).numpy()
+        lambert = np.maximum(np.einsum("ij,ij->i", hits.normals, towards) / distance, 0)
+        lamp = LAMPLIGHT * lambert * np.where(shaded, 0.15, 1.0) * 2.2 / (1 + 0.4 * distance**2)
+        sky = SKYLIGHT * (1 - hits.normals[:, 0]) / 2 + SKYLIGHT * hits.normals[:, 2]
+        return np.asarray(AMBIENT + sky + lamp, np.float32)

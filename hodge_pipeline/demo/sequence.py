@@ -1,0 +1,210 @@
+"""The demo's data: the room seen along the loop, written as a TUM RGB-D sequence."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline import se3
+from hodge_pipeline.demo.noise import measured_depth, photographed
+from hodge_pipeline.demo.path import HandHeldLoop
+from hodge_pipeline.demo.render import Renderer
+from hodge_pipeline.demo.room import build_room
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.stages import Advance, no_progress
+from hodge_pipeline.types import Bytes, Camera, Floats
+
+VERSION = 1
+"""Raised whenever the same options give other files, so that nobody goes on with old ones."""
+STAMP_FILE = "demo.json"
+FIRST_STAMP_S = 1_400_000_000.0
+CAMERA_HZ, TRUTH_HZ = 30.0, 100.0
+UNITS_PER_METRE = 5000
+FOCAL_SHARE_OF_WIDTH = 525 / 640
+JPEG_QUALITY = 92
+CACHED_SEQUENCES = 4
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class DemoOptions:
+    """What is rendered."""
+
+    frames: int = Field(
+        default=120, ge=2, description="images; at the defaults neighbours are 3 degrees and 6 cm apart"
+    )
+    width: int = Field(
+        default=320, ge=16, description="pixels; 320 keeps the complete demo below a minute on two cores"
+    )
+    height: int = Field(default=240, ge=16, description="pixels")
+    seed: int = Field(default=0, ge=0, description="of textures, books, tremor and noise")
+    noise: float = Field(default=1.0, ge=0, description="scale of every error of the camera; 0 gives exact images")
+    turns: float = Field(
+        default=1.06, gt=0, description="rounds of the room; above 1 the last images overlap the first"
+    )
+    stride: int = Field(default=5, ge=1, description="of a 30 Hz camera's images every stride-th is kept")
+
+    @property
+    def camera(self) -> Camera:
+        """The camera, 63 degrees wide."""
+        focal = FOCAL_SHARE_OF_WIDTH * self.width
+        return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
+
+    @property
+    def key(self) -> str:
+        """A short name of these options and this version of the generator."""
+        return hashlib.sha256(_stamp(self).encode()).hexdigest()[:12]
+
+
+def make_sequence(folder: Path | str, options: DemoOptions | None = None, advance: Advance = no_progress) -> Path:
+    """The folder, holding a TUM RGB-D sequence of these options; one that holds it already is left as it is.
+
+    `rgb/*.jpg`, `depth/*.png` (16 bit, 5000 a metre), `rgb.txt`, `depth.txt`, `groundtruth.txt` (poses at 100 Hz)
+    and `intrinsics.txt` (`fx fy cx cy width height`). It is made beside the folder and renamed when complete, so that
+    a killed run leaves no half of it. `advance(1)` is called after each frame. `SourceError` where the folder holds
+    anything else.
+    """
+    folder, options = Path(folder), options or DemoOptions()
+    if _is_made(folder, options):
+        advance(options.frames)
+        return folder
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise SourceError(
+            f"{folder}: exists and is not the demo sequence of these options; name another folder, or remove it"
+        )
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", suffix=".partial", dir=folder.parent))
+    try:
+        _write(draft, options, advance)
+        _publish(draft, folder, options)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+    return folder
+
+
+def demo_source(
+    cache_dir: Path | None = None, options: DemoOptions | None = None, advance: Advance = no_progress
+) -> Path:
+    """The folder of the demo sequence in the user's cache, made at the first call.
+
+    The cache is `$XDG_CACHE_HOME/hodge-pipeline`, else `~/.cache/hodge-pipeline`; it keeps the last few sequences used.
+    """
+    options = options or DemoOptions()
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    cache = cache_dir or base / "hodge-pipeline"
+    folder = make_sequence(cache / f"demo-{options.key}", options, advance)
+    os.utime(folder)
+    _forget_oldest(cache, folder)
+    return folder
+
+
+def _forget_oldest(cache: Path, keep: Path) -> None:
+    """Remove all but the sequences used last; nothing else in the cache is touched."""
+    others = [p.parent for p in cache.glob(f"demo-*/{STAMP_FILE}") if p.parent != keep]
+    others.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+    for old in others[CACHED_SEQUENCES - 1 :]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _stamp(options: DemoOptions) -> str:
+    return json.dumps({"version": VERSION, "options": asdict(options)}, indent=1, sort_keys=True) + "\n"
+
+
+def _is_made(folder: Path, options: DemoOptions) -> bool:
+    stamp = folder / STAMP_FILE
+    return stamp.is_file() and stamp.read_text() == _stamp(options)
+
+
+def _publish(draft: Path, folder: Path, options: DemoOptions) -> None:
+    """Rename the draft; where another process was first, its sequence is the same and stays."""
+    draft.chmod(0o755)
+    try:
+        draft.rename(folder)
+    except OSError:
+        if not _is_made(folder, options):
+            raise
+
+
+def _write(draft: Path, options: DemoOptions, advance: Advance) -> None:
+    """The complete sequence; the frames are rendered by two threads, and no frame depends on another."""
+    rng = np.random.default_rng([options.seed, 2])
+    colour_s = np.arange(options.frames) * options.stride / CAMERA_HZ + rng.uniform(0, 0.002, options.frames) + 0.05
+    depth_s = colour_s + rng.uniform(-0.006, 0.006, options.frames)
+    duration_s = options.frames * options.stride / CAMERA_HZ
+    path = HandHeldLoop(options.seed, duration_s, options.turns)
+    recorder = _Recorder(draft, options, path)
+    (draft / "rgb").mkdir()
+    (draft / "depth").mkdir()
+    with ThreadPoolExecutor(2) as pool:
+        names = []
+        for pair in pool.map(recorder.record, range(options.frames), colour_s, depth_s):
+            names.append(pair)
+            advance(1)
+    _write_list(draft / "rgb.txt", "colour images", [colour for colour, _ in names])
+    _write_list(draft / "depth.txt", "depth images", [depth for _, depth in names])
+    _write_truth(draft / "groundtruth.txt", path)
+    _write_intrinsics(draft / "intrinsics.txt", options.camera)
+    (draft / STAMP_FILE).write_text(_stamp(options))
+
+
+class _Recorder:
+    """Renders and writes one frame at a time; colour and depth each at the pose of their own time."""
+
+    def __init__(self, folder: Path, options: DemoOptions, path: HandHeldLoop) -> None:
+        self.folder, self.options, self.path = folder, options, path
+        self.renderer = Renderer(build_room(options.seed), options.camera)
+
+    def record(self, number: int, colour_s: float, depth_s: float) -> tuple[str, str]:
+        """The names of the colour and the depth image, below the sequence's folder."""
+        rng = np.random.default_rng([self.options.seed, 3, number])
+        colour_pose, depth_pose = self.path.world_from_cam(np.array([colour_s, depth_s]))
+        image = photographed(self.renderer.colour(colour_pose), rng, self.options.noise)
+        depth_m = measured_depth(*self.renderer.depth(depth_pose), rng, self.options.noise)
+        colour_name, depth_name = f"rgb/{_at(colour_s)}.jpg", f"depth/{_at(depth_s)}.png"
+        jpeg = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        _write_image(self.folder / colour_name, image[..., ::-1], jpeg)
+        _write_image(self.folder / depth_name, np.rint(depth_m * UNITS_PER_METRE).astype(np.uint16), [])
+        return colour_name, depth_name
+
+
+def _at(time_s: float) -> str:
+    """The stamp of a time as names and lists carry it."""
+    return f"{FIRST_STAMP_S + time_s:.6f}"
+
+
+def _write_image(
+    path: Path, image: Bytes | np.ndarray[tuple[int, ...], np.dtype[np.uint16]], how: Sequence[int]
+) -> None:
+    done, encoded = cv2.imencode(path.suffix, image, how)
+    if not done:
+        raise SourceError(f"{path}: OpenCV cannot encode this image; install opencv-python-headless with {path.suffix}")
+    path.write_bytes(encoded.tobytes())
+
+
+def _write_list(path: Path, what: str, names: Sequence[str]) -> None:
+    lines = [f"{Path(name).stem} {name}" for name in names]
+    path.write_text("\n".join([f"# {what}", "# timestamp filename", *lines]) + "\n")
+
+
+def _write_truth(path: Path, loop: HandHeldLoop) -> None:
+    times_s = np.arange(0, loop.duration_s + 0.2, 1 / TRUTH_HZ) + 0.0037
+    world_from_cam: Floats = loop.world_from_cam(times_s)
+    rows = np.concatenate([world_from_cam[:, :3, 3], se3.to_quat_xyzw(world_from_cam)], axis=1)
+    lines = [f"{_at(t)} " + " ".join(f"{value:.7f}" for value in row) for t, row in zip(times_s, rows, strict=True)]
+    path.write_text("\n".join(["# ground truth trajectory", "# timestamp tx ty tz qx qy qz qw", *lines]) + "\n")
+
+
+def _write_intrinsics(path: Path, camera: Camera) -> None:
+    values = f"{camera.fx} {camera.fy} {camera.cx} {camera.cy} {camera.width} {camera.height}"
+    path.write_text(f"# fx fy cx cy width height\n{values}\n")
