@@ -158,4 +158,5 @@ def _read_twice(read: Callable[[], Any], what: str) -> Any:
 
 
 def _assert_same(first: Any, second: Any, what: str) -> None:
-    assert (first is None) == (second is None) and (first is None or np.array_equal(first, second)), f"{what}: differs"
+    same = first is second if first is None or second is None else np.array_equal(first, second, equal_nan=True)
+    assert same, f"{what}: differs"

@@ -203,10 +203,10 @@ def test_fr1_by_contract_and_convention(data_dir: Path) -> None:
     assert len(source.frames) == 60 and len(source.trajectory) == 2742
     assert all(frame.world_from_cam is not None and frame.read_colour is not None for frame in source.frames)
     assert source.frames[0].stamp_s == 1305031229.528784 and source.frames[0].camera.fx == 517.3
-    first, later = source.frames[0], source.frames[6]
+    first, later = source.frames[0], source.frames[3]
     right = se3.inverse(first.world_from_cam) @ later.world_from_cam
     wrong = first.world_from_cam @ se3.inverse(later.world_from_cam)
-    assert agreement(first, later, right) > 1.5 * agreement(first, later, wrong)
+    assert agreement(first, later, right) > 5 * agreement(first, later, wrong)
 
 
 def test_frame_numbers_for_stamps(data_dir: Path) -> None:

@@ -11,7 +11,6 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass as plain_dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +20,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters import images
 from hodge_adapters.camera_files import Intrinsics, checked, fit_note, read_intrinsics
+from hodge_adapters.image_frames import image_frame
 from hodge_adapters.text_rows import listed, read_rows, read_text, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -133,19 +133,15 @@ class SevenScenesReader:
         return camera, tuple(beside[:1])
 
     def _frame(self, files: FrameFiles, camera: Camera, pose: Floats, several: bool) -> Frame:
-        size = camera.width, camera.height
-        depth, colour = files.paths["depth"], files.paths.get("color")
-        return Frame(
-            frame_id=f"{files.sequence}/{files.number:06d}" if several else files.number,
-            stamp_s=float(files.number),
-            camera=camera,
-            read_depth=partial(
-                images.read_depth, depth, units_per_metre=UNITS_PER_METRE, no_depth=self.no_depth, size=size
-            ),
-            read_colour=partial(images.read_colour, colour, size=size) if colour else None,
-            encoded_depth=partial(images.encoded_depth, depth, units_per_metre=UNITS_PER_METRE),
-            encoded_colour=partial(images.encoded_colour, colour) if colour else None,
-            world_from_cam=pose if np.isfinite(pose).all() else None,
+        return image_frame(
+            f"{files.sequence}/{files.number:06d}" if several else files.number,
+            files.number,
+            camera,
+            files.paths["depth"],
+            files.paths.get("color"),
+            units_per_metre=UNITS_PER_METRE,
+            no_depth=self.no_depth,
+            world_from_cam=pose,
             sequence=files.sequence,
         )
 
@@ -185,6 +181,8 @@ def _with_depth(path: Path, chosen: Sequence[tuple[str, Path]], notes: list[str]
     missing: list[str] = []
     for name, folder in chosen:
         listing = _list_numbers(folder)
+        if not listing:
+            notes.append(f"{name}: no frames in it")
         complete = [number for number in sorted(listing) if "depth" in listing[number]]
         missing.extend(f"{name}/{number:06d}" for number in sorted(listing.keys() - complete))
         usable.extend(FrameFiles(name, number, rank, listing[number]) for rank, number in enumerate(complete))

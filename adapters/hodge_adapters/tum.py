@@ -6,7 +6,6 @@ Poses are camera to world, of the camera whose images these are: depth is regist
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -17,11 +16,12 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters import images
 from hodge_adapters.association import interpolated_poses
 from hodge_adapters.camera_files import Intrinsics, checked, fit_note, read_intrinsics
-from hodge_adapters.image_lists import StampedImages, find_association_file, read_pairs
+from hodge_adapters.image_frames import image_frame
+from hodge_adapters.image_lists import find_association_file, read_pairs
 from hodge_adapters.poses_text import parse_tum
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Camera, Floats, Frame, Source, Trajectory
+from hodge_pipeline.types import Floats, Source, Trajectory
 
 UNITS_PER_METRE = 5000.0
 CAMERAS = {
@@ -105,7 +105,19 @@ class TumReader:
         return Source(
             name=path.resolve().name,
             path=path,
-            frames=tuple(self._frame(listing, row, ids[row], camera, scale, poses[row]) for row in rows),
+            frames=tuple(
+                image_frame(
+                    ids[row],
+                    listing.stamps_s[row],
+                    camera,
+                    listing.depth[row],
+                    listing.colour[row],
+                    units_per_metre=scale,
+                    no_depth=self.no_depth,
+                    world_from_cam=poses[row],
+                )
+                for row in rows
+            ),
             trajectory=trajectory,
             notes=tuple(notes),
             files=(*listing.files, *camera_file, *truth_file, *listing.depth, *filter(None, listing.colour)),
@@ -161,22 +173,6 @@ class TumReader:
             hint = ": are its stamps of another clock? see truth_match" if without == len(stamps_s) else ""
             notes.append(f"{without} of {len(stamps_s)} frames have no truth within {self.max_gap_s:g} s{hint}")
         return poses
-
-    def _frame(
-        self, listing: StampedImages, row: int, frame_id: int, camera: Camera, scale: float, pose: Floats
-    ) -> Frame:
-        size = camera.width, camera.height
-        depth, colour = listing.depth[row], listing.colour[row]
-        return Frame(
-            frame_id=frame_id,
-            stamp_s=float(listing.stamps_s[row]),
-            camera=camera,
-            read_depth=partial(images.read_depth, depth, units_per_metre=scale, no_depth=self.no_depth, size=size),
-            read_colour=partial(images.read_colour, colour, size=size) if colour else None,
-            encoded_depth=partial(images.encoded_depth, depth, units_per_metre=scale),
-            encoded_colour=partial(images.encoded_colour, colour) if colour else None,
-            world_from_cam=pose if np.isfinite(pose).all() else None,
-        )
 
 
 def frame_ids(stamps_s: Floats) -> list[int]:

@@ -1,0 +1,41 @@
+"""Lazy frames of a depth image and the colour image on the same pixel grid."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from hodge_adapters import images
+from hodge_pipeline.types import Camera, Floats, Frame
+
+
+def image_frame(
+    frame_id: int | str,
+    stamp_s: float,
+    camera: Camera,
+    depth: Path,
+    colour: Path | None,
+    *,
+    units_per_metre: float,
+    no_depth: tuple[int, ...] = (0,),
+    world_from_cam: Floats,
+    sequence: str = "",
+) -> Frame:
+    """A frame that reads its images when asked, and then refuses those of another size than the camera.
+
+    A pose (4, 4) that is not finite means none.
+    """
+    size = camera.width, camera.height
+    return Frame(
+        frame_id=frame_id,
+        stamp_s=float(stamp_s),
+        camera=camera,
+        read_depth=partial(images.read_depth, depth, units_per_metre=units_per_metre, no_depth=no_depth, size=size),
+        read_colour=partial(images.read_colour, colour, size=size) if colour else None,
+        encoded_depth=partial(images.encoded_depth, depth, units_per_metre=units_per_metre),
+        encoded_colour=partial(images.encoded_colour, colour) if colour else None,
+        world_from_cam=world_from_cam if np.isfinite(world_from_cam).all() else None,
+        sequence=sequence,
+    )

@@ -1,0 +1,99 @@
+"""Redwood's layout, as Open3D's reconstruction system keeps it: `depth/`, `image/` or `color/`, `trajectory.log`."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hodge_adapters.text_rows import Row, listed, read_rows, to_floats
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats
+
+COLOUR_FOLDERS = ("image", "color", "rgb")
+LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
+_NUMBER = re.compile(r"\D*(\d+)")
+_IMAGES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class NumberedImages:
+    """Depth images by the number that their names start with, and colour images of the same numbers."""
+
+    numbers: list[int]
+    depth: list[Path]
+    colour: list[Path | None]
+
+
+def is_redwood(folder: Path) -> bool:
+    """Whether the folder has a depth and a colour folder and no list of stamps."""
+    has_colour = any((folder / name).is_dir() for name in COLOUR_FOLDERS)
+    return has_colour and (folder / "depth").is_dir() and not (folder / "depth.txt").is_file()
+
+
+def list_images(folder: Path, notes: list[str]) -> NumberedImages:
+    """The images of a folder by number; depth without colour is noted."""
+    depth = _by_number(folder / "depth", notes)
+    if not depth:
+        raise SourceError(
+            f"{folder / 'depth'}: no numbered PNG in it: give the folder with depth/ and image/ or color/"
+        )
+    colour_folder = next((folder / name for name in COLOUR_FOLDERS if (folder / name).is_dir()), None)
+    colour = _by_number(colour_folder, notes) if colour_folder else {}
+    numbers = sorted(depth)
+    alone = [number for number in numbers if number not in colour]
+    if alone:
+        notes.append(f"{len(alone)} frames have no colour image: {listed(alone)}")
+    return NumberedImages(numbers, [depth[n] for n in numbers], [colour.get(n) for n in numbers])
+
+
+def find_log(folder: Path) -> Path | None:
+    """The trajectory of a folder, by its usual places."""
+    return next((folder / name for name in LOG_FILES if (folder / name).is_file()), None)
+
+
+def read_log(path: Path) -> dict[int, Floats]:
+    """Poses world_from_cam (4, 4) by frame number, from blocks of `i j k` and four rows; rotations made orthonormal.
+
+    Raises `SourceError` with `file:line` for a block that is incomplete or no rigid motion.
+    """
+    rows = read_rows(path)
+    if not rows or len(rows) % 5:
+        raise SourceError(
+            f"{path}: {len(rows)} lines are no blocks of `i j k` and a 4x4 matrix: is it a .log trajectory?"
+        )
+    return dict(_parse_block(path, rows[at : at + 5]) for at in range(0, len(rows), 5))
+
+
+def _parse_block(path: Path, block: list[Row]) -> tuple[int, Floats]:
+    head, *body = block
+    values = [to_floats(row.fields) for row in body]
+    if len(head.fields) != 3 or not head.fields[0].isdecimal() or any(not v or len(v) != 4 for v in values):
+        raise SourceError(f"{path}:{head.line}: not `i j k` and four rows of four numbers: is it a .log trajectory?")
+    pose = np.array(values, np.float64)
+    if not se3.is_motion(pose):
+        raise SourceError(f"{path}:{head.line}: the pose of frame {head.fields[0]} is no rigid motion: mend the file")
+    pose[:3, :3] = se3.project_to_so3(pose[:3, :3])
+    return int(head.fields[0]), pose
+
+
+def _by_number(folder: Path, notes: list[str]) -> dict[int, Path]:
+    try:
+        names = sorted(name for name in os.listdir(folder) if name.lower().endswith(_IMAGES))
+    except OSError as error:
+        raise SourceError(f"{folder}: cannot be listed ({error.strerror}): restore it or its permissions") from error
+    found: dict[int, Path] = {}
+    skipped: list[str] = []
+    for name in names:
+        match = _NUMBER.match(name)
+        if match is None or int(match[1]) in found:
+            skipped.append(name)
+        else:
+            found[int(match[1])] = folder / name
+    if skipped:
+        notes.append(f"{folder.name}: {len(skipped)} images without a number of their own left out: {listed(skipped)}")
+    return found

@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hodge_adapters.icl_nuim import IclNuimReader
+from hodge_adapters.icl_pov import read_pose, read_ray_lengths
+from hodge_adapters.redwood import read_log
+from readers_data import (
+    agreement,
+    depth_values,
+    points_in_cam,
+    some_poses,
+    tum_line,
+    write_colour,
+    write_depth,
+)
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.testing import check_reader
+from hodge_pipeline.types import Camera, Floats
+
+SMALL = (10.0, -10.0, 3.5, 2.5)
+# The camera of one published file: right, up and direction are orthogonal, |right| is 4/3.
+POSITION, AHEAD, UP = [0.91, 4.65, -2.92], [0.0496855, -0.285692, 0.957033], [0.00725319, 0.958294, 0.285692]
+RIGHT = np.array([1.32832, 0.00964677, -0.0660817])
+
+
+def pov_text(position: list[float] = POSITION, ahead: list[float] = AHEAD, up: list[float] = UP) -> str:
+    vectors = {"cam_pos     ": position, "cam_dir     ": ahead, "cam_up      ": up, "cam_right   ": RIGHT.tolist()}
+    lines = [f"{name} = [{', '.join(map(str, vector))}]';\n" for name, vector in vectors.items()]
+    return "".join(lines) + "cam_angle    = 90;\n"
+
+
+def floor_ray_lengths(world_from_cam: Floats, camera: Camera) -> Floats:
+    """The lengths of the rays down to the plane y = 0 (H, W), huge where a ray goes up."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    down = (rays @ world_from_cam[:3, :3].T)[..., 1]
+    with np.errstate(divide="ignore"):
+        return np.where(down < -1e-9, -world_from_cam[1, 3] / down, 1e10)
+
+
+def pov_folder(folder: Path, count: int = 2) -> Path:
+    folder.mkdir()
+    camera = Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
+    for number in range(count):
+        stem = folder / f"scene_00_{number:04d}"
+        stem.with_suffix(".txt").write_text(pov_text([0.1 * number, 1.5, 0.0]))
+        lengths = floor_ray_lengths(read_pose(stem.with_suffix(".txt"), 1.0), camera)
+        stem.with_suffix(".depth").write_text(" ".join(f"{value:.6g}" for value in lengths.ravel()))
+        write_colour(stem.with_suffix(".png"), size=(480, 640))
+    return folder
+
+
+def redwood_folder(folder: Path, count: int = 3) -> Path:
+    blocks = []
+    for number, pose in enumerate(some_poses(count)):
+        write_depth(folder / f"depth/{number:05d}.png", depth_values(number))
+        write_colour(folder / f"color/{number:05d}.jpg")
+        rows = "\n".join(" ".join(f"{value:.8f}" for value in row) for row in pose)
+        blocks.append(f"{number} {number} {number + 1}\n{rows}\n")
+    (folder / "trajectory.log").write_text("".join(blocks))
+    return folder
+
+
+def test_pov_files_by_contract_and_geometry(tmp_path: Path) -> None:
+    source = check_reader(IclNuimReader(), pov_folder(tmp_path / "kt0"), max_decoded=1)
+    assert [(f.frame_id, f.stamp_s) for f in source.frames] == [(0, 0.0), (1, 1.0)] and len(source.trajectory) == 2
+    frame = source.frames[1]
+    assert frame.camera == Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
+    points = points_in_cam(frame.read_depth(), frame.camera, step=16)
+    assert len(points) > 500, "the floor is seen"
+    assert abs(se3.transform(frame.world_from_cam, points)[:, 1]).max() < 2e-4, "and lies at height 0"
+
+
+def test_the_axes_of_a_pov_camera(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text(pov_text())
+    pose = read_pose(tmp_path / "a.txt", 1.0)
+    assert se3.is_motion(pose, 1e-9)
+    np.testing.assert_allclose(pose[:3, 0], RIGHT / np.linalg.norm(RIGHT), atol=1e-5)
+    np.testing.assert_allclose(pose[:3, 1], UP, atol=1e-5)
+    np.testing.assert_allclose(pose[:3, 3], POSITION)
+    np.testing.assert_allclose(read_pose(tmp_path / "a.txt", 100.0)[:3, 3], np.array(POSITION) / 100)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "cam_pos = [1, 2, 3]';", pov_text(up=AHEAD), pov_text(ahead=[0, 0, 0]), pov_text([float("nan"), 0, 0])]
+)
+def test_pov_parameters_that_are_no_pose(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    assert read_pose(tmp_path / "a.txt", 1.0) is None
+
+
+def test_pov_frames_without_pose_or_colour_are_noted(tmp_path: Path) -> None:
+    folder = pov_folder(tmp_path / "kt0")
+    (folder / "scene_00_0000.txt").write_text("")
+    (folder / "scene_00_0001.png").unlink()
+    (folder / "scene_00_0001.txt").write_text(pov_text([149.376, 451.41, -285.9]))
+    source = IclNuimReader().open(folder)
+    assert source.frames[0].world_from_cam is None and source.frames[1].read_colour is None
+    assert "1 frames without usable camera parameters: 0" in source.notes
+    assert any("centimetres" in note for note in source.notes)
+
+
+def test_ray_lengths_become_z(tmp_path: Path) -> None:
+    camera = Camera(3, 2, 2.0, -2.0, 1.0, 0.0)
+    (tmp_path / "a.depth").write_text("1 2 inf\n-1 1e10 1.5\n")
+    z = read_ray_lengths(tmp_path / "a.depth", camera=camera, units_per_metre=1.0)
+    np.testing.assert_allclose(z, [[1 / np.sqrt(1.25), 2, 0], [0, 0, 1.5 / np.sqrt(1.5)]], rtol=1e-6)
+    assert z.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("1 2 3", "truncated"), ("1 2 x 4 5 6", "not a text"), ("1 " * 400, "too large"), ("", "0 ray")],
+)
+def test_damaged_ray_lengths_are_named(tmp_path: Path, text: str, reason: str) -> None:
+    (tmp_path / "a.depth").write_text(text)
+    with pytest.raises(SourceError, match=rf"a\.depth.*{reason}"):
+        read_ray_lengths(tmp_path / "a.depth", camera=Camera(3, 2, 2.0, -2.0, 1.0, 0.0), units_per_metre=1.0)
+
+
+def test_the_tum_like_layout(tmp_path: Path) -> None:
+    for number in range(3):
+        write_depth(tmp_path / f"depth/{number}.png", depth_values(number))
+        write_colour(tmp_path / f"rgb/{number}.png")
+    (tmp_path / "associations.txt").write_text("".join(f"{n} depth/{n}.png {n} rgb/{n}.png\n" for n in range(3)))
+    poses = some_poses(2)
+    (tmp_path / "livingRoom0.gt.freiburg").write_text("".join(tum_line(1 + n, pose) for n, pose in enumerate(poses)))
+    source = check_reader(IclNuimReader(intrinsics=SMALL), tmp_path)
+    assert [frame.frame_id for frame in source.frames] == [0, 1, 2] and len(source.trajectory) == 2
+    assert source.frames[0].world_from_cam is None, "the truth starts at 1"
+    assert "1 of 3 frames have no truth" in source.notes
+    np.testing.assert_allclose(source.frames[2].world_from_cam, poses[1], atol=1e-6)
+    np.testing.assert_allclose(source.frames[1].read_depth(), depth_values(1) / 5000, rtol=1e-6)
+    published = IclNuimReader().open(tmp_path)
+    assert published.frames[0].camera == Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
+    with pytest.raises(SourceError, match="8x6.*640x480"):
+        published.frames[0].read_depth()
+
+
+def test_the_redwood_layout(tmp_path: Path) -> None:
+    folder = redwood_folder(tmp_path / "room")
+    (folder / "color/00001.jpg").unlink()
+    (folder / "depth/readme.png").write_bytes(b"")
+    source = check_reader(IclNuimReader(intrinsics=SMALL), folder)
+    assert [frame.frame_id for frame in source.frames] == [0, 1, 2] and source.trajectory is None
+    assert source.frames[1].read_colour is None
+    np.testing.assert_allclose(source.frames[2].world_from_cam, some_poses(3)[2], atol=1e-7)
+    np.testing.assert_allclose(source.frames[1].read_depth(), depth_values(1) / 1000, rtol=1e-6)
+    assert "depth: 1 images without a number of their own left out: readme.png" in source.notes
+    assert "1 frames have no colour image: 1" in source.notes
+    assert any("an estimate of another program" in note for note in source.notes)
+    assert [f.frame_id for f in IclNuimReader(every=2).open(folder).frames] == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [
+        ("", r"trajectory\.log: 0 lines"),
+        ("0 0 1\n1 0 0 0\n", r"trajectory\.log: 2 lines"),
+        ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1\n0 0 0 1\n", r"trajectory\.log:1: not"),
+        ("0 0 1\n2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", r"trajectory\.log:1: .*no rigid motion"),
+    ],
+)
+def test_a_log_that_is_damaged_is_named(tmp_path: Path, text: str, where: str) -> None:
+    (tmp_path / "trajectory.log").write_text(text)
+    with pytest.raises(SourceError, match=where):
+        read_log(tmp_path / "trajectory.log")
+
+
+def test_what_is_none_of_the_layouts(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bare/depth").mkdir(parents=True)
+    (tmp_path / "bare/color").mkdir()
+    (tmp_path / "text").write_text("")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for name in ("empty", "bare", "text", "loop", "absent"):
+        with pytest.raises(SourceError, match=name):
+            IclNuimReader().open(tmp_path / name)
+    assert all(IclNuimReader().sniff(tmp_path / name).confidence == 0 for name in ("empty", "text", "loop", "absent"))
+
+
+def test_the_real_redwood_rendering(data_dir: Path) -> None:
+    source = check_reader(IclNuimReader(), data_dir / "icl_nuim/livingroom1_redwood")
+    assert len(source.frames) == 211 and source.frames[0].camera == Camera(
+        WIDTH * 80, HEIGHT * 80, 525, 525, 319.5, 239.5
+    )
+    first, later = source.frames[0], source.frames[10]
+    right = se3.inverse(first.world_from_cam) @ later.world_from_cam
+    wrong = first.world_from_cam @ se3.inverse(later.world_from_cam)
+    assert agreement(first, later, right) > 0.85
+    assert agreement(first, later, wrong) < 0.2
+
+
+def test_the_authors_poses(data_dir: Path) -> None:
+    path = data_dir / "icl_nuim/author_poses/livingRoom2.gt.freiburg.derived.txt"
+    trajectory = check_reader(IclNuimReader(), path).trajectory
+    assert trajectory.stamps_s[0] == 1 and len(trajectory) > 880
+    np.testing.assert_allclose(trajectory.world_from_cam[0, :3, 3], [0, 0, -2.25], atol=1e-9)
