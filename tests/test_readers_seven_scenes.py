@@ -63,6 +63,7 @@ def test_a_scene_and_its_splits(scene: Path) -> None:
     assert {name.split("/")[0] for name in ids(split="train")} == {"seq-01", "seq-03"}
     assert ids(split="test") == [0, 1, 2], "one sequence alone keeps its numbers"
     assert ids(split="train", sequences=("seq-03",)) == [0, 1, 2]
+    assert SevenScenesReader(split="train", sequences=("seq-03",)).open(scene).notes == ()
     assert ids(every=2)[:3] == ["seq-01/000000", "seq-01/000002", "seq-02/000000"]
     assert SevenScenesReader().open(scene).trajectory is None
     assert len(SevenScenesReader(split="test").open(scene).trajectory) == 3

@@ -106,13 +106,14 @@ class SevenScenesReader:
             if self.split != "all" or self.sequences:
                 raise SourceError(f"{path}: no sequences to choose from: give the scene's folder, with seq-01 in it")
             return [(path.resolve().name, path)]
-        wanted = {_sequence_number(name, "the option sequences") for name in self.sequences}
-        for numbers in (wanted, _split_numbers(path, self.split) if self.split != "all" else set()):
-            absent = numbers - {_sequence_number(name, str(path)) for name, _ in folders}
-            if absent:
-                notes.append(f"sequences asked for but not there: {listed([f'seq-{n:02d}' for n in sorted(absent)])}")
-            if numbers:
-                folders = [(name, folder) for name, folder in folders if _sequence_number(name, str(path)) in numbers]
+        numbers = {name: _sequence_number(name, str(path)) for name, _ in folders}
+        by_name = {_sequence_number(name, "the option sequences") for name in self.sequences}
+        by_split = _split_numbers(path, self.split) if self.split != "all" else set()
+        absent = sorted((by_name | by_split) - set(numbers.values()))
+        if absent:
+            notes.append(f"sequences asked for but not there: {listed([f'seq-{number:02d}' for number in absent])}")
+        for wanted in filter(None, (by_name, by_split)):
+            folders = [(name, folder) for name, folder in folders if numbers[name] in wanted]
         if not folders:
             raise SourceError(
                 f"{path}: none of the sequences asked for is there: change the options split and sequences"
