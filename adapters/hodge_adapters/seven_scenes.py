@@ -7,10 +7,7 @@ data set's authors say, are not calibrated to each other: the depth camera's int
 from __future__ import annotations
 
 import os
-import re
-from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -21,8 +18,16 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters import images
 from hodge_adapters.camera_files import Intrinsics, checked, fit_note, read_intrinsics
 from hodge_adapters.image_frames import image_frame
-from hodge_adapters.text_rows import listed, read_rows, read_text, to_floats
-from hodge_pipeline import se3
+from hodge_adapters.seven_scenes_files import (
+    FRAME_FILE,
+    FrameFiles,
+    read_poses,
+    sequence_folders,
+    sequence_number,
+    split_numbers,
+    with_depth,
+)
+from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, Floats, Frame, Source, Trajectory
@@ -30,20 +35,6 @@ from hodge_pipeline.types import Camera, Floats, Frame, Source, Trajectory
 UNITS_PER_METRE = 1000.0
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0, (640, 480))
 CAMERA_FILE = "camera-intrinsics.txt"
-SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
-
-_FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)$", re.IGNORECASE)
-_SEQUENCE = re.compile(r"(?:seq|sequence)-?(\d+)$", re.IGNORECASE)
-
-
-@plain_dataclass(frozen=True)
-class FrameFiles:
-    """The files of one frame: its sequence, its number and rank in it, and the paths that are there."""
-
-    sequence: str
-    number: int
-    rank: int
-    paths: dict[str, Path]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -67,10 +58,10 @@ class SevenScenesReader:
     def sniff(self, path: Path) -> Sniff:
         """Certain where a file named `frame-000000.depth.png` lies in the folder or in a sequence below it."""
         try:
-            for folder in (path, *(folder for _, folder in _sequence_folders(path))):
+            for folder in (path, *(folder for _, folder in sequence_folders(path))):
                 with os.scandir(folder) as entries:
                     for entry in entries:
-                        match = _FRAME_FILE.match(entry.name)
+                        match = FRAME_FILE.match(entry.name)
                         if match and match[2].lower() == "depth":
                             return Sniff(0.95, f"frame-*.depth.png in {folder.name}")
         except (OSError, SourceError):
@@ -85,9 +76,9 @@ class SevenScenesReader:
         """
         path = Path(path)
         notes: list[str] = []
-        usable = _with_depth(path, self._chosen(path, notes), notes)
+        usable = with_depth(path, self._chosen(path, notes), notes)
         camera, camera_files = self._camera(path, usable, notes)
-        poses = _read_poses(usable, notes)
+        poses = read_poses(usable, notes)
         several = len({files.sequence for files in usable}) > 1
         taken = [row for row, files in enumerate(usable) if files.rank % self.every == 0]
         return Source(
@@ -101,14 +92,14 @@ class SevenScenesReader:
 
     def _chosen(self, path: Path, notes: list[str]) -> list[tuple[str, Path]]:
         """Names and folders of the sequences to read; a folder without sequences is one itself."""
-        folders = _sequence_folders(path)
+        folders = sequence_folders(path)
         if not folders:
             if self.split != "all" or self.sequences:
                 raise SourceError(f"{path}: no sequences to choose from: give the scene's folder, with seq-01 in it")
             return [(path.resolve().name, path)]
-        numbers = {name: _sequence_number(name, str(path)) for name, _ in folders}
-        by_name = {_sequence_number(name, "the option sequences") for name in self.sequences}
-        by_split = _split_numbers(path, self.split) if self.split != "all" else set()
+        numbers = {name: sequence_number(name, str(path)) for name, _ in folders}
+        by_name = {sequence_number(name, "the option sequences") for name in self.sequences}
+        by_split = split_numbers(path, self.split) if self.split != "all" else set()
         absent = sorted((by_name | by_split) - set(numbers.values()))
         if absent:
             notes.append(f"sequences asked for but not there: {listed([f'seq-{number:02d}' for number in absent])}")
@@ -145,93 +136,6 @@ class SevenScenesReader:
             world_from_cam=pose,
             sequence=files.sequence,
         )
-
-
-def _sequence_folders(path: Path) -> list[tuple[str, Path]]:
-    """The folders seq-01, seq-02, … in this one, by number. Raises `SourceError` where it is no folder."""
-    try:
-        inside = [entry for entry in path.iterdir() if _SEQUENCE.match(entry.name) and entry.is_dir()]
-    except OSError as error:
-        raise SourceError(
-            f"{path}: not a folder that can be read ({error.strerror}): give a 7-Scenes folder"
-        ) from error
-    return sorted(((entry.name, entry) for entry in inside), key=lambda item: (_sequence_number(item[0], ""), item[0]))
-
-
-def _sequence_number(name: str, where: str) -> int:
-    match = _SEQUENCE.match(name)
-    if match is None:
-        raise SourceError(f"{where}: `{name}` is no sequence: expected a name such as seq-01")
-    return int(match[1])
-
-
-def _split_numbers(path: Path, split: str) -> set[int]:
-    """The sequence numbers that a split file lists; it writes sequence1 for seq-01."""
-    file = path / SPLIT_FILES[split]
-    if not file.is_file():
-        raise SourceError(f"{file}: not there: set split to all, or name the sequences")
-    numbers = {_sequence_number(row.fields[0], f"{file}:{row.line}") for row in read_rows(file)}
-    if not numbers:
-        raise SourceError(f"{file}: lists no sequence: set split to all, or name the sequences")
-    return numbers
-
-
-def _with_depth(path: Path, chosen: Sequence[tuple[str, Path]], notes: list[str]) -> list[FrameFiles]:
-    """The frames that have a depth image, ranked within their sequence; the others are noted."""
-    usable: list[FrameFiles] = []
-    missing: list[str] = []
-    for name, folder in chosen:
-        listing = _list_numbers(folder)
-        if not listing:
-            notes.append(f"{name}: no frames in it")
-        complete = [number for number in sorted(listing) if "depth" in listing[number]]
-        missing.extend(f"{name}/{number:06d}" for number in sorted(listing.keys() - complete))
-        usable.extend(FrameFiles(name, number, rank, listing[number]) for rank, number in enumerate(complete))
-    if not usable:
-        raise SourceError(
-            f"{path}: no frame-000000.depth.png in it: give a sequence folder, or a scene with seq-01 in it"
-        )
-    if missing:
-        notes.append(f"{len(missing)} frames without a depth image left out: {listed(missing)}")
-    colourless = [f"{files.sequence}/{files.number:06d}" for files in usable if "color" not in files.paths]
-    if colourless:
-        notes.append(f"{len(colourless)} frames have no colour image: {listed(colourless)}")
-    return usable
-
-
-def _list_numbers(folder: Path) -> dict[int, dict[str, Path]]:
-    """The files of each frame number, by what they are; a PNG counts before a JPEG."""
-    found: dict[int, dict[str, Path]] = defaultdict(dict)
-    try:
-        names = sorted(os.listdir(folder))
-    except OSError as error:
-        raise SourceError(f"{folder}: cannot be listed ({error.strerror}): restore its permissions") from error
-    for name in names:
-        match = _FRAME_FILE.match(name)
-        if match and (match[2].lower() == "pose") == (match[3].lower() == "txt"):
-            found[int(match[1])][match[2].lower()] = folder / name
-    return found
-
-
-def _read_poses(usable: Sequence[FrameFiles], notes: list[str]) -> Floats:
-    """Poses (N, 4, 4) with rotations projected to SO(3), NaN where there is none that can be used."""
-    poses = np.array([_read_pose(files.paths.get("pose")) for files in usable])
-    good = se3.is_motion(poses)
-    poses[~good] = np.nan
-    poses[good, :3, :3] = se3.project_to_so3(poses[good, :3, :3])
-    if not good.all():
-        bad = [f"{usable[row].sequence}/{usable[row].number:06d}" for row in np.flatnonzero(~good).tolist()]
-        notes.append(f"{len(bad)} frames without a usable pose (missing, not finite or not rigid): {listed(bad)}")
-    return poses
-
-
-def _read_pose(path: Path | None) -> Floats:
-    """The sixteen numbers of a pose file as (4, 4), NaN where they are not."""
-    try:
-        numbers = to_floats(read_text(path).split()) if path else None
-    except SourceError:
-        numbers = None
-    return np.reshape(numbers if numbers and len(numbers) == 16 else [np.nan] * 16, (4, 4)).astype(np.float64)
 
 
 def _trajectory(usable: Sequence[FrameFiles], poses: Floats) -> Trajectory | None:
