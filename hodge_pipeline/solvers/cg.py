@@ -1,0 +1,43 @@
+"""Preconditioned conjugate gradients for a Newton step: stops early, or at negative curvature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+
+from hodge_pipeline.types import Floats
+
+Operator: TypeAlias = Callable[[Floats], Floats]
+
+
+def truncated_cg(
+    apply: Operator, precondition: Operator, gradient: Floats, tolerance: float, max_steps: int
+) -> tuple[Floats, Floats, int]:
+    """A descent direction x with H x ≈ −g, its residual H x + g, and the steps taken (Steihaug 1983).
+
+    `tolerance` is on the residual's norm in the preconditioner's metric, relative to that of g.
+    """
+    x, r = np.zeros_like(gradient), gradient.copy()
+    z = precondition(r)
+    rz = first = float(r @ z)
+    direction = -z
+    for step in range(1, max_steps + 1):
+        if rz <= 0:
+            return x, r, step - 1
+        image = apply(direction)
+        curvature = float(direction @ image)
+        if curvature <= 0:
+            return (direction, image + gradient, step) if step == 1 else (x, r, step)
+        alpha = rz / curvature
+        x += alpha * direction
+        r += alpha * image
+        z = precondition(r)
+        new = float(r @ z)
+        if new <= tolerance**2 * first:
+            return x, r, step
+        direction *= new / rz
+        direction -= z
+        rz = new
+    return x, r, max_steps

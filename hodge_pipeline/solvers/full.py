@@ -1,0 +1,160 @@
+"""The full objective: chi² = Σ rᵀ Ω r with the 6x6 information of each edge in its own frame, by Gauss-Newton.
+
+r = (2 q_vec, t) of (R_ij, t_ij)⁻¹ (T_i⁻¹ T_j), which is g2o's residual in radians; (θ, x, y) in the plane. Poses are moved
+in the world frame: R_i ← exp(ω_i^) R_i, t_i ← t_i + v_i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.sparse import bsr_matrix
+from scipy.spatial.transform import Rotation
+
+from hodge_pipeline import se3
+from hodge_pipeline.solvers.cg import Operator, truncated_cg
+from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.solvers.newton import Point, Step
+from hodge_pipeline.solvers.problem import Problem
+from hodge_pipeline.solvers.rotations import exponential, lever
+from hodge_pipeline.types import Floats
+
+DIRECT_AFTER_CG_STEPS = 100
+"""A Newton step that needs more makes a direct factorisation of all unknowns worth its price."""
+REFACTOR_AFTER_CG_STEPS = 15
+MAX_CG_STEPS = 1000
+
+
+@dataclass(frozen=True)
+class FullResiduals:
+    """`residual (E, p + d)`, `frame (E, p + d, p + d)` = dr / d(ω, v) in world axes, `reach (E, d)` = t_j − t_i."""
+
+    residual: Floats
+    frame: Floats
+    reach: Floats
+    cost_per_edge: Floats
+
+
+@dataclass(frozen=True)
+class FullPoint(Point):
+    """A point with its residuals."""
+
+    left: FullResiduals
+
+
+def full_residuals(problem: Problem, information: Floats, rotations: Floats, translations: Floats) -> FullResiduals:
+    """The residuals at these rotations (n, d, d) and translations (n, d)."""
+    d, p = problem.dimension, problem.tangent_size
+    at_tail, at_head = rotations[problem.tail], rotations[problem.head]
+    predicted = at_tail @ problem.rotations
+    error = np.swapaxes(predicted, 1, 2) @ at_head
+    reach = translations[problem.head] - translations[problem.tail]
+    missed = reach - np.einsum("eij,ej->ei", at_tail, problem.translations)
+    residual = np.empty((len(reach), p + d))
+    residual[:, p:] = np.einsum("eji,ej->ei", predicted, missed)
+    frame = np.zeros((len(reach), p + d, p + d))
+    frame[:, p:, p:] = np.swapaxes(predicted, 1, 2)
+    if d == 2:
+        residual[:, 0] = np.arctan2(error[:, 1, 0], error[:, 0, 0])
+        frame[:, 0, 0] = 1.0
+    else:
+        quat = Rotation.from_matrix(error).as_quat()
+        quat = np.where(quat[:, 3:] < 0, -quat, quat)
+        residual[:, :3] = 2 * quat[:, :3]
+        turn = quat[:, 3, None, None] * np.eye(3) + se3.hat(quat[:, :3])
+        frame[:, :3, :3] = turn @ np.swapaxes(at_head, 1, 2)
+    cost = np.einsum("ei,ei->e", residual, np.einsum("eij,ej->ei", information, residual))
+    return FullResiduals(residual, frame, reach, cost)
+
+
+@dataclass
+class _Direct:
+    """The latest direct factor, if the graph turned out to need one, and how many CG steps it last took."""
+
+    solve: Callable[[Floats], Floats] | None = None
+    cg_steps: int = 0
+
+
+@dataclass(frozen=True)
+class FullObjective:
+    """chi² of a problem with its information (E, p + d, p + d) over (rotation, translation)."""
+
+    problem: Problem
+    information: Floats
+    direct: _Direct = field(default_factory=_Direct)
+
+    def at(self, rotations: Floats, translations: Floats) -> FullPoint:
+        """The point at these poses."""
+        left = full_residuals(self.problem, self.information, rotations, translations)
+        return FullPoint(rotations, translations, float(left.cost_per_edge.sum()), left)
+
+    def step(self, point: Point, tolerance: float) -> Step:
+        """A Gauss-Newton step by PCG: first with the two Laplacians, with a direct factor once they prove too weak."""
+        assert isinstance(point, FullPoint)
+        gradient, hessian = self.normal_equations(point.left)
+        spent = 0
+        if self.direct.solve is None:
+            precondition = self.laplacian_preconditioner(point.rotations)
+            direction, left, spent = _solve(hessian, precondition, gradient, tolerance, DIRECT_AFTER_CG_STEPS)
+        if self.direct.solve is not None or spent >= DIRECT_AFTER_CG_STEPS:
+            if self.direct.solve is None or self.direct.cg_steps > REFACTOR_AFTER_CG_STEPS:
+                self.direct.solve = factorise(hessian.tocsc(), "NATURAL").solve
+            direction, left, used = _solve(hessian, self.direct.solve, gradient, tolerance, MAX_CG_STEPS)
+            self.direct.cg_steps = used
+            spent += used
+        slope = 2 * float(gradient @ direction)
+        return Step(direction, slope, -0.5 * slope - float(direction @ left), spent)
+
+    def moved(self, point: Point, direction: Floats) -> FullPoint:
+        """The point whose free poses are moved by a direction (free · (p + d),)."""
+        free, p = self.problem.free_count, self.problem.tangent_size
+        step = direction.reshape(free, -1)
+        turned, shifted = point.rotations.copy(), point.translations.copy()
+        turned[:free] = exponential(step[:, :p]) @ point.rotations[:free]
+        shifted[:free] += step[:, p:]
+        return self.at(turned, shifted)
+
+    def normal_equations(self, left: FullResiduals) -> tuple[Floats, bsr_matrix]:
+        """Half the gradient (free · (p + d),) and half the Gauss-Newton Hessian."""
+        problem, p = self.problem, self.problem.tangent_size
+        weighted = np.swapaxes(left.frame, 1, 2) @ self.information
+        core = weighted @ left.frame
+        force = np.einsum("eij,ej->ei", weighted, left.residual)
+        arm = lever(left.reach)
+        at_tail = force.copy()
+        at_tail[:, :p] -= np.einsum("eji,ej->ei", arm, force[:, p:])
+        gradient = (problem.at_head @ force - problem.at_tail @ at_tail)[: problem.free_count]
+        half = core.copy()
+        half[:, :, :p] -= core[:, :, p:] @ arm
+        tail_tail = half.copy()
+        tail_tail[:, :p] -= np.swapaxes(arm, 1, 2) @ half[:, p:]
+        blocks = np.concatenate([tail_tail, core, -np.swapaxes(half, 1, 2), -half])
+        return gradient.reshape(-1), problem.symmetric_pattern.assemble(blocks)
+
+    def laplacian_preconditioner(self, rotations: Floats) -> Operator:
+        """The isotropic Hessian of consistent edges, inverted exactly up to the levers' share of the rotations."""
+        problem = self.problem
+        p, d, free = problem.tangent_size, problem.dimension, problem.free_count
+        arms = lever(np.einsum("eij,ej->ei", rotations[problem.tail], problem.translations))
+        arms = problem.tau[:, None, None] * arms
+        coupling = problem.coupling_pattern.assemble(np.concatenate([arms, -arms]))
+        back = coupling.transpose()
+        rotation, translation = problem.rotation_factor.solve, problem.translation_factor.solve
+        rotation_scale = 2.0 if d == 3 else 1.0
+
+        def apply(r: Floats) -> Floats:
+            parts = r.reshape(free, p + d)
+            moved = translation(parts[:, p:])
+            turned = rotation(parts[:, :p] - (back @ moved.reshape(-1)).reshape(free, p)) / rotation_scale
+            moved -= translation((coupling @ turned.reshape(-1)).reshape(free, d))
+            return np.concatenate([turned, moved], axis=1).reshape(-1)
+
+        return apply
+
+
+def _solve(
+    hessian: bsr_matrix, precondition: Operator, gradient: Floats, tolerance: float, max_steps: int
+) -> tuple[Floats, Floats, int]:
+    return truncated_cg(lambda x: np.asarray(hessian @ x), precondition, gradient, tolerance, max_steps)

@@ -1,0 +1,79 @@
+"""Batches of d x d rotations, d = 2 or 3, and their tangent vectors with p = 1 or 3 components."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.types import Bools, Floats
+
+POLAR_STEPS = 12
+POLAR_TOLERANCE = 1e-8
+"""Of the last step: Newton's iteration squares it."""
+
+
+def exponential(omega: Floats) -> Floats:
+    """Rotations (N, d, d) of tangent vectors (N, p)."""
+    if omega.shape[1] == 1:
+        cosine, sine = np.cos(omega[:, 0]), np.sin(omega[:, 0])
+        return np.stack([cosine, -sine, sine, cosine], axis=1).reshape(-1, 2, 2)
+    return se3.so3_exp(omega)
+
+
+def axial(matrices: Floats) -> Floats:
+    """Vectors b (N, p) of matrices B (N, d, d) with d tr(exp(ω^) B) = −ω · b: twice the axis of the skew part."""
+    b = matrices
+    if b.shape[-1] == 2:
+        return np.asarray(b[:, 1:, 0] - b[:, :1, 1])
+    return np.stack([b[:, 2, 1] - b[:, 1, 2], b[:, 0, 2] - b[:, 2, 0], b[:, 1, 0] - b[:, 0, 1]], axis=1)
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """The cross products a x b (N, p) of vectors (N, d)."""
+    if a.shape[1] == 2:
+        return np.asarray(a[:, :1] * b[:, 1:] - a[:, 1:] * b[:, :1])
+    return np.stack(
+        [
+            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
+            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
+            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
+        ],
+        axis=1,
+    )
+
+
+def lever(vectors: Floats) -> Floats:
+    """Matrices (N, d, p) with `lever(u) @ ω = u x ω`, the negative of how u moves when it is turned by ω."""
+    if vectors.shape[1] == 2:
+        return np.stack([vectors[:, 1], -vectors[:, 0]], axis=1)[:, :, None]
+    return se3.hat(vectors)
+
+
+def project(matrices: Floats) -> Floats:
+    """The nearest rotations (N, d, d) in the Frobenius norm."""
+    if matrices.shape[-1] == 2:
+        cosine = matrices[:, 0, 0] + matrices[:, 1, 1]
+        sine = matrices[:, 1, 0] - matrices[:, 0, 1]
+        return exponential(np.arctan2(sine, cosine)[:, None])
+    rotations, good = _polar(matrices)
+    if not good.all():
+        rotations[~good] = se3.project_to_so3(matrices[~good])
+    return rotations
+
+
+def _polar(matrices: Floats) -> tuple[Floats, Bools]:
+    """The orthogonal polar factors by Newton's iteration (Higham 1986), and where it may be trusted."""
+    x = matrices / np.maximum(np.linalg.norm(matrices, axis=(1, 2)), 1e-300)[:, None, None]
+    good = np.ones(len(x), bool)
+    for _ in range(POLAR_STEPS):
+        cofactor = np.stack([cross(x[:, 1], x[:, 2]), cross(x[:, 2], x[:, 0]), cross(x[:, 0], x[:, 1])], axis=1)
+        determinant = np.einsum("nk,nk->n", x[:, 0], cofactor[:, 0])
+        good &= determinant > 1e-9
+        inverse_transpose = cofactor / np.where(good, determinant, 1.0)[:, None, None]
+        scale = np.where(good, np.abs(determinant), 1.0)[:, None, None] ** (-1 / 3)
+        new = 0.5 * (scale * x + inverse_transpose / scale)
+        change = np.abs(new - x)[good].max(initial=0.0)
+        x = new
+        if change < POLAR_TOLERANCE:
+            break
+    return x, good

@@ -1,0 +1,129 @@
+"""Scalar weights of the isotropic objective from 6x6 information, and what is wrong with an information matrix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.types import Bools, Floats, ViewGraph
+
+PLANAR_AXES = np.array([2, 3, 4])
+"""(θ, x, y) in (φ, ρ)."""
+OUT_OF_PLANE = np.array([0, 1, 5])
+PLANAR_TOLERANCE = 1e-12
+INDEFINITE_TOLERANCE = 1e-9
+"""Of the largest eigenvalue: a more negative one is not rounding."""
+FLOOR = 1e-9
+"""Of the median weight: what an edge that says nothing on rotation, or on translation, gets in its place."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Isotropic weights κ, τ (E,), the full information over (φ, ρ), 3x3 for a planar graph, and what was found.
+
+    `used (E,)`: edges that say anything. `definite`: whether every used matrix is positive semi-definite.
+    """
+
+    kappa: Floats
+    tau: Floats
+    information: Floats
+    used: Bools
+    definite: bool
+    notes: tuple[str, ...]
+
+
+def check_graph(graph: ViewGraph) -> None:
+    """Raise `GraphError` for the first edge that is no finite motion, has no finite information or names no vertex."""
+    if graph.edge_count and (graph.edges.min() < 0 or graph.edges.max() >= graph.vertex_count):
+        row = int(np.argmax(((graph.edges < 0) | (graph.edges >= graph.vertex_count)).any(axis=1)))
+        raise GraphError(f"edge {row} names vertex row {graph.edges[row].tolist()} of {graph.vertex_count}: mend it")
+    for name, values in (("measurement", graph.i_from_j), ("information", graph.information)):
+        bad = ~np.isfinite(values).all(axis=(1, 2))
+        if bad.any():
+            i, j = graph.vertex_ids[graph.edges[np.argmax(bad)]]
+            count = int(bad.sum())
+            raise GraphError(f"edge {np.argmax(bad)} ({i}, {j}): its {name} is not finite ({count} such): remove it")
+
+
+def is_planar(graph: ViewGraph) -> bool:
+    """Whether every edge lies in the plane z = 0 and says nothing out of it: a lifted 2-D graph."""
+    if not graph.edge_count:
+        return False
+    motion = graph.i_from_j
+    off = np.abs(np.concatenate([motion[:, 2, :2], motion[:, :2, 2], motion[:, 2:3, 3]], axis=1)).max()
+    return bool(off < PLANAR_TOLERANCE and not graph.information[:, OUT_OF_PLANE].any())
+
+
+def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
+    """The weights of each edge: τ = d / tr(Ω_t⁻¹); κ = 3 / (2 tr(Ω_R⁻¹)), or Ω_θ in the plane (SE-Sync, section II)."""
+    notes: list[str] = []
+    information = graph.information
+    if dimension == 2:
+        information = information[:, PLANAR_AXES[:, None], PLANAR_AXES]
+    information = 0.5 * (information + np.swapaxes(information, 1, 2))
+    p = information.shape[-1] - dimension
+    kappa = _mean_precision(information[:, :p, :p]) / (2 if dimension == 3 else 1)
+    tau = _mean_precision(information[:, p:, p:])
+    loops = graph.edges[:, 0] == graph.edges[:, 1]
+    used = ((kappa > 0) | (tau > 0)) & ~loops
+    if loops.any():
+        notes.append(f"{int(loops.sum())} edges join a vertex to itself: ignored")
+    if (silent := int((~used & ~loops).sum())) > 0:
+        notes.append(f"{silent} edges have no information: ignored")
+    indefinite = _indefinite(information) & used
+    if indefinite.any():
+        notes.append(f"{int(indefinite.sum())} of {graph.edge_count} information matrices are indefinite")
+    kappa, tau = _floor(kappa, used, "rotation", notes), _floor(tau, used, "translation", notes)
+    return Weights(kappa, tau, information, used, not indefinite.any(), tuple(notes))
+
+
+def _mean_precision(blocks: Floats) -> Floats:
+    """The harmonic mean of the eigenvalues (E,), 0 where one is not positive."""
+    if blocks.shape[-1] == 1:
+        return np.maximum(blocks[:, 0, 0], 0.0)
+    scale = np.abs(blocks).max(axis=(1, 2), initial=0.0)
+    safe = np.where(scale > 0, scale, 1.0)[:, None, None]
+    a = blocks / safe
+    diagonal = np.einsum("eii->ei", a)
+    if a.shape[-1] == 2:
+        determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] ** 2
+        minors = diagonal.sum(axis=1)
+    else:
+        cofactor = np.stack(
+            [
+                a[:, 1, 1] * a[:, 2, 2] - a[:, 1, 2] ** 2,
+                a[:, 0, 0] * a[:, 2, 2] - a[:, 0, 2] ** 2,
+                a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] ** 2,
+            ],
+            axis=1,
+        )
+        determinant = np.linalg.det(a)
+        minors = cofactor.sum(axis=1)
+    positive = (determinant > 0) & (minors > 0) & (diagonal.sum(axis=1) > 0)
+    mean = a.shape[-1] * determinant / np.where(positive, minors, 1.0)
+    return np.where(positive, mean, 0.0) * scale
+
+
+def _indefinite(information: Floats) -> Bools:
+    """Where (E,) a matrix has a negative eigenvalue beyond rounding, in units that make its diagonal one."""
+    if not len(information):
+        return np.zeros(0, bool)
+    same = bool((information == information[:1]).all())
+    checked = information[:1] if same else information
+    diagonal = np.einsum("eii->ei", checked)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    eigenvalues = np.linalg.eigvalsh(checked * scale[:, :, None] * scale[:, None, :])
+    found = (eigenvalues[:, 0] < -INDEFINITE_TOLERANCE * np.maximum(eigenvalues[:, -1], 0)) | (diagonal < 0).any(axis=1)
+    return np.broadcast_to(found, len(information)) if same else np.asarray(found)
+
+
+def _floor(weights: Floats, used: Bools, what: str, notes: list[str]) -> Floats:
+    """The weights with the zeros of used edges raised to almost nothing, so that every Laplacian is connected."""
+    silent = used & (weights <= 0)
+    if not silent.any():
+        return weights
+    said = weights[used & (weights > 0)]
+    notes.append(f"{int(silent.sum())} edges say nothing definite on {what}: they count as next to nothing there")
+    return np.where(silent, FLOOR * np.median(said) if len(said) else 1.0, weights)
