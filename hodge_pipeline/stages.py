@@ -7,6 +7,7 @@ A stage is found by name through the entry points `hodge_pipeline.<kind>` (see `
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -78,9 +79,8 @@ class Registrar(Protocol):
         ...
 
 
-@runtime_checkable
-class Executor(Protocol):
-    """Runs the same task on many blocks, in worker processes or on a cluster."""
+class Workers(Protocol):
+    """What an executor opens: hands that run the same task on many blocks."""
 
     def map(self, task: Callable[[Task], Result], blocks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
         """(index, result) of each block as it finishes, in any order.
@@ -88,6 +88,15 @@ class Executor(Protocol):
         The task is a module-level function or a partial of one. A worker that dies costs its blocks a retry;
         `WorkerError` after several. An error that the task raises is raised here.
         """
+        ...
+
+
+@runtime_checkable
+class Executor(Protocol):
+    """Opens workers: processes on this machine, or a cluster."""
+
+    def open(self) -> AbstractContextManager[Workers]:
+        """Workers that live until the context is left. The same task gives the same result on any executor."""
         ...
 
 

@@ -3,8 +3,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hodge_adapters.camera_files import Intrinsics, read_intrinsics
 
+from hodge_adapters.camera_files import Intrinsics, read_intrinsics
 from hodge_pipeline.errors import SourceError
 
 PLAIN = Intrinsics(525.0, 524.0, 319.5, 239.5)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hodge_adapters.seven_scenes import SevenScenesReader
-from readers_data import seven_scenes_sequence
 
+from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Source, Trajectory
+from readers_data import seven_scenes_sequence
 
 CALLS = count()
 

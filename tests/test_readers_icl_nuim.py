@@ -4,9 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from hodge_adapters.icl_nuim import IclNuimReader
 from hodge_adapters.icl_pov import read_pose, read_ray_lengths
 from hodge_adapters.redwood import read_log
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.testing import check_reader
+from hodge_pipeline.types import Camera, Floats
 from readers_data import (
     agreement,
     depth_values,
@@ -16,11 +21,6 @@ from readers_data import (
     write_colour,
     write_depth,
 )
-
-from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError
-from hodge_pipeline.testing import check_reader
-from hodge_pipeline.types import Camera, Floats
 
 SMALL = (10.0, -10.0, 3.5, 2.5)
 # The camera of one published file: right, up and direction are orthogonal, |right| is 4/3.

@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hodge_adapters import images
-from readers_data import HEIGHT, WIDTH, depth_values, write_colour, write_depth
 
+from hodge_adapters import images
 from hodge_pipeline.errors import SourceError
+from readers_data import HEIGHT, WIDTH, depth_values, write_colour, write_depth
 
 
 def test_depth_is_metres_and_zero_where_the_file_has_none(tmp_path: Path) -> None:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hodge_adapters.poses_text import KittiWriter, TumWriter, parse_tum, read_kitti, read_tum, write_kitti, write_tum
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hodge_adapters.poses_text import KittiWriter, TumWriter, parse_tum, read_kitti, read_tum, write_kitti, write_tum
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.stages import Writer

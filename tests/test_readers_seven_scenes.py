@@ -5,7 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from hodge_adapters.seven_scenes import SevenScenesReader
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.testing import check_reader
+from hodge_pipeline.types import Camera
 from readers_data import (
     HEIGHT,
     WIDTH,
@@ -16,11 +21,6 @@ from readers_data import (
     some_poses,
     write_depth,
 )
-
-from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError
-from hodge_pipeline.testing import check_reader
-from hodge_pipeline.types import Camera
 
 
 @pytest.fixture

@@ -4,16 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hodge_adapters.association import interpolated_poses, nearest_pairs
-from hodge_adapters.tum import TumReader
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from readers_data import HEIGHT, WIDTH, agreement, some_poses, tum_folder, tum_line
 
+from hodge_adapters.association import interpolated_poses, nearest_pairs
+from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Source, Trajectory
+from readers_data import HEIGHT, WIDTH, agreement, some_poses, tum_folder, tum_line
 
 
 @pytest.fixture

@@ -1,0 +1,145 @@
+"""Worker processes on this machine."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any, TypeVar
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.errors import WorkerError
+from hodge_pipeline.stages import Workers
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+SINGLE_THREADED = {
+    name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+}
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class LocalExecutor:
+    """Runs blocks in spawned worker processes, one thread each.
+
+    Spawned, not forked: small_gicp deadlocks in a forked child once its parent has used it.
+    """
+
+    workers: int | None = Field(
+        None, ge=0, description="processes; none: one for each core; 0: no process, the blocks run in this one"
+    )
+    retries: int = Field(2, ge=0, description="how often a block is tried again whose worker died")
+
+    @contextmanager
+    def open(self) -> Iterator[Workers]:
+        """Workers that live until the block is left, then end at once; they start with the first task."""
+        count = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
+        if count == 0:
+            yield InProcess()
+            return
+        pool = SpawnedWorkers(count, self.retries)
+        try:
+            yield pool
+        finally:
+            pool.kill()
+
+
+class InProcess:
+    """Runs blocks one after the other in this process: for debugging."""
+
+    def map(self, task: Callable[[Task], Result], blocks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
+        """(index, result) of each block, in order."""
+        return ((row, task(block)) for row, block in enumerate(blocks))
+
+
+class SpawnedWorkers:
+    """A pool of processes that is mended when one of them dies."""
+
+    def __init__(self, count: int, retries: int) -> None:
+        self._count, self._retries = count, retries
+        self._pool: ProcessPoolExecutor | None = None
+
+    def map(self, task: Callable[[Task], Result], blocks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
+        """(index, result) of each block as it finishes; a block of a worker that died is tried again."""
+        tries = [0] * len(blocks)
+        waiting = list(range(len(blocks) - 1, -1, -1))
+        running: dict[Future[Any], int] = {}
+        while waiting or running:
+            # no more than the pool has hands for: when a worker dies, only blocks that were begun are charged a try
+            while waiting and len(running) < 2 * self._count:
+                row = waiting.pop()
+                running[self._started().submit(task, blocks[row])] = row
+            finished, _ = wait(running, return_when=FIRST_COMPLETED)
+            lost = [running[future] for future in finished if isinstance(future.exception(), BrokenProcessPool)]
+            for future in finished:
+                row = running.pop(future)
+                if row not in lost:
+                    yield row, future.result()
+            if lost:
+                lost += running.values()
+                running.clear()
+                self._recover(lost, tries)
+                waiting += sorted(lost, reverse=True)
+
+    def _recover(self, lost: list[int], tries: list[int]) -> None:
+        self.kill()
+        for row in lost:
+            tries[row] += 1
+            if tries[row] > self._retries:
+                raise WorkerError(
+                    f"block {row} lost its worker process {tries[row]} times (killed, or out of memory?): "
+                    "close other programs or use fewer workers (--set executor.workers=1), then run again"
+                )
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            context = multiprocessing.get_context("spawn")
+            with _environment(SINGLE_THREADED), _hidden_main():
+                self._pool = ProcessPoolExecutor(self._count, mp_context=context)
+                self._pool.submit(os.getpid)  # the first submission starts every process
+        return self._pool
+
+    def kill(self) -> None:
+        """End every worker at once."""
+        pool, self._pool = self._pool, None
+        if pool is None:
+            return
+        processes = list((pool._processes or {}).values())  # shutdown alone would wait for what they do
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.join()
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _hidden_main() -> Iterator[None]:
+    """Keep spawned children from importing the user's script: no guard is needed there, and a notebook works too."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main

@@ -1,0 +1,96 @@
+"""One run in progress: its stages with their keys, costs, notes and log."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from hodge_pipeline import artifacts, binding
+from hodge_pipeline.monitor import Monitor
+from hodge_pipeline.recipe import Recipe
+from hodge_pipeline.stages import Advance, Executor, no_progress
+from hodge_pipeline.types import Source
+from hodge_pipeline.watch import Watcher
+from hodge_pipeline.workspace import KEY_FILE, StageFolder, Workspace, key_of
+
+LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless")
+log = logging.getLogger("hodge_pipeline")
+
+
+@cache
+def versions() -> dict[str, str]:
+    """The versions of this package and of the libraries that decide its numbers."""
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "absent"
+    return found
+
+
+@dataclass
+class Job:
+    """What every step of a run shares. `keys` holds the key of each stage so far, by its name."""
+
+    recipe: Recipe
+    workspace: Workspace
+    watcher: Watcher
+    executor: Executor
+    monitor: Monitor = field(default_factory=Monitor)
+    keys: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def path(self, stage: str) -> Path:
+        """Where a stage's artifacts lie."""
+        return self.workspace.folder / "stages" / stage
+
+    def note(self, message: str) -> None:
+        """Tell the user, the log and the report; a finished stage tells its notes again in every later run."""
+        if message not in self.notes:
+            self.notes.append(message)
+            self.watcher.say(message)
+            log.warning(message)
+
+    @contextmanager
+    def stage(
+        self, name: str, title: str, total: int, options: Any, inputs: tuple[str, ...]
+    ) -> Iterator[tuple[StageFolder, Advance]]:
+        """One stage: its folder and its progress. Its key is its options, the versions and its inputs' keys."""
+        key = key_of(name, binding.unbind(options), versions(), [self.keys[stage] for stage in inputs])
+        self.keys[name] = key
+        told = len(self.notes)
+        with self.monitor.measure() as cost, self.workspace.stage(name, key) as folder:
+            if folder.finished:
+                log.info("%s: already done", title)
+                for message in folder.info.get("notes", []):
+                    self.note(message)
+                yield folder, no_progress
+            else:
+                log.info("%s: begins", title)
+                with self.watcher.stage(title, total) as advance:
+                    yield folder, advance
+        if not folder.finished:
+            log.info("%s: %.1f s wall, %.1f s CPU, %.0f MB", title, cost.wall_s, cost.cpu_s, cost.peak_mb)
+            self.workspace.note(name, {"title": title, "notes": self.notes[told:], **vars(cost)})
+
+    def costs(self) -> list[dict[str, Any]]:
+        """Title, wall_s, cpu_s and peak_mb of each stage so far, those of earlier sessions included."""
+        infos = (artifacts.read_json(self.path(name) / KEY_FILE) for name in self.keys if self.path(name).is_dir())
+        return [info for info in infos if "title" in info]
+
+
+def source_key(source: Source, reader: Any) -> str:
+    """The key of an input: the reader's options, and name, size and time of each file."""
+    files = []
+    for path in source.files:
+        status = os.stat(path)
+        files.append((str(path), status.st_size, status.st_mtime_ns))
+    return key_of("source", binding.unbind(reader), files)

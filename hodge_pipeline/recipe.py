@@ -1,0 +1,77 @@
+"""A recipe: which stages make a run, and their options."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline import binding, recipe_file
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.odometry import OdometryOptions
+from hodge_pipeline.registration.pairs import Acceptance
+from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, FrameReader, Fuser, Registrar
+from hodge_pipeline.yaml_file import Document, Keys
+
+OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+
+
+@dataclass(frozen=True, config=OPTIONS)
+class SourceOptions:
+    """What to read, and as what."""
+
+    path: Path | None = Field(None, description="a folder or file; `hodge run --source` sets it")
+    reader: FrameReader | None = Field(None, description="its format; none: the reader that is surest of the path")
+
+
+@dataclass(frozen=True, config=OPTIONS)
+class EvaluationOptions:
+    """What is measured at the end."""
+
+    tables: bool = Field(True, description="the two score tables, about 40 CPU seconds for 250 frames")
+    rpe_delta_frames: int = Field(1, ge=1, description="frames between the two poses of a relative pose error")
+
+
+@dataclass(frozen=True, config=OPTIONS)
+class Recipe:
+    """A whole run. Every stage is `{stage: name, option: value, …}`, or its name alone."""
+
+    edges: EdgeBuilder = Field(description="which pairs of frames to register")
+    registration: Registrar = Field(description="how a pair is registered")
+    solver: ConsistencySolver = Field(description="how the poses are made consistent")
+    executor: Executor = Field(description="where pairs are registered")
+    description: str = Field("", description="one sentence for `hodge recipes`")
+    seed: int = Field(0, ge=0, description="of everything random; the same seed gives the same poses")
+    source: SourceOptions = SourceOptions()
+    clouds: CloudOptions = CloudOptions()
+    odometry: OdometryOptions | None = Field(None, description="the first poses; none: from the source")
+    acceptance: Acceptance = Acceptance()
+    outer_iterations: int = Field(
+        2, ge=1, le=20, description="rounds of new edges, registration and solve, each from the poses of the last"
+    )
+    fusion: tuple[Fuser, ...] = Field((), description="each makes one model from the final poses")
+    evaluation: EvaluationOptions = EvaluationOptions()
+    recording: RecordingOptions = RecordingOptions()
+
+
+def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path | None = None) -> Recipe:
+    """The recipe of a name or file, with overrides such as `solver.inner_iterations=5` and another source.
+
+    Raises `RecipeError`: `file:line: key: what was expected`.
+    """
+    document = recipe_file.load(name_or_path, overrides)
+    recipe = binding.bind(Recipe, document.data, lambda keys: origin(document, keys))
+    if source is None:
+        return recipe
+    return dataclasses.replace(recipe, source=dataclasses.replace(recipe.source, path=source))
+
+
+def origin(document: Document, keys: Keys) -> str:
+    """`file:line` of a key, or of the nearest key above it that was written."""
+    while keys not in document.origins:
+        keys = keys[:-1]
+    return document.origins[keys]

@@ -1,0 +1,127 @@
+"""Executors: the same results everywhere, a dead worker costs a retry, errors and orphans."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import psutil
+import pytest
+
+from hodge_pipeline.errors import SourceError, WorkerError
+from hodge_pipeline.executors.dask import DaskExecutor
+from hodge_pipeline.executors.local import LocalExecutor
+from hodge_pipeline.stages import Executor
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def thread_limit(_: int) -> str:
+    return os.environ["OMP_NUM_THREADS"]
+
+
+def process_id(_: int) -> int:
+    return os.getpid()
+
+
+def fail_on_three(number: int) -> int:
+    if number == 3:
+        raise SourceError("frame 3: truncated: copy it again")
+    return number
+
+
+def die_once(folder: Path, number: int) -> int:
+    """Kill this worker the first time that block 2 is seen."""
+    mark = folder / "died"
+    if number == 2 and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def die_always(number: int) -> int:
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+EXECUTORS: dict[str, Callable[[], Executor]] = {
+    "in process": lambda: LocalExecutor(workers=0),
+    "spawned": lambda: LocalExecutor(workers=2),
+    "dask": lambda: DaskExecutor(workers=2),
+}
+
+
+@pytest.fixture(params=list(EXECUTORS))
+def executor(request: pytest.FixtureRequest) -> Executor:
+    return EXECUTORS[request.param]()
+
+
+def test_every_block_comes_back_once_and_workers_serve_again(executor: Executor) -> None:
+    with executor.open() as workers:
+        assert sorted(workers.map(square, range(7))) == [(k, k * k) for k in range(7)]
+        assert sorted(workers.map(square, [])) == []
+        assert sorted(workers.map(square, [5])) == [(0, 25)]
+
+
+def test_an_error_in_a_task_is_raised_here(executor: Executor) -> None:
+    with executor.open() as workers, pytest.raises(SourceError, match="frame 3"):
+        list(workers.map(fail_on_three, range(6)))
+
+
+@pytest.mark.parametrize("name", ["spawned", "dask"])
+def test_a_worker_that_dies_costs_a_retry(name: str, tmp_path: Path) -> None:
+    with EXECUTORS[name]().open() as workers:
+        results = sorted(workers.map(partial(die_once, tmp_path), range(8)))
+    assert results == [(k, k) for k in range(8)]
+    assert (tmp_path / "died").exists()
+
+
+@pytest.mark.parametrize("name", ["spawned", "dask"])
+def test_a_block_that_always_kills_ends_in_one_line(name: str) -> None:
+    with EXECUTORS[name]().open() as workers, pytest.raises(WorkerError, match="block 1 lost its"):
+        list(workers.map(die_always, range(3)))
+
+
+def test_workers_have_one_thread_and_both_work() -> None:
+    with LocalExecutor(workers=2).open() as workers:
+        assert {value for _, value in workers.map(thread_limit, range(4))} == {"1"}
+        assert os.getpid() not in {pid for _, pid in workers.map(process_id, range(4))}
+
+
+def test_leaving_early_leaves_no_orphans() -> None:
+    before = set(psutil.Process().children(recursive=True))
+    with LocalExecutor(workers=2).open() as workers:
+        next(workers.map(square, range(100)))
+        started = set(psutil.Process().children(recursive=True)) - before
+        assert len(started) >= 2
+    alive = [p for p in started if p.is_running() and "resource_tracker" not in " ".join(p.cmdline())]
+    assert not alive
+
+
+def test_a_script_without_a_main_guard_runs(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        textwrap.dedent("""
+        import math
+        from hodge_pipeline.executors.local import LocalExecutor
+        with LocalExecutor(workers=2).open() as workers:
+            print(sorted(workers.map(math.factorial, [3, 4])))
+        """)
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[(0, 6), (1, 24)]"
+
+
+def test_a_scheduler_that_is_not_there_is_one_line() -> None:
+    with (
+        pytest.raises(WorkerError, match="no Dask scheduler answers"),
+        DaskExecutor(address="tcp://127.0.0.1:9", timeout_s=0.5).open(),
+    ):
+        raise AssertionError
