@@ -17,14 +17,15 @@ TREMOR_TERMS = 6
 class HandHeldLoop:
     """A smooth closed path with tremor; camera axes are x right, y down, z forward, the world's z is up.
 
-    - `duration_s` for `turns` rounds: after one round the camera is back where it started but for the tremor.
+    - `duration_s` for `turns` rounds: after one round the camera is back where it started but for the tremor. Less than
+      one round is gone there and back.
     - `radius_m` of the round, `height_m` of the camera over the floor.
     - `tremor_m`, `tremor_deg`: standard deviation of the hand's shaking along and about each axis.
     """
 
     seed: int
     duration_s: float
-    turns: float = 1.06
+    turns: float
     radius_m: float = 1.0
     height_m: float = 1.45
     tremor_m: float = 0.006
@@ -32,9 +33,11 @@ class HandHeldLoop:
 
     def world_from_cam(self, times_s: Floats) -> Floats:
         """Poses (N, 4, 4) at the times (N,), from 0 to `duration_s`."""
-        angle = 2 * np.pi * self.turns * np.asarray(times_s, float) / self.duration_s
-        steady = self._steady(angle)
-        return np.asarray(steady @ se3.exp(self._tremor(np.asarray(times_s, float))))
+        times_s = np.asarray(times_s, float)
+        share = times_s / self.duration_s
+        done = share if self.turns >= 1 else (1 - np.cos(2 * np.pi * share)) / 2
+        steady = self._steady(2 * np.pi * self.turns * done)
+        return np.asarray(steady @ se3.exp(self._tremor(times_s)))
 
     def _steady(self, angle: Floats) -> Floats:
         """The path without tremor: the camera opposite to where it looks, so that it sees the room's width."""

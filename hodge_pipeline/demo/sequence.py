@@ -34,6 +34,7 @@ CAMERA_HZ, TRUTH_HZ = 30.0, 100.0
 UNITS_PER_METRE = 5000
 FOCAL_SHARE_OF_WIDTH = 525 / 640
 JPEG_QUALITY = 92
+FULL_LOOP, STEP_DEG = 1.06, 3.2
 CACHED_SEQUENCES = 4
 
 
@@ -42,7 +43,7 @@ class DemoOptions:
     """What is rendered."""
 
     frames: int = Field(
-        default=120, ge=2, description="images; at the defaults neighbours are 3 degrees and 6 cm apart"
+        default=120, ge=2, description="images; neighbours are 3 degrees and 6 cm apart unless turns says other"
     )
     width: int = Field(
         default=320, ge=16, description="pixels; 320 keeps the complete demo below a minute on two cores"
@@ -50,8 +51,11 @@ class DemoOptions:
     height: int = Field(default=240, ge=16, description="pixels")
     seed: int = Field(default=0, ge=0, description="of textures, books, tremor and noise")
     noise: float = Field(default=1.0, ge=0, description="scale of every error of the camera; 0 gives exact images")
-    turns: float = Field(
-        default=1.06, gt=0, description="rounds of the room; above 1 the last images overlap the first"
+    turns: float | None = Field(
+        default=None,
+        gt=0,
+        description="rounds of the room; above 1 the last images overlap the first, below 1 the camera goes there and "
+        "back; none: 1.06, or, with too few frames for that, as far as neighbours stay 3 degrees apart",
     )
     stride: int = Field(default=5, ge=1, description="of a 30 Hz camera's images every stride-th is kept")
 
@@ -60,6 +64,14 @@ class DemoOptions:
         """The camera, 63 degrees wide."""
         focal = FOCAL_SHARE_OF_WIDTH * self.width
         return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
+
+    @property
+    def rounds(self) -> float:
+        """`turns`, or what stands for none."""
+        if self.turns is not None:
+            return self.turns
+        reach = self.frames * STEP_DEG / 360
+        return FULL_LOOP if reach >= FULL_LOOP else min(reach, 1.0) / 2
 
     @property
     def key(self) -> str:
@@ -142,7 +154,7 @@ def _write(draft: Path, options: DemoOptions, advance: Advance) -> None:
     colour_s = np.arange(options.frames) * options.stride / CAMERA_HZ + rng.uniform(0, 0.002, options.frames) + 0.05
     depth_s = colour_s + rng.uniform(-0.006, 0.006, options.frames)
     duration_s = options.frames * options.stride / CAMERA_HZ
-    path = HandHeldLoop(options.seed, duration_s, options.turns)
+    path = HandHeldLoop(options.seed, duration_s, options.rounds)
     recorder = _Recorder(draft, options, path)
     (draft / "rgb").mkdir()
     (draft / "depth").mkdir()

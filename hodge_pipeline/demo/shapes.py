@@ -35,7 +35,9 @@ def _grid(rows: int, columns: int) -> Ints:
 
 def box(width: float, depth: float, height: float) -> Mesh:
     """A box: width along x, depth along y, height along z."""
-    vertices, normals, triangles = [], [], []
+    vertices: list[Floats] = []
+    normals: list[Floats] = []
+    triangles: list[Ints] = []
     quad = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 2
     for axis in range(3):
         for side in (-0.5, 0.5):

@@ -62,7 +62,7 @@ def _grey(values: Floats) -> Floats:
 
 
 def _mix(share: Floats, a: tuple[float, float, float], b: tuple[float, float, float]) -> Floats:
-    return share[..., None] * np.array(a) + (1 - share[..., None]) * np.array(b)
+    return np.asarray(share[..., None] * np.array(a) + (1 - share[..., None]) * np.array(b))
 
 
 def _axes() -> tuple[Floats, Floats]:
@@ -96,7 +96,7 @@ def boards(rng: np.random.Generator) -> Floats:
     shade = rng.uniform(0.75, 1.0, 8)[board]
     end = np.abs((column + rng.uniform(0, 1, 8)[board]) % 1 - 0.5) < 0.004
     joint = (np.abs(row * 8 - np.round(row * 8)) < 0.045) | end
-    return wood(rng) * (shade * np.where(joint, 0.45, 1.0))[..., None]
+    return np.asarray(wood(rng) * (shade * np.where(joint, 0.45, 1.0))[..., None])
 
 
 def fabric(rng: np.random.Generator) -> Floats:
@@ -123,7 +123,7 @@ def rug(rng: np.random.Generator) -> Floats:
         around = np.arctan2(row - centre_row, column - centre_column)
         petals = rng.uniform(0.03, 0.08) * (1 + 0.35 * np.cos(rng.integers(3, 9) * around))
         image[np.hypot(row - centre_row, column - centre_column) < petals] = rng.uniform(0.1, 0.95, 3)
-    return image * (0.8 + 0.2 * _grey(_clouds(rng, 0.5)))
+    return np.asarray(image * (0.8 + 0.2 * _grey(_clouds(rng, 0.5))))
 
 
 def picture(rng: np.random.Generator) -> Floats:
@@ -149,7 +149,7 @@ def spine(rng: np.random.Generator) -> Floats:
         image[np.abs(row - at) < rng.uniform(0.01, 0.03)] = rng.uniform(0.2, 1.0, 3)
     letters = np.repeat(rng.random(16) < 0.65, SIZE // 16)[:, None] & (np.abs(row - 0.5) < 0.33)
     image[letters & (np.abs(column - 0.5) < 0.2)] = rng.uniform(0.0, 1.0, 3)
-    return image * (0.85 + 0.15 * _grey(_clouds(rng, 1.0)))
+    return np.asarray(image * (0.85 + 0.15 * _grey(_clouds(rng, 1.0))))
 
 
 def text(rng: np.random.Generator) -> Floats:
@@ -158,7 +158,7 @@ def text(rng: np.random.Generator) -> Floats:
     row, column = _axes()
     ink *= (row * 32) % 1 < 0.55
     ink[(np.abs(row - 0.5) > 0.44) | (np.abs(column - 0.5) > 0.42)] = 0
-    return _grey(0.95 - 0.75 * ink)
+    return _grey(0.95 - 0.75 * np.asarray(ink, float))
 
 
 def sky(rng: np.random.Generator) -> Floats:
