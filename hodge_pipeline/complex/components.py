@@ -1,0 +1,56 @@
+"""The connected components of a graph, ordered by size and described in words."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components as csgraph_components
+
+from hodge_pipeline.complex.coboundary import check_edges
+from hodge_pipeline.types import Bools, Ints
+
+MOST_PIECES_LISTED = 8
+
+
+def connected_components(edges: Ints, vertex_count: int) -> Ints:
+    """The component (V,) of each vertex: 0 the largest; of equal ones, that with the first vertex comes first."""
+    edges = np.asarray(edges, np.int64).reshape(-1, 2)
+    check_edges(edges, vertex_count)
+    ones = np.ones(len(edges), np.int8)
+    adjacency = csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
+    count, label = csgraph_components(adjacency, directed=False)
+    _, first = np.unique(label, return_index=True)
+    order = np.lexsort((first, -np.bincount(label, minlength=count)))
+    rank = np.empty(count, np.int64)
+    rank[order] = np.arange(count)
+    return np.asarray(rank[label], np.int64)
+
+
+def first_of_component(component: Ints) -> Bools:
+    """Where (V,) a vertex is the first of its component: its gauge vertex."""
+    first = np.zeros(len(component), bool)
+    first[np.unique(component, return_index=True)[1]] = True
+    return first
+
+
+def describe_components(component: Ints, vertex_ids: NDArray[np.generic]) -> tuple[str, ...]:
+    """One warning that lists the pieces of a graph that is not connected, else nothing."""
+    sizes = np.bincount(component)
+    if len(sizes) <= 1:
+        return ()
+    several = np.flatnonzero(sizes > 1)
+    pieces = [_describe_piece(int(p), vertex_ids[component == p]) for p in several[:MOST_PIECES_LISTED]]
+    if len(several) > MOST_PIECES_LISTED:
+        pieces.append(f"{len(several) - MOST_PIECES_LISTED} smaller pieces")
+    single = vertex_ids[np.isin(component, np.flatnonzero(sizes == 1))]
+    if len(single):
+        shown = ", ".join(str(name) for name in single[:MOST_PIECES_LISTED])
+        rest = ", …" if len(single) > MOST_PIECES_LISTED else ""
+        pieces.append(f"{len(single)} without any edge ({shown}{rest})")
+    text = "; ".join(pieces)
+    return (f"graph falls into {len(sizes)} pieces, each with its own gauge: {text}",)
+
+
+def _describe_piece(number: int, names: NDArray[np.generic]) -> str:
+    return f"piece {number}: {len(names)} vertices ({names[0]} … {names[-1]})"

@@ -1,0 +1,301 @@
+"""The plain Poisson solver: the exact part of the residual 1-form moves the poses (paper, Section 4, Eqs. (7)-(9))."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass as plain_dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from scipy.sparse import csr_matrix
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.checks import check_graph, orthonormal
+from hodge_pipeline.complex.coboundary import coboundary_0, grounded_laplacian
+from hodge_pipeline.complex.components import connected_components, describe_components, first_of_component
+from hodge_pipeline.complex.cycles import (
+    SpanningForest,
+    adjusted_edges,
+    fundamental_products,
+    loop_deviation,
+    spanning_forest,
+)
+from hodge_pipeline.complex.edge_weights import EdgeWeighting, edge_weights
+from hodge_pipeline.complex.form import Logarithm, centroids, residual_form, shifted
+from hodge_pipeline.solvers.linear import Factor, factorise
+from hodge_pipeline.types import Bools, Floats, Ints, Solution, SolverIteration, ViewGraph
+
+STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
+WEIGHTS_SETTLED = 1e-3
+SMALLEST_WEIGHT = 1e-6  # a rejected edge still ties its ends together, so that no component falls apart
+SMALLEST_SCALE_M = 1e-6
+MAD_TO_SIGMA = 1.4826
+TUNING = {"huber": 1.345, "geman_mcclure": 3.0}  # in sigmas: 95 % efficiency; half weight at about 2 sigma
+
+
+@plain_dataclass(frozen=True)
+class _Problem:
+    """The edges that can be used, around the centroid of their component."""
+
+    edges: Ints
+    i_from_j: Floats
+    base_weights: Floats
+    d0: csr_matrix
+    component: Ints
+    gauge: Bools
+    start: Floats
+    offset: Floats
+    start_in_world: Floats
+
+    def in_world(self, poses: Floats) -> Floats:
+        """The poses away from the centroid again; the gauge vertices are those of the start to the last bit."""
+        out = shifted(poses, self.offset)
+        out[self.gauge] = self.start_in_world[self.gauge]
+        return out
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class PoissonSolver:
+    """Poses whose residual 1-form has no exact part left: `L f = d0ᵀ W ω`, `T_k ← exp(f_k) T_k`, a few times.
+
+    Every step is one scalar sparse factorisation with six right-hand sides. ω is formed around the centroid of each
+    connected component: far from the world's origin a little rotation would become much translation, and the result
+    would depend on where the origin is. f is taken with mean zero, then the component is moved back as one body, so
+    that its first vertex keeps its pose exactly.
+
+    With a robust kernel the edges are first reweighted (IRLS) by steps from the start poses; then the weights are
+    frozen and the reported iterations begin at the start poses again. So the loop deviation D in the history falls
+    as it does in the paper: it measures the *adjusted* edges `T_i⁻¹ exp(f_j − f_i) T_j` of that one step, that is how
+    far the exponential of the sum is from the product of exponentials. It is never taken from the absolute poses,
+    where it is 0 by construction, and says nothing about the measured edges' own inconsistency, which no solver can
+    change (`measured_loop_deviation_*` in the metrics).
+    """
+
+    weights: EdgeWeighting = Field(
+        "unit",
+        description="weight of each edge: unit as in the paper up to a factor; fitness of its registration; "
+        "information, 6 / tr(S Ω⁻¹ S) with S = diag(lever_arm_m × 3, 1 × 3), for measured pose graphs",
+    )
+    robust: Literal["none", "huber", "geman_mcclure"] = Field(
+        "geman_mcclure",
+        description="kernel against false edges: none is the paper's least squares; huber bounds the pull of a false "
+        "edge; geman_mcclure, the default, all but removes it",
+    )
+    scale_m: float | None = Field(
+        None,
+        gt=0,
+        description="metres: the residual of a good edge (one sigma). Default: 1.4826 times the median residual, "
+        "taken anew in each reweighting step",
+    )
+    reweighting_steps: int = Field(20, ge=1, description="at most so many IRLS steps; they end once weights settle")
+    lever_arm_m: float = Field(
+        1.0,
+        gt=0,
+        description="metres: a rotation counts as the displacement it causes at this distance, about that of the "
+        "scene from the camera (1 m suits rooms)",
+    )
+    inner_iterations: int = Field(
+        3, ge=1, description="Poisson steps with the same edges: each leaves about 2 % of the error (paper: 1 to 3)"
+    )
+    tolerance: float = Field(
+        1e-10, gt=0, description="stop once the RMS of f over the vertices (radians and metres) is below this"
+    )
+    log: Logarithm = Field(
+        "se3",
+        description="logarithm of the residual motion: se3 does not depend on the edges' directions; pairing is the "
+        "paper's own (rotation vector, translation), which does",
+    )
+
+    def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
+        """Consistent poses; a graph of several components is solved piece by piece, isolated vertices keep their pose.
+
+        Raises `GraphError` for motions or information that are not finite, and for an empty graph.
+        """
+        world_from_cam = np.asarray(world_from_cam, float)
+        check_graph(graph, world_from_cam)
+        base_weights, notes = edge_weights(graph, self.weights, self.lever_arm_m)
+        proper = graph.edges[:, 0] != graph.edges[:, 1]
+        used = proper & (base_weights > 0)
+        problem = _problem(graph, used, base_weights, world_from_cam)
+        robust_weights, scale = self._robust_weights(problem)
+        forest = spanning_forest(problem.edges, graph.vertex_count)
+        history = self._iterate(problem, robust_weights, forest)
+        weights = np.zeros(graph.edge_count)
+        weights[used] = robust_weights
+        measured = loop_deviation(fundamental_products(forest, problem.i_from_j))
+        metrics = {
+            "loops": float(len(measured)),
+            "measured_loop_deviation_sum": float(measured.sum()),
+            "measured_loop_deviation_mean": _mean(measured),
+            "robust_scale_m": scale,
+            "iterations": float(len(history)),
+            **(history[-1].metrics if history else {}),
+        }
+        return Solution(
+            world_from_cam=history[-1].world_from_cam if history else world_from_cam.copy(),
+            component=problem.component,
+            weights=weights,
+            history=history,
+            metrics=metrics,
+            notes=(
+                *notes,
+                *_edge_notes(proper, base_weights),
+                *describe_components(problem.component, graph.vertex_ids),
+                *self._convergence_notes(problem, history),
+            ),
+        )
+
+    def _iterate(self, problem: _Problem, weights: Floats, forest: SpanningForest) -> tuple[SolverIteration, ...]:
+        if len(problem.edges) == 0:
+            return ()
+        total = problem.base_weights * weights
+        factor = _factorise(problem, total)
+        poses, history = problem.start, []
+        omega = self._form(problem, poses)
+        for _ in range(self.inner_iterations):
+            correction = _poisson(problem, factor, total, omega)
+            adjusted = adjusted_edges(problem.edges, poses, correction, pairing=self.log == "pairing")
+            deviation = loop_deviation(fundamental_products(forest, adjusted))
+            poses = self._moved(problem, poses, correction)
+            omega = self._form(problem, poses)
+            step = float(np.sqrt((correction**2).sum(axis=1).mean()))
+            history.append(
+                SolverIteration(
+                    world_from_cam=problem.in_world(poses),
+                    objective=float(0.5 * total @ (omega**2).sum(axis=1)),
+                    metrics=_metrics(problem, poses, deviation, step),
+                )
+            )
+            if step < self.tolerance:
+                break
+        return tuple(history)
+
+    def _robust_weights(self, problem: _Problem) -> tuple[Floats, float]:
+        """The frozen weights (E,) in (0, 1], 1 without a kernel, and the scale in metres that they ended with."""
+        weights = np.ones(len(problem.edges))
+        if self.robust == "none" or len(weights) == 0:
+            return weights, float("nan")
+        poses, scale = problem.start, float("nan")
+        for _ in range(self.reweighting_steps):
+            total = problem.base_weights * weights
+            omega = self._form(problem, poses)
+            poses = self._moved(problem, poses, _poisson(problem, _factorise(problem, total), total, omega))
+            residual = self._displacement(problem, poses)
+            scale = self.scale_m or _robust_scale(residual)
+            previous, weights = weights, _kernel(residual / (TUNING[self.robust] * scale), self.robust)
+            if np.abs(weights - previous).mean() < WEIGHTS_SETTLED:
+                break
+        return weights, scale
+
+    def _displacement(self, problem: _Problem, poses: Floats) -> Floats:
+        """The residual (E,) of each edge in its own two frames, metres: no matter where the world's origin is."""
+        translation, angle = _residuals(problem, poses)
+        return np.hypot(translation, self.lever_arm_m * angle)
+
+    def _form(self, problem: _Problem, poses: Floats) -> Floats:
+        return residual_form(problem.edges, problem.i_from_j, poses, self.log)
+
+    def _moved(self, problem: _Problem, poses: Floats, correction: Floats) -> Floats:
+        motion = se3.pairing_exp(correction) if self.log == "pairing" else se3.exp(correction)
+        moved = motion @ poses
+        start_from_moved = problem.start[problem.gauge] @ se3.inverse(moved[problem.gauge])
+        out = np.asarray(start_from_moved[problem.component[problem.gauge].argsort()][problem.component] @ moved)
+        out[problem.gauge] = problem.start[problem.gauge]
+        return out
+
+    def _convergence_notes(self, problem: _Problem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
+        if not history:
+            return ("no edge joins two vertices: every pose is as it was at the start",)
+        notes = []
+        half_turns = int((np.linalg.norm(self._form(problem, problem.start)[:, :3], axis=1) > np.pi - 1e-3).sum())
+        if half_turns:
+            notes.append(f"{half_turns} edges disagree with the start by a half turn: the sign of their ω is arbitrary")
+        step = history[-1].metrics["step_rms"]
+        if step > STILL_MOVING:
+            notes.append(
+                f"not converged: step {len(history)} still moved the poses by {step:.2g}: more inner_iterations"
+            )
+        return tuple(notes)
+
+
+def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam: Floats) -> _Problem:
+    edges = graph.edges[used]
+    component = connected_components(edges, graph.vertex_count)
+    offset = centroids(world_from_cam, component)
+    return _Problem(
+        edges=edges,
+        i_from_j=orthonormal(graph.i_from_j[used]),
+        base_weights=base_weights[used],
+        d0=coboundary_0(edges, graph.vertex_count),
+        component=component,
+        gauge=first_of_component(component),
+        start=orthonormal(shifted(world_from_cam, -offset)),
+        offset=offset,
+        start_in_world=world_from_cam,
+    )
+
+
+def _factorise(problem: _Problem, weights: Floats) -> Factor:
+    return factorise(grounded_laplacian(problem.d0, weights, problem.gauge))
+
+
+def _poisson(problem: _Problem, factor: Factor, weights: Floats, omega: Floats) -> Floats:
+    """F (V, 6) with `d0ᵀ W d0 f = d0ᵀ W ω` (Eq. (7)) and mean zero on each component."""
+    divergence = problem.d0.T @ (weights[:, None] * omega)
+    f = np.zeros_like(divergence)
+    f[~problem.gauge] = factor.solve(divergence[~problem.gauge])
+    count = np.bincount(problem.component)
+    sums = np.stack([np.bincount(problem.component, column) for column in f.T], axis=1)
+    return np.asarray(f - (sums / count[:, None])[problem.component])
+
+
+def _residuals(problem: _Problem, poses: Floats) -> tuple[Floats, Floats]:
+    """Translation (E,) in metres and angle (E,) in radians of each edge's disagreement with the poses.
+
+    The translation is the RMS of those that the two cameras see, so it does not depend on the edge's direction.
+    """
+    i, j = problem.edges.T
+    poses_say = se3.inverse(poses[i]) @ poses[j]
+    at_i, at_j = poses_say @ se3.inverse(problem.i_from_j), se3.inverse(problem.i_from_j) @ poses_say
+    translation = np.sqrt(((at_i[:, :3, 3] ** 2).sum(axis=1) + (at_j[:, :3, 3] ** 2).sum(axis=1)) / 2)
+    return translation, np.linalg.norm(se3.so3_log(at_j[:, :3, :3]), axis=1)
+
+
+def _metrics(problem: _Problem, poses: Floats, deviation: Floats, step: float) -> Mapping[str, float]:
+    translation, angle = _residuals(problem, poses)
+    return {
+        "translation_residual_mean_m": _mean(translation),
+        "translation_residual_median_m": float(np.median(translation)),
+        "rotation_residual_mean_rad": _mean(angle),
+        "rotation_residual_median_rad": float(np.median(angle)),
+        "step_rms": step,
+        "loop_deviation_sum": float(deviation.sum()),
+        "loop_deviation_mean": _mean(deviation),
+    }
+
+
+def _mean(values: Floats) -> float:
+    return float(values.mean()) if len(values) else 0.0
+
+
+def _robust_scale(residual: Floats) -> float:
+    """One sigma in metres from the median; edges in no loop fit exactly and would drag it to 0, so they do not vote."""
+    voting = residual[residual > 1e-9 * residual.max(initial=0.0)]
+    return max(MAD_TO_SIGMA * float(np.median(voting)) if len(voting) else 0.0, SMALLEST_SCALE_M)
+
+
+def _kernel(ratio: Floats, robust: str) -> Floats:
+    weight = 1.0 / np.maximum(ratio, 1.0) if robust == "huber" else 1.0 / (1.0 + ratio**2) ** 2
+    return np.maximum(weight, SMALLEST_WEIGHT)
+
+
+def _edge_notes(proper: Bools, base_weights: Floats) -> tuple[str, ...]:
+    notes = []
+    if not proper.all():
+        notes.append(f"{int((~proper).sum())} edges join a vertex to itself and say nothing about poses: ignored")
+    weightless = int((proper & (base_weights <= 0)).sum())
+    if weightless:
+        notes.append(f"{weightless} edges of weight 0 are ignored")
+    return tuple(notes)
