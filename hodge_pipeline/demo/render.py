@@ -11,6 +11,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.room import Room
 from hodge_pipeline.types import Camera, Floats, Floats32, Ints
 
+HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+"""open3d sends the ray of pixel (0, 0) through (0.5, 0.5); in `Camera` the centres of pixels are whole numbers."""
 SHADOW_GAP_M = 0.01
 AMBIENT, SKYLIGHT, LAMPLIGHT = 0.42, 0.16, 0.62
 
@@ -63,7 +65,7 @@ class Renderer:
 
     def _cast(self, world_from_cam: Floats) -> Hits:
         rays = self._scene.create_rays_pinhole(
-            intrinsic_matrix=o3d.core.Tensor.from_numpy(self.camera.matrix),
+            intrinsic_matrix=o3d.core.Tensor.from_numpy(self.camera.matrix + HALF_PIXEL),
             extrinsic_matrix=o3d.core.Tensor.from_numpy(se3.inverse(world_from_cam)),
             width_px=self.camera.width,
             height_px=self.camera.height,

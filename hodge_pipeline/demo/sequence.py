@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -35,7 +36,7 @@ UNITS_PER_METRE = 5000
 FOCAL_SHARE_OF_WIDTH = 525 / 640
 JPEG_QUALITY = 92
 FULL_LOOP, STEP_DEG = 1.06, 3.2
-CACHED_SEQUENCES = 4
+CACHED_SEQUENCES, ABANDONED_S = 4, 86_400.0
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -95,13 +96,18 @@ def make_sequence(folder: Path | str, options: DemoOptions | None = None, advanc
         raise SourceError(
             f"{folder}: exists and is not the demo sequence of these options; name another folder, or remove it"
         )
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", suffix=".partial", dir=folder.parent))
     try:
-        _write(draft, options, advance)
-        _publish(draft, folder, options)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", suffix=".partial", dir=folder.parent))
+        try:
+            _write(draft, options, advance)
+            _publish(draft, folder, options)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+    except OSError as error:
+        raise SourceError(
+            f"{folder}: cannot write the demo sequence ({error}); free the disk or name another folder"
+        ) from error
     return folder
 
 
@@ -122,7 +128,10 @@ def demo_source(
 
 
 def _forget_oldest(cache: Path, keep: Path) -> None:
-    """Remove all but the sequences used last; nothing else in the cache is touched."""
+    """Remove all but the sequences used last, and what killed runs left; nothing else in the cache is touched."""
+    for draft in cache.glob(".demo-*.partial"):
+        if time.time() - draft.stat().st_mtime > ABANDONED_S:
+            shutil.rmtree(draft, ignore_errors=True)
     others = [p.parent for p in cache.glob(f"demo-*/{STAMP_FILE}") if p.parent != keep]
     others.sort(key=lambda path: path.stat().st_mtime, reverse=True)
     for old in others[CACHED_SEQUENCES - 1 :]:

@@ -32,7 +32,7 @@ class Textures:
         `footprint (P,)` is the width of one pixel in units of uv: the level chosen by it keeps fine patterns from
         flickering between frames, as the optics of a camera do.
         """
-        level = np.clip(np.ceil(np.log2(np.maximum(footprint * SIZE, 1e-9))), 0, LEVELS - 1).astype(np.int64)
+        level = np.clip(np.rint(np.log2(np.maximum(footprint * SIZE, 1e-9))), 0, LEVELS - 1).astype(np.int64)
         size = SIZE >> level
         base = self.offsets[level] + texture * size * size
         at = uv * size[:, None] - 0.5
