@@ -1,0 +1,150 @@
+"""What a report holds: the run fills it, the tables, the plots and the page read it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.types import Floats, Ints, ViewGraph
+
+
+@dataclass(frozen=True)
+class SourceSummary:
+    """What was read: how many frames, how many of them with a true pose, and what the reader remarked."""
+
+    name: str
+    path: str
+    frames: int
+    frames_with_truth: int = 0
+    sequences: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class TrajectoryRow:
+    """Absolute (ATE) and relative (RPE) error of one set of poses against the truth."""
+
+    name: str
+    frames: int
+    left_out: int
+    ate_rmse_m: float
+    ate_median_m: float
+    ate_max_m: float
+    rpe_translation_m: float
+    rpe_rotation_deg: float
+    degenerate: bool = False
+
+
+@dataclass(frozen=True)
+class LoopRow:
+    """Loop deviation D after one inner iteration, summed over `loops` loops of a fixed basis."""
+
+    iteration: str
+    loops: int
+    total: float
+
+    @property
+    def mean(self) -> float:
+        """D of one loop on average, NaN without loops."""
+        return self.total / self.loops if self.loops else float("nan")
+
+
+@dataclass(frozen=True)
+class EdgeRow:
+    """One measured edge and how far it is from the final poses; frames as the source names them."""
+
+    i: str
+    j: str
+    source: str
+    fitness: float
+    weight: float
+    residual_m: float
+    residual_deg: float
+
+
+@dataclass(frozen=True)
+class ComponentRow:
+    """The frames of one connected part of the viewing graph, in words (`0–120, 124`)."""
+
+    count: int
+    frames: str
+
+
+@dataclass(frozen=True)
+class GraphSummary:
+    """The viewing graph in numbers: what it joins, where its edges come from, what was rejected and why."""
+
+    vertices: int
+    edges: int
+    edges_by_source: Mapping[str, int]
+    components: tuple[ComponentRow, ...]
+    edges_ignored: int = 0
+    rejected: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class StageRow:
+    """What one stage cost."""
+
+    name: str
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
+
+
+@dataclass(frozen=True)
+class Path3D:
+    """The positions (N, 3) of one set of poses, aligned to be compared; NaN where a frame has none."""
+
+    name: str
+    positions: Floats
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals (E,) of all edges under one set of poses, in metres and radians."""
+
+    name: str
+    translation_m: Floats
+    angle_rad: Floats
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What the plots are drawn from; a plot without its data is left out.
+
+    `component (N,)` breaks the paths between parts and sequences. `convergence` holds the objective after each
+    iteration, one series for each solve.
+    """
+
+    paths: tuple[Path3D, ...] = ()
+    component: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    residuals: tuple[Residuals, ...] = ()
+    graph: ViewGraph | None = None
+    convergence: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything that `report.html` and `report.json` say about one run.
+
+    `before` and `after` name the sets of poses that the verdict compares, as in `scores` and `trajectories`.
+    """
+
+    title: str
+    source: SourceSummary
+    before: str = "odometry"
+    after: str = "result"
+    scores: ScoreTable | None = None
+    trajectories: tuple[TrajectoryRow, ...] = ()
+    loops: tuple[LoopRow, ...] = ()
+    graph: GraphSummary | None = None
+    worst_edges: tuple[EdgeRow, ...] = ()
+    stages: tuple[StageRow, ...] = ()
+    notes: tuple[str, ...] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+    recipe: str = ""
+    pictures: Pictures = field(default_factory=Pictures)

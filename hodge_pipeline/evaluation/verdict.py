@@ -1,0 +1,159 @@
+"""Whether the run made the poses better, and what a reader should distrust."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
+from hodge_pipeline.evaluation.contents import GraphSummary, Report, TrajectoryRow
+
+Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
+
+SAME = 0.02
+"""A relative change below this counts as none: a truth of the kind that RGB-D benchmarks have is no finer."""
+
+LARGE_RESIDUAL_M = 0.1
+LARGE_RESIDUAL_DEG = 5.0
+UNMATCHED_SHARE = 0.01
+
+
+VERBS = {1: "fell", 0: "hardly changed,", -1: "rose"}
+GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
+
+
+@dataclass(frozen=True)
+class Change:
+    """One error before and after, in metres, and by which share of itself it changed."""
+
+    what: str
+    before_m: float
+    after_m: float
+
+    @property
+    def share(self) -> float:
+        """−0.4 where the error fell by 40 %."""
+        return (self.after_m - self.before_m) / self.before_m if self.before_m > 0 else float(self.after_m > 0)
+
+    @property
+    def sign(self) -> int:
+        """1 better, −1 worse, 0 where the change is too small to count."""
+        return 0 if abs(self.share) <= SAME else (1 if self.share < 0 else -1)
+
+    def __str__(self) -> str:
+        size = f"from {length(self.before_m)} to {length(self.after_m)} ({percent(self.share)})"
+        return f"{self.what} {VERBS[self.sign]} {size}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The outcome in one word and in one sentence, and the changes it rests on."""
+
+    outcome: Outcome
+    sentence: str
+    changes: tuple[Change, ...]
+
+
+def judge(report: Report) -> Verdict:
+    """The verdict on a report: every measured error counts, and where they disagree it is `mixed`."""
+    changes = (*_score_changes(report), *_trajectory_changes(report))
+    if not changes:
+        sentence = "There were neither overlapping clouds nor true poses to measure by."
+        return Verdict("not measured", f"Not measured. {sentence}", ())
+    signs = {change.sign for change in changes} - {0}
+    outcome: Outcome = "unchanged" if not signs else "mixed" if len(signs) > 1 else _one_way(signs.pop())
+    told = "; ".join(str(change) for change in changes)
+    return Verdict(outcome, f"{outcome.capitalize()} against {report.before}: {told}.", changes)
+
+
+def _one_way(sign: int) -> Outcome:
+    return "improved" if sign > 0 else "worse"
+
+
+def _score_changes(report: Report) -> Iterator[Change]:
+    table = report.scores
+    if table is None or report.before not in table.names or report.after not in table.names:
+        return
+    before, after = table.names.index(report.before), table.names.index(report.after)
+    for graph in table.graphs:
+        distance = graph.mean_distance_m
+        if graph.counts[before] and graph.counts[after]:
+            what = f"the mean distance of overlapping clouds ({GRAPH_NAMES[graph.kind]})"
+            yield Change(what, float(distance[before]), float(distance[after]))
+
+
+def _trajectory_changes(report: Report) -> Iterator[Change]:
+    rows = {row.name: row for row in report.trajectories if row.frames}
+    if report.before in rows and report.after in rows:
+        before, after = rows[report.before].ate_rmse_m, rows[report.after].ate_rmse_m
+        yield Change("the error of the trajectory (ATE)", before, after)
+
+
+def suspicions(report: Report) -> tuple[str, ...]:
+    """What a reader should distrust, one line each; the run's own notes come first."""
+    graph = () if report.graph is None else tuple(_graph_suspicions(report.graph))
+    return (
+        *report.notes,
+        *graph,
+        *_edge_suspicions(report),
+        *_unmatched(report),
+        *(line for row in report.trajectories for line in _trajectory_suspicions(row)),
+    )
+
+
+def _graph_suspicions(graph: GraphSummary) -> Iterator[str]:
+    if len(graph.components) > 1:
+        yield (
+            f"The viewing graph falls into {len(graph.components)} parts that nothing connects: "
+            "their poses relative to each other mean nothing."
+        )
+    alone = sum(part.count == 1 for part in graph.components)
+    if alone and graph.vertices > 1:
+        yield f"{alone} of {graph.vertices} frames have no edge at all: they keep the pose they started with."
+    if graph.edges_ignored:
+        yield f"The solver ignored {graph.edges_ignored} of {graph.edges} edges (weight 0)."
+
+
+def _edge_suspicions(report: Report) -> Iterator[str]:
+    large = [
+        edge
+        for edge in report.worst_edges
+        if edge.weight > 0 and (edge.residual_m > LARGE_RESIDUAL_M or edge.residual_deg > LARGE_RESIDUAL_DEG)
+    ]
+    if large:
+        yield (
+            f"At least {len(large)} edges that the solver used are more than {length(LARGE_RESIDUAL_M)} or "
+            f"{LARGE_RESIDUAL_DEG:g}° off the result: see the worst edges."
+        )
+
+
+def _unmatched(report: Report) -> Iterator[str]:
+    if report.scores is None:
+        return
+    for graph in report.scores.graphs:
+        for name, unmatched, count in zip(report.scores.names, graph.unmatched, graph.counts, strict=True):
+            if unmatched > UNMATCHED_SHARE * count:
+                pairs = f"{unmatched} of {count} {GRAPH_NAMES[graph.kind]}"
+                yield f"{name}: {pairs} have no point within {length(NO_NEIGHBOUR_M)} of each other."
+
+
+def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[str]:
+    if row.left_out:
+        yield f"{row.name}: {row.left_out} frames without a true pose are not in the error of the trajectory."
+    if row.degenerate:
+        yield f"{row.name}: its positions lie on a line (or are fewer than three): its orientations aligned it."
+
+
+def length(metres: float) -> str:
+    """A length with a unit that suits its size."""
+    if not abs(metres) < float("inf"):
+        return "–"
+    if abs(metres) < 0.02:
+        return f"{metres * 1000:.3g} mm"
+    return f"{metres * 100:.3g} cm" if abs(metres) < 1 else f"{metres:.3g} m"
+
+
+def percent(share: float) -> str:
+    """A signed share in per cent, with a real minus sign."""
+    return f"{share * 100:+.0f} %".replace("-", "−")
