@@ -22,7 +22,6 @@ from hodge_pipeline.types import (
     Registration,
     Solution,
     Source,
-    Trajectory,
     ViewGraph,
 )
 
@@ -131,6 +130,9 @@ class Fuser(Protocol):
 class Writer(Protocol):
     """Writes what another program reads."""
 
-    def write(self, path: Path, trajectory: Trajectory) -> None:
-        """One file, written atomically."""
+    def write(self, path: Path, source: Source) -> None:
+        """One file or folder, written atomically, of what it can hold: a trajectory, a graph.
+
+        `SourceError` where the source has nothing of that kind.
+        """
         ...

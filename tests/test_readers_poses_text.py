@@ -11,7 +11,7 @@ from hodge_adapters.poses_text import KittiWriter, TumWriter, parse_tum, read_ki
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.stages import Writer
-from hodge_pipeline.types import Trajectory
+from hodge_pipeline.types import Source, Trajectory
 
 IDENTITY = "0 0 0 0 0 0 1"
 
@@ -48,10 +48,13 @@ def test_a_quarter_turn_by_hand(tmp_path: Path) -> None:
 def test_the_writers_are_stages(tmp_path: Path) -> None:
     for writer in (TumWriter(), KittiWriter()):
         assert isinstance(writer, Writer)
-        writer.write(tmp_path / "poses", trajectory(3, 0))
+        source = Source("poses", tmp_path, trajectory=trajectory(3, 0))
+        writer.write(tmp_path / "poses", source)
         first = (tmp_path / "poses").read_bytes()
-        writer.write(tmp_path / "poses", trajectory(3, 0))
+        writer.write(tmp_path / "poses", source)
         assert (tmp_path / "poses").read_bytes() == first
+        with pytest.raises(SourceError, match="no trajectory"):
+            writer.write(tmp_path / "poses", Source("empty", tmp_path))
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:

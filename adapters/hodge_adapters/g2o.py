@@ -224,6 +224,19 @@ def write_g2o(
     temporary.replace(path)
 
 
+@stage(frozen=True, config=ConfigDict(extra="forbid"))
+class G2oWriter:
+    """Writes a measured graph as 3-D g2o, with the trajectory's poses where it has one for each vertex."""
+
+    def write(self, path: Path, source: Source) -> None:
+        """One file, atomically; see `write_g2o`."""
+        if source.graph is None:
+            raise SourceError(f"{source.path}: has no graph to write: convert one that has edges")
+        poses = None if source.trajectory is None else source.trajectory.world_from_cam
+        complete = poses is not None and len(poses) == source.graph.vertex_count
+        write_g2o(path, source.graph, poses if complete else None)
+
+
 def _pose_columns(motions: Floats, dimension: int) -> Floats:
     if dimension == 2:
         return flatten_poses(motions)

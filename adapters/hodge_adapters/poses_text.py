@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters.text_rows import Row, listed, read_rows, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, Trajectory
+from hodge_pipeline.types import Floats, Source, Trajectory
 
 
 @plain_dataclass(frozen=True)
@@ -85,18 +85,24 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
 class TumWriter:
     """Writes a trajectory as TUM text."""
 
-    def write(self, path: Path, trajectory: Trajectory) -> None:
+    def write(self, path: Path, source: Source) -> None:
         """One file, atomically; see `write_tum`."""
-        write_tum(path, trajectory)
+        write_tum(path, _trajectory(source))
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class KittiWriter:
     """Writes a trajectory as KITTI text."""
 
-    def write(self, path: Path, trajectory: Trajectory) -> None:
+    def write(self, path: Path, source: Source) -> None:
         """One file, atomically; see `write_kitti`."""
-        write_kitti(path, trajectory)
+        write_kitti(path, _trajectory(source))
+
+
+def _trajectory(source: Source) -> Trajectory:
+    if source.trajectory is None:
+        raise SourceError(f"{source.path}: has no trajectory to write: convert one that has poses")
+    return source.trajectory
 
 
 def _lines(table: Floats) -> str:
