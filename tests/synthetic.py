@@ -13,6 +13,6 @@ TINY = DemoOptions(frames=24, width=160, height=120)
 
 @pytest.fixture(scope="session")
 def tiny_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A TUM folder of 24 small noisy frames, going 38 degrees round the room and back; about 1 s of CPU, once."""
+    """A TUM folder of 24 small noisy frames, going 41 degrees round the room and back; about 1 s of CPU, once."""
     # A module that imports this fixture gets one of its own, so the folder is shared through the base directory.
     return make_sequence(tmp_path_factory.getbasetemp() / "tiny_sequence", TINY)

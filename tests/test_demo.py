@@ -154,7 +154,7 @@ def test_the_path_returns_and_stays_hand_held() -> None:
 
 
 def test_truth_at_100_hz_interpolates_to_a_tenth_of_a_millimetre() -> None:
-    loop = HandHeldLoop(0, 20.0, turns=1.06)
+    loop = HandHeldLoop(0, 20.0, turns=1.12)
     times_s = np.arange(0, 20, 0.01)
     poses, between = loop.world_from_cam(times_s), loop.world_from_cam(times_s[:-1] + 0.005)
     error = se3.log(se3.inverse(between) @ se3.interpolate(poses[:-1], poses[1:], np.full(len(between), 0.5)))
@@ -263,6 +263,6 @@ def test_the_cache_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert {path.name for path in cache.iterdir()} == {"demo-of-mine", second.name}
 
 
-@pytest.mark.parametrize(("frames", "rounds"), [(24, 24 * 3.2 / 720), (115, 0.5), (120, 1.06), (500, 1.06)])
+@pytest.mark.parametrize(("frames", "rounds"), [(24, 24 * 3.4 / 720), (115, 0.5), (120, 1.12), (500, 1.12)])
 def test_short_sequences_go_as_far_as_small_steps_reach(frames: int, rounds: float) -> None:
     assert DemoOptions(frames=frames).rounds == pytest.approx(rounds)

@@ -27,7 +27,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Bytes, Camera, Floats
 
-VERSION = 1
+VERSION = 2
 """Raised whenever the same options give other files, so that nobody goes on with old ones."""
 STAMP_FILE = "demo.json"
 FIRST_STAMP_S = 1_400_000_000.0
@@ -35,7 +35,7 @@ CAMERA_HZ, TRUTH_HZ = 30.0, 100.0
 UNITS_PER_METRE = 5000
 FOCAL_SHARE_OF_WIDTH = 525 / 640
 JPEG_QUALITY = 92
-FULL_LOOP, STEP_DEG = 1.06, 3.2
+FULL_LOOP, STEP_DEG = 1.12, 3.4
 CACHED_SEQUENCES, ABANDONED_S = 4, 86_400.0
 
 
@@ -56,7 +56,7 @@ class DemoOptions:
         default=None,
         gt=0,
         description="rounds of the room; above 1 the last images overlap the first, below 1 the camera goes there and "
-        "back; none: 1.06, or, with too few frames for that, as far as neighbours stay 3 degrees apart",
+        "back; none: 1.12, or, with too few frames for that, as far as neighbours stay 3 degrees apart",
     )
     stride: int = Field(default=5, ge=1, description="of a 30 Hz camera's images every stride-th is kept")
 
