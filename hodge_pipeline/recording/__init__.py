@@ -1,1 +1,1 @@
-"""The Rerun recording of a run: the only place that imports rerun."""
+"""The Rerun recording of a run. Every line of Rerun is in this package; `options` alone imports without it."""

@@ -1,0 +1,73 @@
+"""Where the story is looked at from: outside the room, above it, from the side where the camera was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from rerun.chunk import Chunk
+
+from hodge_pipeline import se3
+from hodge_pipeline.types import Floats
+
+ELEVATION = 0.6
+DISTANCE = 0.8
+"""In units of the scene's size, along the mean view and above it."""
+MAX_POINTS = 20_000
+
+
+@dataclass(frozen=True)
+class Eye:
+    """Position, target and up direction, each (3,), in the world."""
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    up: tuple[float, float, float]
+
+
+def look_at(model_chunks: Iterable[Chunk], pose_chunks: Iterable[Chunk]) -> Eye | None:
+    """An eye that has the model in view, or the cameras where there is no model; None where there are no poses."""
+    poses = _poses(pose_chunks)
+    if not len(poses):
+        return None
+    points = _points(model_chunks)
+    scene = points if len(points) else poses[:, :3, 3]
+    low, high = np.percentile(scene, [3, 97], axis=0)
+    size = max(float(np.linalg.norm(high - low)), 0.5)
+    up = _unit(-poses[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
+    forward = poses[:, :3, 2].mean(axis=0)
+    forward = _unit(forward - (forward @ up) * up, _unit(np.cross(up, [1.0, 0.3, 0.2]), up))
+    target = (low + high) / 2
+    position = target - DISTANCE * size * (forward - ELEVATION * up)
+    return Eye(_triple(position), _triple(target), _triple(up))
+
+
+def _unit(vector: Floats, fallback: Floats) -> Floats:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-3 else fallback
+
+
+def _triple(vector: Floats) -> tuple[float, float, float]:
+    return float(vector[0]), float(vector[1]), float(vector[2])
+
+
+def _column(chunk: Chunk, name: str, width: int) -> Floats:
+    batch = chunk.to_record_batch()
+    if name not in batch.schema.names:
+        return np.zeros((0, width))
+    values = batch.column(name).flatten()
+    return np.asarray(values.flatten().to_numpy(zero_copy_only=False), float).reshape(-1, width)
+
+
+def _points(chunks: Iterable[Chunk]) -> Floats:
+    names = ("Mesh3D:vertex_positions", "Points3D:positions")
+    found = [_column(chunk, name, 3) for chunk in chunks for name in names]
+    points = np.concatenate([np.zeros((0, 3)), *found])
+    return points[:: max(len(points) // MAX_POINTS, 1)]
+
+
+def _poses(chunks: Iterable[Chunk]) -> Floats:
+    parts = [(_column(c, "Transform3D:quaternion", 4), _column(c, "Transform3D:translation", 3)) for c in chunks]
+    poses = [se3.from_quat_xyzw(t, q) for q, t in parts if len(q) and len(q) == len(t)]
+    return np.concatenate([np.zeros((0, 4, 4)), *poses])

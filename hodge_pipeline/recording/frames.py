@@ -1,0 +1,157 @@
+"""Images, cameras and clouds of the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import rerun as rr
+
+from hodge_pipeline.recording import layout
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.shapes import evenly
+from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes
+from hodge_pipeline.types import Camera, CloudSet, EncodedImage, Frame, Ints
+
+CHUNK_BYTES = 4_000_000
+"""Images go in chunks of this size: few enough to be quick, small enough for a viewer to fetch one."""
+IMAGE_PLANE_M = 0.25
+POINT_BYTES = 16
+
+
+def log_frames(
+    stream: rr.RecordingStream, name: str, frames: Sequence[Frame], notes: Sequence[str], options: RecordingOptions
+) -> tuple[str, ...]:
+    """What was thinned, in words; the images as their files hold them, the cameras, the frames' names."""
+    rows, thinned = image_rows(frames, options)
+    log_markdown(stream, layout.SOURCE, "\n".join([f"# {name}", f"{len(frames)} frames", *(f"- {n}" for n in notes)]))
+    log_notes(stream, 0, thinned)
+    _log_names(stream, frames)
+    _log_cameras(stream, frames)
+    for path, reader in ((layout.COLOUR, _colour), (layout.DEPTH, _depth)):
+        for chunk_rows, images in _chunks(frames, rows, reader):
+            _log_images(stream, path, frame_columns(frames, len(frames), chunk_rows), images)
+    return thinned
+
+
+def image_rows(frames: Sequence[Frame], options: RecordingOptions) -> tuple[Ints, tuple[str, ...]]:
+    """The frames whose images are kept, evenly spaced and within the size, and what that left out."""
+    if not options.has_images:
+        return np.zeros(0, np.int64), ()
+    sizes = np.array([sum(len(image.contents) for image in _images(frame)) for frame in frames], np.int64)
+    wished = every = options.image_every if options.level == "normal" else 1
+    while every <= len(frames) and sizes[::every].sum() > options.max_bytes("images"):
+        every += 1
+    rows = np.arange(0, len(frames), every) if every <= len(frames) else np.arange(0)
+    if every == wished:
+        return rows, ()
+    note = f"images of {len(rows)} of {len(frames)} frames, to stay under {options.max_megabytes:g} MB"
+    return rows, (f"recording: {note} (recording.max_megabytes)",)
+
+
+def log_clouds(
+    stream: rr.RecordingStream, frames: Sequence[Frame], clouds: CloudSet, options: RecordingOptions
+) -> tuple[str, ...]:
+    """What was thinned, in words; each frame's cloud in its camera's axes, under the moving camera."""
+    total = int(clouds.offsets[-1])
+    kept = options.count(options.cloud_points, total, POINT_BYTES, options.max_bytes("clouds"))
+    if not options.has_images or not total or not kept:
+        return ()
+    sizes = np.diff(clouds.offsets)
+    parts = [
+        start + evenly(int(size), int(np.floor(size * kept / total)))
+        for start, size in zip(clouds.offsets, sizes, strict=False)
+    ]
+    picked = np.concatenate(parts)
+    stream.send_columns(
+        layout.CLOUD,
+        indexes=frame_columns(frames, len(clouds), np.arange(len(clouds))),
+        columns=rr.Points3D.columns(
+            positions=np.asarray(clouds.points[picked]), colors=np.asarray(clouds.colours[picked])
+        ).partition([len(part) for part in parts]),
+    )
+    notes = (f"recording: {len(picked)} of {total} cloud points",) if len(picked) < total else ()
+    log_notes(stream, 0, notes)
+    return notes
+
+
+def _colour(frame: Frame) -> EncodedImage | None:
+    return frame.encoded_colour() if frame.encoded_colour else None
+
+
+def _depth(frame: Frame) -> EncodedImage | None:
+    return frame.encoded_depth() if frame.encoded_depth else None
+
+
+def _images(frame: Frame) -> list[EncodedImage]:
+    return [image for image in (_colour(frame), _depth(frame)) if image is not None]
+
+
+def _chunks(
+    frames: Sequence[Frame], rows: Ints, reader: Callable[[Frame], EncodedImage | None]
+) -> Iterator[tuple[Ints, list[EncodedImage]]]:
+    """Rows and images, in lots of about `CHUNK_BYTES`."""
+    lot: list[tuple[int, EncodedImage]] = []
+    lot_bytes = 0
+    for row in rows:
+        image = reader(frames[row])
+        if image is None:
+            continue
+        if lot and lot_bytes + len(image.contents) > CHUNK_BYTES:
+            yield np.array([held for held, _ in lot]), [held for _, held in lot]
+            lot, lot_bytes = [], 0
+        lot.append((int(row), image))
+        lot_bytes += len(image.contents)
+    if lot:
+        yield np.array([held for held, _ in lot]), [held for _, held in lot]
+
+
+def _log_images(
+    stream: rr.RecordingStream, path: str, indexes: list[rr.TimeColumn], images: list[EncodedImage]
+) -> None:
+    blobs = [np.frombuffer(image.contents, np.uint8) for image in images]
+    types = [image.media_type for image in images]
+    if path == layout.COLOUR:
+        stream.send_columns(path, indexes, rr.EncodedImage.columns(blob=blobs, media_type=types))
+        return
+    metres = [image.units_per_metre or 1000.0 for image in images]
+    stream.send_columns(path, indexes, rr.EncodedDepthImage.columns(blob=blobs, media_type=types, meter=metres))
+
+
+def _log_names(stream: rr.RecordingStream, frames: Sequence[Frame]) -> None:
+    if frames:
+        stream.send_columns(
+            layout.CAMERA,
+            indexes=frame_columns(frames, len(frames), np.arange(len(frames))),
+            columns=rr.AnyValues.columns(
+                frame_id=[str(frame.frame_id) for frame in frames],
+                sequence=[frame.sequence for frame in frames],
+                stamp_s=[frame.stamp_s for frame in frames],
+            ),
+        )
+
+
+def _log_cameras(stream: rr.RecordingStream, frames: Sequence[Frame]) -> None:
+    """Static where all frames share one camera, which is the common case."""
+    rows = np.array([row for row, frame in enumerate(frames) if frame.camera is not None], np.int64)
+    cameras = [camera for frame in frames if (camera := frame.camera) is not None]
+    if not cameras:
+        return
+    if len(set(cameras)) == 1:
+        stream.send_columns(layout.PINHOLE, [], _pinholes(cameras[:1]))
+    else:
+        stream.send_columns(layout.PINHOLE, frame_columns(frames, len(frames), rows), _pinholes(cameras))
+
+
+def _pinholes(cameras: Sequence[Camera]) -> rr.ComponentColumnList:
+    """Rerun wants positive focal lengths: a negative fy becomes a camera whose y points up."""
+    matrices = np.array([camera.matrix for camera in cameras])
+    flipped = matrices[:, 1, 1] < 0
+    matrices[:, 1, 1] = np.abs(matrices[:, 1, 1])
+    axes = [rr.ViewCoordinates.RUF if flip else rr.ViewCoordinates.RDF for flip in flipped]
+    return rr.Pinhole.columns(
+        image_from_camera=matrices.transpose(0, 2, 1).reshape(-1, 9),
+        resolution=[[camera.width, camera.height] for camera in cameras],
+        camera_xyz=axes,
+        image_plane_distance=np.full(len(cameras), IMAGE_PLANE_M),
+    )

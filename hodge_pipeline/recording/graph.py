@@ -1,0 +1,221 @@
+"""Trajectories, the viewing graph, and the solve."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import rerun as rr
+
+from hodge_pipeline import se3
+from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_column
+from hodge_pipeline.types import Candidates, Floats, Frame, Ints, Solution, ViewGraph
+
+LINE_BYTES = 40
+"""One edge of the film: two points, a colour, two list offsets."""
+LABEL_BYTES = 60
+
+TRAJECTORY_RADIUS, FRUSTUM_RADIUS, EDGE_RADIUS, CENTRE_RADIUS = -1.6, -0.5, -0.6, -2.0
+"""Rerun takes a negative radius as points on the screen, so that lines stay legible at every distance."""
+
+
+def log_poses(
+    stream: rr.RecordingStream, name: str, world_from_cam: Floats, frames: Sequence[Frame], options: RecordingOptions
+) -> tuple[str, ...]:
+    """What was left out, in words; a trajectory as a line, as frusta, and as one transform for each frame."""
+    drawable = np.flatnonzero(shapes.is_drawable(world_from_cam))
+    sequences = np.array([frame.sequence for frame in frames] or [""] * len(world_from_cam), dtype=np.str_)
+    colour = shapes.TRAJECTORY_COLOURS.get(name, shapes.RESULT_COLOUR)
+    lines = shapes.strips(world_from_cam, sequences)
+    line = rr.LineStrips3D(
+        lines, colors=[colour], radii=[TRAJECTORY_RADIUS], labels=[name] * len(lines), show_labels=False
+    )
+    stream.log(layout.trajectory(name), line, static=True)
+    picked = drawable[shapes.evenly(len(drawable), options.frusta)]
+    frusta = rr.LineStrips3D(shapes.frustum_lines(world_from_cam[picked]), colors=[colour], radii=[FRUSTUM_RADIUS])
+    stream.log(layout.frusta(name), frusta, static=True)
+    stream.send_columns(
+        layout.poses(name),
+        indexes=frame_columns(frames, len(world_from_cam), drawable),
+        columns=rr.Transform3D.columns(
+            translation=world_from_cam[drawable, :3, 3], quaternion=se3.to_quat_xyzw(world_from_cam[drawable])
+        ),
+    )
+    missing = len(world_from_cam) - len(drawable)
+    notes = (f"recording: {missing} of {len(world_from_cam)} poses of {name} are unknown and not drawn",)
+    return _noted(stream, 0, notes if missing else ())
+
+
+def log_edges(
+    stream: rr.RecordingStream,
+    outer: int,
+    graph: ViewGraph,
+    world_from_cam: Floats,
+    residual_m: Floats | None,
+    verdicts: Sequence[str] | None,
+    rejected: Candidates | None,
+    options: RecordingOptions,
+    max_bytes: float,
+) -> tuple[str, ...]:
+    """What was thinned, in words; the edges coloured by residual, with their reason, and the pairs that failed."""
+    residual_m = shapes.residuals_m(graph, world_from_cam) if residual_m is None else np.asarray(residual_m, float)
+    colours = shapes.residual_colours(residual_m, options.residual_scale_m)
+    kept = options.count(options.edge_lines, graph.edge_count, LINE_BYTES + LABEL_BYTES, max_bytes / 2)
+    rows = shapes.evenly(graph.edge_count, kept)
+    labels = [_label(graph, int(row), residual_m, verdicts) for row in rows]
+    _log_lines(stream, layout.edges(outer), world_from_cam, graph.edges[rows], colours[rows], labels)
+    if rejected is not None:
+        kept = options.count(options.edge_lines, len(rejected.pairs), LINE_BYTES, max_bytes / 4)
+        pairs = rejected.pairs[shapes.evenly(len(rejected.pairs), kept)]
+        grey = np.full((len(pairs), 3), shapes.REJECTED_COLOUR, np.uint8)
+        _log_lines(stream, layout.rejected(outer), world_from_cam, pairs, grey, None)
+    log_markdown(stream, layout.graph_text(outer), graph_summary(outer, graph, residual_m, rejected))
+    return _noted(stream, outer, _thinning("edges", len(rows), graph.edge_count, outer))
+
+
+def log_solution(
+    stream: rr.RecordingStream,
+    outer: int,
+    graph: ViewGraph,
+    start: Floats,
+    solution: Solution,
+    first_iteration: int,
+    options: RecordingOptions,
+    max_bytes: float,
+) -> tuple[str, ...]:
+    """What was thinned, in words; the film of the solve, its scalars, and the edges under its result."""
+    states = [start, *(step.world_from_cam for step in solution.history)]
+    states += [solution.world_from_cam] if not solution.history else []
+    residuals = np.array([shapes.residuals_m(graph, poses) for poses in states]).reshape(len(states), graph.edge_count)
+    for name, (rows, values) in solver_series(states, residuals, solution).items():
+        indexes = iteration_columns(outer, len(states), first_iteration, rows)
+        stream.send_columns(layout.under(layout.SOLVER_PLOTS, name), indexes, rr.Scalars.columns(scalars=values))
+    notes: list[str] = []
+    if options.has_images:
+        notes += _log_film(stream, outer, graph, states, residuals, first_iteration, options, max_bytes / 2)
+    colours = shapes.residual_colours(residuals[-1], options.residual_scale_m)
+    colours[solution.weights == 0] = shapes.IGNORED_COLOUR
+    lines = shapes.evenly(
+        graph.edge_count, options.count(options.edge_lines, graph.edge_count, LINE_BYTES, max_bytes / 4)
+    )
+    final = solution.world_from_cam
+    _log_lines(stream, layout.solved_edges(outer), final, graph.edges[lines], colours[lines], None)
+    log_notes(stream, outer, solution.notes)
+    return _noted(stream, outer, notes + list(_thinning("solved edges", len(lines), graph.edge_count, outer)))
+
+
+def solver_series(states: Sequence[Floats], residuals: Floats, solution: Solution) -> Mapping[str, tuple[Ints, Floats]]:
+    """Rows and values of each scalar: 0 is the start, which has no objective and no step."""
+    count = len(states)
+    series: dict[str, tuple[Ints, Floats]] = {}
+    known = np.isfinite(residuals).any(axis=1) if residuals.size else np.zeros(count, bool)
+    if known.all():
+        series["residual_mean_m"] = (np.arange(count), np.nanmean(residuals, axis=1))
+        series["residual_95th_m"] = (np.arange(count), np.nanpercentile(residuals, 95, axis=1))
+    moved = [np.linalg.norm(b[:, :3, 3] - a[:, :3, 3], axis=1) for a, b in zip(states, states[1:], strict=False)]
+    series["step_max_m"] = (np.arange(1, count), np.array([np.nanmax(m, initial=0.0) for m in moved]))
+    history = solution.history
+    rows = np.arange(1, len(history) + 1)
+    series["objective"] = (rows, np.array([step.objective for step in history]))
+    for name in sorted({name for step in history for name in step.metrics}):
+        having = np.array([name in step.metrics for step in history])
+        series[name] = (rows[having], np.array([step.metrics[name] for step in history if name in step.metrics]))
+    return {name: (rows, values) for name, (rows, values) in series.items() if len(rows)}
+
+
+def iteration_columns(outer: int, count: int, first_iteration: int, rows: Ints) -> list[rr.TimeColumn]:
+    """The times of inner iterations `rows` of `count`: the running number of the run, and the round's story slot."""
+    return [
+        rr.TimeColumn(layout.ITERATION, sequence=first_iteration + rows),
+        story_column(outer, rows / max(count, 1)),
+    ]
+
+
+def graph_summary(outer: int, graph: ViewGraph, residual_m: Floats, rejected: Candidates | None) -> str:
+    """The viewing graph's counts as Markdown."""
+    degree = np.bincount(graph.edges.ravel(), minlength=graph.vertex_count)
+    names, counts = np.unique(graph.source, return_counts=True)
+    known = residual_m[np.isfinite(residual_m)]
+    lines = [f"# Viewing graph, round {outer}", "", "| | |", "|---|---|", f"| frames | {graph.vertex_count} |"]
+    lines += [f"| edges | {graph.edge_count} |"]
+    lines += [f"| … {name} | {count} |" for name, count in zip(names, counts, strict=True)]
+    if graph.vertex_count:
+        lines += [f"| edges of a frame, least / mean / most | {degree.min()} / {degree.mean():.1f} / {degree.max()} |"]
+        lines += [f"| frames without an edge | {np.count_nonzero(degree == 0)} |"]
+    if len(known):
+        lines += [f"| residual, median / 95th / largest | {_millimetres(known)} |"]
+    if rejected is not None:
+        lines += [f"| candidates that became no edge | {len(rejected.pairs)} |"]
+    return "\n".join(lines)
+
+
+def _millimetres(residual_m: Floats) -> str:
+    return " / ".join(f"{1000 * value:.1f}" for value in np.percentile(residual_m, [50, 95, 100])) + " mm"
+
+
+def _log_film(
+    stream: rr.RecordingStream,
+    outer: int,
+    graph: ViewGraph,
+    states: Sequence[Floats],
+    residuals: Floats,
+    first_iteration: int,
+    options: RecordingOptions,
+    max_bytes: float,
+) -> list[str]:
+    """Edges and camera centres after each inner iteration, evenly thinned: first the iterations, then the lines."""
+    drawn = np.flatnonzero(np.all([shapes.is_drawable(poses) for poses in states], axis=0))
+    has_ends = np.isin(graph.edges, drawn).all(axis=1)
+    available = int(np.count_nonzero(has_ends))
+    steps = options.count(options.film_steps, len(states), max(available, 1) * LINE_BYTES, max_bytes)
+    rows = shapes.evenly(len(states), max(steps, 2))
+    kept = options.count(options.edge_lines, available, LINE_BYTES * len(rows), max_bytes)
+    lines = np.flatnonzero(has_ends)[shapes.evenly(available, kept)]
+    indexes = iteration_columns(outer, len(states), first_iteration, rows)
+    if len(lines):
+        strips = np.concatenate([shapes.segments(states[row], graph.edges[lines]) for row in rows])
+        colours = shapes.residual_colours(residuals[np.ix_(rows, lines)].reshape(-1), options.residual_scale_m)
+        columns = rr.LineStrips3D.columns(strips=strips, colors=colours).partition([len(lines)] * len(rows))
+        stream.send_columns(layout.FILM_EDGES, indexes, columns)
+        stream.log(layout.FILM_EDGES, rr.LineStrips3D.from_fields(radii=[EDGE_RADIUS]), static=True)
+    centres = np.concatenate([states[row][drawn, :3, 3] for row in rows]).astype(np.float32)
+    points = rr.Points3D.columns(positions=centres).partition([len(drawn)] * len(rows))
+    stream.send_columns(layout.FILM_TRAJECTORY, indexes, points)
+    style = rr.Points3D.from_fields(colors=[shapes.RESULT_COLOUR], radii=[CENTRE_RADIUS])
+    stream.log(layout.FILM_TRAJECTORY, style, static=True)
+    notes = [f"recording: film of round {outer} shows {len(rows)} of {len(states)} iterations"]
+    thinned = _thinning("film edges", len(lines), graph.edge_count, outer)
+    return (notes if len(rows) < len(states) else []) + list(thinned)
+
+
+def _log_lines(
+    stream: rr.RecordingStream,
+    path: str,
+    world_from_cam: Floats,
+    pairs: Ints,
+    colours: np.ndarray[tuple[int, ...], np.dtype[np.uint8]],
+    labels: list[str] | None,
+) -> None:
+    lines = shapes.segments(world_from_cam, pairs)
+    drawn = np.asarray(np.isfinite(lines).all(axis=(1, 2)))
+    names = None if labels is None else [label for label, keep in zip(labels, drawn, strict=True) if keep]
+    strips = rr.LineStrips3D(lines[drawn], colors=colours[drawn], radii=[EDGE_RADIUS], labels=names, show_labels=False)
+    stream.log(path, strips, static=True)
+
+
+def _label(graph: ViewGraph, row: int, residual_m: Floats, verdicts: Sequence[str] | None) -> str:
+    i, j = (graph.vertex_ids[k] for k in graph.edges[row])
+    verdict = f", {verdicts[row]}" if verdicts is not None else ""
+    fitness = "" if np.isnan(graph.fitness[row]) else f", fitness {graph.fitness[row]:.2f}"
+    return f"{i} – {j}: {graph.source[row]}, {1000 * residual_m[row]:.1f} mm{fitness}{verdict}"
+
+
+def _thinning(what: str, kept: int, available: int, outer: int) -> tuple[str, ...]:
+    return (f"recording: {kept} of {available} {what} of round {outer} drawn",) if kept < available else ()
+
+
+def _noted(stream: rr.RecordingStream, slot: int, notes: Sequence[str]) -> tuple[str, ...]:
+    log_notes(stream, slot, notes)
+    return tuple(notes)

@@ -1,0 +1,106 @@
+"""Every entity path, timeline and part name of a recording, in one place. `docs/recordings.md` explains them."""
+
+from __future__ import annotations
+
+import re
+
+STORY = "story"
+"""The timeline that all data with a time share: seconds of a film in which each stage has its own slot."""
+FRAME = "frame"
+ITERATION = "iteration"
+TIME = "time"
+
+SLOT_S = 10.0
+"""Length of one stage's slot on the story timeline."""
+
+WORLD = "/world"
+MODEL = "/world/model"
+CAMERA = "/world/camera"
+CLOUD = "/world/camera/cloud"
+PINHOLE = "/world/camera/image"
+COLOUR = "/world/camera/image/colour"
+DEPTH = "/world/camera/image/depth"
+TRAJECTORIES = "/world/trajectories"
+EDGES = "/world/edges"
+FILM = "/world/film"
+FILM_EDGES = "/world/film/edges"
+FILM_TRAJECTORY = "/world/film/trajectory"
+SOLVER_PLOTS = "/plots/solver"
+FRAME_PLOTS = "/plots/frames"
+BARS = "/bars"
+RECIPE = "/text/recipe"
+LOG = "/text/log"
+SOURCE = "/text/source"
+SCORES = "/text/scores"
+LEGEND = "/text/legend"
+
+PART_SUFFIX = ".rrd"
+PARTIAL_SUFFIX = ".partial.rrd"
+
+_PART = re.compile(r"\d{3}-(?P<stage>[a-z]+)(?:-(?P<detail>.+))?$")
+
+
+def slug(name: str) -> str:
+    """The name as one part of an entity path or of a file name."""
+    return re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_") or "unnamed"
+
+
+def round_name(outer: int) -> str:
+    """The trajectory of outer round 1, 2, …"""
+    return f"round_{outer}"
+
+
+def trajectory(name: str) -> str:
+    """The line of a trajectory."""
+    return f"{TRAJECTORIES}/{slug(name)}"
+
+
+def frusta(name: str) -> str:
+    """The camera frusta along a trajectory."""
+    return f"{trajectory(name)}/frusta"
+
+
+def poses(name: str) -> str:
+    """The poses of a trajectory, one transform for each frame."""
+    return f"{trajectory(name)}/poses"
+
+
+def edges(outer: int) -> str:
+    """The viewing graph of an outer round, under the poses it was made with."""
+    return f"{EDGES}/{round_name(outer)}"
+
+
+def rejected(outer: int) -> str:
+    """The candidate pairs of an outer round that became no edges."""
+    return f"{edges(outer)}/rejected"
+
+
+def solved_edges(outer: int) -> str:
+    """The viewing graph of an outer round, under the poses that its solve gave."""
+    return f"{edges(outer)}/solved"
+
+
+def graph_text(outer: int) -> str:
+    """The viewing graph's counts in an outer round."""
+    return f"/text/graph/{round_name(outer)}"
+
+
+def under(parent: str, name: str) -> str:
+    """The entity of a named series, bar chart or table."""
+    return f"{parent}/{slug(name)}"
+
+
+def part_name(number: int, stage: str, detail: str = "") -> str:
+    """The file name of a stage's part: its number gives the order of the run."""
+    return f"{number:03d}-{stage}" + (f"-{slug(detail)}" if detail else "") + PART_SUFFIX
+
+
+def parse_part(file_name: str) -> tuple[str, str]:
+    """Stage and detail of a part's file name; empty where it is none."""
+    match = _PART.match(file_name.removesuffix(PARTIAL_SUFFIX).removesuffix(PART_SUFFIX).lstrip("."))
+    return (match["stage"], match["detail"] or "") if match else ("", "")
+
+
+def outer_number(outer: int, offset: int) -> int:
+    """The part number of stage `offset` in outer round 1, 2, …"""
+    return min(10 * outer, 880) + offset

@@ -1,0 +1,113 @@
+"""All parts of a run as one recording, with the blueprint that opens on the story."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from subprocess import SubprocessError
+
+import rerun as rr
+from rerun.chunk import Chunk, RrdReader
+
+from hodge_pipeline.recording import binary, layout
+from hodge_pipeline.recording.blueprint import Contents, legend, make_blueprint
+from hodge_pipeline.recording.eye import look_at
+from hodge_pipeline.recording.stream import log_markdown, log_notes, partial_path, writing
+
+
+@dataclass(frozen=True)
+class Merged:
+    """What `merge` wrote: `part_bytes` by file name, and notes of parts that were mended or lost."""
+
+    path: Path
+    total_bytes: int
+    part_bytes: Mapping[str, int]
+    notes: tuple[str, ...] = ()
+
+
+def merge(folder: Path, out: Path, application_id: str, recording_id: str) -> Merged:
+    """One file of all parts in the folder, in the order of the run.
+
+    A part that a killed writer left is taken where no complete one is there. A damaged part is mended as far as it
+    can be read; the others are not touched by it.
+    """
+    parts = find_parts(folder)
+    contents = contents_of(parts)
+    notes: list[str] = []
+    with tempfile.TemporaryDirectory(prefix="hodge-recording-") as scratch:
+        readers = [(part, reader) for part in parts if (reader := _open(part, Path(scratch), notes)) is not None]
+        eye = look_at(_chunks(readers, layout.MODEL), _chunks(readers, layout.poses(contents.trajectory)))
+        with writing(out, application_id, recording_id, make_blueprint(contents, eye)) as stream:
+            for _, reader in readers:
+                _send(stream, reader, layout.poses(contents.trajectory))
+            log_notes(stream, 0, notes, level="WARN")
+            log_markdown(stream, layout.LEGEND, legend(contents))
+    sizes = {part.name: part.stat().st_size for part in parts}
+    return Merged(out, out.stat().st_size, sizes, tuple(notes))
+
+
+def find_parts(folder: Path) -> list[Path]:
+    """The parts in the order of the run; unfinished ones where there is no complete one."""
+    complete = [path for path in folder.glob(f"*{layout.PART_SUFFIX}") if not path.name.startswith(".")]
+    unfinished = set(folder.glob(f".*{layout.PARTIAL_SUFFIX}")) - {partial_path(path) for path in complete}
+    parts = [path for path in (*complete, *unfinished) if layout.parse_part(path.name)[0]]
+    return sorted(parts, key=lambda path: path.name.lstrip("."))
+
+
+def contents_of(parts: Iterable[Path]) -> Contents:
+    """What the parts hold, by their names."""
+    stages = [layout.parse_part(path.name) for path in parts]
+    solved = [int(detail) for stage, detail in stages if stage == "solution"]
+    rounds = [int(detail) for stage, detail in stages if stage == "edges"]
+    named = [detail for stage, detail in stages if stage == "poses"]
+    best = layout.round_name(max(solved)) if solved else next((n for n in named if n != "truth"), "truth")
+    return Contents(
+        stages=frozenset(stage for stage, _ in stages),
+        trajectories=tuple(named),
+        trajectory=best,
+        last_graph=max(rounds, default=0),
+        last_solution=max(solved, default=0),
+    )
+
+
+def _open(part: Path, scratch: Path, notes: list[str]) -> RrdReader | None:
+    try:
+        return _reader(part)
+    except RuntimeError:
+        pass
+    mended = scratch / part.name
+    try:
+        environment = binary.quiet_environment(scratch)
+        binary.run(["rrd", "merge", "--continue-on-error", str(part), "-o", str(mended)], environment)
+        reader = _reader(mended)
+    except (RuntimeError, OSError, SubprocessError):
+        notes.append(f"recording: {part.name} is damaged and left out: record that stage again")
+        return None
+    notes.append(f"recording: {part.name} is cut off: what could be read of it is shown")
+    return reader
+
+
+def _reader(part: Path) -> RrdReader:
+    """A reader that has seen the entire file, so that damage shows here and not half-way into the merge."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        reader = RrdReader(part)
+        for _ in reader.stream():
+            pass
+    return reader
+
+
+def _chunks(readers: Iterable[tuple[Path, RrdReader]], entity: str) -> Iterator[Chunk]:
+    for _, reader in readers:
+        yield from reader.stream().filter(content=entity)
+
+
+def _send(stream: rr.RecordingStream, reader: RrdReader, poses: str) -> None:
+    """The part's chunks; the best trajectory's poses also move the camera that holds images and clouds."""
+    for chunk in reader.stream():
+        stream.send_chunks(chunk)
+        if chunk.entity_path == poses:
+            stream.send_chunks(chunk.with_entity_path(layout.CAMERA))

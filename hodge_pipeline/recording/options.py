@@ -1,0 +1,65 @@
+"""What a recording keeps, and how large it may become: the recipe's section `recording`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+Level = Literal["off", "summary", "normal", "full"]
+
+SHARES = {"images": 0.85, "clouds": 0.04, "model": 0.07, "solver": 0.04}
+"""How the stages divide `max_megabytes`: fixed, so that no stage's part depends on which others are there."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class RecordingOptions:
+    """What the recording keeps. Whatever is thinned is thinned evenly, and said in the recording's log."""
+
+    level: Level = Field(
+        default="normal",
+        description="off: no recording; summary: no images, clouds or solver film; normal: all, thinned to the counts "
+        "below; full: all, thinned only where max_megabytes asks for it",
+    )
+    max_megabytes: float = Field(
+        default=150.0,
+        gt=0,
+        description="10^6 bytes: bound on the file; 85 % of it for images, the rest for clouds, model and solver; 150 "
+        "holds 1000 VGA colour and depth images",
+    )
+    image_every: int = Field(default=1, ge=1, description="frames: record every n-th frame's images")
+    cloud_points: int = Field(
+        default=300_000,
+        ge=0,
+        description="points of all frames' clouds together; more says little beside the fused model",
+    )
+    model_points: int = Field(
+        default=250_000, ge=1, description="points or mesh vertices of the fused model; a laptop's viewer stays fluid"
+    )
+    edge_lines: int = Field(
+        default=20_000, ge=1, description="lines in one picture of the graph; more is a solid block"
+    )
+    film_steps: int = Field(
+        default=60, ge=2, description="inner iterations of one solve that are drawn; the scalars are kept for all"
+    )
+    frusta: int = Field(default=60, ge=0, description="camera frusta drawn along one trajectory")
+    residual_scale_m: float = Field(
+        default=0.05,
+        gt=0,
+        description="metres: residual at the bright end of the edges' colours; fixed, so that runs compare",
+    )
+
+    def max_bytes(self, stage: str) -> int:
+        """The bytes that a stage of `SHARES` may take."""
+        return int(SHARES[stage] * self.max_megabytes * 1e6)
+
+    def count(self, wished: int, available: int, bytes_each: float, max_bytes: float) -> int:
+        """How many of the available items to keep: the wish counts up to level `normal`, the bytes always."""
+        kept = available if self.level == "full" else min(available, wished)
+        return min(kept, int(max_bytes // bytes_each))
+
+    @property
+    def has_images(self) -> bool:
+        """Whether images, clouds and the solver's film are kept."""
+        return self.level in ("normal", "full")

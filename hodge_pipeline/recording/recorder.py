@@ -1,0 +1,148 @@
+"""The recorder: one method for each stage of a run, one part file for each call, `finish` to merge them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import rerun as rr
+
+from hodge_pipeline.recording import frames as frame_log
+from hodge_pipeline.recording import graph as graph_log
+from hodge_pipeline.recording import layout, results
+from hodge_pipeline.recording.merge import Merged, merge
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.stream import writing
+from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Model, Solution, ViewGraph
+
+Notes = tuple[str, ...]
+
+
+class Recorder:
+    """Writes the parts of one run's recording into a folder.
+
+    A part depends on its arguments and the options alone, and is replaced as a whole: a resumed run records only what
+    it computes again. Outer rounds count from 1; `rounds` says how many there will be, since they share the solver's
+    bytes. Each method gives notes of what was thinned or left out. With level `off` nothing is written.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        recording_id: str,
+        application_id: str = "hodge-pipeline",
+        options: RecordingOptions | None = None,
+        rounds: int = 1,
+    ) -> None:
+        self.folder, self.recording_id, self.application_id = folder, recording_id, application_id
+        self.options = options or RecordingOptions()
+        self.rounds = max(rounds, 1)
+
+    def frames(self, name: str, frames: Sequence[Frame], notes: Sequence[str] = ()) -> Notes:
+        """The frames' images as their files hold them, their cameras and names; `notes` are the reader's."""
+        return self._part(0, "frames", "", lambda s: frame_log.log_frames(s, name, frames, notes, self.options))
+
+    def clouds(self, frames: Sequence[Frame], clouds: CloudSet) -> Notes:
+        """Each frame's down-sampled cloud, in its camera's axes."""
+        return self._part(1, "clouds", "", lambda s: frame_log.log_clouds(s, frames, clouds, self.options))
+
+    def poses(self, name: str, world_from_cam: Floats, frames: Sequence[Frame] = ()) -> Notes:
+        """A trajectory (N, 4, 4) by its name, such as truth or odometry; NaN where a pose is unknown."""
+        return self._part(
+            2, "poses", name, lambda s: graph_log.log_poses(s, name, world_from_cam, frames, self.options)
+        )
+
+    def edges(
+        self,
+        outer: int,
+        graph: ViewGraph,
+        world_from_cam: Floats,
+        *,
+        residual_m: Floats | None = None,
+        verdicts: Sequence[str] | None = None,
+        rejected: Candidates | None = None,
+    ) -> Notes:
+        """The viewing graph of an outer round under the poses it was made with, and the candidates that failed.
+
+        `residual_m (E,)` colours the edges; without it, what `shapes.residuals_m` gives. `verdicts (E,)` go into the
+        edges' labels.
+        """
+        return self._part(
+            layout.outer_number(outer, 0),
+            "edges",
+            str(outer),
+            lambda s: graph_log.log_edges(
+                s, outer, graph, world_from_cam, residual_m, verdicts, rejected, self.options, self._round_bytes
+            ),
+        )
+
+    def solution(
+        self,
+        outer: int,
+        graph: ViewGraph,
+        start: Floats,
+        solution: Solution,
+        frames: Sequence[Frame] = (),
+        *,
+        first_iteration: int = 0,
+    ) -> Notes:
+        """The solve of an outer round from the poses `start`: its film, its scalars, its resulting trajectory.
+
+        `first_iteration` is the number of the start on the iteration timeline: 1 + the iterations of earlier rounds.
+        """
+
+        def log(stream: rr.RecordingStream) -> Notes:
+            notes = graph_log.log_solution(
+                stream, outer, graph, start, solution, first_iteration, self.options, self._round_bytes
+            )
+            name = layout.round_name(outer)
+            return notes + graph_log.log_poses(stream, name, solution.world_from_cam, frames, self.options)
+
+        return self._part(layout.outer_number(outer, 1), "solution", str(outer), log)
+
+    def model(self, model: Model) -> Notes:
+        """The fused scene."""
+        return self._part(900, "model", model.name, lambda s: results.log_model(s, model, self.options))
+
+    def evaluation(
+        self,
+        frames: Sequence[Frame] = (),
+        *,
+        per_frame: Mapping[str, Floats] | None = None,
+        bars: Mapping[str, Floats] | None = None,
+        tables: Mapping[str, str] | None = None,
+    ) -> Notes:
+        """Scores: series (N,) over the frames such as the ATE in metres, bar charts, and Markdown tables by title."""
+
+        def log(stream: rr.RecordingStream) -> Notes:
+            results.log_evaluation(stream, frames, per_frame or {}, bars or {}, tables or {})
+            return ()
+
+        return self._part(901, "evaluation", "", log)
+
+    def text(self, recipe: str, log_lines: Sequence[str]) -> Notes:
+        """The resolved recipe as YAML, and the run's log."""
+
+        def log(stream: rr.RecordingStream) -> Notes:
+            results.log_text(stream, recipe, log_lines, self.rounds + 1)
+            return ()
+
+        return self._part(902, "text", "", log)
+
+    def finish(self, out: Path) -> Merged | None:
+        """All parts of the folder as one file that opens on the story; None with level `off`."""
+        if self.options.level == "off":
+            return None
+        return merge(self.folder, out, self.application_id, self.recording_id)
+
+    @property
+    def _round_bytes(self) -> float:
+        return self.options.max_bytes("solver") / self.rounds
+
+    def _part(self, number: int, stage: str, detail: str, log: Callable[[rr.RecordingStream], Notes]) -> Notes:
+        if self.options.level == "off":
+            return ()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / layout.part_name(number, stage, detail)
+        with writing(path, self.application_id, self.recording_id) as stream:
+            return log(stream)

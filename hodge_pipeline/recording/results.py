@@ -1,0 +1,82 @@
+"""The fused model, the scores, the recipe and the log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import rerun as rr
+
+from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_column
+from hodge_pipeline.types import Floats, Frame, Model
+
+VERTEX_BYTES = 28
+"""A vertex with normal and colour; a triangle has `TRIANGLE_BYTES`, and there are about two for each vertex."""
+TRIANGLE_BYTES = 12
+POINT_RADIUS = -1.2
+"""Negative: points on the screen."""
+
+
+def log_model(stream: rr.RecordingStream, model: Model, options: RecordingOptions) -> tuple[str, ...]:
+    """What was thinned, in words; the fused scene as a mesh or as points, there at every time."""
+    available = len(model.points_in_world)
+    bytes_each = VERTEX_BYTES + (0 if model.triangles is None else 2 * TRIANGLE_BYTES)
+    kept = options.count(options.model_points, available, bytes_each, options.max_bytes("model"))
+    thin = shapes.thin_model(model, max(kept, 1))
+    if thin.triangles is None or not len(thin.triangles):
+        cloud = rr.Points3D(thin.points_in_world, colors=thin.colours, radii=[POINT_RADIUS])
+        stream.log(layout.MODEL, cloud, static=True)
+    else:
+        # Only the side that was seen is drawn, so that a room can be looked into from outside.
+        mesh = rr.Mesh3D(
+            vertex_positions=thin.points_in_world,
+            triangle_indices=thin.triangles,
+            vertex_normals=thin.normals_in_world,
+            vertex_colors=thin.colours,
+            face_rendering=rr.components.MeshFaceRendering.Front,
+        )
+        stream.log(layout.MODEL, mesh, static=True)
+    thinned = len(thin.points_in_world) < available
+    notes = (f"recording: {len(thin.points_in_world)} of {available} points of model {model.name}",) if thinned else ()
+    log_notes(stream, 0, (*model.notes, *notes))
+    return notes
+
+
+def log_evaluation(
+    stream: rr.RecordingStream,
+    frames: Sequence[Frame],
+    per_frame: Mapping[str, Floats],
+    bars: Mapping[str, Floats],
+    tables: Mapping[str, str],
+) -> None:
+    """Series over the frames (NaN where a frame has no score), bar charts, and tables in Markdown."""
+    for name, values in per_frame.items():
+        rows = np.flatnonzero(np.isfinite(values))
+        if len(rows):
+            indexes = frame_columns(frames, len(values), rows)
+            scalars = rr.Scalars.columns(scalars=np.asarray(values, float)[rows])
+            stream.send_columns(layout.under(layout.FRAME_PLOTS, name), indexes, scalars)
+    for name, values in bars.items():
+        stream.log(layout.under(layout.BARS, name), rr.BarChart(np.asarray(values, float)), static=True)
+    text = "\n\n".join(f"## {title}\n\n{table}" for title, table in tables.items())
+    log_markdown(stream, layout.SCORES, text or "No scores.")
+
+
+def log_text(stream: rr.RecordingStream, recipe: str, log_lines: Sequence[str], slots: int) -> None:
+    """The resolved recipe, and the run's log spread over the story."""
+    log_markdown(stream, layout.RECIPE, f"```yaml\n{recipe}\n```")
+    if log_lines:
+        share = slots * np.arange(len(log_lines)) / len(log_lines)
+        stream.send_columns(
+            layout.LOG,
+            indexes=[story_column(0, share)],
+            columns=rr.TextLog.columns(text=list(log_lines), level=[level_of(line) for line in log_lines]),
+        )
+
+
+def level_of(line: str) -> str:
+    """The level that a line of the log speaks of."""
+    lower = line.lower()
+    return "ERROR" if "error" in lower else "WARN" if "warning" in lower else "INFO"

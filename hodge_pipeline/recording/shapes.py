@@ -1,0 +1,108 @@
+"""Lines, colours and thinning: plain arrays, no Rerun."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.types import Bytes, Floats, Floats32, Ints, Model, ViewGraph
+
+RESIDUAL_ARM_M = 1.0
+"""A residual rotation counts as its arc at this distance, about that of the walls in a room."""
+
+RESIDUAL_COLOURS = np.array([[60, 115, 225], [130, 145, 170], [190, 180, 120], [255, 225, 50]], float)
+"""Blue to yellow, ever brighter: legible without red and green, and in grey; the worst edges stand out."""
+IGNORED_COLOUR = (230, 60, 160)
+REJECTED_COLOUR = (110, 110, 110)
+RESULT_COLOUR = (255, 255, 255)
+TRAJECTORY_COLOURS = {"truth": (0, 200, 140), "odometry": (230, 130, 0)}
+"""Bluish green and orange of Okabe and Ito's colour-blind safe set, brightened for the dark background."""
+
+FRUSTUM_DEPTH_M = 0.06
+_CORNERS = np.array([[-0.8, -0.6, 1.0], [0.8, -0.6, 1.0], [0.8, 0.6, 1.0], [-0.8, 0.6, 1.0]]) * FRUSTUM_DEPTH_M
+_FRUSTUM = np.vstack([_CORNERS, np.zeros((1, 3))])[[0, 4, 1, 2, 4, 3, 0, 1, 2, 3]]
+
+
+def evenly(available: int, kept: int) -> Ints:
+    """Rows (kept,) of `available`, evenly spread, the first and the last among them."""
+    kept = max(min(kept, available), 0)
+    return np.unique(np.linspace(0, available - 1, kept).round().astype(np.int64)) if kept else np.zeros(0, np.int64)
+
+
+def residuals_m(graph: ViewGraph, world_from_cam: Floats) -> Floats:
+    """Residual (E,) of each edge in metres, `√(|t|² + (1 m · angle)²)`; NaN where a pose is not known."""
+    translation_m, angle_rad = edge_residuals(graph, world_from_cam)
+    return np.asarray(np.hypot(translation_m, RESIDUAL_ARM_M * angle_rad))
+
+
+def residual_colours(residual_m: Floats, scale_m: float) -> Bytes:
+    """RGB (..., 3) of residuals: dark blue at 0, bright yellow from `scale_m` on and for NaN."""
+    share = np.clip(np.nan_to_num(np.asarray(residual_m, float) / scale_m, nan=1.0), 0.0, 1.0)
+    stops = np.linspace(0, 1, len(RESIDUAL_COLOURS))
+    channels: list[Floats] = [np.interp(share, stops, RESIDUAL_COLOURS[:, channel]) for channel in range(3)]
+    return np.asarray(np.stack(channels, axis=-1).round(), np.uint8)
+
+
+def segments(world_from_cam: Floats, pairs: Ints) -> Floats32:
+    """Lines (P, 2, 3) between the camera centres of each pair."""
+    return np.asarray(world_from_cam[pairs, :3, 3], np.float32)
+
+
+def is_drawable(world_from_cam: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Where (...,) a pose is finite."""
+    return np.asarray(np.isfinite(world_from_cam).all(axis=(-1, -2)))
+
+
+def strips(world_from_cam: Floats, sequences: np.ndarray[tuple[int, ...], np.dtype[np.str_]]) -> list[Floats32]:
+    """Lines through the camera centres, broken where a sequence ends or a pose is missing."""
+    drawable = is_drawable(world_from_cam)
+    broken = (sequences[1:] != sequences[:-1]) | ~drawable[1:] | ~drawable[:-1]
+    runs = np.split(np.arange(len(drawable)), np.flatnonzero(broken) + 1)
+    return [np.asarray(world_from_cam[run, :3, 3], np.float32) for run in runs if len(run) and drawable[run[0]]]
+
+
+def frustum_lines(world_from_cam: Floats) -> Floats32:
+    """One line (N, 10, 3) for each pose, that draws its frustum, x right and z forward."""
+    return np.asarray(se3.transform(world_from_cam, _FRUSTUM), np.float32)
+
+
+def thin_model(model: Model, kept: int) -> Model:
+    """The model with about `kept` points at most: points left out evenly, a mesh clustered in voxels."""
+    if len(model.points_in_world) <= kept:
+        return model
+    if model.triangles is None:
+        rows = evenly(len(model.points_in_world), kept)
+        return _replace(model, rows, None)
+    return _clustered(model, kept)
+
+
+def _clustered(model: Model, kept: int) -> Model:
+    points = np.asarray(model.points_in_world, float)
+    low = points.min(axis=0)
+    voxel_m = max(float(np.ptp(points, axis=0).max()) / 2000, 1e-9)
+    while True:
+        _, first, cluster = np.unique(_keys(points - low, voxel_m), return_index=True, return_inverse=True)
+        if len(first) <= kept:
+            break
+        voxel_m *= max(1.05, float(np.sqrt(len(first) / kept)))
+    triangles = cluster.reshape(-1)[np.asarray(model.triangles)]
+    a, b, c = triangles.T
+    return _replace(model, first, triangles[(a != b) & (b != c) & (a != c)].astype(np.int32))
+
+
+def _keys(offsets: Floats, voxel_m: float) -> Ints:
+    cells = np.floor(offsets / voxel_m).astype(np.int64)
+    size = cells.max(axis=0) + 1
+    return np.asarray((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2])
+
+
+def _replace(model: Model, rows: Ints, triangles: np.ndarray[tuple[int, ...], np.dtype[np.int32]] | None) -> Model:
+    return Model(
+        name=model.name,
+        points_in_world=model.points_in_world[rows],
+        normals_in_world=None if model.normals_in_world is None else model.normals_in_world[rows],
+        colours=None if model.colours is None else model.colours[rows],
+        triangles=triangles,
+        notes=model.notes,
+    )

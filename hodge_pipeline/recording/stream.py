@@ -1,0 +1,86 @@
+"""One file, one explicit recording stream: written under a temporary name, renamed when complete."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from hodge_pipeline.recording import layout
+from hodge_pipeline.types import Floats, Frame, Ints
+
+UNIX_STAMP_S = 1e8
+"""Stamps above this (1973) are seconds since 1970, smaller ones count from a start of their own."""
+
+
+def open_stream(application_id: str, recording_id: str) -> rr.RecordingStream:
+    """A stream of its own, without clock timelines: the same input gives the same rows."""
+    stream = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
+
+
+def partial_path(path: Path) -> Path:
+    """Where a part lies while it is written; a killed writer leaves it there."""
+    return path.with_name(f".{path.name.removesuffix(layout.PART_SUFFIX)}{layout.PARTIAL_SUFFIX}")
+
+
+@contextmanager
+def writing(
+    path: Path, application_id: str, recording_id: str, blueprint: rr.blueprint.Blueprint | None = None
+) -> Iterator[rr.RecordingStream]:
+    """A stream into this file, which appears under its name only when all is in it."""
+    partial = partial_path(path)
+    stream = open_stream(application_id, recording_id)
+    stream.save(partial, default_blueprint=blueprint)
+    try:
+        yield stream
+    except BaseException:
+        stream.disconnect()
+        partial.unlink(missing_ok=True)
+        raise
+    stream.flush()
+    stream.disconnect()
+    os.replace(partial, path)
+
+
+def story_column(slot: int, share: Floats) -> rr.TimeColumn:
+    """Times on the story timeline at these shares, in [0, 1), of a stage's slot."""
+    return rr.TimeColumn(layout.STORY, duration=layout.SLOT_S * (slot + np.asarray(share, float)))
+
+
+def frame_columns(frames: Sequence[Frame], count: int, rows: Ints) -> list[rr.TimeColumn]:
+    """The times of frames `rows` of `count`: frame row, story, and sensor time where the stamps are real."""
+    columns = [rr.TimeColumn(layout.FRAME, sequence=rows), story_column(0, rows / max(count, 1))]
+    if has_real_stamps(frames):
+        stamps = np.array([frames[row].stamp_s for row in rows])
+        since_1970 = min(frame.stamp_s for frame in frames) > UNIX_STAMP_S
+        columns.append(
+            rr.TimeColumn(layout.TIME, timestamp=stamps) if since_1970 else rr.TimeColumn(layout.TIME, duration=stamps)
+        )
+    return columns
+
+
+def has_real_stamps(frames: Sequence[Frame]) -> bool:
+    """Whether the stamps are a clock's: finite, not all one value, and not merely the frame numbers."""
+    stamps = np.array([frame.stamp_s for frame in frames])
+    ids = np.array([frame.frame_id if isinstance(frame.frame_id, int) else np.nan for frame in frames])
+    return bool(len(stamps) and np.isfinite(stamps).all() and np.ptp(stamps) > 0 and not (stamps == ids).all())
+
+
+def log_notes(stream: rr.RecordingStream, slot: int, notes: Iterable[str], level: str = "INFO") -> None:
+    """Lines of the run's log, at the start of a stage's slot."""
+    for note in notes:
+        stream.set_time(layout.STORY, duration=layout.SLOT_S * slot)
+        stream.log(layout.LOG, rr.TextLog(note, level=level))
+    stream.reset_time()
+
+
+def log_markdown(stream: rr.RecordingStream, path: str, text: str) -> None:
+    """A text that is there at every time."""
+    stream.log(path, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
