@@ -1,4 +1,4 @@
-"""The Lie-algebra valued 1-form of the viewing graph (paper, Sections 3.3 and 4)."""
+"""The Lie-algebra valued 1-form of the viewing graph, and Algorithm 2: its extension to the embedding surface."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from typing import Literal
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.embedding import Surface
+from hodge_pipeline.complex.shortest_paths import path_integrals
+from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints
 
 Logarithm = Literal["se3", "pairing"]
@@ -35,3 +38,20 @@ def shifted(world_from_cam: Floats, offset: Floats) -> Floats:
     out = np.array(world_from_cam, float)
     out[:, :3, 3] += offset
     return out
+
+
+def surface_form(surface: Surface, omega: Floats, lengths: Floats | None = None) -> Floats:
+    """ω (E + D, k) on every edge of the surface, from ω (E, k) on the graph's (Algorithm 2, Eq. (5)).
+
+    A diagonal gets the sum of ω along a shortest path of the graph: by hops, or by positive `lengths (E,)` such as
+    the edges' standard deviations. One that joins a vertex to itself gets 0, one parallel to an edge that edge's ω
+    (of several, the shortest, then the first). Where shortest paths tie, the vertices' order decides.
+    """
+    count = surface.graph_edge_count
+    if omega.shape[0] != count:
+        raise GraphError(f"ω has {omega.shape[0]} rows, but the embedded graph has {count} edges")
+    lengths = np.ones(count) if lengths is None else np.asarray(lengths, float)
+    if lengths.shape != (count,) or not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise GraphError(f"shortest paths need a positive, finite length for each of the {count} edges")
+    graph_edges, diagonals = surface.edges[:count], surface.edges[count:]
+    return np.concatenate([omega, path_integrals(graph_edges, surface.vertex_count, omega, lengths, diagonals)])

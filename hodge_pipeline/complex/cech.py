@@ -1,0 +1,234 @@
+"""The Čech complex of the viewing graph: its cliques (flag complex), or those whose clouds really meet (nerve).
+
+Definition 1 of the paper, and Section 4, "Cech Complex Construction".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from hodge_pipeline.complex.coboundary import check_edges
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.types import Bools, CloudSet, Floats, Ints
+
+CANDIDATES_AT_ONCE = 2_000_000
+SIMPLICES_AT_ONCE = 2_000
+MOST_SIMPLICES = 50_000_000
+
+
+@dataclass(frozen=True)
+class SimplicialComplex:
+    """Simplices by dimension: `simplices[k] (N_k, k + 1)` vertex rows, ascending in each row, rows in that order too.
+
+    The orientation of a simplex is that of its ascending vertices: an edge (i, j) has i < j.
+    """
+
+    simplices: tuple[Ints, ...]
+
+    @property
+    def dimension(self) -> int:
+        """The highest dimension listed, even if it has no simplex."""
+        return len(self.simplices) - 1
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """How many simplices of each dimension."""
+        return tuple(len(rows) for rows in self.simplices)
+
+    @property
+    def vertex_count(self) -> int:
+        """How many vertices, isolated ones included."""
+        return len(self.simplices[0])
+
+    def rows_of(self, simplices: Ints) -> Ints:
+        """The row (N,) of each simplex (N, k + 1) of ascending vertices, −1 where it is not in the complex."""
+        order = simplices.shape[1] - 1
+        if order == 0:
+            return np.asarray(simplices[:, 0], np.int64)
+        keys = self._keys(self.simplices[order])
+        wanted = self._keys(simplices)
+        place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
+        found = (keys[place] == wanted) & (wanted >= 0) if len(keys) else np.zeros(len(wanted), bool)
+        return np.where(found, place, -1)
+
+    def _keys(self, simplices: Ints) -> Ints:
+        # the row of the face without the last vertex, then that vertex: never overflows, whatever the dimension
+        prefix = self.rows_of(simplices[:, :-1])
+        return np.where(prefix < 0, -1, prefix * self.vertex_count + simplices[:, -1])
+
+    def coboundary(self, order: int) -> csr_matrix:
+        """d_order (N_{order+1}, N_order) int8 of Eq. (1): `(d ω)_{0…p+1} = Σ (−1)^i ω_{0…î…p+1}`, rows as listed."""
+        if not 0 <= order < self.dimension:
+            raise GraphError(f"d{order} needs simplices of dimension {order + 1}: the complex has {self.dimension}")
+        cofaces = self.simplices[order + 1]
+        count, corners = cofaces.shape
+        columns = [self.rows_of(np.delete(cofaces, i, axis=1)) for i in range(corners)]
+        signs = [np.full(count, (-1) ** i, np.int8) for i in range(corners)]
+        rows = np.tile(np.arange(count), corners)
+        shape = (count, len(self.simplices[order]))
+        return csr_matrix((np.concatenate(signs), (rows, np.concatenate(columns))), shape=shape)
+
+
+@dataclass(frozen=True)
+class OrientedEdges:
+    """The simple graph behind measured edges: `edges (N, 2)` with i < j, unique and in order.
+
+    Measured edge e lies on row `row[e]`, in its direction where `sign[e]` is +1; a self-loop has row −1.
+    """
+
+    edges: Ints
+    row: Ints
+    sign: Ints
+
+    def pooled(self, omega: Floats, weights: Floats) -> tuple[Floats, Floats]:
+        """The weighted mean (N, k) of the 1-form over parallel edges, in the simple graph's direction, and their total
+        weight (N,).
+        """
+        real = self.row >= 0
+        row, signed = self.row[real], (self.sign[:, None] * omega)[real]
+        total: Floats = np.bincount(row, weights[real], minlength=len(self.edges)).astype(float)
+        spread = csr_matrix((weights[real], (row, np.arange(len(row)))), shape=(len(self.edges), len(row)))
+        return np.asarray((spread @ signed) / np.where(total > 0, total, 1.0)[:, None]), total
+
+
+def orient_edges(edges: Ints, vertex_count: int) -> OrientedEdges:
+    """The simple, oriented graph of measured edges (E, 2): parallel edges become one, self-loops none."""
+    edges = np.asarray(edges, np.int64).reshape(-1, 2)
+    check_edges(edges, vertex_count)
+    real = edges[:, 0] != edges[:, 1]
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    keys, inverse = np.unique((low * vertex_count + high)[real], return_inverse=True)
+    row = np.full(len(edges), -1, np.int64)
+    row[real] = inverse
+    simple = np.stack([keys // max(vertex_count, 1), keys % max(vertex_count, 1)], axis=1)
+    return OrientedEdges(simple, row, np.where(edges[:, 0] <= edges[:, 1], 1, -1))
+
+
+def flag_complex(edges: Ints, vertex_count: int, dimension: int = 2, most: int = MOST_SIMPLICES) -> SimplicialComplex:
+    """Every clique of up to `dimension + 1` vertices (Section 4). Parallel edges count once, self-loops not at all.
+
+    Raises `GraphError` before a dimension would list more than `most` simplices; `clique_counts` says how many.
+    """
+    if dimension < 1:
+        raise GraphError(f"a complex of dimension {dimension} has no edges: ask for 1 or more")
+    simple = orient_edges(edges, vertex_count).edges
+    search = _CliqueSearch(simple, vertex_count)
+    levels = [np.arange(vertex_count, dtype=np.int64)[:, None], simple]
+    ranked = search.ranked_edges
+    for order in range(2, dimension + 1):
+        parts, found = [np.zeros((0, order + 1), np.int64)], 0
+        for part in search.extended(ranked):
+            found += len(part)
+            if found > most:
+                raise GraphError(
+                    f"the graph has more than {most} cliques of {order + 1} vertices: thin out its edges, or raise "
+                    "the limit"
+                )
+            parts.append(part)
+        ranked = np.concatenate(parts)
+        levels.append(_in_order(np.sort(search.vertex_of_rank[ranked], axis=1), vertex_count))
+    return SimplicialComplex(tuple(levels))
+
+
+def clique_counts(edges: Ints, vertex_count: int, dimension: int = 2) -> tuple[int, ...]:
+    """How many simplices of each dimension the flag complex has; the top one is counted without being kept."""
+    simple = orient_edges(edges, vertex_count).edges
+    search = _CliqueSearch(simple, vertex_count)
+    counts, ranked = [vertex_count, len(simple)], search.ranked_edges
+    for _ in range(2, dimension):
+        ranked = np.concatenate([np.zeros((0, ranked.shape[1] + 1), np.int64), *search.extended(ranked)])
+        counts.append(len(ranked))
+    if dimension >= 2:
+        counts.append(sum(len(part) for part in search.extended(ranked)))
+    return tuple(counts[: dimension + 1])
+
+
+class _CliqueSearch:
+    """Cliques in the order of vertex degree: a vertex has at most √(2E) neighbours of higher rank."""
+
+    def __init__(self, edges: Ints, vertex_count: int) -> None:
+        degree = np.bincount(edges.ravel(), minlength=vertex_count)
+        self.vertex_of_rank = np.argsort(degree, kind="stable")
+        rank = np.empty(vertex_count, np.int64)
+        rank[self.vertex_of_rank] = np.arange(vertex_count)
+        ranked = np.sort(rank[edges], axis=1)
+        self.count = vertex_count
+        self.keys = np.sort(ranked[:, 0] * vertex_count + ranked[:, 1])
+        self.ranked_edges: Ints = np.stack([self.keys // max(vertex_count, 1), self.keys % max(vertex_count, 1)], 1)
+        self.offsets = np.searchsorted(self.ranked_edges[:, 0], np.arange(vertex_count + 1))
+
+    def extended(self, cliques: Ints) -> Iterator[Ints]:
+        """The cliques (N, k + 1) that extend cliques (M, k) by a vertex of higher rank, in bounded batches."""
+        last = cliques[:, -1]
+        candidates = self.offsets[last + 1] - self.offsets[last]
+        ends = np.cumsum(candidates)
+        start = 0
+        while start < len(cliques):
+            before = int(ends[start - 1]) if start else 0
+            stop = max(start + 1, int(np.searchsorted(ends, before + CANDIDATES_AT_ONCE, side="right")))
+            yield self._extend(cliques[start:stop], candidates[start:stop])
+            start = stop
+
+    def _extend(self, cliques: Ints, candidates: Ints) -> Ints:
+        row = np.repeat(np.arange(len(cliques)), candidates)
+        within = np.arange(len(row)) - np.repeat(np.cumsum(candidates) - candidates, candidates)
+        new = self.ranked_edges[self.offsets[cliques[row, -1]] + within, 1]
+        for corner in range(cliques.shape[1] - 1):
+            joined = self._has_edge(cliques[row, corner], new)
+            row, new = row[joined], new[joined]
+        return np.concatenate([cliques[row], new[:, None]], axis=1)
+
+    def _has_edge(self, low: Ints, high: Ints) -> Bools:
+        wanted = low * self.count + high
+        place = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
+        return np.asarray(self.keys[place] == wanted)
+
+
+def _in_order(simplices: Ints, vertex_count: int) -> Ints:
+    if simplices.shape[1] * np.log2(max(vertex_count, 2)) < 62:
+        key = np.zeros(len(simplices), np.int64)
+        for column in simplices.T:
+            key = key * vertex_count + column
+        return simplices[np.argsort(key, kind="stable")]
+    return simplices[np.lexsort(simplices.T[::-1])]
+
+
+def voxel_occupancy(clouds: CloudSet, world_from_cam: Floats, voxel_m: float) -> csr_matrix:
+    """Which voxels of the world each cloud enters: (clouds, voxels) of 0 and 1; a cloud without points has none."""
+    if voxel_m <= 0:
+        raise GraphError(f"voxel_m is {voxel_m}: a voxel's side must be positive")
+    frame = np.repeat(np.arange(len(clouds)), clouds.sizes)
+    rotation, position = world_from_cam[:, :3, :3], world_from_cam[:, :3, 3]
+    cells = np.empty((len(frame), 3), np.int64)
+    for row in range(len(clouds)):
+        cut = slice(clouds.offsets[row], clouds.offsets[row + 1])
+        points_in_world = clouds.points[cut] @ rotation[row].T + position[row]
+        cells[cut] = np.floor(points_in_world / voxel_m)
+    _, voxel = np.unique(cells, axis=0, return_inverse=True)
+    voxel = voxel.ravel()
+    shape = (len(clouds), int(voxel.max(initial=-1)) + 1)
+    occupancy = csr_matrix((np.ones(len(frame), np.int32), (frame, voxel)), shape=shape)
+    occupancy.data[:] = 1
+    return occupancy
+
+
+def nerve(flag: SimplicialComplex, occupancy: csr_matrix, least_voxels: int = 1) -> SimplicialComplex:
+    """The complex of Definition 1: cliques of three or more clouds only where they share `least_voxels` voxels.
+
+    Vertices and edges are the viewing graph's and stay as they are.
+    """
+    kept = list(flag.simplices[:2])
+    for simplices in flag.simplices[2:]:
+        parts = [np.zeros(0, bool)]
+        for start in range(0, len(simplices), SIMPLICES_AT_ONCE):
+            block = simplices[start : start + SIMPLICES_AT_ONCE]
+            common = occupancy[block[:, 0]]
+            for corner in block.T[1:]:
+                common = common.multiply(occupancy[corner]).tocsr()
+            parts.append(common.getnnz(axis=1) >= least_voxels)
+        kept.append(simplices[np.concatenate(parts)])
+    return SimplicialComplex(tuple(kept))
