@@ -1,7 +1,7 @@
 """The full objective: chi² = Σ rᵀ Ω r with the 6x6 information of each edge in its own frame, by Gauss-Newton.
 
-r = (2 q_vec, t) of (R_ij, t_ij)⁻¹ (T_i⁻¹ T_j), which is g2o's residual in radians; (θ, x, y) in the plane. Poses are moved
-in the world frame: R_i ← exp(ω_i^) R_i, t_i ← t_i + v_i.
+r = (2 q_vec, t) of (R_ij, t_ij)⁻¹ (T_i⁻¹ T_j), which is g2o's residual in radians; (θ, x, y) in the plane.
+Poses are moved in the world frame: R_i ← exp(ω_i^) R_i, t_i ← t_i + v_i.
 """
 
 from __future__ import annotations

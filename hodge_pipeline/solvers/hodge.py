@@ -1,34 +1,31 @@
-"""Maximum-likelihood poses of any graph, from any start: chordal rotations, then Newton-CG preconditioned by Laplacians."""
+"""Maximum-likelihood poses of any graph, from any start: chordal rotations, then preconditioned Newton-CG."""
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal, TypeAlias
 
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
-from hodge_pipeline import se3
-from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.certificate import Certificate, certify
-from hodge_pipeline.solvers.chordal import chordal_rotations
 from hodge_pipeline.solvers.full import FullObjective
 from hodge_pipeline.solvers.newton import Descent, Limits, Point, descend
 from hodge_pipeline.solvers.objective import IsotropicObjective
-from hodge_pipeline.solvers.problem import make_problem, pinned_vertices
-from hodge_pipeline.solvers.rotations import project
-from hodge_pipeline.solvers.weights import Weights, check_graph, edge_weights, is_planar
+from hodge_pipeline.solvers.setup import NO_ROWS, InitialName, Setup, prepare
 from hodge_pipeline.types import Floats, Ints, Solution, SolverIteration, ViewGraph
 
-ObjectiveName = Literal["isotropic", "full"]
-InitialName = Literal["chordal", "given"]
+ObjectiveName: TypeAlias = Literal["isotropic", "full"]
+Watch: TypeAlias = Callable[[Point], None]
 WARM_START_TOLERANCE = 1e-4
 """The isotropic optimum starts the full objective: nearer than this they differ anyway."""
-ROUNDING = 1e-22
+SEVERAL_FIXED = "not certified: with several fixed vertices to a component the dual is another one"
 
 
 def solve(
@@ -57,142 +54,64 @@ def solve(
 
     Raises `GraphError` for numbers that are not finite and edges that name no vertex.
     """
-    check_graph(graph)
-    options = _Options(objective, initial, certificate, max_iterations, relative_tolerance, time_limit_s, keep_history)
-    rows = np.zeros(0, np.int64) if fixed is None else np.asarray(fixed, np.int64)
+    rows = NO_ROWS if fixed is None else np.asarray(fixed, np.int64)
     if start is None and (initial == "given" or len(rows)):
         raise GraphError("fixed vertices and a given initial guess need start poses: pass start")
-    size = (2 if is_planar(graph) else 3) if dimension is None else dimension
-    return _Run(graph, edge_weights(graph, size), size, rows, start, options).solve()
+    setup = prepare(graph, start, rows, dimension)
+    notes = [*setup.weights.notes, *describe_components(setup.component, graph.vertex_ids)]
+    full = objective == "full" and setup.weights.definite
+    if objective == "full" and not full:
+        notes.append("the full objective has no minimum with indefinite information: isotropic weights are used")
+    history: list[SolverIteration] = []
+
+    def watch(point: Point) -> None:
+        if keep_history:
+            history.append(SolverIteration(setup.poses(point), point.cost))
+
+    limits = Limits(max_iterations, relative_tolerance, time.monotonic() + time_limit_s)
+    descent = _descend(setup, initial, limits, full, watch)
+    if not descent.converged:
+        notes.append(f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far")
+    metrics = _metrics(descent, full)
+    if certificate and full:
+        notes.append("only the isotropic objective can be certified")
+    elif certificate:
+        answer = _certify(setup, descent.point)
+        notes.append(answer.note)
+        metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
+    weights = setup.weights.used.astype(float)
+    return Solution(setup.poses(descent.point), setup.component, weights, tuple(history), metrics, tuple(notes))
 
 
-@dataclass(frozen=True)
-class _Options:
-    objective: ObjectiveName
-    initial: InitialName
-    certificate: bool
-    max_iterations: int
-    relative_tolerance: float
-    time_limit_s: float
-    keep_history: bool
+def _descend(setup: Setup, initial: InitialName, limits: Limits, full: bool, watch: Watch) -> Descent:
+    """The descent of the isotropic objective, and from there, where wanted, of the full one."""
+    isotropic = IsotropicObjective(setup.problem)
+    loose = replace(limits, relative_tolerance=max(limits.relative_tolerance, WARM_START_TOLERANCE))
+    point = isotropic.at(*setup.initial(initial))
+    warm = descend(isotropic, point, loose if full else limits, setup.rounding, watch)
+    if not full:
+        return warm
+    objective = FullObjective(setup.problem, setup.weights.information[setup.weights.used])
+    first = objective.at(warm.point.rotations, warm.point.translations)
+    descent = descend(objective, first, limits.after(len(warm.costs) - 1), setup.rounding, watch)
+    return replace(descent, cg_steps=descent.cg_steps + warm.cg_steps)
 
 
-class _Run:
-    """One solve: from the graph's rows to the problem's order and back."""
+def _certify(setup: Setup, point: Point) -> Certificate:
+    problem = setup.problem
+    if problem.count - problem.free_count > setup.component.max(initial=-1) + 1:
+        return Certificate(False, 0.0, math.inf, 0, SEVERAL_FIXED)
+    return certify(problem, point.rotations, point.translations, point.cost)
 
-    def __init__(
-        self, graph: ViewGraph, weights: Weights, dimension: int, fixed: Ints, start: Floats | None, options: _Options
-    ) -> None:
-        self.graph, self.weights, self.dimension, self.options = graph, weights, dimension, options
-        self.deadline_s = time.monotonic() + options.time_limit_s
-        used = graph.edges[weights.used]
-        self.component = connected_components(used, graph.vertex_count)
-        self.pinned = pinned_vertices(self.component, fixed)
-        self.gauge = self._gauge(fixed, start)
-        poses = np.broadcast_to(np.eye(4), (graph.vertex_count, 4, 4)) if start is None else start
-        self.start = se3.inverse(self.gauge) @ poses
-        d, motion = dimension, graph.i_from_j[weights.used]
-        self.problem = make_problem(
-            used,
-            project(motion[:, :d, :d]),
-            np.ascontiguousarray(motion[:, :d, 3]),
-            weights.kappa[weights.used],
-            weights.tau[weights.used],
-            self.pinned,
-        )
-        self.history: list[SolverIteration] = []
 
-    def _gauge(self, fixed: Ints, start: Floats | None) -> Floats:
-        """What each vertex's solved pose is multiplied by on the left (V, 4, 4): components without a fixed vertex
-        are solved with their first vertex at the identity.
-        """
-        gauge = np.broadcast_to(np.eye(4), (self.graph.vertex_count, 4, 4)).copy()
-        if start is None:
-            return gauge
-        first = np.unique(self.component, return_index=True)[1]
-        held = np.isin(np.arange(len(first)), self.component[fixed])
-        free = ~held[self.component]
-        gauge[free] = start[first[self.component[free]]]
-        return gauge
-
-    def solve(self) -> Solution:
-        """The solution, by the isotropic objective first."""
-        options, problem, notes = self.options, self.problem, list(self.weights.notes)
-        notes += describe_components(self.component, self.graph.vertex_ids)
-        full = options.objective == "full" and self.weights.definite
-        if options.objective == "full" and not full:
-            notes.append("the full objective has no minimum with indefinite information: isotropic weights are used")
-        isotropic = IsotropicObjective(problem)
-        tolerance = max(options.relative_tolerance, WARM_START_TOLERANCE) if full else options.relative_tolerance
-        limits = Limits(options.max_iterations, tolerance, self.deadline_s)
-        descent = descend(isotropic, isotropic.at(*self._initial()), limits, self._floor(), self._watch("isotropic"))
-        if full:
-            descent = self._full(descent, limits)
-        if not descent.converged:
-            notes.append(f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far")
-        metrics = self._metrics(descent, full)
-        if options.certificate and not full:
-            answer = self._certify(descent.point)
-            notes.append(answer.note)
-            metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
-        elif options.certificate:
-            notes.append("only the isotropic objective can be certified")
-        poses = self._poses(descent.point)
-        weights = np.zeros(self.graph.edge_count)
-        weights[self.weights.used] = 1.0
-        return Solution(poses, self.component, weights, tuple(self.history), metrics, tuple(notes))
-
-    def _full(self, warm: Descent, limits: Limits) -> Descent:
-        options = self.options
-        objective = FullObjective(self.problem, self.weights.information[self.weights.used])
-        left = replace(limits.after(len(warm.costs) - 1), relative_tolerance=options.relative_tolerance)
-        point = objective.at(warm.point.rotations, warm.point.translations)
-        descent = descend(objective, point, left, self._floor(), self._watch("full"))
-        return replace(descent, cg_steps=descent.cg_steps + warm.cg_steps)
-
-    def _certify(self, point: Point) -> Certificate:
-        if self.pinned.sum() > self.component.max(initial=-1) + 1:
-            note = "not certified: a graph with several fixed vertices has another dual"
-            return Certificate(False, 0.0, math.inf, 0, note)
-        return certify(self.problem, point.rotations, point.translations, point.cost)
-
-    def _initial(self) -> tuple[Floats, Floats]:
-        d, order = self.dimension, self.problem.order
-        start = self.start[order]
-        translations = np.ascontiguousarray(start[:, :d, 3])
-        if self.options.initial == "given":
-            return project(start[:, :d, :d]), translations
-        pinned = project(start[self.problem.free_count :, :d, :d])
-        return chordal_rotations(self.problem, pinned), translations
-
-    def _floor(self) -> float:
-        """The cost that rounding alone leaves."""
-        problem = self.problem
-        scale = problem.kappa.sum() * problem.dimension
-        return float(
-            ROUNDING * (scale + problem.tau @ np.einsum("ei,ei->e", problem.translations, problem.translations))
-        )
-
-    def _poses(self, point: Point) -> Floats:
-        d, order = self.dimension, self.problem.order
-        poses = np.broadcast_to(np.eye(4), (len(order), 4, 4)).copy()
-        poses[order, :d, :d], poses[order, :d, 3] = point.rotations, point.translations
-        return self.gauge @ poses
-
-    def _watch(self, name: str):  # type: ignore[no-untyped-def]
-        if not self.options.keep_history:
-            return None
-        return lambda point: self.history.append(SolverIteration(self._poses(point), point.cost, {name: point.cost}))
-
-    def _metrics(self, descent: Descent, full: bool) -> dict[str, float]:
-        name = "chi2" if full else "isotropic"
-        return {
-            "objective": descent.point.cost,
-            name: descent.point.cost,
-            "iterations": float(len(descent.costs) - 1),
-            "cg_steps": float(descent.cg_steps),
-            "converged": float(descent.converged),
-        }
+def _metrics(descent: Descent, full: bool) -> dict[str, float]:
+    return {
+        "objective": descent.point.cost,
+        "chi2" if full else "isotropic": descent.point.cost,
+        "iterations": float(len(descent.costs) - 1),
+        "cg_steps": float(descent.cg_steps),
+        "converged": float(descent.converged),
+    }
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

@@ -19,10 +19,14 @@ CHAIN_EDGES_PER_VERTEX = 1.5
 
 @dataclass(frozen=True)
 class Factor:
-    """A factorised matrix of `size` rows, to be solved with as often as needed."""
+    """A factorised matrix of `size` rows, to be solved with as often as needed.
+
+    `fill`: how many numbers its triangle holds.
+    """
 
     size: int
     solve_columns: Callable[[Floats], Floats]
+    fill: int = 0
 
     def solve(self, rhs: Floats) -> Floats:
         """The solution (n,) or (n, k) of `matrix @ x = rhs`."""
@@ -42,7 +46,8 @@ def factorise(matrix: csc_matrix | csr_matrix, ordering: str = "auto") -> Factor
     size = int(csc.shape[0])
     if size == 0:
         return Factor(0, lambda rhs: rhs)
-    return Factor(size, _decompose(csc, "MMD_AT_PLUS_A" if ordering == "auto" else ordering).solve)
+    factor = _decompose(csc, "MMD_AT_PLUS_A" if ordering == "auto" else ordering)
+    return Factor(size, factor.solve, (factor.nnz + size) // 2)
 
 
 def fill_reducing_order(laplacian: csc_matrix | csr_matrix) -> Ints:

@@ -1,23 +1,26 @@
-"""The isotropic objective F = Σ κ‖R_j − R_i R_ij‖² + τ‖t_j − t_i − R_i t_ij‖² (SE-Sync, equation 11) and its derivatives.
+"""The isotropic objective F = Σ κ‖R_j − R_i R_ij‖² + τ‖t_j − t_i − R_i t_ij‖² and its derivatives.
 
-A rotation is turned in the world frame, R_i ← exp(ω_i^) R_i: so the Hessian of consistent edges is the scalar
-Laplacian of κ on each component of ω, which is why that Laplacian preconditions it.
+SE-Sync, equation 11. A rotation is turned in the world frame, R_i ← exp(ω_i^) R_i: so the Hessian of consistent edges
+is the scalar Laplacian of κ on each component of ω, which is why that Laplacian preconditions it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.solvers.cg import Operator, truncated_cg
 from hodge_pipeline.solvers.newton import Point, Step
+from hodge_pipeline.solvers.preconditioner import is_chain_like, joint_preconditioner
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import axial, cross, exponential, lever
 from hodge_pipeline.types import Floats
 
 MAX_CG_STEPS = 1000
+JOINT_AFTER_CG_STEPS = 30
+"""A Newton step that needs more makes the direct factor worth its price, where that is low."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def best_translations(problem: Problem, rotations: Floats, translations: Floats)
     arm = np.einsum("eij,ej->ei", rotations[problem.tail], problem.translations)
     shift = problem.tau[:, None] * (translations[problem.head] - translations[problem.tail] - arm)
     force = (problem.at_head @ shift - problem.at_tail @ shift)[: problem.free_count]
-    out = translations.copy()
+    out: Floats = translations.copy()
     out[: problem.free_count] -= problem.translation_factor.solve(force)
     return out
 
@@ -110,11 +113,20 @@ class IsotropicPoint(Point):
     left: Residuals
 
 
+@dataclass
+class _Joint:
+    """The latest direct factor, once the Laplacian proved too weak on a graph like a chain."""
+
+    precondition: Operator | None = None
+    wanted: bool = False
+
+
 @dataclass(frozen=True)
 class IsotropicObjective:
     """F as a function of the rotations alone, the translations always the best ones."""
 
     problem: Problem
+    joint: _Joint = field(default_factory=_Joint)
 
     def at(self, rotations: Floats, translations: Floats) -> IsotropicPoint:
         """The point at these rotations; the translations are a start for the best ones."""
@@ -127,16 +139,19 @@ class IsotropicObjective:
         assert isinstance(point, IsotropicPoint)
         model = quadratic_model(self.problem, point.left)
         gradient = model.gradient.reshape(-1)
-        solve, shape = self.problem.rotation_factor.solve, model.gradient.shape
-        direction, left, steps = truncated_cg(
-            reduced_hessian(self.problem, model),
-            lambda r: solve(r.reshape(shape)).reshape(-1),
-            gradient,
-            tolerance,
-            MAX_CG_STEPS,
-        )
+        apply, precondition = reduced_hessian(self.problem, model), self._preconditioner(point)
+        direction, left, steps = truncated_cg(apply, precondition, gradient, tolerance, MAX_CG_STEPS)
+        self.joint.wanted = steps > JOINT_AFTER_CG_STEPS and is_chain_like(self.problem)
         slope = 2 * float(gradient @ direction)
         return Step(direction, slope, -0.5 * slope - float(direction @ left), steps)
+
+    def _preconditioner(self, point: IsotropicPoint) -> Operator:
+        if self.joint.wanted:
+            self.joint.precondition = joint_preconditioner(self.problem, point.left.arm)
+        if self.joint.precondition is not None:
+            return self.joint.precondition
+        solve, shape = self.problem.rotation_factor.solve, (self.problem.free_count, self.problem.tangent_size)
+        return lambda r: solve(r.reshape(shape)).reshape(-1)
 
     def moved(self, point: Point, direction: Floats) -> IsotropicPoint:
         """The point whose free rotations are turned by a direction (free · p,)."""

@@ -103,7 +103,7 @@ def _mean_precision(blocks: Floats) -> Floats:
         minors = cofactor.sum(axis=1)
     positive = (determinant > 0) & (minors > 0) & (diagonal.sum(axis=1) > 0)
     mean = a.shape[-1] * determinant / np.where(positive, minors, 1.0)
-    return np.where(positive, mean, 0.0) * scale
+    return np.asarray(np.where(positive, mean, 0.0) * scale)
 
 
 def _indefinite(information: Floats) -> Bools:

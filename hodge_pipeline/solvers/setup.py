@@ -1,0 +1,105 @@
+"""From a viewing graph's rows to a problem's order and back: gauge, pinned vertices, first guess."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.chordal import chordal_rotations
+from hodge_pipeline.solvers.newton import Point
+from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
+from hodge_pipeline.solvers.rotations import project
+from hodge_pipeline.solvers.weights import Weights, check_graph, edge_weights, is_planar
+from hodge_pipeline.types import Floats, Ints, ViewGraph
+
+InitialName: TypeAlias = Literal["chordal", "given"]
+ROUNDING = 1e-22
+"""Of the objective of edges as wrong as they can be: below it, a cost is rounding."""
+NO_ROWS = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A problem, and what takes its poses back to the graph's rows.
+
+    - `weights`: of all edges of the graph; the problem holds those that are `used`, in their order.
+    - `component (V,)` of the used edges; `gauge (V, 4, 4)`: what a solved pose is multiplied by on the left, since a
+      component without a fixed vertex is solved with its first vertex at the identity.
+    - `start (V, 4, 4)`: the given poses in the solver's gauge.
+    """
+
+    weights: Weights
+    dimension: int
+    component: Ints
+    gauge: Floats
+    start: Floats
+    problem: Problem
+
+    def poses(self, point: Point) -> Floats:
+        """The poses (V, 4, 4) of a point in the graph's order and gauge."""
+        d, order = self.dimension, self.problem.order
+        poses = np.broadcast_to(np.eye(4), (len(order), 4, 4)).copy()
+        poses[order, :d, :d], poses[order, :d, 3] = point.rotations, point.translations
+        return np.asarray(self.gauge @ poses)
+
+    def initial(self, name: InitialName) -> tuple[Floats, Floats]:
+        """Rotations (n, d, d) and translations (n, d) in the problem's order to begin with."""
+        d = self.dimension
+        start = self.start[self.problem.order]
+        translations = np.ascontiguousarray(start[:, :d, 3])
+        if name == "given":
+            return project(start[:, :d, :d]), translations
+        pinned = project(start[self.problem.free_count :, :d, :d])
+        return chordal_rotations(self.problem, pinned), translations
+
+    @property
+    def rounding(self) -> float:
+        """The cost that rounding alone leaves."""
+        p = self.problem
+        lengths = np.einsum("ei,ei->e", p.translations, p.translations)
+        return float(ROUNDING * (p.dimension * p.kappa.sum() + p.tau @ lengths))
+
+
+def prepare(
+    graph: ViewGraph, start: Floats | None = None, fixed: Ints = NO_ROWS, dimension: Literal[2, 3] | None = None
+) -> Setup:
+    """The set-up of a graph. Raises `GraphError` where its numbers cannot be used."""
+    check_graph(graph)
+    if start is not None and start.shape != (graph.vertex_count, 4, 4):
+        raise GraphError(f"start poses have shape {start.shape}, expected {(graph.vertex_count, 4, 4)}")
+    if start is not None and not np.isfinite(start).all():
+        row = int(np.argmax(~np.isfinite(start).all(axis=(1, 2))))
+        raise GraphError(f"start pose of vertex {graph.vertex_ids[row]} is not finite: mend it or start without")
+    size = (2 if is_planar(graph) else 3) if dimension is None else dimension
+    weights = edge_weights(graph, size)
+    used = graph.edges[weights.used]
+    component = connected_components(used, graph.vertex_count)
+    gauge = _gauge(component, fixed, start)
+    poses = np.broadcast_to(np.eye(4), gauge.shape) if start is None else start
+    motion = graph.i_from_j[weights.used]
+    problem = make_problem(
+        used,
+        project(motion[:, :size, :size]),
+        np.ascontiguousarray(motion[:, :size, 3]),
+        weights.kappa[weights.used],
+        weights.tau[weights.used],
+        pinned_vertices(component, fixed),
+    )
+    return Setup(weights, size, component, gauge, se3.inverse(gauge) @ poses, problem)
+
+
+def _gauge(component: Ints, fixed: Ints, start: Floats | None) -> Floats:
+    gauge: Floats = np.broadcast_to(np.eye(4), (len(component), 4, 4)).copy()
+    if start is None:
+        return gauge
+    first = np.unique(component, return_index=True)[1]
+    held = np.zeros(len(first), bool)
+    held[component[fixed]] = True
+    free = ~held[component]
+    gauge[free] = start[first[component[free]]]
+    return gauge
