@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -45,6 +46,17 @@ def json_text(data: Any) -> str:
 def write_json(path: Path, data: Any) -> None:
     """Write JSON atomically (see `json_text`)."""
     write_text(path, json_text(data))
+
+
+def link_or_copy(existing: Path, path: Path) -> None:
+    """Give a file another name atomically: no second copy where the file system can link."""
+    draft = path.with_name(f".{path.name}.draft")
+    draft.unlink(missing_ok=True)
+    try:
+        os.link(existing, draft)
+    except OSError:
+        shutil.copyfile(existing, draft)
+    os.replace(draft, path)
 
 
 def _finite(value: Any) -> Any:

@@ -15,7 +15,7 @@ from typing import Any
 from hodge_pipeline import artifacts, binding
 from hodge_pipeline.monitor import Monitor
 from hodge_pipeline.recipe import Recipe
-from hodge_pipeline.stages import Advance, Executor, no_progress
+from hodge_pipeline.stages import Advance, Workers, no_progress
 from hodge_pipeline.types import Source
 from hodge_pipeline.watch import Watcher
 from hodge_pipeline.workspace import KEY_FILE, StageFolder, Workspace, key_of
@@ -43,7 +43,7 @@ class Job:
     recipe: Recipe
     workspace: Workspace
     watcher: Watcher
-    executor: Executor
+    workers: Workers
     monitor: Monitor = field(default_factory=Monitor)
     keys: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -94,3 +94,21 @@ def source_key(source: Source, reader: Any) -> str:
         status = os.stat(path)
         files.append((str(path), status.st_size, status.st_mtime_ns))
     return key_of("source", binding.unbind(reader), files)
+
+
+@contextmanager
+def logging_to(path: Path) -> Iterator[None]:
+    """Add what the run logs to a file, each line with its time."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    try:
+        yield
+    except BaseException as error:
+        log.error("stopped: %s", error or type(error).__name__)
+        raise
+    finally:
+        log.removeHandler(handler)
+        handler.close()

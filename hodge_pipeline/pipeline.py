@@ -6,23 +6,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hodge_pipeline import binding, outputs, steps
-from hodge_pipeline.evaluation.report import Report
-from hodge_pipeline.job import Job
-from hodge_pipeline.recipe import Recipe, load_recipe
-from hodge_pipeline.types import Floats, Solution, Source, ViewGraph
+from hodge_pipeline.evaluation.contents import Report
+from hodge_pipeline.job import Job, logging_to
+from hodge_pipeline.recipe import Recipe, load_recipe, with_source
+from hodge_pipeline.record import record
+from hodge_pipeline.rounds import Round
+from hodge_pipeline.types import Source
 from hodge_pipeline.watch import Nobody, Watcher
 from hodge_pipeline.workspace import Workspace
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its folder, and what a script wants of it. `world_from_cam (N, 4, 4)` in frame order."""
+    """A finished run: its folder, what was read, its last round (graph, solution, poses in frame order), the report."""
 
     folder: Path
     source: Source
-    world_from_cam: Floats
-    graph: ViewGraph
-    solution: Solution
+    result: Round
     report: Report
 
 
@@ -39,25 +39,29 @@ def run(
     Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     if isinstance(recipe, str):
-        recipe = load_recipe(recipe, source=None if source is None else Path(source))
+        recipe = load_recipe(recipe)
+    if source is not None:
+        recipe = with_source(recipe, Path(source))
     folder = Path(out)
-    with Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace, _log_file(folder):
-        return _run(Job(recipe, workspace, watcher or Nobody()))
+    with (
+        Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace,
+        logging_to(folder / "log.txt"),
+        recipe.executor.open() as workers,
+    ):
+        return _run(Job(recipe, workspace, watcher or Nobody(), workers))
 
 
 def _run(job: Job) -> Run:
-    recipe = job.recipe
-    source = read(job)
+    source = steps.read(job)
     clouds = steps.prepare_clouds(job, source)
-    graph, poses = steps.odometry(job, source, clouds)
-    rounds = [steps.Round(graph, poses)]
-    for number in range(1, recipe.outer_iterations + 1):
+    rounds = [steps.odometry(job, source)]
+    for number in range(1, job.recipe.outer_iterations + 1):
+        poses = rounds[-1].world_from_cam
         candidates = steps.propose_edges(job, number, source, clouds, poses)
-        graph = steps.register_edges(job, number, source, candidates, poses)
-        solution = steps.solve(job, number, graph, poses)
-        poses = solution.world_from_cam
-        rounds.append(steps.Round(graph, poses, candidates, solution))
-    models = steps.fuse(job, source, poses)
+        registered = steps.register_edges(job, number, candidates, poses)
+        rounds.append(steps.solve(job, number, source, candidates, registered, poses))
+    models = steps.fuse(job, source, rounds[-1].world_from_cam)
     scores = steps.evaluate(job, source, rounds)
+    record(job, source, rounds, models, scores)
     report = outputs.write(job, source, rounds, models, scores)
-    return Run(job.workspace.folder, source, poses, graph, solution, report)
+    return Run(job.workspace.folder, source, rounds[-1], report)

@@ -24,16 +24,18 @@ OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 class SourceOptions:
     """What to read, and as what."""
 
-    path: Path | None = Field(None, description="a folder or file; `hodge run --source` sets it")
-    reader: FrameReader | None = Field(None, description="its format; none: the reader that is surest of the path")
+    path: Path | None = Field(default=None, description="a folder or file; `hodge run --source` sets it")
+    reader: FrameReader | None = Field(
+        default=None, description="its format; none: the reader that is surest of the path"
+    )
 
 
 @dataclass(frozen=True, config=OPTIONS)
 class EvaluationOptions:
     """What is measured at the end."""
 
-    tables: bool = Field(True, description="the two score tables, about 40 CPU seconds for 250 frames")
-    rpe_delta_frames: int = Field(1, ge=1, description="frames between the two poses of a relative pose error")
+    tables: bool = Field(default=True, description="the two score tables, about 40 CPU seconds for 250 frames")
+    rpe_delta_frames: int = Field(default=1, ge=1, description="frames between the two poses of a relative pose error")
 
 
 @dataclass(frozen=True, config=OPTIONS)
@@ -44,16 +46,19 @@ class Recipe:
     registration: Registrar = Field(description="how a pair is registered")
     solver: ConsistencySolver = Field(description="how the poses are made consistent")
     executor: Executor = Field(description="where pairs are registered")
-    description: str = Field("", description="one sentence for `hodge recipes`")
-    seed: int = Field(0, ge=0, description="of everything random; the same seed gives the same poses")
+    description: str = Field(default="", description="one sentence for `hodge recipes`")
+    seed: int = Field(default=0, ge=0, description="of everything random; the same seed gives the same poses")
     source: SourceOptions = SourceOptions()
     clouds: CloudOptions = CloudOptions()
-    odometry: OdometryOptions | None = Field(None, description="the first poses; none: from the source")
+    odometry: OdometryOptions = OdometryOptions()
     acceptance: Acceptance = Acceptance()
     outer_iterations: int = Field(
-        2, ge=1, le=20, description="rounds of new edges, registration and solve, each from the poses of the last"
+        default=2,
+        ge=1,
+        le=20,
+        description="rounds of new edges, registration and solve, each from the poses of the last",
     )
-    fusion: tuple[Fuser, ...] = Field((), description="each makes one model from the final poses")
+    fusion: tuple[Fuser, ...] = Field(default=(), description="each makes one model from the final poses")
     evaluation: EvaluationOptions = EvaluationOptions()
     recording: RecordingOptions = RecordingOptions()
 
@@ -65,9 +70,12 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path |
     """
     document = recipe_file.load(name_or_path, overrides)
     recipe = binding.bind(Recipe, document.data, lambda keys: origin(document, keys))
-    if source is None:
-        return recipe
-    return dataclasses.replace(recipe, source=dataclasses.replace(recipe.source, path=source))
+    return recipe if source is None else with_source(recipe, source)
+
+
+def with_source(recipe: Recipe, path: Path) -> Recipe:
+    """The recipe on another source."""
+    return dataclasses.replace(recipe, source=dataclasses.replace(recipe.source, path=path))
 
 
 def origin(document: Document, keys: Keys) -> str:

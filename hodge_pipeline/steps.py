@@ -2,43 +2,62 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hodge_pipeline import artifacts
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline import artifacts, se3
+from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphScores, ScoreTable, score_table
 from hodge_pipeline.fusion.ply import write_ply
-from hodge_pipeline.job import Job
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Solution, Source, ViewGraph
+from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.job import Job, source_key
+from hodge_pipeline.registration import clouds as cloud_stage
+from hodge_pipeline.registration import odometry as odometry_stage
+from hodge_pipeline.registration import pairs as pair_stage
+from hodge_pipeline.registration.pairs import Registered
+from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.types import Candidates, CloudSet, Floats, Source
 
 
-@dataclass(frozen=True)
-class Round:
-    """One outer iteration: its edges, and the poses that they led to. The first is the odometry: no candidates."""
+def read(job: Job) -> Source:
+    """The source, opened; its images stay on disk."""
+    path = job.recipe.source.path
+    if path is None:
+        raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
+    reader = job.recipe.source.reader or guess_reader(path)
+    source = reader.open(path)
+    if not source.frames:
+        raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
+    for note in source.notes:
+        job.note(note)
+    if len(source.frames) == 1:
+        job.note(f"{path}: has a single frame: there is nothing to register, the model is that frame alone")
+    job.keys["source"] = source_key(source, reader)
+    return source
 
-    graph: ViewGraph
-    world_from_cam: Floats
-    candidates: Candidates | None = None
-    solution: Solution | None = None
 
-
-def solve(job: Job, number: int, graph: ViewGraph, world_from_cam: Floats) -> Solution:
-    """The consistent poses of round `number`."""
-    name = f"solve-{number}"
-    with job.stage(name, f"solve {number}", 1, job.recipe.solver, (f"register-{number}",)) as (folder, advance):
+def prepare_clouds(job: Job, source: Source) -> CloudSet:
+    """The down-sampled cloud of each frame."""
+    options, total = job.recipe.clouds, len(source.frames)
+    with job.stage("clouds", "clouds", total, options, ("source",)) as (folder, advance):
         if not folder.finished:
-            solution = job.recipe.solver.solve(graph, world_from_cam)
-            for note in solution.notes:
+            clouds, notes = cloud_stage.prepare_clouds(source.frames, options, job.workers, advance)
+            clouds.save(folder.path)
+            for note in notes:
                 job.note(note)
-            artifacts.save_solution(folder.path / "solution.npz", solution)
-            advance(1)
-    return artifacts.load_solution(job.path(name) / "solution.npz")
+    return CloudSet.open(job.path("clouds"))
 
 
 def propose_edges(job: Job, number: int, source: Source, clouds: CloudSet, world_from_cam: Floats) -> Candidates:
     """The pairs to register in round `number`, from the poses so far."""
     name = f"edges-{number}"
     before = "odometry" if number == 1 else f"solve-{number - 1}"
-    with job.stage(name, f"edges {number}", 1, job.recipe.edges, ("clouds", before)) as (folder, advance):
+    with job.stage(name, f"edges, round {number}", 1, job.recipe.edges, ("clouds", before)) as (folder, advance):
         if not folder.finished:
             candidates = job.recipe.edges.propose(source.frames, clouds, world_from_cam)
             artifacts.save(folder.path / "candidates.npz", candidates)
@@ -46,17 +65,119 @@ def propose_edges(job: Job, number: int, source: Source, clouds: CloudSet, world
     return artifacts.load(job.path(name) / "candidates.npz", Candidates)
 
 
+def odometry(job: Job, source: Source) -> Round:
+    """The first poses, from consecutive frames alone."""
+    options = job.recipe.odometry
+    stamps = np.array([frame.stamp_s for frame in source.frames])
+    sequences = list(sequences_of(source).values())
+    with job.stage("odometry", "odometry", len(stamps), options, ("clouds",)) as (folder, advance):
+        if not folder.finished:
+            found = odometry_stage.odometry(job.path("clouds"), sequences, stamps, options, job.workers, advance)
+            artifacts.save(folder.path / "steps.npz", found.steps)
+            artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": found.world_from_cam})
+            for note in found.notes:
+                job.note(note)
+    steps = artifacts.load(job.path("odometry") / "steps.npz", Registered)
+    poses = artifacts.load_arrays(job.path("odometry") / "poses.npz")["world_from_cam"]
+    return Round(steps.as_graph(vertex_ids(source), np.full(len(steps.pairs), "sequential")), poses)
+
+
+def register_edges(job: Job, number: int, candidates: Candidates, world_from_cam: Floats) -> Registered:
+    """The candidates of round `number` registered from the poses so far; a killed run goes on at its last block."""
+    name, total = f"register-{number}", len(candidates.pairs)
+    i, j = candidates.pairs.T
+    guesses = se3.inverse(world_from_cam[i]) @ world_from_cam[j]
+    with job.stage(
+        name, f"registration, round {number}", total, job.recipe.registration, ("clouds", f"edges-{number}")
+    ) as (folder, advance):
+        if not folder.finished:
+            blocks = BlockStore(folder.path / "blocks")
+            found = pair_stage.register_pairs(
+                job.path("clouds"), job.recipe.registration, candidates.pairs, guesses, job.workers, advance,
+                finished=blocks.read(), on_block=blocks.write,
+            )  # fmt: skip
+            artifacts.save(folder.path / "registered.npz", found)
+            blocks.remove()
+    return artifacts.load(job.path(name) / "registered.npz", Registered)
+
+
+def solve(
+    job: Job, number: int, source: Source, candidates: Candidates, registered: Registered, start: Floats
+) -> Round:
+    """Round `number`: the accepted edges, and the poses consistent with them from the poses `start`."""
+    name, options = f"solve-{number}", (job.recipe.acceptance, job.recipe.solver)
+    reasons = job.recipe.acceptance.reasons(registered)
+    accepted = reasons == ""
+    graph = registered.select(accepted).as_graph(vertex_ids(source), candidates.source[accepted])
+    with job.stage(name, f"solve, round {number}", 1, options, (f"register-{number}",)) as (folder, advance):
+        if not folder.finished:
+            solution = job.recipe.solver.solve(graph, start)
+            artifacts.save_solution(folder.path / "solution.npz", solution)
+            for note in solution.notes:
+                job.note(f"round {number}: {note}")
+            advance(1)
+    solution = artifacts.load_solution(job.path(name) / "solution.npz")
+    rejected = candidates.pairs[~accepted], reasons[~accepted]
+    return Round(graph, solution.world_from_cam, candidates, solution, *rejected)
+
+
+def vertex_ids(source: Source) -> NDArray[np.generic]:
+    """The frames as the source names them: numbers, or words."""
+    return np.array([frame.frame_id for frame in source.frames])
+
+
+@dataclass(frozen=True)
+class BlockStore:
+    """Registered blocks on disk, so that a killed registration goes on with the next one."""
+
+    folder: Path
+
+    def read(self) -> dict[int, Registered]:
+        """The blocks that are there, by number."""
+        return {int(path.stem): artifacts.load(path, Registered) for path in sorted(self.folder.glob("[0-9]*.npz"))}
+
+    def write(self, block: int, result: Registered) -> None:
+        """Keep one block."""
+        self.folder.mkdir(exist_ok=True)
+        artifacts.save(self.folder / f"{block:06d}.npz", result)
+
+    def remove(self) -> None:
+        """Forget the blocks: the whole is written."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
 def fuse(job: Job, source: Source, world_from_cam: Floats) -> dict[str, Path]:
-    """The PLY file of each model."""
-    last = f"solve-{job.recipe.outer_iterations}"
-    files = {}
-    for fuser in job.recipe.fusion:
-        name = f"fuse-{type(fuser).__name__}"
-        with job.stage(name, "fusion", len(source.frames), fuser, ("source", last)) as (folder, advance):
+    """The PLY file of each model, by its name."""
+    last, files = f"solve-{job.recipe.outer_iterations}", {}
+    for row, fuser in enumerate(job.recipe.fusion):
+        name = f"fuse-{row}"
+        with job.stage(name, f"fusion {row + 1}", len(source.frames), fuser, ("source", last)) as (folder, advance):
             if not folder.finished:
                 model = fuser.fuse(source.frames, world_from_cam, advance)
+                write_ply(folder.path / f"{model.name}.ply", model)
                 for note in model.notes:
                     job.note(note)
-                write_ply(folder.path / "model.ply", model)
-        files[name] = job.path(name) / "model.ply"
+        (path,) = job.path(name).glob("*.ply")
+        files[path.stem] = path
     return files
+
+
+def evaluate(job: Job, source: Source, rounds: Sequence[Round]) -> ScoreTable | None:
+    """The score tables of the true poses (where there are any) and of every round."""
+    if not job.recipe.evaluation.tables:
+        return None
+    truth, sets = true_poses(source), pose_sets(rounds)
+    reference = "truth" if has_truth(source) else "result"
+    sets = {"truth": truth, **sets} if has_truth(source) else sets
+    inputs = ("clouds", "odometry", *(f"solve-{number}" for number in range(1, len(rounds))))
+    with job.stage("evaluate", "evaluation", 1, job.recipe.evaluation, inputs) as (folder, advance):
+        if not folder.finished:
+            table = score_table(job.path("clouds"), sets, reference, job.workers)
+            artifacts.save_arrays(
+                folder.path / "scores.npz",
+                {f"{g.kind}_{part}": getattr(g, part) for g in table.graphs for part in ("pairs", "distances_m")},
+            )
+            advance(1)
+    arrays = artifacts.load_arrays(job.path("evaluate") / "scores.npz")
+    graphs = tuple(GraphScores(kind, arrays[f"{kind}_pairs"], arrays[f"{kind}_distances_m"]) for kind in GRAPH_KINDS)
+    return ScoreTable(tuple(sets), reference, graphs)

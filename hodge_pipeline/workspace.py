@@ -71,6 +71,11 @@ class Workspace:
             raise
         return cls(folder, lock)
 
+    @property
+    def identity(self) -> str:
+        """A name of this run that stays the same when it is resumed."""
+        return key_of((self.folder / RECIPE_FILE).read_text("utf-8"))
+
     def close(self) -> None:
         """Let another process have the folder."""
         self._lock.close()

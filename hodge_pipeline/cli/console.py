@@ -49,11 +49,11 @@ class Terminal:
         self._console.print(message, markup=False)
 
 
-def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], *, quiet: bool = False) -> None:
+def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """A table on stdout, numbers to the right."""
     table = Table(title=title, title_justify="left")
     for row, name in enumerate(header):
         table.add_column(name, justify="left" if row == 0 else "right")
     for cells in rows:
         table.add_row(*cells)
-    Console(quiet=quiet, highlight=False).print(table)
+    Console(highlight=False).print(table)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, DistanceBlock, block_distances
-from hodge_pipeline.stages import Advance, Executor, no_progress
+from hodge_pipeline.stages import Advance, Workers, no_progress
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, PointCloud
 
 GraphKind: TypeAlias = Literal["distance", "iou"]
@@ -84,7 +84,7 @@ def _overlapping_voxels(points_in_world: list[Floats]) -> Ints:
 
 
 def edge_distances(
-    clouds_folder: Path, pairs: Ints, world_from_cam: Floats, executor: Executor, advance: Advance = no_progress
+    clouds_folder: Path, pairs: Ints, world_from_cam: Floats, workers: Workers, advance: Advance = no_progress
 ) -> Floats:
     """The distance d (..., P) in metres of each pair, under each set of poses (..., N, 4, 4).
 
@@ -97,7 +97,7 @@ def edge_distances(
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))
     cuts = [order[start : start + PAIRS_PER_BLOCK] for start in range(0, len(order), PAIRS_PER_BLOCK)]
     blocks = [DistanceBlock(clouds_folder, pairs[cut], _relative(poses, pairs[cut])) for cut in cuts]
-    for block, found in executor.map(block_distances, blocks):
+    for block, found in workers.map(block_distances, blocks):
         distances[:, cuts[block]] = found
         advance(len(cuts[block]))
     return distances.reshape(*world_from_cam.shape[:-3], len(pairs))
@@ -161,7 +161,7 @@ def score_table(
     clouds_folder: Path,
     pose_sets: Mapping[str, Floats],
     reference: str,
-    executor: Executor,
+    workers: Workers,
     advance: Advance = no_progress,
     *,
     kinds: tuple[GraphKind, ...] = GRAPH_KINDS,
@@ -176,7 +176,7 @@ def score_table(
     clouds = CloudSet.open(clouds_folder)
     graphs = [evaluation_pairs(clouds, pose_sets[reference], kind) for kind in kinds]
     union, rank = np.unique(np.concatenate(graphs), axis=0, return_inverse=True)
-    distances = edge_distances(clouds_folder, union, np.stack(list(pose_sets.values())), executor, advance)
+    distances = edge_distances(clouds_folder, union, np.stack(list(pose_sets.values())), workers, advance)
     columns = np.split(rank.reshape(-1), np.cumsum([len(pairs) for pairs in graphs])[:-1])
     scored = (GraphScores(*row) for row in zip(kinds, graphs, (distances[:, c] for c in columns), strict=True))
     return ScoreTable(tuple(pose_sets), reference, tuple(scored))

@@ -76,7 +76,7 @@ class SpawnedWorkers:
             # no more than the pool has hands for: when a worker dies, only blocks that were begun are charged a try
             while waiting and len(running) < 2 * self._count:
                 row = waiting.pop()
-                running[self._started().submit(task, blocks[row])] = row
+                running[self._submit(task, blocks[row])] = row
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             lost = [running[future] for future in finished if isinstance(future.exception(), BrokenProcessPool)]
             for future in finished:
@@ -99,13 +99,12 @@ class SpawnedWorkers:
                     "close other programs or use fewer workers (--set executor.workers=1), then run again"
                 )
 
-    def _started(self) -> ProcessPoolExecutor:
-        if self._pool is None:
-            context = multiprocessing.get_context("spawn")
-            with _environment(SINGLE_THREADED), _hidden_main():
-                self._pool = ProcessPoolExecutor(self._count, mp_context=context)
-                self._pool.submit(os.getpid)  # the first submission starts every process
-        return self._pool
+    def _submit(self, task: Callable[[Task], Result], block: Task) -> Future[Result]:
+        # a submission may start a process, which takes the environment and the main module as they are now
+        with _environment(SINGLE_THREADED), _hidden_main():
+            if self._pool is None:
+                self._pool = ProcessPoolExecutor(self._count, mp_context=multiprocessing.get_context("spawn"))
+            return self._pool.submit(task, block)
 
     def kill(self) -> None:
         """End every worker at once."""

@@ -1,0 +1,61 @@
+"""The commands that run: `hodge run`, `hodge demo`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hodge_pipeline.cli.console import Terminal, print_table
+from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.recipe import load_recipe
+
+if TYPE_CHECKING:
+    from hodge_pipeline.pipeline import Run
+
+
+def run(
+    recipe: str,
+    source: Path | None,
+    out: Path,
+    overrides: Sequence[str],
+    *,
+    overwrite: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Run a recipe and print what came out."""
+    loaded = load_recipe(recipe, overrides, source)
+    if loaded.source.path is None:
+        raise RecipeError(f"recipe '{recipe}' names no source: add --source PATH")
+    from hodge_pipeline.evaluation.report import as_json as report_json
+    from hodge_pipeline.pipeline import run as run_pipeline
+
+    with Terminal(quiet or as_json) as terminal:
+        result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal)
+    if as_json:
+        from hodge_pipeline.artifacts import json_text
+
+        print(json_text(report_json(result.report)), end="")
+    elif not quiet:
+        _print_summary(result)
+
+
+def demo(out: Path, overrides: Sequence[str], *, overwrite: bool, quiet: bool) -> None:
+    """Make the demo sequence, or find it in the cache, and run the recipe `demo` on it."""
+    from hodge_pipeline.demo.sequence import DemoOptions, demo_source
+
+    options = DemoOptions()
+    with Terminal(quiet) as terminal, terminal.stage("render the demo room", options.frames) as advance:
+        folder = demo_source(options=options, advance=advance)
+    run("demo", folder, out, overrides, overwrite=overwrite, quiet=quiet, as_json=False)
+
+
+def _print_summary(result: Run) -> None:
+    from hodge_pipeline.evaluation.tables import graph_tables, score_tables, summary_lines
+
+    for table in (*score_tables(result.report), *graph_tables(result.report)):
+        print_table(table.title, table.header, table.rows)
+    for label, line in summary_lines(result.report):
+        print(f"{label:<8} {line}")
+    print(f"{'report':<8} {result.folder / 'report.html'}")

@@ -1,0 +1,155 @@
+"""What a run leaves for people: poses, graph, edges, report, recording."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import artifacts, binding, registry, yaml_file
+from hodge_pipeline.evaluation.contents import (
+    LoopRow,
+    Path3D,
+    Pictures,
+    Report,
+    Residuals,
+    SourceSummary,
+    StageRow,
+)
+from hodge_pipeline.evaluation.report import write_report
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.evaluation.summary import graph_summary, trajectory_rows, worst_edges
+from hodge_pipeline.evaluation.trajectory import absolute_error
+from hodge_pipeline.job import Job, versions
+from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.types import Floats, Solution, Source, Trajectory, ViewGraph
+
+EDGE_COLUMNS = (
+    "i", "j", "source", "status", "fitness", "rmse_m", "correspondences", "weight", "residual_m", "residual_deg",
+)  # fmt: skip
+
+
+def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
+    """`poses.tum` and `poses.kitti`; of several sequences `poses-<sequence>.*` each, since their stamps may repeat."""
+    sequences = sequences_of(source)
+    for name, rows in sequences.items():
+        stamps = np.array([source.frames[row].stamp_s for row in rows])
+        part = Source(source.name, source.path, trajectory=Trajectory(stamps, world_from_cam[rows]))
+        stem = "poses" if len(sequences) == 1 else f"poses-{name}"
+        for writer in ("tum", "kitti"):
+            registry.load("writers", writer)().write(folder / f"{stem}.{writer}", part)
+
+
+def write_graph(folder: Path, source: Source, last: Round) -> None:
+    """`graph.g2o` (vertices by frame number, or by row where frames have names) and `edges.csv`."""
+    graph = last.graph
+    ids = graph.vertex_ids if graph.vertex_ids.dtype.kind == "i" else np.arange(graph.vertex_count)
+    numbered = ViewGraph(ids, *(getattr(graph, name) for name in list(vars(graph))[1:]))
+    trajectory = Trajectory(np.arange(graph.vertex_count, dtype=float), last.world_from_cam)
+    whole = Source(source.name, source.path, trajectory=trajectory, graph=numbered)
+    registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)
+    artifacts.write_text(folder / "edges.csv", _edge_table(last))
+
+
+def _edge_table(last: Round) -> str:
+    graph, out = last.graph, io.StringIO()
+    translation_m, angle_rad = edge_residuals(graph, last.world_from_cam)
+    weights = np.ones(graph.edge_count) if last.solution is None else last.solution.weights
+    table = csv.writer(out, lineterminator="\n")
+    table.writerow(EDGE_COLUMNS)
+    for row, (i, j) in enumerate(graph.edges):
+        table.writerow(
+            [
+                graph.vertex_ids[i],
+                graph.vertex_ids[j],
+                graph.source[row],
+                "used" if weights[row] > 0 else "ignored",
+                f"{graph.fitness[row]:.4f}",
+                f"{graph.rmse_m[row]:.5f}",
+                graph.correspondences[row],
+                f"{weights[row]:.4f}",
+                f"{translation_m[row]:.6f}",
+                f"{np.rad2deg(angle_rad[row]):.5f}",
+            ]
+        )
+    for (i, j), reason in zip(last.rejected_pairs, last.rejected_reasons, strict=True):
+        table.writerow([graph.vertex_ids[i], graph.vertex_ids[j], reason, "rejected", *[""] * 6])
+    return out.getvalue()
+
+
+def make_report(job: Job, source: Source, rounds: Sequence[Round], scores: ScoreTable | None) -> Report:
+    """Everything that the run measured."""
+    truth, last = true_poses(source), rounds[-1]
+    sets = pose_sets(rounds)
+    assert last.solution is not None
+    component = last.solution.component
+    names = [frame.sequence for frame in source.frames]
+    return Report(
+        title=f"{source.name}",
+        source=SourceSummary(
+            name=source.name,
+            path=str(source.path),
+            frames=len(source.frames),
+            frames_with_truth=sum(frame.world_from_cam is not None for frame in source.frames),
+            sequences=tuple(name for name in sequences_of(source) if name),
+            notes=source.notes,
+        ),
+        scores=scores,
+        trajectories=trajectory_rows(sets, truth, component, names) if has_truth(source) else (),
+        loops=_loop_rows(last.solution),
+        graph=graph_summary(last.graph, component, last.solution.weights, last.rejected_counts),
+        worst_edges=worst_edges(last.graph, last.world_from_cam, last.solution.weights),
+        stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in job.costs()),
+        notes=tuple(job.notes),
+        versions=versions(),
+        recipe=yaml_file.dump(binding.unbind(job.recipe)),
+        pictures=_pictures(source, rounds, sets),
+    )
+
+
+def _loop_rows(solution: Solution) -> tuple[LoopRow, ...]:
+    loops = int(solution.metrics.get("loops", 0))
+    measured = solution.metrics.get("measured_loop_deviation_sum")
+    rows = [] if measured is None else [LoopRow("measured edges", loops, measured)]
+    for number, step in enumerate(solution.history, start=1):
+        if "loop_deviation_sum" in step.metrics:
+            rows.append(LoopRow(f"adjusted edges, inner iteration {number}", loops, step.metrics["loop_deviation_sum"]))
+    return tuple(rows)
+
+
+def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) -> Pictures:
+    """The plots' data: paths aligned to the truth, or as they are where there is none."""
+    last = rounds[-1]
+    assert last.solution is not None
+    component = last.solution.component
+    shown = {name: sets[name] for name in ("odometry", "result")}
+    if has_truth(source):
+        truth = true_poses(source)
+        aligned = {name: absolute_error(poses, truth, component).aligned for name, poses in shown.items()}
+        shown = {"truth": truth, **aligned}
+    paths = [Path3D(name, poses[:, :3, 3]) for name, poses in shown.items()]
+    residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in ("odometry", "result"))
+    convergence = {
+        f"round {number}": tuple(step.objective for step in one.solution.history)
+        for number, one in enumerate(rounds)
+        if one.solution is not None
+    }
+    return Pictures(tuple(paths), component, residuals, last.graph, convergence)
+
+
+def write(
+    job: Job, source: Source, rounds: Sequence[Round], models: dict[str, Path], scores: ScoreTable | None
+) -> Report:
+    """Write everything but the recording into the run folder; gives the report."""
+    folder = job.workspace.folder
+    write_poses(folder, source, rounds[-1].world_from_cam)
+    write_graph(folder, source, rounds[-1])
+    for name, path in models.items():
+        artifacts.link_or_copy(path, folder / f"{name}.ply")
+    report = make_report(job, source, rounds, scores)
+    write_report(folder, report)
+    return report

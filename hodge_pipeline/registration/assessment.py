@@ -1,0 +1,90 @@
+"""What a registration is worth: measured in the same way for every registrar, so that their edges can be mixed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.types import Floats, Ints, Registration
+
+MIN_POINTS = 10
+MIN_SIGMA_M = 1e-3  # no depth sensor is better; keeps noise-free (modelled) pairs finite
+
+FindNearest: TypeAlias = Callable[[Floats], tuple[Ints, Floats]]
+"""Rows of the nearest target points, and squared distances in m², for query points (N, 3)."""
+
+
+class Assessment(NamedTuple):
+    """See `Registration` for the fields."""
+
+    information: Floats
+    fitness: float
+    rmse_m: float
+    correspondences: int
+
+
+NOTHING = Assessment(np.zeros((6, 6)), 0.0, float("nan"), 0)
+
+
+def assess(
+    find_nearest: FindNearest,
+    target_points: Floats,
+    target_normals: Floats,
+    source_points: Floats,
+    i_from_j: Floats,
+    *,
+    max_distance_m: float,
+    points_per_sample: float,
+) -> Assessment:
+    """Fitness, RMSE and information of `i_from_j`, from the points of j with a point of i within the distance.
+
+    The information is that of the point-to-plane error e = n·(p − q) under `i_from_j exp(ξ)`, ξ = (rotation,
+    translation) in j's axes: Σ JᵀJ / (s² c), J = (p_j × n_j, n_j), with s the RMS of e over this pair (at least
+    1 mm). c = `points_per_sample` source points count as one independent measurement, since neighbours share their
+    error. Directions that the surfaces do not fix, as within a plane, get none.
+    """
+    moved = se3.transform(i_from_j, source_points)
+    if not np.isfinite(moved).all():
+        return NOTHING
+    rows, squared = find_nearest(moved)
+    near = squared <= max_distance_m**2
+    count = int(near.sum())
+    if not count:
+        return NOTHING
+    normals = target_normals[rows[near]]
+    plane_errors = np.einsum("ij,ij->i", normals, moved[near] - target_points[rows[near]])
+    variance = max(float(np.mean(plane_errors**2)), MIN_SIGMA_M**2)
+    jacobian = plane_jacobian(normals, source_points[near], i_from_j)
+    return Assessment(
+        information=jacobian.T @ jacobian / (variance * points_per_sample),
+        fitness=count / len(source_points),
+        rmse_m=float(np.sqrt(squared[near].mean())),
+        correspondences=count,
+    )
+
+
+def plane_jacobian(normals_in_i: Floats, points_in_j: Floats, i_from_j: Floats) -> Floats:
+    """Rows (p_j × n_j, n_j) (N, 6): the derivative of n·(i_from_j exp(ξ) p) by ξ = (rotation, translation) at 0."""
+    normals_in_j = normals_in_i @ i_from_j[:3, :3]
+    return np.hstack([np.cross(points_in_j, normals_in_j), normals_in_j])
+
+
+def to_registration(assessment: Assessment, i_from_j: Floats, iterations: int, converged: bool) -> Registration:
+    """The registrar's answer; what has no correspondence has not converged, whatever its optimiser says."""
+    return Registration(
+        i_from_j=i_from_j,
+        information=assessment.information,
+        fitness=assessment.fitness,
+        rmse_m=assessment.rmse_m,
+        correspondences=assessment.correspondences,
+        iterations=iterations,
+        converged=converged and assessment.correspondences >= MIN_POINTS,
+    )
+
+
+def unregistered(i_from_j: Floats) -> Registration:
+    """The answer where there is nothing to register: the guess, which nothing supports."""
+    return to_registration(NOTHING, i_from_j, iterations=0, converged=False)

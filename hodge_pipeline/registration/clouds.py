@@ -1,0 +1,180 @@
+"""From a frame to its down-sampled cloud with normals, and from all frames to one `CloudSet`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import small_gicp
+from pydantic import ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.stages import Advance, Workers, no_progress
+from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats32, Frame, PointCloud
+
+FRAMES_IN_BLOCK = 16
+MIN_POINTS_FOR_NORMALS = 5
+MAX_VOXELS_ALONG_AXIS = 2_000_000  # its cube still fits the 64-bit voxel key
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class CloudOptions:
+    """How a frame becomes a cloud."""
+
+    stride: int = Field(
+        default=2, ge=1, description="Pixels; every n-th row and column. 2 keeps 3 cm voxels filled up to 6 m."
+    )
+    min_range_m: float = Field(
+        default=0.2, ge=0, description="Metres along the optical axis; nearer is the sensor's blind zone."
+    )
+    max_range_m: float = Field(
+        default=6.0, gt=0, description="Metres; beyond it the error of a structured-light sensor passes 5 cm."
+    )
+    voxel_m: float = Field(
+        default=0.03, gt=0, description="Metres; one averaged point per voxel. 0.03 as in the paper."
+    )
+    normal_neighbours: int = Field(
+        default=10, ge=5, description="Points in the plane fit of a normal. 10 as in the paper."
+    )
+    colours: bool = Field(default=True, description="Whether colours are read too; the coloured registrars need them.")
+
+    @model_validator(mode="after")
+    def _check_ranges(self) -> CloudOptions:
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError(f"min_range_m {self.min_range_m} must be below max_range_m {self.max_range_m}")
+        if 2 * self.max_range_m / self.voxel_m > MAX_VOXELS_ALONG_AXIS:
+            raise ValueError(f"voxel_m {self.voxel_m} is too small for max_range_m {self.max_range_m}")
+        return self
+
+
+class CloudCounts(NamedTuple):
+    """What became of a frame: measurements looked at, those valid and in range, points kept; a note where it is odd."""
+
+    looked_at: int
+    valid: int
+    points: int
+    note: str = ""
+
+
+class _Samples(NamedTuple):
+    points_in_cam: Floats32
+    colours: Bytes | None
+    looked_at: int
+    note: str = ""
+
+
+def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:
+    """The down-sampled cloud of one frame, in voxel order, and what was counted on the way.
+
+    Normals are unit vectors that face the camera, zero where fewer than 5 points are there; colours are averaged,
+    zero where the frame has none. Raises `SourceError` where depth cannot be read or the frame has no geometry.
+    """
+    samples = _read_samples(frame, options)
+    points, colours = _voxel_means(samples.points_in_cam, samples.colours, options.voxel_m)
+    cloud = PointCloud(points, _normals(points, options.normal_neighbours), colours)
+    note = samples.note if len(points) else f"frame {frame.frame_id}: no valid measurement in range, its cloud is empty"
+    return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), note)
+
+
+def prepare_clouds(
+    frames: Sequence[Frame], options: CloudOptions, workers: Workers, advance: Advance = no_progress
+) -> tuple[CloudSet, tuple[str, ...]]:
+    """The clouds of all frames, in their order, and a note for each frame that gave none.
+
+    A frame that cannot be read gets an empty cloud. Raises `SourceError` where no frame gave a single point.
+    """
+    blocks = [frames[start : start + FRAMES_IN_BLOCK] for start in range(0, len(frames), FRAMES_IN_BLOCK)]
+    made: dict[int, list[tuple[PointCloud, CloudCounts]]] = {}
+    for index, result in workers.map(partial(_make_block, options=options), blocks):
+        made[index] = result
+        advance(len(result))
+    results = [one for index in range(len(blocks)) for one in made[index]]
+    notes = tuple(counts.note for _, counts in results if counts.note)
+    if not any(counts.points for _, counts in results):
+        reason = notes[0] if notes else "the source has no frames"
+        raise SourceError(f"none of the {len(frames)} frames gave a point cloud; the first: {reason}")
+    return CloudSet.from_clouds([cloud for cloud, _ in results]), notes
+
+
+def _make_block(frames: Sequence[Frame], options: CloudOptions) -> list[tuple[PointCloud, CloudCounts]]:
+    return [_make_or_report(frame, options) for frame in frames]
+
+
+def _make_or_report(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:
+    try:
+        return make_cloud(frame, options)
+    except (SourceError, OSError) as error:
+        note = f"frame {frame.frame_id}: its cloud is empty: {error}"
+        return PointCloud(np.zeros((0, 3), np.float32)), CloudCounts(0, 0, 0, note)
+
+
+def _read_samples(frame: Frame, options: CloudOptions) -> _Samples:
+    if frame.read_depth is not None and frame.camera is not None:
+        return _back_project(frame, frame.read_depth, frame.camera, options)
+    if frame.read_points is not None:
+        return _sensor_points(frame.read_points(), options)
+    raise SourceError(
+        f"frame {frame.frame_id}: registration needs depth with a camera, or points, and the source gives neither: "
+        "use a source with geometry, or one whose graph is measured already"
+    )
+
+
+def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Camera, options: CloudOptions) -> _Samples:
+    depth = read_depth()
+    z = depth[:: options.stride, :: options.stride]
+    rows, columns = np.nonzero((z >= options.min_range_m) & (z <= options.max_range_m))  # false for NaN
+    z_kept = z[rows, columns].astype(np.float32)
+    x = ((columns * options.stride - camera.cx) / camera.fx).astype(np.float32) * z_kept
+    y = ((rows * options.stride - camera.cy) / camera.fy).astype(np.float32) * z_kept
+    colours, note = None, ""
+    if options.colours and frame.read_colour is not None and len(rows):
+        try:
+            image = frame.read_colour()
+            # A colour image of another size covers the same view: take the pixel at the same share of it.
+            v = rows * options.stride * image.shape[0] // depth.shape[0]
+            u = columns * options.stride * image.shape[1] // depth.shape[1]
+            colours = image[v, u]
+        except (SourceError, OSError) as error:
+            note = f"frame {frame.frame_id}: its cloud has no colours: {error}"
+    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, note)
+
+
+def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
+    """Points of a scanner, which sees all round: its range is the distance, not the depth."""
+    points = np.asarray(cloud.points_in_cam, np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        ranges = np.linalg.norm(points, axis=1)
+    kept = (ranges >= options.min_range_m) & (ranges <= options.max_range_m)
+    colours = cloud.colours[kept] if cloud.colours is not None and options.colours else None
+    return _Samples(points[kept], colours, len(points))
+
+
+def _voxel_means(points: Floats32, colours: Bytes | None, voxel_m: float) -> tuple[Floats32, Bytes]:
+    """The mean point and colour of every occupied voxel, ordered by voxel, so the same for any order of the input."""
+    if not len(points):
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    cells = np.floor(points / voxel_m).astype(np.int64)
+    cells -= cells.min(axis=0)
+    counts = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * counts[1] + cells[:, 1]) * counts[2] + cells[:, 2]
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    sizes = np.diff(starts, append=len(keys))[:, None]
+    means = np.add.reduceat(points[order], starts, axis=0, dtype=np.float64) / sizes
+    if colours is None:
+        return means.astype(np.float32), np.zeros((len(means), 3), np.uint8)
+    sums = np.add.reduceat(colours[order], starts, axis=0, dtype=np.int64)
+    return means.astype(np.float32), ((sums + sizes // 2) // sizes).astype(np.uint8)
+
+
+def _normals(points: Floats32, neighbours: int) -> Floats32:
+    if len(points) < MIN_POINTS_FOR_NORMALS:
+        return np.zeros((len(points), 3), np.float32)
+    cloud = small_gicp.PointCloud(points.astype(np.float64))
+    small_gicp.estimate_normals(cloud, small_gicp.KdTree(cloud), min(neighbours, len(points)))
+    normals = np.asarray(cloud.normals())[:, :3]
+    away = np.einsum("ij,ij->i", normals, points) > 0
+    return np.where(away[:, None], -normals, normals).astype(np.float32)

@@ -1,0 +1,147 @@
+"""Frame-to-frame odometry: each frame registered to the one before it, from a constant-velocity guess."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass as plain_dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline import se3
+from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.pairs import Registered, prepared_clouds
+from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
+from hodge_pipeline.types import CloudSet, Floats, Ints, Registration
+
+STEPS_IN_BLOCK = 32
+WARM_UP_STEPS = 2
+SPACE_BETWEEN_SEQUENCES_M = 20.0
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+class OdometryOptions:
+    """How the first poses are found."""
+
+    registration: Registrar = Field(default=Gicp(), description="how two consecutive frames are registered")
+    sure_fitness: float = Field(
+        default=0.7,
+        ge=0,
+        le=1,
+        description="below it a second registration starts from no motion, and the fitter one is kept",
+    )
+    min_fitness: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="below it tracking is lost: no edge, the motion is the one before it, and it is said",
+    )
+
+
+@plain_dataclass(frozen=True)
+class Odometry:
+    """The first poses (N, 4, 4), the steps that led to them, and what went wrong, one line each."""
+
+    world_from_cam: Floats
+    steps: Registered
+    notes: tuple[str, ...]
+
+
+@plain_dataclass(frozen=True)
+class _Block:
+    """Consecutive rows of one sequence with their stamps; the first `warm_up` steps belong to the block before."""
+
+    rows: Ints
+    stamps_s: Floats
+    warm_up: int
+
+
+def odometry(
+    folder: Path,
+    sequences: Sequence[Ints],
+    stamps_s: Floats,
+    options: OdometryOptions,
+    workers: Workers,
+    advance: Advance = no_progress,
+) -> Odometry:
+    """Poses of every frame; each sequence begins with the identity rotation, beside the sequence before it.
+
+    Frames without points are bridged, and keep the pose of the frame before them. A block of steps starts two steps
+    early to know its velocity, so that blocks run side by side and the result does not depend on the workers.
+    `advance` counts frames.
+    """
+    sizes = CloudSet.open(folder).sizes
+    blocks = [block for rows in sequences for block in _blocks(rows[sizes[rows] > 0], stamps_s)]
+    results: dict[int, Registered] = {}
+    for number, result in workers.map(partial(_run_block, folder, options), blocks):
+        results[number] = result
+        advance(len(result.pairs))
+    steps = Registered.joined([results[number] for number in range(len(blocks))])
+    lost = ~(steps.fitness >= options.min_fitness)
+    poses = _chained(len(sizes), sequences, steps)
+    notes = tuple(
+        f"tracking was lost between rows {i} and {j} (fitness {fitness:.2f}): no edge there, the motion is guessed"
+        for (i, j), fitness in zip(steps.pairs[lost], steps.fitness[lost], strict=True)
+    )
+    return Odometry(poses, steps.select(~lost), notes)
+
+
+def _blocks(rows: Ints, stamps_s: Floats) -> list[_Block]:
+    out = []
+    for start in range(0, len(rows) - 1, STEPS_IN_BLOCK):
+        first = max(0, start - WARM_UP_STEPS)
+        part = rows[first : start + STEPS_IN_BLOCK + 1]
+        out.append(_Block(part, stamps_s[part], start - first))
+    return out
+
+
+def _run_block(folder: Path, options: OdometryOptions, block: _Block) -> Registered:
+    """The steps of one block, without its warm-up."""
+    prepared = prepared_clouds(folder, options.registration)
+    durations = _durations(block.stamps_s)
+    velocity, found = np.zeros(6), []
+    for (i, j), duration in zip(_steps(block.rows), durations, strict=True):
+        step = options.registration.register(prepared[i], prepared[j], se3.exp(velocity * duration))
+        if step.fitness < options.sure_fitness:
+            step = max(step, options.registration.register(prepared[i], prepared[j], np.eye(4)), key=_fitness)
+        if step.fitness < options.min_fitness:
+            step = Registration(se3.exp(velocity * duration), np.zeros((6, 6)), step.fitness, step.rmse_m, 0, 0, False)
+        velocity = se3.log(step.i_from_j) / duration
+        found.append(step)
+    return Registered.of(_steps(block.rows)[block.warm_up :], found[block.warm_up :])
+
+
+def _fitness(step: Registration) -> float:
+    return step.fitness
+
+
+def _steps(rows: Ints) -> Ints:
+    return np.stack([rows[:-1], rows[1:]], axis=1)
+
+
+def _durations(stamps_s: Floats) -> Floats:
+    """Time of each step; 1 each where stamps do not ascend, for then they are no clock."""
+    durations = np.diff(stamps_s)
+    return np.where((durations > 0).all(), durations, 1.0)
+
+
+def _chained(count: int, sequences: Sequence[Ints], steps: Registered) -> Floats:
+    motion_to = {int(j): (int(i), motion) for (i, j), motion in zip(steps.pairs, steps.i_from_j, strict=True)}
+    poses = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+    begin_x = 0.0
+    for rows in sequences:
+        before = None
+        for row in rows:
+            if int(row) in motion_to:
+                i, motion = motion_to[int(row)]
+                poses[row] = poses[i] @ motion
+            elif before is not None:
+                poses[row] = poses[before]
+            else:
+                poses[row, 0, 3] = begin_x
+            before = row
+        begin_x = float(poses[rows, 0, 3].max()) + SPACE_BETWEEN_SEQUENCES_M
+    return poses

@@ -1,0 +1,169 @@
+"""Registers pairs of clouds in blocks, by any registrar, on any workers: the same code for an edge everywhere."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass as plain_dataclass
+from dataclasses import fields
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
+from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, Registration, ViewGraph
+
+PAIRS_IN_BLOCK = 64
+"""About half a second: long against sending a block, short enough to share the work and to lose little of it."""
+CLOUDS_KEPT = 96
+"""Prepared clouds that a worker keeps, about 1 MB each."""
+
+
+@plain_dataclass(frozen=True)
+class Registered:
+    """Registrations in columns, in the order of their pairs (P, 2); see `Registration` for each field."""
+
+    pairs: Ints
+    i_from_j: Floats
+    information: Floats
+    fitness: Floats
+    rmse_m: Floats
+    correspondences: Ints
+    iterations: Ints
+    converged: Bools
+
+    @classmethod
+    def of(cls, pairs: Ints, registrations: list[Registration]) -> Registered:
+        """The columns of these registrations."""
+
+        def column(name: str, shape: tuple[int, ...], kind: type) -> NDArray[Any]:
+            return np.array([getattr(one, name) for one in registrations], kind).reshape(-1, *shape)
+
+        return cls(
+            pairs=np.asarray(pairs, np.int64).reshape(-1, 2),
+            i_from_j=column("i_from_j", (4, 4), float),
+            information=column("information", (6, 6), float),
+            fitness=column("fitness", (), float),
+            rmse_m=column("rmse_m", (), float),
+            correspondences=column("correspondences", (), np.int64),
+            iterations=column("iterations", (), np.int64),
+            converged=column("converged", (), np.bool_),
+        )
+
+    @classmethod
+    def joined(cls, parts: list[Registered]) -> Registered:
+        """These columns one after the other."""
+        parts = [cls.of(np.zeros((0, 2), np.int64), []), *parts]
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    def select(self, rows: Ints | Bools) -> Registered:
+        """These rows only."""
+        return Registered(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def as_graph(self, vertex_ids: NDArray[np.generic], source: NDArray[np.str_]) -> ViewGraph:
+        """The viewing graph of these edges; `source (P,)` says where each comes from."""
+        return ViewGraph(
+            vertex_ids=vertex_ids,
+            edges=self.pairs,
+            i_from_j=self.i_from_j,
+            information=self.information,
+            fitness=self.fitness,
+            rmse_m=self.rmse_m,
+            source=source,
+            correspondences=self.correspondences,
+        )
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Acceptance:
+    """Which registered pairs become edges; the others are counted and listed with the reason."""
+
+    min_fitness: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="share of cloud j with a point of cloud i nearby; below it too little holds the pair",
+    )
+    max_rmse_m: float = Field(
+        default=0.06,
+        gt=0,
+        description="metres: RMS distance of those points; two 3 cm grids of one surface differ by 2 to 4 cm",
+    )
+
+    def reasons(self, registered: Registered) -> NDArray[np.str_]:
+        """Why each pair (P,) is rejected, an empty word where it is accepted."""
+        out = np.full(len(registered.pairs), "", "U32")
+        out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
+        out[~(registered.fitness >= self.min_fitness)] = "too little overlap"
+        out[registered.correspondences == 0] = "nothing in common"
+        return out
+
+
+def register_pairs(
+    folder: Path,
+    registrar: Registrar,
+    pairs: Ints,
+    guesses: Floats,
+    workers: Workers,
+    advance: Advance = no_progress,
+    *,
+    finished: Mapping[int, Registered] | None = None,
+    on_block: Callable[[int, Registered], None] = lambda block, result: None,
+) -> Registered:
+    """Every pair (P, 2) registered from its guess `i_from_j (P, 4, 4)`, in the order given.
+
+    `folder` holds the clouds (`CloudSet.save`). The blocks depend on the pairs alone, so `finished` blocks of an
+    earlier run can be given; `on_block` is called with each new one, to be kept. `advance` counts pairs.
+    """
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    cuts = [order[start : start + PAIRS_IN_BLOCK] for start in range(0, len(order), PAIRS_IN_BLOCK)]
+    results = dict(finished or {})
+    advance(sum(len(cuts[block]) for block in results))
+    missing = [block for block in range(len(cuts)) if block not in results]
+    task = partial(_register_block, folder, registrar)
+    for row, result in workers.map(task, [(pairs[cuts[block]], guesses[cuts[block]]) for block in missing]):
+        block = missing[row]
+        results[block] = result
+        on_block(block, result)
+        advance(len(cuts[block]))
+    in_blocks = Registered.joined([results[block] for block in range(len(cuts))])
+    return in_blocks.select(np.argsort(order))
+
+
+def _register_block(folder: Path, registrar: Registrar, block: tuple[Ints, Floats]) -> Registered:
+    pairs, guesses = block
+    prepared = prepared_clouds(folder, registrar)
+    found = [registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in zip(pairs, guesses, strict=True)]
+    return Registered.of(pairs, found)
+
+
+def prepared_clouds(folder: Path, registrar: Registrar) -> PreparedClouds:
+    """The clouds of a folder as the registrar wants them, kept by this process from block to block."""
+    return _kept_clouds(folder, cast(Hashable, registrar))
+
+
+@lru_cache(maxsize=1)
+def _kept_clouds(folder: Path, registrar: Hashable) -> PreparedClouds:
+    return PreparedClouds(folder, cast(Registrar, registrar))
+
+
+class PreparedClouds:
+    """Clouds prepared when they are asked for; the last `CLOUDS_KEPT` of them are kept."""
+
+    def __init__(self, folder: Path, registrar: Registrar) -> None:
+        self._clouds, self._registrar = CloudSet.open(folder), registrar
+        self._kept: OrderedDict[int, Any] = OrderedDict()
+
+    def __getitem__(self, row: int) -> Any:
+        row = int(row)
+        if row not in self._kept:
+            self._kept[row] = self._registrar.prepare(self._clouds[row])
+            if len(self._kept) > CLOUDS_KEPT:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(row)
+        return self._kept[row]
