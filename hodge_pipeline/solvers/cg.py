@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -12,10 +13,20 @@ from hodge_pipeline.types import Floats
 Operator: TypeAlias = Callable[[Floats], Floats]
 
 
+@dataclass(frozen=True)
+class CgResult:
+    """A descent direction x with H x ≈ −g, its residual H x + g, the steps taken, and why it may be short."""
+
+    x: Floats
+    residual: Floats
+    steps: int
+    negative_curvature: bool = False
+
+
 def truncated_cg(
     apply: Operator, precondition: Operator, gradient: Floats, tolerance: float, max_steps: int
-) -> tuple[Floats, Floats, int]:
-    """A descent direction x with H x ≈ −g, its residual H x + g, and the steps taken (Steihaug 1983).
+) -> CgResult:
+    """The Newton direction to within a tolerance, or up to the first direction of negative curvature (Steihaug 1983).
 
     `tolerance` is on the residual's norm in the preconditioner's metric, relative to that of g.
     """
@@ -25,19 +36,21 @@ def truncated_cg(
     direction = -z
     for step in range(1, max_steps + 1):
         if rz <= 0:
-            return x, r, step - 1
+            return CgResult(x, r, step - 1)
         image = apply(direction)
         curvature = float(direction @ image)
         if curvature <= 0:
-            return (direction, image + gradient, step) if step == 1 else (x, r, step)
+            if step == 1:
+                return CgResult(direction, image + gradient, step, True)
+            return CgResult(x, r, step, True)
         alpha = rz / curvature
         x += alpha * direction
         r += alpha * image
         z = precondition(r)
         new = float(r @ z)
         if new <= tolerance**2 * first:
-            return x, r, step
+            return CgResult(x, r, step)
         direction *= new / rz
         direction -= z
         rz = new
-    return x, r, max_steps
+    return CgResult(x, r, max_steps)

@@ -14,7 +14,7 @@ from scipy.sparse import bsr_matrix
 from scipy.spatial.transform import Rotation
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.cg import Operator, truncated_cg
+from hodge_pipeline.solvers.cg import CgResult, Operator, truncated_cg
 from hodge_pipeline.solvers.linear import factorise
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.problem import Problem
@@ -97,15 +97,16 @@ class FullObjective:
         spent = 0
         if self.direct.solve is None:
             precondition = self.laplacian_preconditioner(point.rotations)
-            direction, left, spent = _solve(hessian, precondition, gradient, tolerance, DIRECT_AFTER_CG_STEPS)
+            found = _solve(hessian, precondition, gradient, tolerance, DIRECT_AFTER_CG_STEPS)
+            spent = found.steps
         if self.direct.solve is not None or spent >= DIRECT_AFTER_CG_STEPS:
             if self.direct.solve is None or self.direct.cg_steps > REFACTOR_AFTER_CG_STEPS:
                 self.direct.solve = factorise(hessian.tocsc(), "NATURAL").solve
-            direction, left, used = _solve(hessian, self.direct.solve, gradient, tolerance, MAX_CG_STEPS)
-            self.direct.cg_steps = used
-            spent += used
-        slope = 2 * float(gradient @ direction)
-        return Step(direction, slope, -0.5 * slope - float(direction @ left), spent)
+            found = _solve(hessian, self.direct.solve, gradient, tolerance, MAX_CG_STEPS)
+            self.direct.cg_steps = found.steps
+            spent += found.steps
+        slope = 2 * float(gradient @ found.x)
+        return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), spent)
 
     def moved(self, point: Point, direction: Floats) -> FullPoint:
         """The point whose free poses are moved by a direction (free · (p + d),)."""
@@ -154,7 +155,5 @@ class FullObjective:
         return apply
 
 
-def _solve(
-    hessian: bsr_matrix, precondition: Operator, gradient: Floats, tolerance: float, max_steps: int
-) -> tuple[Floats, Floats, int]:
+def _solve(hessian: bsr_matrix, precondition: Operator, gradient: Floats, tolerance: float, max_steps: int) -> CgResult:
     return truncated_cg(lambda x: np.asarray(hessian @ x), precondition, gradient, tolerance, max_steps)

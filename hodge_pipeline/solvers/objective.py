@@ -6,21 +6,18 @@ is the scalar Laplacian of κ on each component of ω, which is why that Laplaci
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.solvers.cg import Operator, truncated_cg
 from hodge_pipeline.solvers.newton import Point, Step
-from hodge_pipeline.solvers.preconditioner import is_chain_like, joint_preconditioner
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import axial, cross, exponential, lever
 from hodge_pipeline.types import Floats
 
 MAX_CG_STEPS = 1000
-JOINT_AFTER_CG_STEPS = 30
-"""A Newton step that needs more makes the direct factor worth its price, where that is low."""
 
 
 @dataclass(frozen=True)
@@ -77,32 +74,25 @@ def rotation_gradient(problem: Problem, left: Residuals) -> Floats:
     return np.asarray(problem.at_head @ pull - problem.at_tail @ push)[: problem.free_count]
 
 
-def quadratic_model(problem: Problem, left: Residuals) -> QuadraticModel:
-    """The exact second-order model of F in ω at these residuals."""
-    d = problem.dimension
-    trace = np.einsum("eii->e", left.turn)
-    if d == 2:
-        full = trace[:, None, None] * problem.kappa[:, None, None]
-        symmetric = full
-    else:
-        full = trace[:, None, None] * np.eye(3) - left.turn
-        full *= problem.kappa[:, None, None]
-        symmetric = 0.5 * (full + np.swapaxes(full, 1, 2))
-    seen = left.shift + left.arm
-    along = problem.tau * np.einsum("ek,ek->e", seen, left.arm)
-    if d == 2:
-        turned = along[:, None, None]
-    else:
-        outer = (0.5 * problem.tau)[:, None, None] * (seen[:, :, None] * left.arm[:, None, :])
-        turned = along[:, None, None] * np.eye(3) - outer - np.swapaxes(outer, 1, 2)
-    blocks = np.concatenate([symmetric + turned, symmetric, -full, -np.swapaxes(full, 1, 2)])
-    arms = problem.tau[:, None, None] * lever(left.arm)
+def quadratic_model(problem: Problem, left: Residuals, exact: bool = True) -> QuadraticModel:
+    """The second-order model of F in ω at these residuals; without the residuals' own curvature (Gauss-Newton), and
+    so never indefinite, where it need not be exact.
+    """
+    d, p = problem.dimension, problem.tangent_size
+    kappa, tau, eye = problem.kappa[:, None, None], problem.tau[:, None, None], np.eye(p)
+    trace = np.einsum("eii->e", left.turn)[:, None, None]
+    mixed = kappa * (trace * eye - left.turn if d == 3 else trace)
+    turned = 0.5 * (mixed + np.swapaxes(mixed, 1, 2)) if exact else 2 * kappa * eye
+    seen = left.shift + left.arm if exact else left.arm
+    levered = tau * np.einsum("ek,ek->e", seen, left.arm)[:, None, None] * eye
+    if d == 3:
+        outer = (0.5 * tau) * (seen[:, :, None] * left.arm[:, None, :])
+        levered -= outer + np.swapaxes(outer, 1, 2)
+    blocks = np.concatenate([turned + levered, turned, -mixed, -np.swapaxes(mixed, 1, 2)])
+    arms = tau * lever(left.arm)
     coupling = problem.coupling_pattern.assemble(np.concatenate([arms, -arms]))
     return QuadraticModel(
-        rotation_gradient(problem, left),
-        problem.symmetric_pattern.assemble(blocks),
-        coupling,
-        coupling.transpose(),
+        rotation_gradient(problem, left), problem.symmetric_pattern.assemble(blocks), coupling, coupling.transpose()
     )
 
 
@@ -113,20 +103,11 @@ class IsotropicPoint(Point):
     left: Residuals
 
 
-@dataclass
-class _Joint:
-    """The latest direct factor, once the Laplacian proved too weak on a graph like a chain."""
-
-    precondition: Operator | None = None
-    wanted: bool = False
-
-
 @dataclass(frozen=True)
 class IsotropicObjective:
     """F as a function of the rotations alone, the translations always the best ones."""
 
     problem: Problem
-    joint: _Joint = field(default_factory=_Joint)
 
     def at(self, rotations: Floats, translations: Floats) -> IsotropicPoint:
         """The point at these rotations; the translations are a start for the best ones."""
@@ -135,23 +116,28 @@ class IsotropicObjective:
         return IsotropicPoint(rotations, best, left.cost, left)
 
     def step(self, point: Point, tolerance: float) -> Step:
-        """A truncated Newton step: each CG step costs one solve with the Laplacian of κ and one with that of τ."""
-        assert isinstance(point, IsotropicPoint)
-        model = quadratic_model(self.problem, point.left)
-        gradient = model.gradient.reshape(-1)
-        apply, precondition = reduced_hessian(self.problem, model), self._preconditioner(point)
-        direction, left, steps = truncated_cg(apply, precondition, gradient, tolerance, MAX_CG_STEPS)
-        self.joint.wanted = steps > JOINT_AFTER_CG_STEPS and is_chain_like(self.problem)
-        slope = 2 * float(gradient @ direction)
-        return Step(direction, slope, -0.5 * slope - float(direction @ left), steps)
+        """A truncated Newton step: each CG step costs one solve with the Laplacian of κ and one with that of τ.
 
-    def _preconditioner(self, point: IsotropicPoint) -> Operator:
-        if self.joint.wanted:
-            self.joint.precondition = joint_preconditioner(self.problem, point.left.arm)
-        if self.joint.precondition is not None:
-            return self.joint.precondition
-        solve, shape = self.problem.rotation_factor.solve, (self.problem.free_count, self.problem.tangent_size)
-        return lambda r: solve(r.reshape(shape)).reshape(-1)
+        Where the Hessian has a direction of negative curvature, the Gauss-Newton model takes its place: far from the
+        minimum of a long chain its steps go ten times as far.
+        """
+        assert isinstance(point, IsotropicPoint)
+        spent = 0
+        for exact in (True, False):
+            model = quadratic_model(self.problem, point.left, exact)
+            gradient = model.gradient.reshape(-1)
+            found = truncated_cg(
+                reduced_hessian(self.problem, model), self._precondition, gradient, tolerance, MAX_CG_STEPS
+            )
+            spent += found.steps
+            if not found.negative_curvature:
+                break
+        slope = 2 * float(gradient @ found.x)
+        return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), spent)
+
+    def _precondition(self, r: Floats) -> Floats:
+        shape = (self.problem.free_count, self.problem.tangent_size)
+        return self.problem.rotation_factor.solve(r.reshape(shape)).reshape(-1)
 
     def moved(self, point: Point, direction: Floats) -> IsotropicPoint:
         """The point whose free rotations are turned by a direction (free · p,)."""
