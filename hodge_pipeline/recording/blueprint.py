@@ -24,10 +24,17 @@ class Contents:
     last_solution: int = 0
 
 
-def make_blueprint(contents: Contents, eye: Eye | None) -> rrb.Blueprint:
-    """The default blueprint: four tabs, the story first, its timeline the one that all data share."""
+def make_blueprint(contents: Contents, room: Eye | None, graph: Eye | None) -> rrb.Blueprint:
+    """The default blueprint: four tabs, the story first, its timeline the one that all data share.
+
+    `room` sees the model, `graph` the cameras alone.
+    """
     tabs = rrb.Tabs(
-        _story_tab(contents, eye), _frames_tab(eye), _solver_tab(contents, eye), _text_tab(contents), active_tab=0
+        _story_tab(contents, room),
+        _frames_tab(contents, room),
+        _solver_tab(contents, graph),
+        _text_tab(contents),
+        active_tab=0,
     )
     return rrb.Blueprint(
         tabs,
@@ -81,12 +88,12 @@ def _story_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
     return rrb.Horizontal(scene, side, column_shares=[3, 1], name="Story")
 
 
-def _frames_tab(eye: Eye | None) -> rrb.Horizontal:
+def _frames_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
     images = rrb.Vertical(
         rrb.Spatial2DView(origin=layout.PINHOLE, name="Colour", contents=[f"+ {layout.COLOUR}"]),
         rrb.Spatial2DView(origin=layout.PINHOLE, name="Depth", contents=[f"+ {layout.DEPTH}"]),
     )
-    shown = [f"+ {layout.CAMERA}/**", f"- {layout.DEPTH}", f"+ {layout.TRAJECTORIES}/*"]
+    shown = [f"+ {layout.CAMERA}/**", f"- {layout.DEPTH}", f"+ {layout.trajectory(contents.trajectory)}"]
     return rrb.Horizontal(_scene("Camera and its cloud", shown, eye), images, column_shares=[2, 1], name="Frames")
 
 

@@ -150,7 +150,7 @@ def _pinholes(cameras: Sequence[Camera]) -> rr.ComponentColumnList:
     matrices[:, 1, 1] = np.abs(matrices[:, 1, 1])
     axes = [rr.ViewCoordinates.RUF if flip else rr.ViewCoordinates.RDF for flip in flipped]
     return rr.Pinhole.columns(
-        image_from_camera=matrices.transpose(0, 2, 1).reshape(-1, 9),
+        image_from_camera=matrices,
         resolution=[[camera.width, camera.height] for camera in cameras],
         camera_xyz=axes,
         image_plane_distance=np.full(len(cameras), IMAGE_PLANE_M),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from subprocess import SubprocessError
@@ -39,10 +40,12 @@ def merge(folder: Path, out: Path, application_id: str, recording_id: str) -> Me
     notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="hodge-recording-") as scratch:
         readers = [(part, reader) for part in parts if (reader := _open(part, Path(scratch), notes)) is not None]
-        eye = look_at(_chunks(readers, layout.MODEL), _chunks(readers, layout.poses(contents.trajectory)))
-        with writing(out, application_id, recording_id, make_blueprint(contents, eye)) as stream:
+        poses = layout.poses(contents.trajectory)
+        room = look_at(_chunks(readers, layout.MODEL), _chunks(readers, poses))
+        graph = look_at((), _chunks(readers, poses))
+        with writing(out, application_id, recording_id, make_blueprint(contents, room, graph)) as stream:
             for _, reader in readers:
-                _send(stream, reader, layout.poses(contents.trajectory))
+                _send(stream, reader, poses)
             log_notes(stream, 0, notes, level="WARN")
             log_markdown(stream, layout.LEGEND, legend(contents))
     sizes = {part.name: part.stat().st_size for part in parts}
@@ -60,8 +63,8 @@ def find_parts(folder: Path) -> list[Path]:
 def contents_of(parts: Iterable[Path]) -> Contents:
     """What the parts hold, by their names."""
     stages = [layout.parse_part(path.name) for path in parts]
-    solved = [int(detail) for stage, detail in stages if stage == "solution"]
-    rounds = [int(detail) for stage, detail in stages if stage == "edges"]
+    solved = [int(detail) for stage, detail in stages if stage == "solution" and detail.isdigit()]
+    rounds = [int(detail) for stage, detail in stages if stage == "edges" and detail.isdigit()]
     named = [detail for stage, detail in stages if stage == "poses"]
     best = layout.round_name(max(solved)) if solved else next((n for n in named if n != "truth"), "truth")
     return Contents(
@@ -74,20 +77,26 @@ def contents_of(parts: Iterable[Path]) -> Contents:
 
 
 def _open(part: Path, scratch: Path, notes: list[str]) -> RrdReader | None:
-    try:
-        return _reader(part)
-    except RuntimeError:
-        pass
-    mended = scratch / part.name
-    try:
-        environment = binary.quiet_environment(scratch)
-        binary.run(["rrd", "merge", "--continue-on-error", str(part), "-o", str(mended)], environment)
-        reader = _reader(mended)
-    except (RuntimeError, OSError, SubprocessError):
+    """A reader of the part, of its mended copy where it is damaged, or None where it holds nothing."""
+    with suppress(RuntimeError):
+        reader = _reader(part)
+        return reader if reader.recordings() else None
+    mended = _mended(part, scratch)
+    if mended is None or not mended.recordings():
         notes.append(f"recording: {part.name} is damaged and left out: record that stage again")
         return None
     notes.append(f"recording: {part.name} is cut off: what could be read of it is shown")
-    return reader
+    return mended
+
+
+def _mended(part: Path, scratch: Path) -> RrdReader | None:
+    copy = scratch / part.name
+    try:
+        environment = binary.quiet_environment(scratch)
+        binary.run(["rrd", "merge", "--continue-on-error", str(part), "-o", str(copy)], environment)
+        return _reader(copy)
+    except (RuntimeError, OSError, SubprocessError):
+        return None
 
 
 def _reader(part: Path) -> RrdReader:
@@ -95,7 +104,7 @@ def _reader(part: Path) -> RrdReader:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reader = RrdReader(part)
-        for _ in reader.stream():
+        for _ in reader.stream() if reader.recordings() else ():
             pass
     return reader
 

@@ -102,7 +102,7 @@ class Recorder:
 
     def model(self, model: Model) -> Notes:
         """The fused scene."""
-        return self._part(900, "model", model.name, lambda s: results.log_model(s, model, self.options))
+        return self._part(900, "model", "", lambda s: results.log_model(s, model, self.options))
 
     def evaluation(
         self,

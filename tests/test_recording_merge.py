@@ -1,0 +1,156 @@
+"""Parts merged into one recording: whole, replaced, cut off, damaged, left by a killed writer; and what opens."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rerun.chunk import RrdReader
+
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.recording import binary, layout, shapes
+from hodge_pipeline.recording.eye import look_at
+from hodge_pipeline.recording.merge import contents_of, find_parts, merge
+from hodge_pipeline.recording.picture import picture
+from hodge_pipeline.types import CloudSet
+from test_recording import circle, make_frames, record, record_all, ring_graph, rows
+
+KILLED_WRITER = """
+import os, sys
+from pathlib import Path
+import rerun as rr
+from hodge_pipeline.recording import layout, stream
+path = stream.partial_path(Path(sys.argv[1]))
+killed = stream.open_stream("test", "run-1")
+killed.save(path)
+for row in range(5):
+    killed.set_time(layout.STORY, duration=float(row))
+    killed.log("/killed", rr.Scalars(row))
+killed.flush()
+os._exit(9)
+"""
+
+
+def verify(path: Path, scratch: Path) -> None:
+    binary.run(["rrd", "verify", str(path)], binary.quiet_environment(scratch))
+
+
+def test_one_verified_file_with_a_blueprint(tmp_path: Path) -> None:
+    recorder = record(tmp_path / "parts")
+    record_all(recorder)
+    merged = recorder.finish(tmp_path / "recording.rrd")
+    assert merged is not None and merged.notes == () and len(merged.part_bytes) == 9
+    assert merged.total_bytes == merged.path.stat().st_size
+    verify(merged.path, tmp_path)
+    reader = RrdReader(merged.path)
+    assert [entry.recording_id for entry in reader.recordings()] == ["run-1"]
+    assert len(reader.blueprints()) == 1
+    assert not [path for path in tmp_path.rglob("*") if layout.PARTIAL_SUFFIX in path.name]
+
+
+def test_the_camera_moves_along_the_best_trajectory(tmp_path: Path) -> None:
+    recorder = record(tmp_path / "parts")
+    record_all(recorder)
+    recorder.finish(tmp_path / "recording.rrd")
+    moved = rows(tmp_path / "recording.rrd", layout.CAMERA, "Transform3D:translation")
+    np.testing.assert_array_equal(np.float32(np.squeeze(moved)), np.float32(circle()[:, :3, 3]))
+
+
+def test_which_trajectory_and_graph_are_the_last() -> None:
+    names = ["002-poses-odometry.rrd", "002-poses-truth.rrd", "010-edges-1.rrd", "notes.rrd"]
+    before = contents_of(map(Path, names))
+    assert (before.trajectory, before.last_graph, before.last_solution) == ("odometry", 1, 0)
+    after = contents_of(map(Path, [*names, "011-solution-1.rrd", "020-edges-2.rrd"]))
+    assert (after.trajectory, after.last_graph, after.last_solution) == ("round_1", 2, 1)
+    assert contents_of([]).trajectory == "truth"
+
+
+def test_a_stage_recorded_again_replaces_its_part(tmp_path: Path) -> None:
+    recorder = record(tmp_path / "parts")
+    recorder.poses("truth", circle(5))
+    recorder.poses("truth", circle(7))
+    recorder.finish(tmp_path / "recording.rrd")
+    assert len(rows(tmp_path / "recording.rrd", layout.poses("truth"), layout.FRAME)) == 7
+
+
+def test_a_failed_stage_leaves_the_part_before_it(tmp_path: Path) -> None:
+    recorder = record(tmp_path)
+    recorder.poses("truth", circle(5))
+    with pytest.raises(IndexError):
+        recorder.poses("truth", np.eye(4))
+    assert [path.name for path in tmp_path.iterdir()] == ["002-poses-truth.rrd"]
+    assert len(rows(tmp_path / "002-poses-truth.rrd", layout.poses("truth"), layout.FRAME)) == 5
+
+
+def test_damaged_parts_do_not_take_the_others_with_them(tmp_path: Path) -> None:
+    recorder = record(tmp_path / "parts")
+    record_all(recorder)
+    cut, junk = tmp_path / "parts/011-solution-1.rrd", tmp_path / "parts/900-model.rrd"
+    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size * 2 // 3])
+    junk.write_bytes(b"not a recording")
+    merged = recorder.finish(tmp_path / "recording.rrd")
+    assert merged is not None
+    assert merged.notes == (
+        "recording: 011-solution-1.rrd is cut off: what could be read of it is shown",
+        "recording: 900-model.rrd is damaged and left out: record that stage again",
+    )
+    verify(merged.path, tmp_path)
+    assert len(rows(merged.path, layout.COLOUR, layout.FRAME)) == 12
+    assert rows(merged.path, layout.under(layout.SOLVER_PLOTS, "residual_mean_m"), "Scalars:scalars")
+    assert set(merged.notes) <= {row[0] for row in rows(merged.path, layout.LOG, "TextLog:text") if row}
+
+
+def test_rows_of_a_killed_writer_are_kept_until_its_stage_is_done(tmp_path: Path) -> None:
+    part = tmp_path / "parts/020-edges-2.rrd"
+    part.parent.mkdir()
+    killed = subprocess.run([sys.executable, "-c", KILLED_WRITER, str(part)], check=False)
+    assert killed.returncode == 9 and not part.exists()
+    merged = merge(part.parent, tmp_path / "mended.rrd", "test", "run-1")
+    assert [row[0] for row in rows(merged.path, "/killed", "Scalars:scalars")] == [0, 1, 2, 3, 4]
+    verify(merged.path, tmp_path)
+    record(part.parent).edges(2, ring_graph(circle()), circle())
+    assert [path.name for path in find_parts(part.parent)] == [part.name]
+
+
+def test_the_eye_is_above_and_behind_the_cameras(tmp_path: Path) -> None:
+    """Cameras all look along +z with y down, so up is −y and behind is −z."""
+    poses = np.stack([np.eye(4)] * 4)
+    poses[:, 0, 3] = np.arange(4)
+    record(tmp_path).poses("truth", poses)
+    eye = look_at((), RrdReader(tmp_path / "002-poses-truth.rrd").stream().filter(content=layout.poses("truth")))
+    assert eye is not None
+    np.testing.assert_allclose(eye.up, [0, -1, 0], atol=1e-9)
+    np.testing.assert_allclose(eye.target, [1.5, 0, 0], atol=0.01)
+    assert eye.position[1] < -0.5 and eye.position[2] < -0.5
+    assert look_at((), ()) is None
+
+
+def test_stages_without_anything_to_show(tmp_path: Path) -> None:
+    recorder = record(tmp_path / "parts", level="summary")
+    recorder.frames("nothing", [])
+    recorder.clouds([], CloudSet.from_clouds([]))
+    recorder.poses("truth", np.zeros((0, 4, 4)))
+    recorder.evaluation()
+    recorder.text("", [])
+    merged = recorder.finish(tmp_path / "recording.rrd")
+    assert merged is not None and merged.notes == ()
+    verify(merged.path, tmp_path)
+
+
+@pytest.mark.slow
+def test_it_opens_on_trajectories_and_edges(tmp_path: Path) -> None:
+    recorder = record(tmp_path / "parts")
+    record_all(recorder)
+    recorder.frames("circle", make_frames())
+    recorder.finish(tmp_path / "recording.rrd")
+    try:
+        picture(tmp_path / "recording.rrd", tmp_path / "opened.png")
+    except WorkspaceError as error:
+        pytest.skip(str(error))
+    pixels = np.asarray(Image.open(tmp_path / "opened.png").convert("RGB"), int)
+    for colour in (shapes.TRAJECTORY_COLOURS["odometry"], shapes.RESULT_COLOUR, shapes.IGNORED_COLOUR):
+        assert np.count_nonzero(np.abs(pixels - colour).max(axis=-1) < 40) > 20, colour
