@@ -90,7 +90,7 @@ def spatial_poses(records: Records) -> Floats:
 
 
 @dataclass(frozen=True)
-class _Half:
+class Half:
     """The vertices and edges of one dimension."""
 
     vertex_keys: Ints
@@ -100,17 +100,17 @@ class _Half:
     information: Floats
 
 
-def _spatial(records: dict[str, Records]) -> _Half:
+def _spatial(records: dict[str, Records]) -> Half:
     vertices, edges = records["VERTEX_SE3:QUAT"], records["EDGE_SE3:QUAT"]
     information = information_of_file(upper_triangle(edges.values[:, 7:], 6))
-    return _Half(vertices.keys[:, 0], spatial_poses(vertices), edges.keys, spatial_poses(edges), information)
+    return Half(vertices.keys[:, 0], spatial_poses(vertices), edges.keys, spatial_poses(edges), information)
 
 
-def _planar(records: dict[str, Records]) -> _Half:
+def _planar(records: dict[str, Records]) -> Half:
     vertices, edges = records["VERTEX_SE2"], records["EDGE_SE2"]
     information = lift_information(upper_triangle(edges.values[:, 3:], 3))
     poses, motions = lift_poses(vertices.values), lift_poses(edges.values[:, :3])
-    return _Half(vertices.keys[:, 0], poses, edges.keys, motions, information)
+    return Half(vertices.keys[:, 0], poses, edges.keys, motions, information)
 
 
 def rows_of_keys(path: Path, vertex_keys: Ints, edge_keys: Ints) -> tuple[Ints, Ints]:
@@ -126,7 +126,7 @@ def rows_of_keys(path: Path, vertex_keys: Ints, edge_keys: Ints) -> tuple[Ints, 
     return unique[order], rank[inverse.reshape(-1)[len(vertex_keys) :]].reshape(-1, 2)
 
 
-def assemble(path: Path, half: _Half, source: str, fixed_keys: Ints, dimension: int, notes: list[str]) -> PoseGraphFile:
+def assemble(path: Path, half: Half, source: str, fixed_keys: Ints, dimension: int, notes: list[str]) -> PoseGraphFile:
     """The graph of what the file holds; notes what was incomplete."""
     ids, edges = rows_of_keys(path, half.vertex_keys, half.edge_keys)
     poses: Floats | None = half.poses
@@ -140,7 +140,7 @@ def assemble(path: Path, half: _Half, source: str, fixed_keys: Ints, dimension: 
     return PoseGraphFile(graph, poses, fixed, dimension, tuple(notes))
 
 
-def skipped(records: dict[str, Records], other: dict[str, int]) -> list[str]:
+def skipped(other: dict[str, int]) -> list[str]:
     """A note for each kind of line that is not read, with its count."""
     shown = sorted(other.items(), key=lambda item: -item[1])
     notes = [f"{count} lines of kind {tag} are not read" for tag, count in shown[:SKIPPED_TAGS_SHOWN]]
@@ -165,7 +165,7 @@ def load_g2o(path: Path | str) -> PoseGraphFile:
         raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
     dimension = 2 if planar or len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"]) else 3
     half = _planar(records) if dimension == 2 else _spatial(records)
-    return assemble(path, half, "g2o", records["FIX"].keys.reshape(-1), dimension, skipped(records, other))
+    return assemble(path, half, "g2o", records["FIX"].keys.reshape(-1), dimension, skipped(other))
 
 
 def as_source(file: PoseGraphFile, path: Path) -> Source:

@@ -79,12 +79,14 @@ def _parse(
         return Records(path, lines, ints, np.zeros((len(fixed), 0)))
     split = [rest.split(None, keys) for rest in rests]
     for number, parts in zip(numbers, split, strict=True):
-        if len(parts) != keys + 1:
+        if len(parts) != keys + (columns[0] > 0):
             raise SourceError(f"{path}:{number}: {tag} needs {keys} ids and {columns[0]} numbers")
     ints = _integers(path, tag, numbers, [parts[:keys] for parts in split], keys)
+    if columns == (0,):
+        return Records(path, np.array(numbers, np.int64), ints, np.zeros((len(numbers), 0)))
     values = _numbers(path, tag, numbers, [parts[keys] for parts in split], columns)
     records = Records(path, np.array(numbers, np.int64), ints, values)
-    records.refuse(np.isnan(values[:, : columns[0]]).any(axis=1), f"{tag} holds a nan: remove or mend that line")
+    records.refuse(np.asarray(np.isnan(values[:, : columns[0]]).any(axis=1)), f"{tag} holds a nan: remove or mend that line")
     return records
 
 

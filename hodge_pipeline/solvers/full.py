@@ -111,7 +111,7 @@ class FullObjective:
     def moved(self, point: Point, direction: Floats) -> FullPoint:
         """The point whose free poses are moved by a direction (free · (p + d),)."""
         free, p = self.problem.free_count, self.problem.tangent_size
-        step = direction.reshape(free, -1)
+        step = direction.reshape(free, p + self.problem.dimension)
         turned, shifted = point.rotations.copy(), point.translations.copy()
         turned[:free] = exponential(step[:, :p]) @ point.rotations[:free]
         shifted[:free] += step[:, p:]

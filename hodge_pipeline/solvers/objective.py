@@ -51,8 +51,8 @@ def residuals(problem: Problem, rotations: Floats, translations: Floats) -> Resi
     predicted = at_tail @ problem.rotations
     arm = np.einsum("eij,ej->ei", at_tail, problem.translations)
     shift = translations[problem.head] - translations[problem.tail] - arm
-    difference = (at_head - predicted).reshape(len(arm), -1)
-    cost = problem.kappa * np.einsum("ek,ek->e", difference, difference)
+    difference = at_head - predicted
+    cost = problem.kappa * np.einsum("eij,eij->e", difference, difference)
     cost += problem.tau * np.einsum("ek,ek->e", shift, shift)
     return Residuals(at_head @ np.swapaxes(predicted, 1, 2), shift, arm, cost)
 
@@ -143,7 +143,7 @@ class IsotropicObjective:
         """The point whose free rotations are turned by a direction (free · p,)."""
         free = self.problem.free_count
         turned = point.rotations.copy()
-        turned[:free] = exponential(direction.reshape(free, -1)) @ point.rotations[:free]
+        turned[:free] = exponential(direction.reshape(free, self.problem.tangent_size)) @ point.rotations[:free]
         return self.at(turned, point.translations)
 
 

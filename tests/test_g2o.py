@@ -1,0 +1,158 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hodge_adapters.g2o import (
+    G2oReader,
+    information_for_file,
+    information_of_file,
+    load_g2o,
+    write_g2o,
+)
+from hodge_adapters.toro import ToroReader, load_toro
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import ViewGraph
+
+IDENTITY_21 = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4 0 0 4 0 4"
+EDGE = f"EDGE_SE3:QUAT 7 3 1 2 3 0 0 0 1 {IDENTITY_21}"
+
+
+def write(path: Path, *lines: str) -> Path:
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def random_graph(seed: int, planar: bool = False) -> tuple[ViewGraph, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    ids = rng.permutation(np.arange(5) * 10**17)
+    edges = rng.integers(0, 5, (8, 2))
+    twists = rng.normal(size=(13, 6))
+    root = rng.normal(size=(8, 6, 6))
+    information = root @ np.swapaxes(root, 1, 2)
+    if planar:
+        outside = [0, 1, 5]
+        twists[:, outside] = 0
+        information[:, outside] = 0
+        information[:, :, outside] = 0
+    poses = se3.exp(twists)
+    return ViewGraph.from_edges(ids, edges, poses[:8], information, "g2o"), poses[8:]
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), planar=st.booleans())
+def test_a_round_trip_keeps_ids_order_and_values(tmp_path_factory, seed, planar):
+    graph, poses = random_graph(seed, planar)
+    path = tmp_path_factory.mktemp("g2o") / "graph.g2o"
+    write_g2o(path, graph, poses, dimension=2 if planar else 3, fixed=np.array([1, 3]))
+    back = load_g2o(path)
+    assert back.dimension == (2 if planar else 3)
+    assert back.fixed.tolist() == [1, 3]
+    np.testing.assert_array_equal(back.graph.vertex_ids, graph.vertex_ids)
+    np.testing.assert_array_equal(back.graph.edges, graph.edges)
+    np.testing.assert_allclose(back.graph.i_from_j, graph.i_from_j, atol=1e-14)
+    np.testing.assert_allclose(
+        back.graph.information, 0.5 * (graph.information + np.swapaxes(graph.information, 1, 2)), atol=1e-12
+    )
+    np.testing.assert_allclose(back.world_from_vertex, poses, atol=1e-14)
+
+
+def test_the_information_is_over_half_an_angle(tmp_path):
+    graph = load_g2o(write(tmp_path / "a.g2o", EDGE)).graph
+    np.testing.assert_array_equal(graph.information[0], np.eye(6))
+    information = np.random.default_rng(0).normal(size=(3, 6, 6))
+    np.testing.assert_array_equal(information_of_file(information_for_file(information)), information)
+
+
+def test_edges_alone_name_their_vertices_in_order_of_appearance(tmp_path):
+    file = load_g2o(write(tmp_path / "a.g2o", "# a comment", "", EDGE.replace(" ", "\t") + "\r"))
+    assert file.graph.vertex_ids.tolist() == [7, 3]
+    assert file.graph.edges.tolist() == [[0, 1]]
+    assert file.world_from_vertex is None
+    np.testing.assert_array_equal(file.graph.i_from_j[0, :3, 3], [1, 2, 3])
+
+
+def test_gtsam_keys_of_64_bits_survive(tmp_path):
+    key = 8646911284551352321
+    file = load_g2o(write(tmp_path / "a.g2o", EDGE.replace("7 3", f"{key} {key + 1}")))
+    assert file.graph.vertex_ids.tolist() == [key, key + 1]
+
+
+def test_what_is_not_read_is_counted(tmp_path):
+    path = write(tmp_path / "a.g2o", "VERTEX_XY 5 1 1", EDGE, "VERTEX_XY 6 1 1", "VERTEX_SE3:QUAT 7 0 0 0 0 0 0 1")
+    notes = G2oReader().open(path).notes
+    assert "2 lines of kind VERTEX_XY are not read" in notes
+    assert "1 of 2 vertices are named by edges only: no initial poses" in notes
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("EDGE_SE3:QUAT 1 2 0 0 0", ":2: EDGE_SE3:QUAT needs 28 numbers after its ids, has 3"),
+        (EDGE.replace("1 2 3", "1 two 3"), ":2: 'two' is no number"),
+        (EDGE.replace("7 3", "7 x3"), ":2: 'x3' is no 64-bit integer id"),
+        (EDGE.replace("0 0 0 1 1", "0 0 0 0 1"), ":2: its quaternion is zero"),
+        (EDGE.replace("1 2 3", "1 nan 3"), ":2: EDGE_SE3:QUAT holds a nan"),
+        (EDGE + " 5", ":2: EDGE_SE3:QUAT needs 28 numbers after its ids, has 29"),
+        ("EDGE_SE3:QUAT 1", ":2: EDGE_SE3:QUAT needs 2 ids and 28 numbers"),
+        ("EDGE_SE2 1 2 0 0 0 1 0 0 1 0 1", "holds both EDGE_SE3:QUAT and EDGE_SE2"),
+        ("VERTEX_SE3:QUAT 4 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 4 0 0 0 0 0 0 1", "vertex 4 is given twice"),
+    ],
+)
+def test_a_malformed_line_is_named(tmp_path, line, message):
+    path = write(tmp_path / "bad.g2o", EDGE, line)
+    with pytest.raises(SourceError) as error:
+        load_g2o(path)
+    assert str(path) in str(error.value)
+    assert message in str(error.value)
+
+
+def test_other_files_are_refused(tmp_path):
+    empty, binary = write(tmp_path / "empty.g2o"), tmp_path / "image.g2o"
+    binary.write_bytes(b"\x89PNG\xff\x00")
+    for path in (empty, binary, tmp_path / "absent.g2o"):
+        assert G2oReader().sniff(path).confidence < 0.5
+        with pytest.raises(SourceError):
+            load_g2o(path)
+
+
+def test_string_ids_cannot_be_written(tmp_path):
+    graph = ViewGraph.from_edges(np.array(["a", "b"]), np.array([[0, 1]]), np.eye(4)[None])
+    with pytest.raises(SourceError, match="integer ids"):
+        write_g2o(tmp_path / "a.g2o", graph)
+
+
+def test_toro_orders_its_information_in_its_own_way(tmp_path):
+    path = write(tmp_path / "a.graph", "VERTEX2 0 0 0 0", "VERTEX2 1 1 0 0", "EDGE2 0 1 1 0 0.5 1 2 3 4 5 6")
+    file = load_toro(path)
+    planar = file.graph.information[0][np.ix_([3, 4, 2], [3, 4, 2])]
+    np.testing.assert_array_equal(planar, [[1, 2, 5], [2, 3, 6], [5, 6, 4]])
+    assert file.dimension == 2
+    assert ToroReader().sniff(path).confidence > 0.5
+
+
+def test_toro_angles_are_roll_pitch_yaw(tmp_path):
+    path = write(tmp_path / "a.graph", "EDGE3 0 1 1 2 3 0.1 0.2 0.3", "EQUIV 2 1", "EDGE3 1 2 0 0 0 0 0 0")
+    file = load_toro(path)
+    rz, ry, rx = (se3.so3_exp(np.array(v)) for v in ([0, 0, 0.3], [0, 0.2, 0], [0.1, 0, 0]))
+    np.testing.assert_allclose(file.graph.i_from_j[0, :3, :3], rz @ ry @ rx, atol=1e-15)
+    assert file.graph.edges.tolist() == [[0, 1], [1, 1]]
+    assert any("EQUIV" in note for note in file.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "vertices", "edges", "dimension"),
+    [("sesync/sphere2500.g2o", 2500, 4949, 3), ("sesync/kitti_05.g2o", 2761, 2826, 2)],
+)
+def test_real_files(data_dir, name, vertices, edges, dimension):
+    path = data_dir / "pose_graphs" / name
+    source = G2oReader().open(path)
+    assert G2oReader().sniff(path).confidence > 0.9
+    assert ToroReader().sniff(path).confidence == 0
+    assert source.graph is not None
+    assert (source.graph.vertex_count, source.graph.edge_count) == (vertices, edges)
+    assert load_g2o(path).dimension == dimension
+    assert se3.is_motion(source.graph.i_from_j, 1e-9).all()
