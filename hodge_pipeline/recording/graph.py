@@ -16,6 +16,8 @@ from hodge_pipeline.types import Candidates, Floats, Frame, Ints, Solution, View
 LINE_BYTES = 40
 """One edge of the film: two points, a colour, two list offsets."""
 LABEL_BYTES = 60
+STEP_LINES = 200
+"""Iterations are left out of the film only where fewer lines than this would be left in each."""
 
 TRAJECTORY_RADIUS, FRUSTUM_RADIUS, EDGE_RADIUS, CENTRE_RADIUS = -1.6, -0.5, -0.6, -2.0
 """Rerun takes a negative radius as points on the screen, so that lines stay legible at every distance."""
@@ -165,11 +167,11 @@ def _log_film(
     options: RecordingOptions,
     max_bytes: float,
 ) -> list[str]:
-    """Edges and camera centres after each inner iteration, evenly thinned: first the iterations, then the lines."""
+    """Edges and camera centres after each inner iteration, evenly thinned: rather lines than iterations."""
     drawn = np.flatnonzero(np.all([shapes.is_drawable(poses) for poses in states], axis=0))
     has_ends = np.isin(graph.edges, drawn).all(axis=1)
     available = int(np.count_nonzero(has_ends))
-    steps = options.count(options.film_steps, len(states), max(available, 1) * LINE_BYTES, max_bytes)
+    steps = options.count(options.film_steps, len(states), STEP_LINES * LINE_BYTES, max_bytes)
     rows = shapes.evenly(len(states), max(steps, 2))
     kept = options.count(options.edge_lines, available, LINE_BYTES * len(rows), max_bytes)
     lines = np.flatnonzero(has_ends)[shapes.evenly(available, kept)]
