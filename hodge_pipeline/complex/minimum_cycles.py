@@ -42,7 +42,8 @@ class _Horton:
         order = np.lexsort((weights, low * vertex_count + high))
         order = order[(low < high)[order]]
         keys, first = np.unique((low * vertex_count + high)[order], return_index=True)
-        self.edges, self.edge_of_key = edges, dict(zip(keys.tolist(), order[first].tolist(), strict=True))
+        self.edges = edges
+        self.edge_of_key: dict[int, int] = dict(zip(keys.tolist(), order[first].tolist(), strict=True))
         kept = order[first]
         adjacency = csr_matrix((weights[kept], (low[kept], high[kept])), shape=(vertex_count, vertex_count))
         distance, self.parent = dijkstra(adjacency, directed=False, return_predecessors=True)
@@ -60,11 +61,15 @@ class _Horton:
         used = [e for e, _ in steps]
         return steps if len(set(used)) == len(used) else None
 
+    def edge_between(self, a: int, b: int) -> int:
+        """The lightest edge that joins two vertices."""
+        return self.edge_of_key[min(a, b) * self.count + max(a, b)]
+
     def _to_root(self, root: int, vertex: int) -> list[tuple[int, int]]:
         steps = []
         while vertex != root:
             above = int(self.parent[root, vertex])
-            edge = self.edge_of_key[min(above, vertex) * self.count + max(above, vertex)]
+            edge = self.edge_between(above, vertex)
             steps.append((edge, 1 if self.edges[edge, 0] == vertex else -1))
             vertex = above
         return steps
@@ -72,26 +77,53 @@ class _Horton:
 
 def _independent(horton: _Horton, edges: Ints, vertex_count: int) -> Loops:
     chords = spanning_forest(edges, vertex_count).chords
-    bit = {edge: 1 << place for place, edge in enumerate(chords.tolist())}
+    masks = _Masks(horton, {edge: 1 << place for place, edge in enumerate(chords.tolist())})
     reduced: dict[int, int] = {}
     chosen: list[list[tuple[int, int]]] = []
     for candidate in horton.order.tolist():
         if len(chosen) == len(chords):
             break
-        steps = horton.loop(candidate)
-        if steps is not None and _adds_to(reduced, sum(bit.get(edge, 0) for edge, _ in steps)):
+        left = _reduced(reduced, masks.of_candidate(candidate))
+        steps = horton.loop(candidate) if left else None
+        if steps is not None:
+            reduced[left.bit_length()] = left
             chosen.append(steps)
     offsets = np.concatenate([[0], np.cumsum([len(steps) for steps in chosen])]).astype(np.int64)
     flat = np.array([step for steps in chosen for step in steps], np.int64).reshape(-1, 2)
     return Loops(offsets, flat[:, 0], flat[:, 1])
 
 
-def _adds_to(reduced: dict[int, int], mask: int) -> bool:
-    """Whether a cycle is independent of those kept, over GF(2); keeps it if so."""
+class _Masks:
+    """The chords that a loop passes, as the bits of one number; the paths' shared part cancels."""
+
+    def __init__(self, horton: _Horton, bit_of_chord: dict[int, int]) -> None:
+        self.horton, self.bit = horton, bit_of_chord
+        self.ends: list[list[int]] = horton.edges.tolist()
+        self.known: dict[int, int] = {}
+
+    def of_candidate(self, candidate: int) -> int:
+        root, edge = divmod(candidate, len(self.ends))
+        x, y = self.ends[edge]
+        return self._path(root, x) ^ self._path(root, y) ^ self.bit.get(edge, 0)
+
+    def _path(self, root: int, vertex: int) -> int:
+        base, climbed = root * self.horton.count, []
+        while vertex != root and base + vertex not in self.known:
+            climbed.append(vertex)
+            vertex = int(self.horton.parent[root, vertex])
+        mask = self.known.get(base + vertex, 0)
+        for below in reversed(climbed):
+            mask ^= self.bit.get(self.horton.edge_between(vertex, below), 0)
+            self.known[base + below] = mask
+            vertex = below
+        return mask
+
+
+def _reduced(reduced: dict[int, int], mask: int) -> int:
+    """What is left of a cycle modulo those kept, over GF(2): 0 where it depends on them."""
     while mask:
-        pivot = mask.bit_length()
-        if pivot not in reduced:
-            reduced[pivot] = mask
-            return True
-        mask ^= reduced[pivot]
-    return False
+        other = reduced.get(mask.bit_length())
+        if other is None:
+            return mask
+        mask ^= other
+    return 0

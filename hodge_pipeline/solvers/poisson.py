@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass as plain_dataclass
-from typing import Literal
+from functools import partial
+from typing import Literal, TypeAlias
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -16,14 +17,15 @@ from hodge_pipeline.complex.checks import check_graph, orthonormal
 from hodge_pipeline.complex.coboundary import coboundary_0, grounded_laplacian
 from hodge_pipeline.complex.components import connected_components, describe_components, first_of_component
 from hodge_pipeline.complex.cycles import (
-    SpanningForest,
     adjusted_edges,
     fundamental_products,
     loop_deviation,
+    loop_products,
     spanning_forest,
 )
 from hodge_pipeline.complex.edge_weights import EdgeWeighting, edge_weights
 from hodge_pipeline.complex.form import Logarithm, centroids, residual_form, shifted
+from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
 from hodge_pipeline.solvers.linear import Factor, factorise
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, SolverIteration, ViewGraph
 
@@ -31,8 +33,12 @@ STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
 WEIGHTS_SETTLED = 1e-3
 SMALLEST_WEIGHT = 1e-6  # a rejected edge still ties its ends together, so that no component falls apart
 SMALLEST_SCALE_M = 1e-6
+AFFORDABLE_BASIS = 1_000_000  # vertices times edges: a few tenths of a second
 MAD_TO_SIGMA = 1.4826
 TUNING = {"huber": 1.345, "geman_mcclure": 3.0}  # in sigmas: 95 % efficiency; half weight at about 2 sigma
+
+AroundLoops: TypeAlias = Callable[[Floats], Floats]
+"""The motions (L, 4, 4) around the loops of one cycle basis, from the motions (E, 4, 4) of the edges."""
 
 
 @plain_dataclass(frozen=True)
@@ -107,6 +113,12 @@ class PoissonSolver:
         description="logarithm of the residual motion: se3 does not depend on the edges' directions; pairing is the "
         "paper's own (rotation vector, translation), which does",
     )
+    cycle_basis: Literal["auto", "tree", "shortest"] = Field(
+        "auto",
+        description="the loops over which D is summed: those of a breadth-first tree, or a basis of least total "
+        "length, mostly triangles; auto takes the shortest while vertices × edges is at most a million. D grows with "
+        "the loops' length, so compare it only on the same basis; the poses do not depend on it",
+    )
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """Consistent poses; a graph of several components is solved piece by piece, isolated vertices keep their pose.
@@ -120,11 +132,11 @@ class PoissonSolver:
         used = proper & (base_weights > 0)
         problem = _problem(graph, used, base_weights, world_from_cam)
         robust_weights, scale = self._robust_weights(problem)
-        forest = spanning_forest(problem.edges, graph.vertex_count)
-        history = self._iterate(problem, robust_weights, forest)
+        around_loops = self._around_loops(problem)
+        history = self._iterate(problem, robust_weights, around_loops)
         weights = np.zeros(graph.edge_count)
         weights[used] = robust_weights
-        measured = loop_deviation(fundamental_products(forest, problem.i_from_j))
+        measured = loop_deviation(around_loops(problem.i_from_j))
         metrics = {
             "loops": float(len(measured)),
             "measured_loop_deviation_sum": float(measured.sum()),
@@ -147,7 +159,16 @@ class PoissonSolver:
             ),
         )
 
-    def _iterate(self, problem: _Problem, weights: Floats, forest: SpanningForest) -> tuple[SolverIteration, ...]:
+    def _around_loops(self, problem: _Problem) -> AroundLoops:
+        edges, vertex_count = problem.edges, len(problem.component)
+        short = self.cycle_basis == "shortest" or (
+            self.cycle_basis == "auto" and vertex_count * len(edges) <= AFFORDABLE_BASIS
+        )
+        if short:
+            return partial(loop_products, minimum_cycle_basis(edges, vertex_count))
+        return partial(fundamental_products, spanning_forest(edges, vertex_count))
+
+    def _iterate(self, problem: _Problem, weights: Floats, around_loops: AroundLoops) -> tuple[SolverIteration, ...]:
         if len(problem.edges) == 0:
             return ()
         total = problem.base_weights * weights
@@ -157,7 +178,7 @@ class PoissonSolver:
         for _ in range(self.inner_iterations):
             correction = _poisson(problem, factor, total, omega)
             adjusted = adjusted_edges(problem.edges, poses, correction, pairing=self.log == "pairing")
-            deviation = loop_deviation(fundamental_products(forest, adjusted))
+            deviation = loop_deviation(around_loops(adjusted))
             poses = self._moved(problem, poses, correction)
             omega = self._form(problem, poses)
             step = float(np.sqrt((correction**2).sum(axis=1).mean()))
