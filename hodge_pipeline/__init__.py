@@ -1,1 +1,29 @@
-"""Globally consistent registration of many scans by Hodge decomposition on the viewing graph."""
+"""Globally consistent registration of many scans by Hodge decomposition on the viewing graph.
+
+Three lines do a whole run:
+
+    import hodge_pipeline
+    run = hodge_pipeline.run("seven_scenes", "runs/kitchen", source="redkitchen")
+    print(run.report, run.result.world_from_cam.shape)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hodge_pipeline.pipeline import Run, run
+    from hodge_pipeline.recipe import Recipe, load_recipe
+
+__all__ = ["Recipe", "Run", "load_recipe", "run"]
+
+_HOMES = {"Recipe": "recipe", "load_recipe": "recipe", "Run": "pipeline", "run": "pipeline"}
+
+
+def __getattr__(name: str) -> Any:
+    """The public names, imported when they are first used: `import hodge_pipeline` alone costs nothing."""
+    if name not in _HOMES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    import importlib
+
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -15,7 +15,7 @@ from typing import Any
 from hodge_pipeline import artifacts, binding
 from hodge_pipeline.monitor import Monitor
 from hodge_pipeline.recipe import Recipe
-from hodge_pipeline.stages import Advance, Workers, no_progress
+from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Source
 from hodge_pipeline.watch import Watcher
 from hodge_pipeline.workspace import KEY_FILE, StageFolder, Workspace, key_of
@@ -43,7 +43,6 @@ class Job:
     recipe: Recipe
     workspace: Workspace
     watcher: Watcher
-    workers: Workers
     monitor: Monitor = field(default_factory=Monitor)
     keys: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)

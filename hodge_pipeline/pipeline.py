@@ -46,22 +46,22 @@ def run(
     with (
         Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace,
         logging_to(folder / "log.txt"),
-        recipe.executor.open() as workers,
     ):
-        return _run(Job(recipe, workspace, watcher or Nobody(), workers))
+        return _run(Job(recipe, workspace, watcher or Nobody()))
 
 
 def _run(job: Job) -> Run:
     source = steps.read(job)
-    clouds = steps.prepare_clouds(job, source)
-    rounds = [steps.odometry(job, source)]
-    for number in range(1, job.recipe.outer_iterations + 1):
-        poses = rounds[-1].world_from_cam
-        candidates = steps.propose_edges(job, number, source, clouds, poses)
-        registered = steps.register_edges(job, number, candidates, poses)
-        rounds.append(steps.solve(job, number, source, candidates, registered, poses))
+    with job.recipe.executor.open() as workers:
+        clouds = steps.prepare_clouds(job, source, workers)
+        rounds = [steps.odometry(job, source, workers)]
+        for number in range(1, job.recipe.outer_iterations + 1):
+            poses = rounds[-1].world_from_cam
+            candidates = steps.propose_edges(job, number, source, clouds, poses)
+            registered = steps.register_edges(job, number, candidates, poses, workers)
+            rounds.append(steps.solve(job, number, source, candidates, registered, poses))
+        scores = steps.evaluate(job, source, rounds, workers)
     models = steps.fuse(job, source, rounds[-1].world_from_cam)
-    scores = steps.evaluate(job, source, rounds)
     record(job, source, rounds, models, scores)
     report = outputs.write(job, source, rounds, models, scores)
     return Run(job.workspace.folder, source, rounds[-1], report)

@@ -21,6 +21,7 @@ from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Source
 
 
@@ -41,12 +42,12 @@ def read(job: Job) -> Source:
     return source
 
 
-def prepare_clouds(job: Job, source: Source) -> CloudSet:
+def prepare_clouds(job: Job, source: Source, workers: Workers) -> CloudSet:
     """The down-sampled cloud of each frame."""
     options, total = job.recipe.clouds, len(source.frames)
     with job.stage("clouds", "clouds", total, options, ("source",)) as (folder, advance):
         if not folder.finished:
-            clouds, notes = cloud_stage.prepare_clouds(source.frames, options, job.workers, advance)
+            clouds, notes = cloud_stage.prepare_clouds(source.frames, options, workers, advance)
             clouds.save(folder.path)
             for note in notes:
                 job.note(note)
@@ -65,14 +66,14 @@ def propose_edges(job: Job, number: int, source: Source, clouds: CloudSet, world
     return artifacts.load(job.path(name) / "candidates.npz", Candidates)
 
 
-def odometry(job: Job, source: Source) -> Round:
+def odometry(job: Job, source: Source, workers: Workers) -> Round:
     """The first poses, from consecutive frames alone."""
     options = job.recipe.odometry
     stamps = np.array([frame.stamp_s for frame in source.frames])
     sequences = list(sequences_of(source).values())
     with job.stage("odometry", "odometry", len(stamps), options, ("clouds",)) as (folder, advance):
         if not folder.finished:
-            found = odometry_stage.odometry(job.path("clouds"), sequences, stamps, options, job.workers, advance)
+            found = odometry_stage.odometry(job.path("clouds"), sequences, stamps, options, workers, advance)
             artifacts.save(folder.path / "steps.npz", found.steps)
             artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": found.world_from_cam})
             for note in found.notes:
@@ -82,7 +83,9 @@ def odometry(job: Job, source: Source) -> Round:
     return Round(steps.as_graph(vertex_ids(source), np.full(len(steps.pairs), "sequential")), poses)
 
 
-def register_edges(job: Job, number: int, candidates: Candidates, world_from_cam: Floats) -> Registered:
+def register_edges(
+    job: Job, number: int, candidates: Candidates, world_from_cam: Floats, workers: Workers
+) -> Registered:
     """The candidates of round `number` registered from the poses so far; a killed run goes on at its last block."""
     name, total = f"register-{number}", len(candidates.pairs)
     i, j = candidates.pairs.T
@@ -93,7 +96,7 @@ def register_edges(job: Job, number: int, candidates: Candidates, world_from_cam
         if not folder.finished:
             blocks = BlockStore(folder.path / "blocks")
             found = pair_stage.register_pairs(
-                job.path("clouds"), job.recipe.registration, candidates.pairs, guesses, job.workers, advance,
+                job.path("clouds"), job.recipe.registration, candidates.pairs, guesses, workers, advance,
                 finished=blocks.read(), on_block=blocks.write,
             )  # fmt: skip
             artifacts.save(folder.path / "registered.npz", found)
@@ -162,7 +165,7 @@ def fuse(job: Job, source: Source, world_from_cam: Floats) -> dict[str, Path]:
     return files
 
 
-def evaluate(job: Job, source: Source, rounds: Sequence[Round]) -> ScoreTable | None:
+def evaluate(job: Job, source: Source, rounds: Sequence[Round], workers: Workers) -> ScoreTable | None:
     """The score tables of the true poses (where there are any) and of every round."""
     if not job.recipe.evaluation.tables:
         return None
@@ -172,7 +175,7 @@ def evaluate(job: Job, source: Source, rounds: Sequence[Round]) -> ScoreTable | 
     inputs = ("clouds", "odometry", *(f"solve-{number}" for number in range(1, len(rounds))))
     with job.stage("evaluate", "evaluation", 1, job.recipe.evaluation, inputs) as (folder, advance):
         if not folder.finished:
-            table = score_table(job.path("clouds"), sets, reference, job.workers)
+            table = score_table(job.path("clouds"), sets, reference, workers)
             artifacts.save_arrays(
                 folder.path / "scores.npz",
                 {f"{g.kind}_{part}": getattr(g, part) for g in table.graphs for part in ("pairs", "distances_m")},

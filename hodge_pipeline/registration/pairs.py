@@ -20,8 +20,8 @@ from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, Registration, Vi
 
 PAIRS_IN_BLOCK = 64
 """About half a second: long against sending a block, short enough to share the work and to lose little of it."""
-CLOUDS_KEPT = 96
-"""Prepared clouds that a worker keeps, about 1 MB each."""
+CLOUDS_KEPT = 32
+"""Prepared clouds that a worker keeps, 2 to 4 MB each."""
 
 
 @plain_dataclass(frozen=True)

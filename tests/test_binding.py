@@ -1,0 +1,112 @@
+"""Plain data to typed options: errors at their line, stages by name, the schema."""
+
+from pathlib import Path
+
+import pytest
+
+from hodge_pipeline import binding, registry
+from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.recipe import Recipe, load_recipe
+from hodge_pipeline.recipe_file import recipe_names
+from hodge_pipeline.yaml_file import dump, parse
+
+SMALL = """
+edges: {stage: overlap, min_iou: 0.4}
+registration: gicp
+solver: poisson
+executor: local
+"""
+
+
+def load(tmp_path: Path, text: str) -> Recipe:
+    path = tmp_path / "r.yaml"
+    path.write_text(text)
+    return load_recipe(str(path))
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_every_recipe_of_the_package_loads_and_round_trips(name: str) -> None:
+    recipe = load_recipe(name)
+    text = dump(binding.unbind(recipe))
+    again = binding.bind(Recipe, parse(text, "again").data, lambda keys: "again")
+    assert again == recipe
+    assert recipe.description
+
+
+def test_a_stage_by_name_has_its_defaults(tmp_path: Path) -> None:
+    recipe = load(tmp_path, SMALL)
+    assert recipe.registration == registry.load("registration", "gicp")()
+    assert recipe.edges == registry.load("edges", "overlap")(min_iou=0.4)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("edgse: overlap\n", "r.yaml:6: edgse: unknown option (did you mean 'edges'?)"),
+        ("clouds: {voxel: 0.1}\n", "r.yaml:6: clouds.voxel: unknown option (did you mean 'voxel_m'?)"),
+        ("clouds:\n  voxel_m: large\n", "r.yaml:7: clouds.voxel_m: input should be a valid number"),
+        ("clouds:\n  voxel_m: -1\n", "r.yaml:7: clouds.voxel_m: input should be greater than 0, got -1"),
+        ("clouds: 3\n", "r.yaml:6: clouds: expected a mapping of options, got 3"),
+        ("outer_iterations: two\n", "r.yaml:6: outer_iterations: input should be a valid integer"),
+        ("fusion: [{stage: tsfd}]\n", "r.yaml:6: fusion.0: no stage 'tsfd' of kind 'fusion' (did you mean 'tsdf'?)"),
+        ("fusion: [{voxel_m: 1}]\n", "r.yaml:6: fusion.0: expected {stage: NAME"),
+        (
+            "fusion:\n  - stage: tsdf\n    voxle_m: 1\n",
+            "r.yaml:8: fusion.0.voxle_m: unknown option (did you mean 'voxel_m'",
+        ),
+        ("odometry: {registration: {stage: gicp, distances_m: []}}\n", "r.yaml:6: odometry.registration.distances_m:"),
+        (
+            "recording: {level: loud}\n",
+            "r.yaml:6: recording.level: input should be 'off', 'summary', 'normal' or 'full'",
+        ),
+    ],
+)
+def test_errors_name_file_line_key_and_what_was_expected(tmp_path: Path, change: str, expected: str) -> None:
+    with pytest.raises(RecipeError) as caught:
+        load(tmp_path, SMALL + change)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_stage_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="solver: this option is required"):
+        load(tmp_path, SMALL.replace("solver: poisson\n", ""))
+
+
+def test_nested_stages(tmp_path: Path) -> None:
+    text = SMALL.replace(
+        "{stage: overlap, min_iou: 0.4}", "{stage: combined, builders: [sequential, {stage: overlap, min_iou: 0.2}]}"
+    )
+    builders = load(tmp_path, text).edges.builders  # type: ignore[attr-defined]
+    assert [registry.name_of(builder) for builder in builders] == ["sequential", "overlap"]
+
+
+def test_the_schema_offers_every_stage_and_refuses_unknown_keys() -> None:
+    schema = binding.json_schema(Recipe)
+    names = {option["anyOf"][0]["const"] for option in schema["$defs"]["kind-registration"]["anyOf"]}
+    assert names == set(registry.names("registration"))
+    assert schema["additionalProperties"] is False
+    assert schema["properties"]["registration"]["$ref"] == "#/$defs/kind-registration"
+    overlap = next(o for o in schema["$defs"]["kind-edges"]["anyOf"] if o["anyOf"][0]["const"] == "overlap")
+    assert overlap["anyOf"][1]["properties"]["min_iou"]["description"]
+
+
+def test_the_schema_agrees_with_the_recipes() -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = binding.json_schema(Recipe)
+    for name in recipe_names():
+        jsonschema.validate(binding.unbind(load_recipe(name)), schema)
+
+
+@pytest.mark.parametrize("kind", registry.KINDS)
+def test_every_registered_stage_loads_and_keeps_its_contract(kind: str) -> None:
+    for name in registry.names(kind):
+        cls = registry.load(kind, name)
+        assert (cls.__doc__ or "").strip(), f"{kind} {name} does not say what it is"
+        for field, info in cls.__pydantic_fields__.items():
+            assert info.description, f"{kind} {name}: option {field} does not say what it is for"
+        if not any(info.is_required() for info in cls.__pydantic_fields__.values()):
+            stage = cls()
+            assert isinstance(stage, registry.KINDS[kind].protocol)
+            with pytest.raises(AttributeError):
+                stage.a_field_that_is_not_there = 1

@@ -1,0 +1,205 @@
+"""The main job on a small rendered sequence: what a run leaves, resume after a kill, bad input."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import hodge_pipeline
+from hodge_adapters.poses_text import read_tum
+from hodge_pipeline.errors import HodgeError, RecipeError, SourceError, WorkspaceError
+from hodge_pipeline.pipeline import Run
+from hodge_pipeline.recipe import Recipe, load_recipe
+from synthetic import tiny_sequence  # noqa: F401 - a fixture
+
+SMALL = ("clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=1", "recording.level=summary")
+STAGES = ("clouds", "odometry", "edges-1", "register-1", "solve-1", "edges-2", "register-2", "solve-2", "fuse-0")
+
+
+def small_recipe(source: Path, *overrides: str) -> Recipe:
+    return load_recipe("demo", [*SMALL, *overrides], source)
+
+
+@pytest.fixture(scope="module")
+def run(tiny_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:  # noqa: F811
+    return hodge_pipeline.run(small_recipe(tiny_sequence), tmp_path_factory.mktemp("runs") / "tiny")
+
+
+class Log:
+    """A watcher that remembers which stages really ran, and may stop the run at one."""
+
+    def __init__(self, stop_at: str = "") -> None:
+        self.stop_at, self.stages, self.said = stop_at, list[str](), list[str]()
+
+    @contextmanager
+    def stage(self, title: str, total: int) -> Iterator[object]:
+        self.stages.append(title)
+        if title == self.stop_at:
+            raise KeyboardInterrupt
+        yield lambda done: None
+
+    def say(self, message: str) -> None:
+        self.said.append(message)
+
+
+def test_a_run_leaves_what_a_person_can_open(run: Run) -> None:
+    names = {path.name for path in run.folder.iterdir()}
+    expected = {"recipe.yaml", "poses.tum", "poses.kitti", "graph.g2o", "edges.csv", "report.html", "report.json"}
+    assert names >= expected | {"cloud.ply", "recording.rrd", "log.txt"}
+    report = json.loads((run.folder / "report.json").read_text())
+    assert report["source"]["frames"] == 24
+    np.testing.assert_array_equal(read_tum(run.folder / "poses.tum").world_from_cam[:, :3, 3],
+                                  run.result.world_from_cam[:, :3, 3])  # fmt: skip
+
+
+def test_the_result_is_near_the_truth(run: Run) -> None:
+    rows = {row.name: row for row in run.report.trajectories}
+    assert rows["result"].ate_rmse_m < 0.03
+    assert rows["result"].ate_rmse_m <= rows["odometry"].ate_rmse_m + 0.002
+
+
+def test_loop_deviation_falls(run: Run) -> None:
+    assert run.result.solution is not None
+    deviation = [step.metrics["loop_deviation_mean"] for step in run.result.solution.history]
+    assert deviation[0] < 5e-4
+    assert deviation[-1] < 1e-9
+
+
+def test_the_same_command_again_computes_nothing(run: Run) -> None:
+    assert run.source.path is not None
+    log = Log()
+    again = hodge_pipeline.run(small_recipe(run.source.path), run.folder, watcher=log)
+    assert log.stages == []
+    np.testing.assert_array_equal(again.result.world_from_cam, run.result.world_from_cam)
+
+
+def test_another_run_gives_the_same_poses_on_any_number_of_workers(run: Run, tmp_path: Path) -> None:
+    recipe = small_recipe(run.source.path, "executor.workers=2", "recording.level=off", "evaluation.tables=false")
+    other = hodge_pipeline.run(recipe, tmp_path / "other")
+    np.testing.assert_array_equal(other.result.world_from_cam, run.result.world_from_cam)
+
+
+@pytest.mark.parametrize("title", ["odometry", "registration, round 1", "solve, round 2", "fusion 1", "recording"])
+def test_a_run_that_was_stopped_goes_on_where_it_stopped(run: Run, tmp_path: Path, title: str) -> None:
+    recipe = small_recipe(run.source.path, "executor.workers=0", "evaluation.tables=false")
+    first, second = Log(stop_at=title), Log()
+    with pytest.raises(KeyboardInterrupt):
+        hodge_pipeline.run(recipe, tmp_path / "run", watcher=first)
+    resumed = hodge_pipeline.run(recipe, tmp_path / "run", watcher=second)
+    assert second.stages[0] == title
+    assert not set(first.stages[:-1]) & set(second.stages)
+    np.testing.assert_array_equal(resumed.result.world_from_cam, run.result.world_from_cam)
+
+
+def test_a_killed_registration_keeps_its_blocks(run: Run, tmp_path: Path) -> None:
+    script = textwrap.dedent(f"""
+        import os, signal, sys
+        import hodge_pipeline
+        from hodge_pipeline.recipe import load_recipe
+        from hodge_pipeline import steps
+        keep = steps.BlockStore.write
+        def write(self, block, result):
+            keep(self, block, result)
+            os.kill(os.getpid(), signal.SIGKILL)
+        steps.BlockStore.write = write
+        recipe = load_recipe("demo", {[*SMALL, "executor.workers=0"]!r}, {str(run.source.path)!r})
+        hodge_pipeline.run(recipe, {str(tmp_path / "run")!r})
+    """)
+    killed = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+    assert len(list((tmp_path / "run/stages/register-1.part/blocks").glob("*.npz"))) == 1
+    resumed = hodge_pipeline.run(small_recipe(run.source.path, "executor.workers=0"), tmp_path / "run")
+    np.testing.assert_array_equal(resumed.result.world_from_cam, run.result.world_from_cam)
+
+
+def test_a_later_stage_alone_is_repeated_when_its_option_changes(run: Run, tmp_path: Path) -> None:
+    folder, log = tmp_path / "copy", Log()
+    shutil.copytree(run.folder, folder)
+    recipe = small_recipe(run.source.path, "fusion=[{stage: cloud, voxel_m: 0.05}]")
+    with pytest.raises(WorkspaceError, match="--overwrite"):
+        hodge_pipeline.run(recipe, folder)
+    hodge_pipeline.run(recipe, folder, overwrite=True, watcher=log)
+    assert log.stages == ["fusion 1", "recording"]
+
+
+@pytest.fixture
+def damaged(tiny_sequence: Path, tmp_path: Path) -> Path:  # noqa: F811
+    folder = tmp_path / "sequence"
+    shutil.copytree(tiny_sequence, folder)
+    return folder
+
+
+def quick(source: Path, out: Path, *overrides: str) -> Run:
+    off = ("recording.level=off", "evaluation.tables=false", "executor.workers=0", "outer_iterations=1")
+    return hodge_pipeline.run(small_recipe(source, *off, *overrides), out)
+
+
+def test_unreadable_and_empty_frames_are_kept_without_edges_and_reported(damaged: Path, tmp_path: Path) -> None:
+    depths = sorted((damaged / "depth").iterdir())
+    depths[5].write_bytes(depths[5].read_bytes()[:2000])
+    depths[9].unlink()
+    cv2.imwrite(str(depths[12]), np.zeros((120, 160), np.uint16))
+    cv2.imwrite(str(depths[16]), np.full((60, 80), 9000, np.uint16))
+    result = quick(damaged, tmp_path / "run")
+    bad = {5, 9, 12, 16}
+    notes = "\n".join(result.report.notes)
+    for row in bad:
+        assert f"frame {result.source.frames[row].frame_id}" in notes
+    assert not bad & set(result.result.graph.edges.ravel().tolist())
+    assert len(read_tum(tmp_path / "run/poses.tum")) == 24
+    good = sorted(set(range(24)) - bad)
+    steps = np.linalg.norm(np.diff(result.result.world_from_cam[good, :3, 3], axis=0), axis=1)
+    assert steps.max() < 0.3
+
+
+def test_a_sequence_in_two_pieces_is_a_warning_that_lists_them(damaged: Path, tmp_path: Path) -> None:
+    for number, path in enumerate(sorted((damaged / "depth").iterdir())):
+        if number >= 12:
+            cv2.imwrite(str(path), np.random.default_rng(number).integers(4000, 20000, (120, 160), np.uint16))
+    result = quick(damaged, tmp_path / "run")
+    assert result.result.solution is not None
+    assert result.result.solution.component.max() >= 1
+    assert any("piece" in note for note in result.report.notes)
+
+
+def test_one_frame(damaged: Path, tmp_path: Path) -> None:
+    first = sorted((damaged / "depth").iterdir())[0]
+    for path in sorted((damaged / "depth").iterdir())[1:]:
+        path.unlink()
+    lines = [line for line in (damaged / "depth.txt").read_text().splitlines() if "#" in line or first.name in line]
+    (damaged / "depth.txt").write_text("\n".join(lines) + "\n")
+    result = quick(damaged, tmp_path / "run")
+    assert len(result.result.world_from_cam) == 1
+    assert any("single frame" in note for note in result.report.notes)
+
+
+def test_no_frame_with_depth_is_one_line(damaged: Path, tmp_path: Path) -> None:
+    for path in (damaged / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros((120, 160), np.uint16))
+    with pytest.raises(SourceError, match="none of the 24 frames gave a point cloud"):
+        quick(damaged, tmp_path / "run")
+
+
+@pytest.mark.parametrize("make", ["missing", "empty folder"])
+def test_a_source_that_is_none_is_one_line(tmp_path: Path, make: str) -> None:
+    path = tmp_path / "source"
+    if make == "empty folder":
+        path.mkdir()
+    with pytest.raises(HodgeError) as caught:
+        quick(path, tmp_path / "run")
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_recipe_without_source_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="source"):
+        hodge_pipeline.run("demo", tmp_path / "run")
