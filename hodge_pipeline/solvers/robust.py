@@ -1,0 +1,176 @@
+"""Poses in spite of wrong edges: graduated non-convexity from a start that short cycles have vouched for.
+
+Yang, Antonante, Tzoumas and Carlone 2020. No edge is trusted for being sequential: where triangles test the edges they
+say which to begin with; where none does, every edge begins alike.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as stage
+
+from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
+from hodge_pipeline.solvers.hodge import ObjectiveName, solve
+from hodge_pipeline.solvers.newton import Limits, Point, descend
+from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
+from hodge_pipeline.solvers.setup import Setup, prepare
+from hodge_pipeline.types import Floats, Solution, ViewGraph
+
+Kernel: TypeAlias = Literal["truncated", "geman_mcclure"]
+CHI2_99_SPATIAL, CHI2_99_PLANAR = 16.812, 11.345
+"""The 99 % quantiles of χ² with 6 and 3 degrees of freedom."""
+WEIGHT_FLOOR = 1e-9
+"""An edge that is left out keeps this share of its weight, so that the Laplacians stay definite."""
+UNTESTED_WEIGHT = 0.1
+TRUST_SPREADS = (0.1, 0.25, 0.5)
+"""Each is tried; the end with the least truncated cost is kept, which on real graphs is the one nearest the truth."""
+KEPT_FROM = 0.5
+LEAST_WEIGHT = 1e-3
+STEP = 1.4
+STEPS_EACH = 3
+MAX_ROUNDS = 100
+
+
+@dataclass(frozen=True)
+class _Round:
+    """A point, and the weights (used edges,) that led to it."""
+
+    point: Point
+    weights: Floats
+
+
+def solve_robust(
+    graph: ViewGraph,
+    *,
+    start: Floats | None = None,
+    kernel: Kernel = "truncated",
+    threshold: float | None = None,
+    objective: ObjectiveName = "full",
+    dimension: Literal[2, 3] | None = None,
+) -> Solution:
+    """The poses of the edges that agree, with `weights` 1 for those and 0 for the others (between, for Geman–McClure).
+
+    `threshold`: an edge is wrong where its χ² with isotropic weights exceeds this; None takes the 99 % quantile of
+    right edges. The components are those of the edges that are kept.
+    """
+    setup = prepare(graph, start, dimension=dimension)
+    limit = threshold or (CHI2_99_PLANAR if setup.dimension == 2 else CHI2_99_SPATIAL)
+    problem = setup.problem
+    # the isotropic objective counts a rotation of θ as 2 κ θ²; in the plane κ is the information itself, so twice
+    setup = replace(setup, problem=replace(problem, kappa=problem.kappa / 2)) if setup.dimension == 2 else setup
+    corruption = _corruption(graph, setup, limit)
+    tried = [_graduate(setup, _trust(corruption, spread), limit, kernel) for spread in TRUST_SPREADS]
+    last = min(tried, key=lambda end: float(np.minimum(_squares(setup, end.point), limit).sum()))
+    tested = int((~np.isnan(corruption)).sum())
+    weights = np.zeros(graph.edge_count)
+    weights[setup.weights.used] = np.round(last.weights) if kernel == "truncated" else last.weights
+    kept = np.flatnonzero(weights > LEAST_WEIGHT)
+    chosen = graph.select(kept)
+    chosen = replace(chosen, information=weights[kept, None, None] * chosen.information)
+    final = solve(
+        chosen,
+        start=setup.poses(last.point),
+        initial="given",
+        objective=objective,
+        dimension=2 if setup.dimension == 2 else 3,
+    )
+    notes = (
+        *(note for note in setup.weights.notes if note not in final.notes),
+        f"{len(kept)} of {graph.edge_count} edges kept; short cycles test {tested} of them all",
+        *final.notes,
+    )
+    metrics = {**final.metrics, "kept_edges": float(len(kept)), "tested_edges": float(tested)}
+    return replace(final, weights=weights, notes=notes, metrics=metrics)
+
+
+def _corruption(graph: ViewGraph, setup: Setup, limit: float) -> Floats:
+    """How bad the used edges are by their short cycles, from 0 to 1; NaN where none tests one."""
+    rows = np.flatnonzero(setup.weights.used)
+    variances = 0.5 / setup.problem.kappa, 1 / setup.problem.tau
+    return edge_corruption(short_loops(graph.edges[rows], graph.i_from_j[rows], *variances, limit), len(rows))
+
+
+def _trust(corruption: Floats, spread: float) -> Floats:
+    """The weights to begin with."""
+    weights = np.exp(-((np.nan_to_num(corruption) / spread) ** 2))
+    return np.where(np.isnan(corruption), UNTESTED_WEIGHT, weights)
+
+
+def _graduate(setup: Setup, trust: Floats, limit: float, kernel: Kernel) -> _Round:
+    """Rounds of weighted solves in which the kernel goes from convex to its final shape."""
+    point = _solved(setup, trust, None)
+    squares = _squares(setup, point)
+    seen = np.average(squares, weights=np.maximum(trust, WEIGHT_FLOOR))
+    worst = float(max(np.max(squares[trust > KEPT_FROM], initial=0.0), seen))
+    control = limit / (2 * worst - limit) if worst > limit else math.inf
+    if kernel == "geman_mcclure":
+        control = max(2 * worst / limit, 1.0)
+    weights = trust
+    for _ in range(MAX_ROUNDS):
+        new = _truncated(squares, limit, control) if kernel == "truncated" else _geman_mcclure(squares, limit, control)
+        point = _solved(setup, new, point)
+        squares = _squares(setup, point)
+        settled = np.abs(new - weights).max(initial=0.0) < 1e-3
+        weights = new
+        if kernel == "truncated":
+            control *= STEP
+            if settled and bool(((weights < 1e-3) | (weights > 1 - 1e-3)).all()):
+                break
+        else:
+            if settled and control <= 1.0:
+                break
+            control = max(control / STEP, 1.0)
+    return _Round(point, weights)
+
+
+def _truncated(squares: Floats, limit: float, control: float) -> Floats:
+    """Weights of the truncated least squares (Yang et al., equation 14)."""
+    if math.isinf(control):
+        return (squares <= limit).astype(float)
+    middle = np.sqrt(limit * control * (control + 1) / np.maximum(squares, 1e-300)) - control
+    return np.clip(middle, 0.0, 1.0)
+
+
+def _geman_mcclure(squares: Floats, limit: float, control: float) -> Floats:
+    """Weights of the Geman–McClure kernel (Yang et al., equation 12)."""
+    return np.asarray((control * limit / (squares + control * limit)) ** 2)
+
+
+def _solved(setup: Setup, weights: Floats, point: Point | None) -> Point:
+    """The point that some Newton steps with these weights lead to, from the chordal rotations where there is none."""
+    held = np.maximum(weights, WEIGHT_FLOOR)
+    problem = replace(setup.problem, kappa=held * setup.problem.kappa, tau=held * setup.problem.tau)
+    weighted = replace(setup, problem=problem)
+    objective = IsotropicObjective(problem)
+    rotations, translations = weighted.initial("chordal") if point is None else (point.rotations, point.translations)
+    steps = 100 if point is None else STEPS_EACH
+    return descend(objective, objective.at(rotations, translations), Limits(steps, 1e-6), weighted.rounding).point
+
+
+def _squares(setup: Setup, point: Point) -> Floats:
+    """χ² (used edges,) with the weights as given."""
+    return residuals(setup.problem, point.rotations, point.translations).cost_per_edge
+
+
+@stage(frozen=True, config=ConfigDict(extra="forbid"))
+class RobustSolver:
+    """Maximum-likelihood poses of the edges that agree with each other."""
+
+    kernel: Kernel = Field(
+        "truncated", description="truncated: an edge counts or it does not; geman_mcclure: smooth weights"
+    )
+    threshold: float | None = Field(
+        None, gt=0, description="χ² above which an edge is wrong; the default is the 99 % quantile of right edges"
+    )
+    objective: ObjectiveName = Field("full", description="what the edges that are kept are solved with, as in hodge")
+
+    def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
+        """The poses; the first vertex of each component of all edges keeps its start pose."""
+        return solve_robust(
+            graph, start=world_from_cam, kernel=self.kernel, threshold=self.threshold, objective=self.objective
+        )

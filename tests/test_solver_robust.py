@@ -1,0 +1,145 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
+from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
+from hodge_pipeline.solvers.hodge import solve
+from hodge_pipeline.solvers.robust import RobustSolver, solve_robust
+from hodge_pipeline.stages import ConsistencySolver
+from hodge_pipeline.types import ViewGraph
+
+SIGMA_RAD, SIGMA_M = 0.01, 0.02
+
+
+def band(count: int, reach: int, seed: int, planar: bool = False) -> tuple[ViewGraph, np.ndarray]:
+    """Each vertex joined to the next `reach` ones, and the true poses."""
+    rng = np.random.default_rng(seed)
+    twists = rng.normal(size=(count, 6))
+    edges = np.array([(i, i + s) for s in range(1, reach + 1) for i in range(count - s)])
+    errors = rng.normal(size=(len(edges), 6)) * np.repeat([SIGMA_RAD, SIGMA_M], 3)
+    information = np.tile(np.diag(np.repeat([SIGMA_RAD**-2, SIGMA_M**-2], 3)), (len(edges), 1, 1))
+    if planar:
+        twists[:, [0, 1, 5]] = errors[:, [0, 1, 5]] = 0
+        information[:, [0, 1, 5]] = 0
+    truth = se3.exp(twists)
+    measured = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ se3.exp(errors)
+    return ViewGraph.from_edges(np.arange(count), edges, measured, information), truth
+
+
+def spoiled(graph: ViewGraph, share: float, seed: int) -> tuple[ViewGraph, np.ndarray]:
+    """The graph with a share of its edges wrong, and which."""
+    rng = np.random.default_rng(seed)
+    wrong = rng.random(graph.edge_count) < share
+    motion = graph.i_from_j.copy()
+    motion[wrong] = se3.exp(rng.normal(size=(int(wrong.sum()), 6)))
+    if not graph.information[:, 0].any():
+        motion[wrong] = se3.exp(rng.normal(size=(int(wrong.sum()), 6)) * np.array([0, 0, 1, 1, 1, 0]))
+    return dataclasses.replace(graph, i_from_j=motion), wrong
+
+
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
+def test_wrong_edges_are_found_and_left_out(share, planar):
+    graph, truth = band(30, 8, 1, planar)
+    graph, wrong = spoiled(graph, share, 2)
+    solution = solve_robust(graph, start=truth)
+    kept = solution.weights > 0.5
+    assert not kept[wrong].any()
+    assert kept[~wrong].mean() > 0.93
+    main = solution.component == 0
+    assert main.sum() >= 29
+    relative = se3.inverse(truth[main]) @ solution.world_from_cam[main]
+    assert np.abs(relative - np.eye(4)).max() < 0.1
+    assert any(f"{kept.sum()} of {graph.edge_count} edges kept" in note for note in solution.notes)
+
+
+def test_a_wrong_sequential_edge_is_not_trusted():
+    graph, truth = band(12, 4, 3)
+    motion = graph.i_from_j.copy()
+    motion[5] = se3.exp(np.ones(6))
+    solution = solve_robust(dataclasses.replace(graph, i_from_j=motion), start=truth)
+    assert solution.weights[5] == 0
+    assert np.delete(solution.weights, 5).mean() > 0.95
+
+
+def test_smooth_weights_lie_between():
+    graph, truth = band(20, 6, 4)
+    graph, wrong = spoiled(graph, 0.2, 5)
+    weights = solve_robust(graph, start=truth, kernel="geman_mcclure").weights
+    assert weights[wrong].max() < 0.05
+    assert np.median(weights[~wrong]) > 0.3
+    assert ((weights > 0.05) & (weights < 0.95)).any()
+
+
+def test_what_only_wrong_edges_join_falls_apart():
+    left, truth = band(8, 4, 6)
+    bridges = np.array([(0, 9), (4, 12), (7, 15)])
+    wild = se3.exp(np.random.default_rng(7).normal(size=(3, 6)))
+    graph = ViewGraph.from_edges(
+        np.arange(16),
+        np.concatenate([left.edges, left.edges + 8, bridges]),
+        np.concatenate([left.i_from_j, left.i_from_j, wild]),
+        np.concatenate([left.information, left.information, left.information[:3]]),
+    )
+    solution = solve_robust(graph, start=np.concatenate([truth, truth]))
+    assert np.isfinite(solution.world_from_cam).all()
+    assert solution.weights[-3:].sum() <= 1
+    assert solution.weights[:-3].mean() > 0.9
+
+
+def test_edges_in_no_cycle_are_untested():
+    edges = np.array([(0, 1), (1, 2), (0, 2), (2, 3), (4, 3), (3, 4)])
+    motions = np.tile(np.eye(4), (6, 1, 1))
+    motions[5, 0, 3] = 5.0
+    loops = short_loops(edges, motions, np.full(6, 1e-2), np.full(6, 1e-2), 16.8)
+    assert sorted(map(tuple, np.sort(loops.edges, axis=1))) == [(-1, 4, 5), (0, 1, 2)]
+    score = edge_corruption(loops, 6)
+    assert np.isnan(score).tolist() == [False, False, False, True, False, False]
+    assert score[:3].max() < 1e-9
+    assert score[4:].min() > 0.8
+
+
+def test_the_stage_keeps_its_protocol():
+    graph, truth = band(8, 3, 8)
+    assert isinstance(RobustSolver(), ConsistencySolver)
+    np.testing.assert_allclose(RobustSolver().solve(graph, truth).world_from_cam[0], truth[0], atol=1e-12)
+
+
+def test_the_covariance_of_a_chain_adds_up():
+    """0 → 1 → 2: the second pose has its own edge's covariance and the first one's, moved."""
+    graph, truth = band(3, 1, 9)
+    own = np.linalg.inv(graph.information)
+    exact = solve(graph, start=truth).world_from_cam
+    found = marginal_covariances(graph, exact, np.arange(3))
+    moved = se3.adjoint(se3.inverse(exact[2]) @ exact[1])
+    np.testing.assert_array_equal(found[0], np.zeros((6, 6)))
+    np.testing.assert_allclose(found[1], own[0], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found[2], own[1] + moved @ own[0] @ moved.T, rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(relative_covariances(graph, exact, np.array([[0, 2]]))[0], found[2], atol=1e-10)
+    np.testing.assert_allclose(relative_covariances(graph, exact, np.array([[1, 2]]))[0], own[1], atol=1e-10)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_covariances_match_many_solves(planar):
+    graph, truth = band(6, 3, 10, planar)
+    clean = se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
+    rng = np.random.default_rng(11)
+    errors = np.repeat([SIGMA_RAD, SIGMA_M], 3) * np.array([0, 0, 1, 1, 1, 0] if planar else [1] * 6)
+    seen = []
+    for _ in range(300):
+        noisy = clean @ se3.exp(errors * rng.normal(size=(graph.edge_count, 6)))
+        poses = solve(dataclasses.replace(graph, i_from_j=noisy), start=truth).world_from_cam
+        seen.append(se3.log(se3.inverse(truth[5]) @ poses[5]))
+    sampled = np.cov(np.array(seen).T)
+    predicted = marginal_covariances(dataclasses.replace(graph, i_from_j=clean), truth, np.array([5]))[0]
+    np.testing.assert_allclose(np.diag(sampled), np.diag(predicted), rtol=0.35, atol=1e-12)
+
+
+def test_vertices_in_two_components_have_no_relative_covariance():
+    graph, truth = band(4, 1, 12)
+    with pytest.raises(GraphError, match="two components"):
+        relative_covariances(graph.select(np.array([0, 2])), truth, np.array([[0, 3]]))
