@@ -102,13 +102,16 @@ def _first_error(error: ValidationError, where: Where, keys: Keys) -> RecipeErro
     return RecipeError(f"{where(here)}: {_dotted(here)}: {what.rstrip('.')}, got {first['input']!r}")
 
 
+KIND = "x-stage-kind"
+
+
 class _StageSchema(GenerateJsonSchema):
-    """JSON schema in which a field typed by a stage Protocol refers to that kind."""
+    """JSON schema in which a field typed by a stage Protocol is marked with that kind."""
 
     def is_instance_schema(self, schema: Any) -> JsonSchemaValue:
-        """A reference to the kind's definition, which `json_schema` adds."""
+        """A mark in place of the kind; `_linked` makes a reference of it once pydantic has checked its own."""
         kind = registry.kind_of(schema["cls"])
-        return {"$ref": f"#/$defs/kind-{kind.name}"} if kind else super().is_instance_schema(schema)
+        return {KIND: kind.name} if kind else super().is_instance_schema(schema)
 
 
 def json_schema(cls: type) -> dict[str, Any]:
@@ -123,7 +126,7 @@ def json_schema(cls: type) -> dict[str, Any]:
             except RecipeError:
                 continue
         definitions[f"kind-{kind}"] = {"anyOf": options} if options else {"type": "object"}
-    return schema
+    return dict(_linked(schema))
 
 
 def _stage_schema(kind: str, name: str, definitions: dict[str, Any]) -> dict[str, Any]:
@@ -132,3 +135,13 @@ def _stage_schema(kind: str, name: str, definitions: dict[str, Any]) -> dict[str
     stage["properties"] = {"stage": {"const": name}, **stage.get("properties", {})}
     stage["required"] = ["stage", *stage.get("required", [])]
     return {"anyOf": [{"const": name}, stage]}
+
+
+def _linked(node: Any) -> Any:
+    """The schema with each mark as a reference to the definition of its kind."""
+    if isinstance(node, list):
+        return [_linked(item) for item in node]
+    if not isinstance(node, dict):
+        return node
+    linked = {key: _linked(value) for key, value in node.items() if key != KIND}
+    return {**linked, "$ref": f"#/$defs/kind-{node[KIND]}"} if isinstance(node.get(KIND), str) else linked

@@ -18,6 +18,8 @@ from hodge_pipeline.errors import WorkspaceError
 
 KEY_FILE = "key.json"
 RECIPE_FILE = "recipe.yaml"
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, None)
+"""What the system says when a file cannot be written; None is numpy's own short write."""
 
 
 def key_of(*parts: Any) -> str:
@@ -166,8 +168,8 @@ def _disk_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+        if error.errno not in NO_ROOM:
             raise
         raise WorkspaceError(
-            f"{path}: {error.strerror}: what was finished stays; make room and run the same command again"
+            f"{path}: {error.strerror or error}: what was finished stays; make room and run the same command again"
         ) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,9 @@ from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances, evaluation_pairs, score_table
 from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud, ViewGraph
 
-DATA = Path(os.environ.get("HODGE_DATA", Path(__file__).parents[1] / "../shared/data"))
-KITCHEN = DATA / "seven_scenes/redkitchen/seq-01"
-
 
 class Inline:
-    """An executor that does the work here, last block first: results may come in any order."""
+    """Workers that do the work here, last block first: results may come in any order."""
 
     def map(self, task: Callable[[Any], Any], blocks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         for index in reversed(range(len(blocks))):
@@ -161,26 +157,25 @@ def test_progress_counts_every_pair(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, 0, atol=1e-9)
 
 
-def kitchen_clouds(frames: range) -> tuple[CloudSet, Floats]:
+def kitchen_clouds(folder: Path, frames: range) -> tuple[CloudSet, Floats]:
     """Clouds as `method` has them (every second pixel, 0.2–6 m, 3 cm voxels, 10 neighbours), by small_gicp alone."""
     cv2, small_gicp = pytest.importorskip("cv2"), pytest.importorskip("small_gicp")
     clouds, poses = [], []
     v, u = np.mgrid[0:480:2, 0:640:2]
     for frame in frames:
-        raw = cv2.imread(str(KITCHEN / f"frame-{frame:06d}.depth.png"), cv2.IMREAD_UNCHANGED)[::2, ::2]
+        raw = cv2.imread(str(folder / f"frame-{frame:06d}.depth.png"), cv2.IMREAD_UNCHANGED)[::2, ::2]
         z = np.where(raw == 65535, 0, raw) / 1000
         points = np.stack([(u - 320) / 585 * z, (v - 240) / 585 * z, z], axis=-1)[(z >= 0.2) & (z <= 6)]
         sampled = small_gicp.voxelgrid_sampling(small_gicp.PointCloud(points), 0.03)
         small_gicp.estimate_normals(sampled, num_neighbors=10)
         clouds.append(PointCloud(*(a[:, :3].astype(np.float32) for a in (sampled.points(), sampled.normals()))))
-        pose = np.loadtxt(KITCHEN / f"frame-{frame:06d}.pose.txt")
+        pose = np.loadtxt(folder / f"frame-{frame:06d}.pose.txt")
         poses.append(se3.from_parts(se3.project_to_so3(pose[:3, :3]), pose[:3, 3]))
     return CloudSet.from_clouds(clouds), np.stack(poses)
 
 
-@pytest.mark.skipif(not KITCHEN.is_dir(), reason=f"no 7-Scenes red kitchen in {KITCHEN}")
-def test_true_poses_of_red_kitchen_score_as_the_method_says(tmp_path: Path) -> None:
-    clouds, truth = kitchen_clouds(range(0, 1000, 40))
+def test_true_poses_of_red_kitchen_score_as_the_method_says(tmp_path: Path, data_dir: Path) -> None:
+    clouds, truth = kitchen_clouds(data_dir / "seven_scenes/redkitchen/seq-01", range(0, 1000, 40))
     drift = np.cumsum(np.random.default_rng(0).normal(scale=[0.002] * 3 + [0.01] * 3, size=(25, 6)), axis=0)
     sets = {"truth": truth, "odometry": truth @ se3.exp(drift)}
     for graph in score_table(saved(clouds, tmp_path), sets, "truth", Inline()).graphs:

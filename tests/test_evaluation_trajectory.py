@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -15,24 +14,22 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.trajectory import absolute_error, align, associate, relative_error
 from hodge_pipeline.types import Floats
 
-DATA = Path(os.environ.get("HODGE_DATA", Path(__file__).parents[1] / "../shared/data"))
-EVO = DATA / "trajectories/evo"
-needs_evo_data = pytest.mark.skipif(not EVO.is_dir(), reason=f"no evo trajectories in {EVO}")
+EVO = "trajectories/evo"
 
 
-def read_tum(name: str) -> tuple[Floats, Floats]:
-    table = np.loadtxt(EVO / name)
+def read_tum(path: Path) -> tuple[Floats, Floats]:
+    table = np.loadtxt(path)
     return table[:, 0], se3.from_quat_xyzw(table[:, 1:4], table[:, 4:])
 
 
-def read_kitti(name: str) -> Floats:
-    rows = np.loadtxt(EVO / name).reshape(-1, 3, 4)
+def read_kitti(path: Path) -> Floats:
+    rows = np.loadtxt(path).reshape(-1, 3, 4)
     return se3.from_parts(rows[:, :, :3], rows[:, :, 3])
 
 
-def tum_pair(estimate: str, reference: str) -> tuple[Floats, Floats]:
-    stamps, poses = read_tum(estimate)
-    true_stamps, truth = read_tum(reference)
+def tum_pair(folder: Path, estimate: str, reference: str) -> tuple[Floats, Floats]:
+    stamps, poses = read_tum(folder / estimate)
+    true_stamps, truth = read_tum(folder / reference)
     rows, true_rows = associate(stamps, true_stamps)
     return poses[rows], truth[true_rows]
 
@@ -41,7 +38,6 @@ def random_poses(count: int, seed: int = 0) -> Floats:
     return se3.exp(np.random.default_rng(seed).normal(size=(count, 6)))
 
 
-@needs_evo_data
 @pytest.mark.parametrize(
     ("estimate", "reference", "with_scale", "rmse_m"),
     [
@@ -50,24 +46,25 @@ def random_poses(count: int, seed: int = 0) -> Floats:
         ("fr2_desk_ORB_kf_mono.txt", "fr2_desk_groundtruth.txt", True, 0.00773),
     ],
 )
-def test_published_errors_of_tum(estimate: str, reference: str, with_scale: bool, rmse_m: float) -> None:
-    error = absolute_error(*tum_pair(estimate, reference), with_scale=with_scale)
+def test_published_errors_of_tum(
+    data_dir: Path, estimate: str, reference: str, with_scale: bool, rmse_m: float
+) -> None:
+    error = absolute_error(*tum_pair(data_dir / EVO, estimate, reference), with_scale=with_scale)
     assert error.rmse_m == pytest.approx(rmse_m, abs=5e-6)
     assert error.left_out == 0
 
 
-@needs_evo_data
 @pytest.mark.parametrize(("estimate", "rmse_m"), [("KITTI_00_ORB.txt", 1.303), ("KITTI_00_SPTAM.txt", 3.738)])
-def test_published_errors_of_kitti(estimate: str, rmse_m: float) -> None:
-    assert absolute_error(read_kitti(estimate), read_kitti("KITTI_00_gt.txt")).rmse_m == pytest.approx(rmse_m, abs=5e-4)
+def test_published_errors_of_kitti(data_dir: Path, estimate: str, rmse_m: float) -> None:
+    poses, truth = (read_kitti(data_dir / EVO / name) for name in (estimate, "KITTI_00_gt.txt"))
+    assert absolute_error(poses, truth).rmse_m == pytest.approx(rmse_m, abs=5e-4)
 
 
-@needs_evo_data
 @pytest.mark.parametrize("delta_frames", [1, 10])
-def test_relative_error_equals_evo(delta_frames: int) -> None:
+def test_relative_error_equals_evo(data_dir: Path, delta_frames: int) -> None:
     metrics = pytest.importorskip("evo.core.metrics")
     trajectory = pytest.importorskip("evo.core.trajectory")
-    estimate, reference = tum_pair("freiburg1_xyz-rgbdslam.txt", "freiburg1_xyz-groundtruth.txt")
+    estimate, reference = tum_pair(data_dir / EVO, "freiburg1_xyz-rgbdslam.txt", "freiburg1_xyz-groundtruth.txt")
     ours = relative_error(estimate, reference, delta_frames)
     pair = tuple(trajectory.PosePath3D(poses_se3=list(poses)) for poses in (reference, estimate))
     for relation, rmse in (

@@ -130,7 +130,7 @@ def _durations(stamps_s: Floats) -> Floats:
 
 def _chained(count: int, sequences: Sequence[Ints], steps: Registered) -> Floats:
     motion_to = {int(j): (int(i), motion) for (i, j), motion in zip(steps.pairs, steps.i_from_j, strict=True)}
-    poses = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+    poses: Floats = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
     begin_x = 0.0
     for rows in sequences:
         before = None

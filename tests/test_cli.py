@@ -1,0 +1,102 @@
+"""The command line as a user types it."""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from synthetic import tiny_sequence  # noqa: F401 - a fixture
+
+LIGHT = ["--set", "fusion=[]", "--set", "recording.level=off", "--set", "evaluation.tables=false"]
+LIGHT += ["--set", "executor.workers=0", "--set", "outer_iterations=1"]
+
+
+def hodge(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "hodge_pipeline.cli.main", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_help_opens_with_examples_and_imports_nothing_heavy() -> None:
+    code = (
+        "import sys\nfrom hodge_pipeline.cli.main import app\n"
+        "try:\n    app(['--help'])\nexcept SystemExit:\n    pass\n"
+        "heavy = {'numpy', 'scipy', 'open3d', 'rerun', 'pydantic', 'matplotlib', 'cv2'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "hodge run seven_scenes --source" in done.stdout
+    assert done.stdout.index("Examples") < done.stdout.index("Commands")
+
+
+def test_stages_and_recipes_are_listed() -> None:
+    stages, recipes = hodge("stages"), hodge("recipes")
+    for name in ("tum", "overlap", "gicp", "poisson", "tsdf", "dask"):
+        assert name in stages.stdout
+    assert {line.split()[0] for line in recipes.stdout.splitlines()} >= {"demo", "seven_scenes", "tum"}
+    options = hodge("stages", "edges").stdout
+    assert "min_iou = 0.5" in options
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["run", "sevenscenes", "--source", ".", "--out", "x"], 1, "did you mean 'seven_scenes'"),
+        (["run", "demo", "--source", ".", "--set", "edges.stage=overlp", "--out", "x"], 1, "did you mean 'overlap'"),
+        (["run", "demo", "--source", ".", "--set", "seed=a", "--out", "x"], 1, "--set seed=a: seed: input should be"),
+        (["run", "demo", "--out", "x"], 1, "--source"),
+        (["run", "demo", "--source", "nowhere", "--out", "{tmp}/x"], 1, "nowhere"),
+        (["inspect", "nowhere"], 1, "no such file or folder"),
+        (["stages", "edge"], 1, "did you mean 'edges'"),
+        (["view", "nowhere"], 1, "no recording here"),
+        (["run", "demo"], 2, "--out"),
+        (["fly"], 2, "No such command"),
+    ],
+)
+def test_mistakes_are_one_line(arguments: list[str], code: int, message: str, tmp_path: Path) -> None:
+    done = hodge(*(argument.replace("{tmp}", str(tmp_path)) for argument in arguments))
+    assert done.returncode == code, done.stderr
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    if code == 1:
+        assert done.stderr.startswith("error: ")
+        assert done.stderr.count("\n") == 1
+
+
+def test_a_run_prints_a_summary_or_json_or_nothing(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    run = ["run", "tum", "--source", tiny_sequence, "--out", tmp_path / "run", *LIGHT]
+    first = hodge(*run)
+    assert first.returncode == 0, first.stderr
+    assert "verdict" in first.stdout
+    assert "\x1b[" not in first.stdout + first.stderr
+    assert json.loads(hodge(*run, "--json").stdout)["source"]["frames"] == 24
+    quiet = hodge(*run, "--quiet")
+    assert (quiet.stdout, quiet.stderr) == ("", "")
+
+
+def test_inspect_says_what_a_folder_is(tiny_sequence: Path) -> None:  # noqa: F811
+    facts = json.loads(hodge("inspect", tiny_sequence, "--json").stdout)
+    assert facts["formats"][0]["reader"] == "tum"
+    assert facts["frames"] == 24
+    assert 0.3 < facts["depth range in metres"][0] < facts["depth range in metres"][1] < 10
+    text = hodge("inspect", tiny_sequence).stdout
+    assert "160x120" in text
+
+
+def test_a_full_disk_is_one_line_and_keeps_what_was_finished(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    command = [sys.executable, "-m", "hodge_pipeline.cli.main", "run", "tum", "--source", str(tiny_sequence)]
+    command += ["--out", str(tmp_path / "run"), *LIGHT, "--quiet"]
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=limit, env=environment)  # noqa: PLW1509
+    assert done.returncode == 1, done.stderr
+    assert "make room" in done.stderr
+    again = hodge(*command[3:])
+    assert again.returncode == 0, again.stderr

@@ -1,0 +1,66 @@
+"""A third party's package, really installed: found, run from a recipe; its broken stage harms nobody."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from synthetic import tiny_sequence  # noqa: F401 - a fixture
+
+PACKAGE = Path(__file__).parent / "plugin_package"
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment in which the package is installed."""
+    site = tmp_path_factory.mktemp("site")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target"]
+    subprocess.run([*pip, str(site), str(PACKAGE)], check=True, capture_output=True)
+    return {**os.environ, "PYTHONPATH": str(site)}
+
+
+def hodge(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "hodge_pipeline.cli.main", *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_it_is_listed_and_the_broken_one_is_named(environment: dict[str, str]) -> None:
+    listed = hodge(environment, "stages", "edges")
+    assert listed.returncode == 0
+    assert "ring" in listed.stdout
+    assert "[hodge-plugin-example 0.3.0]" in listed.stdout
+    assert "broken: stage 'broken'" in listed.stdout
+    assert "overlap" in listed.stdout
+
+
+def test_it_runs_from_a_recipe(environment: dict[str, str], tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    recipe = tmp_path / "ring.yaml"
+    recipe.write_text(
+        "extends: demo\nedges: {stage: ring, reach: 1}\nouter_iterations: 1\nfusion: []\n"
+        "evaluation: {tables: false}\nrecording: {level: off}\nexecutor: {stage: local, workers: 0}\n"
+    )
+    ran = hodge(environment, "run", str(recipe), "--source", str(tiny_sequence), "--out", str(tmp_path / "run"))
+    assert ran.returncode == 0, ran.stderr
+    rows = (tmp_path / "run/edges.csv").read_text().splitlines()[1:]
+    assert len(rows) == 24
+    assert all(row.split(",")[2] == "ring" for row in rows)
+
+
+def test_naming_the_broken_one_is_one_line(environment: dict[str, str], tmp_path: Path) -> None:
+    recipe = tmp_path / "broken.yaml"
+    recipe.write_text("extends: demo\nedges: {stage: broken}\n")
+    ran = hodge(environment, "run", str(recipe), "--source", str(tmp_path), "--out", str(tmp_path / "run"))
+    assert ran.returncode == 1
+    assert ran.stderr.startswith(
+        f"error: {recipe}:2: edges: stage 'broken' of kind 'edges' (hodge-plugin-example 0.3.0)"
+    )
+    assert ran.stderr.count("\n") == 1
+
+
+def test_its_schema_leaves_the_broken_one_out(environment: dict[str, str]) -> None:
+    schema = hodge(environment, "recipes", "--schema")
+    assert schema.returncode == 0
+    assert '"ring"' in schema.stdout
+    assert '"broken"' not in schema.stdout
