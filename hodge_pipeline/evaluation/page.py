@@ -16,7 +16,7 @@ from hodge_pipeline.evaluation.tables import (
     stages_table,
     worst_edges_table,
 )
-from hodge_pipeline.evaluation.verdict import Outcome, judge, length, percent, suspicions
+from hodge_pipeline.evaluation.verdict import Outcome, judge, percent, suspicions
 
 SYMBOLS: dict[Outcome, str] = {"improved": "▲", "unchanged": "＝", "worse": "▼", "mixed": "◆", "not measured": "?"}
 
@@ -41,8 +41,9 @@ p { margin: .3rem 0 .8rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: .92rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem .6rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
-th { font-weight: 600; color: var(--soft); border-bottom-width: 2px; white-space: normal; vertical-align: bottom; }
-.word { text-align: left; white-space: normal; overflow-wrap: anywhere; min-width: 4.5rem; }
+th { font-weight: 600; color: var(--soft); border-bottom-width: 2px; white-space: normal;
+  vertical-align: bottom; min-width: 3.8rem; }
+.word { text-align: left; white-space: normal; overflow-wrap: break-word; min-width: 5.5rem; }
 tr.after td { font-weight: 600; background: var(--shade); }
 ul.notes { padding-left: 1.2rem; } ul.notes li { margin: .2rem 0; }
 .plots { display: grid; gap: 1.2rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); }
@@ -91,17 +92,17 @@ def _head(report: Report) -> str:
 
 def _verdict(report: Report) -> str:
     verdict = judge(report)
-    head, _, rest = verdict.sentence.partition(": " if verdict.changes else " ")
+    kind, symbol = verdict.outcome.replace(" ", "-"), SYMBOLS[verdict.outcome]
     return (
-        f'<div class="verdict {verdict.outcome.replace(" ", "-")}"><b>{SYMBOLS[verdict.outcome]} {escape(head)}</b>'
-        f"<br>{escape(rest[:1].upper() + rest[1:])}</div>"
+        f'<div class="verdict {kind}"><b>{symbol} {escape(verdict.headline)}</b>'
+        f"<br>{escape(verdict.details[:1].upper() + verdict.details[1:])}</div>"
     )
 
 
 def _tiles(report: Report) -> str:
     tiles = [
         (
-            f"{length(change.before_m)} → {length(change.after_m)}",
+            " → ".join(change.lengths),
             f"{change.what.removeprefix('the ')}, {percent(change.share)}",
         )
         for change in judge(report).changes

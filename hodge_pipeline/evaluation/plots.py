@@ -133,7 +133,8 @@ def _score_histogram(figure: Figure, report: Report) -> None:
     bins = np.linspace(lowest, 1.0, HISTOGRAM_BINS).tolist()
     for row, name in enumerate(table.names):
         scores = graph.scores[row][np.isfinite(graph.scores[row])]
-        axes.hist(scores, bins=bins, histtype="step", label=f"{name}, mean {scores.mean():.3f}", **_style(report, name))
+        mean = f", mean {scores.mean():.3f}" if len(scores) else ", not scored"
+        axes.hist(scores, bins=bins, histtype="step", label=f"{name}{mean}", **_style(report, name))
     axes.set_xlabel(f"score, {len(graph.pairs)} {GRAPH_NAMES[graph.kind]}")
     axes.set_ylabel("pairs")
     axes.legend(frameon=False, fontsize=9, loc="upper left")
@@ -157,9 +158,8 @@ def _residuals(figure: Figure, report: Report) -> None:
 
 def _log_histogram(axes: Any, report: Report, columns: list[tuple[str, Floats]]) -> None:
     known = [(name, np.maximum(values[np.isfinite(values)], SMALLEST_RESIDUAL)) for name, values in columns]
-    largest = max((float(values.max(initial=0.0)) for _, values in known), default=0.0)
-    smallest = min((float(values.min(initial=np.inf)) for _, values in known), default=SMALLEST_RESIDUAL)
-    bins = np.geomspace(smallest, max(largest, 2 * smallest) * 1.001, HISTOGRAM_BINS)
+    every = np.concatenate([values for _, values in known if len(values)] or [np.array([SMALLEST_RESIDUAL])])
+    bins = np.geomspace(every.min(), max(every.max(), 2 * every.min()) * 1.001, HISTOGRAM_BINS)
     for name, values in known:
         median = f", median {np.median(values):.2g}" if len(values) else ""
         axes.hist(values, bins=bins, histtype="step", label=f"{name}{median}", **_style(report, name))

@@ -84,13 +84,13 @@ def _score_cells(graph: GraphScores, row: int) -> tuple[str, str, str]:
 
 def _trajectories(report: Report) -> Table:
     header = ("poses", "ATE", "median", "largest", "RPE", "RPE, rotation", "frames")
+    absolute_m = max((row.ate_rmse_m for row in report.trajectories if row.frames), default=0.0)
+    relative_m = max((row.rpe_translation_m for row in report.trajectories if row.frames), default=0.0)
     rows = tuple(
         (
             row.name,
-            length(row.ate_rmse_m),
-            length(row.ate_median_m),
-            length(row.ate_max_m),
-            length(row.rpe_translation_m),
+            *(length(metres, absolute_m) for metres in (row.ate_rmse_m, row.ate_median_m, row.ate_max_m)),
+            length(row.rpe_translation_m, relative_m),
             number(row.rpe_rotation_deg, ".3f", "°"),
             str(row.frames),
         )

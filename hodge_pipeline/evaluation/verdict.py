@@ -17,6 +17,7 @@ SAME = 0.02
 LARGE_RESIDUAL_M = 0.1
 LARGE_RESIDUAL_DEG = 5.0
 UNMATCHED_SHARE = 0.01
+NO_MEASURE = "there were neither overlapping clouds nor true poses to compare the poses by."
 
 
 VERBS = {1: "fell", 0: "hardly changed,", -1: "rose"}
@@ -42,29 +43,40 @@ class Change:
         return 0 if abs(self.share) <= SAME else (1 if self.share < 0 else -1)
 
     def __str__(self) -> str:
-        size = f"from {length(self.before_m)} to {length(self.after_m)} ({percent(self.share)})"
-        return f"{self.what} {VERBS[self.sign]} {size}"
+        before, after = self.lengths
+        return f"{self.what} {VERBS[self.sign]} from {before} to {after} ({percent(self.share)})"
+
+    @property
+    def lengths(self) -> tuple[str, str]:
+        """Before and after in the same unit."""
+        larger_m = max(self.before_m, self.after_m)
+        return length(self.before_m, larger_m), length(self.after_m, larger_m)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome in one word and in one sentence, and the changes it rests on."""
+    """The outcome in one word, in a headline, in detail, and the changes it rests on."""
 
     outcome: Outcome
-    sentence: str
+    headline: str
+    details: str
     changes: tuple[Change, ...]
+
+    @property
+    def sentence(self) -> str:
+        """Headline and details in one."""
+        return f"{self.headline}: {self.details}"
 
 
 def judge(report: Report) -> Verdict:
     """The verdict on a report: every measured error counts, and where they disagree it is `mixed`."""
     changes = (*_score_changes(report), *_trajectory_changes(report))
     if not changes:
-        sentence = "There were neither overlapping clouds nor true poses to measure by."
-        return Verdict("not measured", f"Not measured. {sentence}", ())
+        return Verdict("not measured", "Not measured", NO_MEASURE, ())
     signs = {change.sign for change in changes} - {0}
     outcome: Outcome = "unchanged" if not signs else "mixed" if len(signs) > 1 else _one_way(signs.pop())
     told = "; ".join(str(change) for change in changes)
-    return Verdict(outcome, f"{outcome.capitalize()} against {report.before}: {told}.", changes)
+    return Verdict(outcome, f"{outcome.capitalize()} against {report.before}", f"{told}.", changes)
 
 
 def _one_way(sign: int) -> Outcome:
@@ -145,13 +157,14 @@ def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[str]:
         yield f"{row.name}: its positions lie on a line (or are fewer than three): its orientations aligned it."
 
 
-def length(metres: float) -> str:
-    """A length with a unit that suits its size."""
+def length(metres: float, unit_of_m: float | None = None) -> str:
+    """A length with a unit that suits its size, or the size `unit_of_m` of another."""
     if not abs(metres) < float("inf"):
         return "–"
-    if abs(metres) < 0.02:
+    size_m = abs(metres if unit_of_m is None else unit_of_m)
+    if size_m < 0.025:
         return f"{metres * 1000:.3g} mm"
-    return f"{metres * 100:.3g} cm" if abs(metres) < 1 else f"{metres:.3g} m"
+    return f"{metres * 100:.3g} cm" if size_m < 1 else f"{metres:.3g} m"
 
 
 def percent(share: float) -> str:

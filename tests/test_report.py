@@ -1,0 +1,264 @@
+"""The report: its verdict by hand, its page and its numbers read back."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.evaluation.report import (
+    EdgeRow,
+    LoopRow,
+    Path3D,
+    Pictures,
+    Report,
+    Residuals,
+    SourceSummary,
+    StageRow,
+    as_json,
+    write_report,
+)
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.scores import GraphScores, ScoreTable
+from hodge_pipeline.evaluation.summary import graph_summary, in_runs, trajectory_rows, worst_edges
+from hodge_pipeline.evaluation.tables import score_tables, summary_lines
+from hodge_pipeline.evaluation.verdict import judge, length, percent, suspicions
+from hodge_pipeline.types import Floats, ViewGraph
+
+VOID = {"meta", "img", "br"}
+
+
+def circle(count: int = 20) -> Floats:
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    zeros = np.zeros(count)
+    turned = se3.exp(np.stack([zeros, zeros, angle, zeros, zeros, zeros], axis=1))
+    turned[:, :3, 3] = np.stack([np.cos(angle), np.sin(angle), zeros], axis=1)
+    return turned
+
+
+def shaken(poses: Floats, size: float) -> Floats:
+    return poses @ se3.exp(np.random.default_rng(0).normal(scale=size, size=(len(poses), 6)))
+
+
+def ring(poses: Floats) -> ViewGraph:
+    """Each frame with the next, measured exactly, but for one edge that is 0.5 m off."""
+    count = len(poses)
+    edges = np.array([(k, (k + 1) % count) for k in range(count)])
+    i_from_j = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]]
+    i_from_j[7, 0, 3] += 0.5
+    return ViewGraph.from_edges(np.arange(100, 100 + count), edges, i_from_j, source="sequential")
+
+
+def scored(*mean_distances_m: float) -> ScoreTable:
+    distances_m = np.outer(mean_distances_m, [0.9, 1.0, 1.1])
+    pairs = np.array([(0, 1), (1, 2), (2, 3)])
+    graphs = (GraphScores("distance", pairs, distances_m), GraphScores("iou", pairs, distances_m))
+    return ScoreTable(("truth", "odometry", "result"), "truth", graphs)
+
+
+@pytest.fixture(scope="module")
+def report() -> Report:
+    truth = circle()
+    sets = {"odometry": shaken(truth, 0.03), "result": shaken(truth, 0.003)}
+    graph = ring(truth)
+    weights = np.ones(20)
+    weights[3] = 0
+    return Report(
+        title="A <ring> & its loop",
+        source=SourceSummary(
+            "seven_scenes", "data/ring", 20, 20, ("one", "two"), ("1 frame was unreadable: left out",)
+        ),
+        scores=scored(0.010, 0.020, 0.012),
+        trajectories=trajectory_rows(sets, truth),
+        loops=(LoopRow("measured", 4, 2.0), LoopRow("step 1", 4, 1e-3)),
+        graph=graph_summary(graph, np.zeros(20, np.int64), weights, {"fitness below 0.3": 5}),
+        worst_edges=worst_edges(graph, sets["result"], weights, 3),
+        stages=(StageRow("read", 1.0, 0.5, 100.0), StageRow("solve", 2.0, 3.5, 300.0)),
+        notes=("2 pairs were tried twice",),
+        versions={"hodge-pipeline": "0.1.0"},
+        recipe="reader: seven_scenes  # <ring>\n",
+        pictures=Pictures(
+            paths=tuple(Path3D(name, poses[:, :3, 3]) for name, poses in {"truth": truth, **sets}.items()),
+            component=np.zeros(20, np.int64),
+            residuals=tuple(Residuals(name, *edge_residuals(graph, poses)) for name, poses in sets.items()),
+            graph=graph,
+            convergence={"first": (10.0, 2.0, 1.9)},
+        ),
+    )
+
+
+class WellFormed(HTMLParser):
+    """Fails on an element that is closed out of order; collects text and addresses."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def read_page(path: Path) -> tuple[str, list[str]]:
+    page = WellFormed()
+    page.feed(path.read_text("utf-8"))
+    assert not page.open
+    return "".join(page.text), page.addresses
+
+
+def test_the_page_is_small_well_formed_and_asks_for_nothing(report: Report, tmp_path: Path) -> None:
+    page, _ = write_report(tmp_path, report)
+    text, addresses = read_page(page)
+    assert page.stat().st_size < 3_000_000
+    assert len(addresses) == 5
+    assert all(address.startswith("data:image/png;base64,") for address in addresses)
+    assert not re.search(r"https?://|@import|url\(", page.read_text("utf-8"))
+    for expected in ("A <ring> & its loop", "Improved against odometry", "107", "2 pairs were tried twice", "# <ring>"):
+        assert expected in text
+
+
+def test_json_reads_back_with_the_numbers(report: Report, tmp_path: Path) -> None:
+    _, numbers = write_report(tmp_path, report)
+    found = json.loads(numbers.read_text("utf-8"))
+    assert list(found)[:3] == ["format_version", "title", "verdict"]
+    assert found["verdict"]["outcome"] == "improved"
+    assert found["scores"]["graphs"]["iou"]["poses"]["odometry"]["distance_m"] == pytest.approx(0.02)
+    assert found["scores"]["graphs"]["distance"]["edges"] == 3
+    assert found["graph"]["edges_by_source"] == {"sequential": 20}
+    assert found["worst_edges"][0]["fitness"] is None  # NaN: unknown
+    assert found["loops"][0]["mean"] == 0.5
+    assert found["stages"][1]["cpu_s"] == 3.5
+
+
+def test_the_same_report_gives_the_same_bytes(report: Report, tmp_path: Path) -> None:
+    first, second = tmp_path / "a", tmp_path / "b"
+    for folder in (first, second):
+        folder.mkdir()
+        write_report(folder, report)
+    for name in ("report.html", "report.json"):
+        assert (first / name).read_bytes() == (second / name).read_bytes()
+
+
+def test_an_empty_report_still_says_what_it_is(tmp_path: Path) -> None:
+    report = Report("nothing", SourceSummary("tum", "x", 0))
+    text, addresses = read_page(write_report(tmp_path, report)[0])
+    assert "Not measured" in text
+    assert "no true poses" in text
+    assert addresses == []
+    assert as_json(report)["scores"] is None
+
+
+def test_frames_that_cannot_be_drawn_are_no_error(report: Report, tmp_path: Path) -> None:
+    nowhere = np.full((3, 3), np.nan)
+    still = np.zeros((3, 3))
+    lost = Residuals("result", np.full(20, np.nan), np.full(20, np.nan))
+    pictures = replace(
+        report.pictures,
+        paths=(Path3D("truth", nowhere), Path3D("result", still)),
+        component=np.array([0, 0, 1]),
+        residuals=(lost,),
+        convergence={"first": (0.0, -1.0)},
+    )
+    unknown = scored(np.nan, np.nan, np.nan)
+    _, addresses = read_page(write_report(tmp_path, replace(report, pictures=pictures, scores=unknown))[0])
+    assert len(addresses) == 5
+
+
+@pytest.mark.parametrize(
+    ("before_m", "after_m", "outcome", "words"),
+    [
+        (0.020, 0.012, "improved", "fell from 20 mm to 12 mm (−40 %)"),
+        (0.010, 0.015, "worse", "rose from 10 mm to 15 mm (+50 %)"),
+        (0.010, 0.0101, "unchanged", "hardly changed, from 10 mm to 10.1 mm (+1 %)"),
+    ],
+)
+def test_the_verdict_follows_the_scores(before_m: float, after_m: float, outcome: str, words: str) -> None:
+    verdict = judge(Report("r", SourceSummary("tum", "x", 4), scores=scored(0.01, before_m, after_m)))
+    assert verdict.outcome == outcome
+    assert words in verdict.sentence
+
+
+def test_errors_that_disagree_are_mixed(report: Report) -> None:
+    verdict = judge(replace(report, scores=scored(0.01, 0.01, 0.02)))
+    assert verdict.outcome == "mixed"
+    assert [change.sign for change in verdict.changes] == [-1, -1, 1]
+
+
+def test_the_worst_edge_is_the_wrong_one(report: Report) -> None:
+    worst = report.worst_edges[0]
+    assert (worst.i, worst.j, worst.source) == ("107", "108", "sequential")
+    assert worst.residual_m == pytest.approx(0.5, abs=0.02)
+    sizes = [edge.residual_m * 100 + edge.residual_deg for edge in report.worst_edges]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+def test_what_to_distrust_is_said(report: Report) -> None:
+    #  0–…–9   10–…–18   19
+    component = np.array([0] * 10 + [1] * 9 + [2])
+    assert report.pictures.graph is not None
+    summary = graph_summary(report.pictures.graph, component, np.array([0.0] * 2 + [1.0] * 18))
+    said = "\n".join(suspicions(replace(report, graph=summary, scores=scored(0.01, 0.1, 0.01))))
+    for expected in (
+        "2 pairs were tried twice",
+        "falls into 3 parts",
+        "1 of 20 frames have no edge",
+        "ignored 2 of 20 edges",
+        "At least 1 edges",
+        "odometry: 2 of 3 near-centroid pairs have no point within 10 cm",
+    ):
+        assert expected in said
+
+
+def test_an_ignored_edge_is_not_called_used(report: Report) -> None:
+    ignored = EdgeRow("1", "2", "overlap", 0.5, 0.0, 1.0, 20.0)
+    assert not any("that the solver used" in line for line in suspicions(replace(report, worst_edges=(ignored,))))
+
+
+def test_parts_are_listed_largest_first_as_the_source_names_them(report: Report) -> None:
+    assert report.pictures.graph is not None
+    component = np.array([1, 0, 0, 1, 0] + [0] * 15)
+    parts = graph_summary(report.pictures.graph, component).components
+    assert [(part.count, part.frames) for part in parts] == [(18, "101–102, 104–119"), (2, "100, 103")]
+    assert in_runs(np.arange(0, 60, 2), np.arange(60)).endswith("20, 22, and 18 more")
+    assert in_runs(np.zeros(0, np.int64), np.arange(3)) == "none"
+
+
+def test_relative_motions_stop_at_the_end_of_a_sequence() -> None:
+    truth = circle(6)
+    jumped = truth.copy()
+    jumped[3:] = se3.exp(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])) @ jumped[3:]
+    sequence = ["a"] * 3 + ["b"] * 3
+    (split,) = trajectory_rows({"result": jumped}, truth, sequence=sequence)
+    (whole,) = trajectory_rows({"result": jumped}, truth)
+    assert split.rpe_translation_m == pytest.approx(0, abs=1e-9)
+    assert whole.rpe_translation_m > 0.1
+    assert split.ate_rmse_m > 0.1
+
+
+def test_tables_and_terminal_lines(report: Report) -> None:
+    scores, trajectory = score_tables(report)
+    assert scores.rows[1][:4] == ("odometry", "0.7486", "20.00 mm", "3")
+    assert all(len(row) == len(table.header) for table in (scores, trajectory) for row in table.rows)
+    labels = [label for label, _ in summary_lines(report)]
+    assert labels[:4] == ["verdict", "source", "graph", "time"]
+    assert dict(summary_lines(report))["time"] == "3.0 s, 4.0 CPU s, at most 300 MB"
+
+
+def test_numbers_in_words() -> None:
+    assert [length(value) for value in (0.0012, 0.0305, 1.303, float("nan"))] == ["1.2 mm", "3.05 cm", "1.3 m", "–"]
+    assert [percent(value) for value in (-0.406, 0.1)] == ["−41 %", "+10 %"]
