@@ -38,7 +38,7 @@ def solve(
     fixed: Ints | None = None,
     certificate: bool = False,
     max_iterations: int = 100,
-    relative_tolerance: float = 1e-10,
+    relative_tolerance: float = 1e-9,
     time_limit_s: float = math.inf,
     keep_history: bool = False,
 ) -> Solution:
@@ -131,7 +131,7 @@ class HodgeSolver:
     certificate: bool = Field(False, description="test whether the isotropic minimum is the global one")
     max_iterations: int = Field(100, gt=0, description="Newton steps; real graphs need 3 to 12")
     relative_tolerance: float = Field(
-        1e-10, gt=0, lt=1, description="share of the objective that further steps may still win when it stops"
+        1e-9, gt=0, lt=1, description="share of the objective that further steps may still win when it stops"
     )
     time_limit_s: float = Field(math.inf, gt=0, description="seconds after which the best poses so far are given")
 

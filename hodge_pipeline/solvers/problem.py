@@ -16,6 +16,8 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from hodge_pipeline.solvers.linear import Factor, factorise, fill_reducing_order
 from hodge_pipeline.types import Bools, Floats, Ints
 
+SAME_RATIO = 1e-13
+
 
 @dataclass(frozen=True)
 class BlockPattern:
@@ -98,7 +100,11 @@ class Problem:
 
     @cached_property
     def translation_factor(self) -> Factor:
-        """The scalar Laplacian of τ, factorised once."""
+        """The scalar Laplacian of τ, factorised once: that of κ, where every edge has the same ratio of the two."""
+        ratio = self.tau / self.kappa
+        if len(ratio) and np.ptp(ratio) <= SAME_RATIO * ratio[0]:
+            solve, scale = self.rotation_factor.solve, 1 / ratio[0]
+            return Factor(self.free_count, lambda rhs: scale * solve(rhs))
         return factorise(laplacian(self.tail, self.head, self.tau, self.free_count), "NATURAL")
 
     @cached_property
