@@ -1,0 +1,51 @@
+"""The normal distributions transform (Biber and Strasser 2003; Magnusson 2009), by open3d."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import open3d as o3d
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.registration.open3d_cloud import Open3dCloud, register_levels
+from hodge_pipeline.types import Floats, PointCloud, Registration
+
+ASSESSED_WITHIN_M = 0.1
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Ndt:
+    """Cloud j against Gaussians in voxels of cloud i: no correspondences, a wide basin."""
+
+    voxels_m: tuple[float, ...] = Field(
+        default=(0.5, 0.25),
+        min_length=1,
+        description="Metres, coarse to fine: side of a voxel. Below about 0.2 too few points of a 3 cm cloud fill one.",
+    )
+    max_iterations: int = Field(default=30, ge=1, description="Steps at each level, at most.")
+    points_per_sample: float = Field(
+        default=100.0, gt=0, description="Points that count as one independent measurement in the information."
+    )
+
+    def prepare(self, cloud: PointCloud) -> Open3dCloud:
+        """The cloud, and a tree when the result is assessed."""
+        return Open3dCloud(cloud, neighbours=10)
+
+    def register(self, target: Open3dCloud, source: Open3dCloud, i_from_j: Floats) -> Registration:
+        """Cloud j (source) moved onto cloud i (target) from the guess."""
+        return register_levels(
+            self._align,
+            self.voxels_m,
+            target,
+            source,
+            i_from_j,
+            max_distance_m=ASSESSED_WITHIN_M,
+            points_per_sample=self.points_per_sample,
+        )
+
+    def _align(self, target: Open3dCloud, source: Open3dCloud, voxel_m: float, guess: Floats) -> Any:
+        option = o3d.pipelines.registration.NormalDistributionsTransformOption(
+            voxel_size=voxel_m, max_iteration=self.max_iterations
+        )
+        return o3d.pipelines.registration.registration_ndt(source.geometry, target.geometry, option, guess)

@@ -1,0 +1,100 @@
+"""A cloud as open3d wants it, assessed like every other."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+
+from hodge_pipeline import se3
+from hodge_pipeline.registration.assessment import MIN_POINTS, assess, to_registration, unregistered
+from hodge_pipeline.registration.gicp import PreparedCloud
+from hodge_pipeline.types import Floats, PointCloud, Registration
+
+
+def _use_one_thread() -> None:
+    """Keep open3d's TBB to one thread in this process, whatever OMP_NUM_THREADS says.
+
+    TBB takes the number of processors that it may use when it first runs, and has no other switch; with more than
+    one, sums are added in any order and the last bits of a registration differ from run to run.
+    """
+    if not hasattr(os, "sched_setaffinity"):  # neither macOS nor Windows has it: there the last bits may differ
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.random.default_rng(0).uniform(size=(100, 3))))
+        cloud.estimate_normals()
+        method = o3d.pipelines.registration.TransformationEstimationPointToPlane()
+        o3d.pipelines.registration.registration_icp(cloud, cloud, 0.1, np.eye(4), method)
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+_use_one_thread()
+
+Align = Callable[["Open3dCloud", "Open3dCloud", float, Floats], Any]
+"""One level: (target, source, distance in metres or voxel, guess) to open3d's result."""
+
+
+class Open3dCloud(PreparedCloud):
+    """Adds open3d's own cloud to the trees that the assessment needs."""
+
+    def __init__(self, cloud: PointCloud, neighbours: int) -> None:
+        super().__init__(cloud, neighbours)
+        finite = np.isfinite(cloud.points_in_cam).all(axis=1)
+        self._colours = None if cloud.colours is None else np.asarray(cloud.colours[finite], float) / 255.0
+
+    @property
+    def has_colours(self) -> bool:
+        """Whether any point has a colour: a frame without an image is black."""
+        return self._colours is not None and bool(self._colours.any())
+
+    @cached_property
+    def geometry(self) -> Any:
+        """The open3d cloud, with normals, and colours where there are any."""
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.points))
+        cloud.normals = o3d.utility.Vector3dVector(self.normals)
+        if self._colours is not None:
+            cloud.colors = o3d.utility.Vector3dVector(self._colours)
+        return cloud
+
+
+def register_levels(
+    align: Align,
+    levels: Sequence[float],
+    target: Open3dCloud,
+    source: Open3dCloud,
+    i_from_j: Floats,
+    *,
+    max_distance_m: float,
+    points_per_sample: float,
+) -> Registration:
+    """Cloud j (source) moved onto cloud i (target), level by level; assessed within `max_distance_m`."""
+    guess = np.asarray(i_from_j, np.float64)
+    if min(len(target), len(source)) < MIN_POINTS:
+        return unregistered(guess)
+    motion, iterations = guess, 0
+    for level in levels:
+        try:
+            result = align(target, source, level, motion)
+        except RuntimeError:  # open3d found no correspondence, or no voxel with enough points
+            return unregistered(guess)
+        if not se3.is_motion(result.transformation):
+            return unregistered(guess)
+        motion = se3.from_parts(se3.project_to_so3(result.transformation[:3, :3]), result.transformation[:3, 3])
+        iterations += 1
+    assessment = assess(
+        source_points=source.points,
+        target_points=target.points,
+        target_normals=target.normals,
+        find_nearest=target.find_nearest,
+        i_from_j=motion,
+        max_distance_m=max_distance_m,
+        points_per_sample=points_per_sample,
+    )
+    return to_registration(assessment, motion, iterations, converged=True)
