@@ -15,9 +15,9 @@ from hodge_pipeline.solvers.linear import negative_pivots
 from hodge_pipeline.solvers.problem import BlockPattern, Problem
 from hodge_pipeline.types import Floats
 
-RELATIVE_SHIFT = 1e-5
-"""ε over κ's scale: far above rounding, far below the negative eigenvalues of local minima."""
-RELATIVE_GAP = 1e-4
+RELATIVE_SHIFTS = (1e-10, 1e-7)
+"""ε over κ's scale, the second where the first is lost in rounding; local minima have eigenvalues far below both."""
+RELATIVE_GAP = 1e-6
 """ε is taken larger where even then the bound on the gap stays below this share of F."""
 
 
@@ -71,17 +71,20 @@ def certify(problem: Problem, rotations: Floats, translations: Floats, cost: flo
     d, free = problem.dimension, problem.free_count
     scale = float(np.median(problem.kappa)) if len(problem.kappa) else 1.0
     rank = d * problem.count
-    shift = max(RELATIVE_SHIFT * scale, RELATIVE_GAP * cost / rank)
     matrix = certificate_matrix(problem, rotations, translations)
     kept = np.ones((problem.count, d + 1), bool)
     kept[free:, d] = False
     rows = np.flatnonzero(kept.reshape(-1))
-    shifts = np.zeros((problem.count, d + 1))
-    shifts[:, :d] = shift
-    shifted = csc_matrix(matrix + diags_array(shifts.reshape(-1)))[rows][:, rows]
-    negative = negative_pivots(csc_matrix(shifted))
-    if negative == 0:
-        note = f"globally optimal to within {shift * rank:.3g} of F = {cost:.6g} (certified)"
-        return Certificate(True, shift, shift * rank, 0, note)
-    found = "its factorisation broke down" if negative < 0 else f"{negative} negative eigenvalues"
+    ones = np.zeros((problem.count, d + 1))
+    ones[:, :d] = 1.0
+    negative = -1
+    for relative in RELATIVE_SHIFTS:
+        shift = max(relative * scale, RELATIVE_GAP * cost / rank)
+        shifted = csc_matrix(matrix + diags_array(shift * ones.reshape(-1)))
+        negative = negative_pivots(csc_matrix(shifted[rows][:, rows]))
+        if negative == 0:
+            bound = shift * rank
+            note = f"globally optimal: F = {cost:.9g} is within {bound:.3g} of the least (certified)"
+            return Certificate(True, shift, bound, 0, note)
+    found = "the factorisation broke down" if negative < 0 else f"{negative} negative eigenvalues"
     return Certificate(False, shift, np.inf, negative, f"not certified as the global minimum: {found}")
