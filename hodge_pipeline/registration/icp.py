@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import open3d as o3d
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline.registration.one_thread import o3d
 from hodge_pipeline.registration.open3d_cloud import Open3dCloud, register_levels
 from hodge_pipeline.types import Floats, PointCloud, Registration
 

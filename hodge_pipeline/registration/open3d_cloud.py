@@ -2,40 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.assessment import MIN_POINTS, assess, to_registration, unregistered
 from hodge_pipeline.registration.gicp import PreparedCloud
+from hodge_pipeline.registration.one_thread import o3d
 from hodge_pipeline.types import Floats, PointCloud, Registration
-
-
-def _use_one_thread() -> None:
-    """Keep open3d's TBB to one thread in this process, whatever OMP_NUM_THREADS says.
-
-    TBB takes the number of processors that it may use when it first runs, and has no other switch; with more than
-    one, sums are added in any order and the last bits of a registration differ from run to run.
-    """
-    if not hasattr(os, "sched_setaffinity"):  # neither macOS nor Windows has it: there the last bits may differ
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(before)})
-    try:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.random.default_rng(0).uniform(size=(100, 3))))
-        cloud.estimate_normals()
-        method = o3d.pipelines.registration.TransformationEstimationPointToPlane()
-        o3d.pipelines.registration.registration_icp(cloud, cloud, 0.1, np.eye(4), method)
-    finally:
-        os.sched_setaffinity(0, before)
-
-
-_use_one_thread()
 
 Align = Callable[["Open3dCloud", "Open3dCloud", float, Floats], Any]
 """One level: (target, source, distance in metres or voxel, guess) to open3d's result."""
