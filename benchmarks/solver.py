@@ -108,7 +108,7 @@ def timed(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
 
 
 def gtsam_seconds(path: Path, dimension: int, graph: ViewGraph, repeats: int) -> str:
-    """CPU seconds of GTSAM's chordal start and Gauss-Newton. Its objective is another one: it reads q_vec as an angle."""
+    """CPU seconds of GTSAM's chordal start and Gauss-Newton, on another objective (it reads q_vec as an angle)."""
     try:
         import gtsam
     except ImportError:

@@ -24,11 +24,17 @@ class CgResult:
 
 
 def truncated_cg(
-    apply: Operator, precondition: Operator, gradient: Floats, tolerance: float, max_steps: int
+    apply: Operator,
+    precondition: Operator,
+    gradient: Floats,
+    tolerance: float,
+    max_steps: int,
+    enough: float = 0.0,
 ) -> CgResult:
     """The Newton direction to within a tolerance, or up to the first direction of negative curvature (Steihaug 1983).
 
     `tolerance` is on the residual's norm in the preconditioner's metric, relative to that of g.
+    It also ends where a step, times the steps so far, wins less than `enough` of xᵀ H x + 2 gᵀ x.
     """
     x, r = np.zeros_like(gradient), gradient.copy()
     z = precondition(r)
@@ -48,7 +54,7 @@ def truncated_cg(
         r += alpha * image
         z = precondition(r)
         new = float(r @ z)
-        if new <= tolerance**2 * first:
+        if new <= tolerance**2 * first or step * alpha * rz < enough:
             return CgResult(x, r, step)
         direction *= new / rz
         direction -= z

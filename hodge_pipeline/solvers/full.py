@@ -90,19 +90,19 @@ class FullObjective:
         left = full_residuals(self.problem, self.information, rotations, translations)
         return FullPoint(rotations, translations, float(left.cost_per_edge.sum()), left)
 
-    def step(self, point: Point, tolerance: float) -> Step:
+    def step(self, point: Point, tolerance: float, enough: float) -> Step:
         """A Gauss-Newton step by PCG: first with the two Laplacians, with a direct factor once they prove too weak."""
         assert isinstance(point, FullPoint)
         gradient, hessian = self.normal_equations(point.left)
         spent = 0
         if self.direct.solve is None:
             precondition = self.laplacian_preconditioner(point.rotations)
-            found = _solve(hessian, precondition, gradient, tolerance, DIRECT_AFTER_CG_STEPS)
+            found = _solve(hessian, precondition, gradient, tolerance, DIRECT_AFTER_CG_STEPS, enough)
             spent = found.steps
         if self.direct.solve is not None or spent >= DIRECT_AFTER_CG_STEPS:
             if self.direct.solve is None or self.direct.cg_steps > REFACTOR_AFTER_CG_STEPS:
                 self.direct.solve = factorise(hessian.tocsc(), "NATURAL").solve
-            found = _solve(hessian, self.direct.solve, gradient, tolerance, MAX_CG_STEPS)
+            found = _solve(hessian, self.direct.solve, gradient, tolerance, MAX_CG_STEPS, enough)
             self.direct.cg_steps = found.steps
             spent += found.steps
         slope = 2 * float(gradient @ found.x)
@@ -155,5 +155,7 @@ class FullObjective:
         return apply
 
 
-def _solve(hessian: bsr_matrix, precondition: Operator, gradient: Floats, tolerance: float, max_steps: int) -> CgResult:
-    return truncated_cg(lambda x: np.asarray(hessian @ x), precondition, gradient, tolerance, max_steps)
+def _solve(
+    hessian: bsr_matrix, precondition: Operator, gradient: Floats, tolerance: float, max_steps: int, enough: float
+) -> CgResult:
+    return truncated_cg(lambda x: np.asarray(hessian @ x), precondition, gradient, tolerance, max_steps, enough)

@@ -54,8 +54,8 @@ class Objective(Protocol):
         """The point at these poses."""
         ...
 
-    def step(self, point: Point, tolerance: float) -> Step:
-        """The step from a point, its linear system solved to a relative tolerance."""
+    def step(self, point: Point, tolerance: float, enough: float) -> Step:
+        """The step from a point, its linear system solved to a relative tolerance, or until it wins too little."""
         ...
 
     def moved(self, point: Point, direction: Floats) -> Point:
@@ -82,9 +82,9 @@ def descend(
     for _ in range(limits.max_iterations):
         if point.cost <= floor:
             return Descent(point, tuple(costs), cg_steps, True, "converged")
-        step = objective.step(point, tolerance)
-        cg_steps += step.cg_steps
         smallest = limits.relative_tolerance * point.cost + floor
+        step = objective.step(point, tolerance, smallest)
+        cg_steps += step.cg_steps
         new = _line_search(objective, point, step)
         if new is None:
             converged = step.predicted <= math.sqrt(limits.relative_tolerance) * point.cost

@@ -115,7 +115,7 @@ class IsotropicObjective:
         left = residuals(self.problem, rotations, best)
         return IsotropicPoint(rotations, best, left.cost, left)
 
-    def step(self, point: Point, tolerance: float) -> Step:
+    def step(self, point: Point, tolerance: float, enough: float) -> Step:
         """A truncated Newton step: each CG step costs one solve with the Laplacian of κ and one with that of τ.
 
         Where the Hessian has a direction of negative curvature, the Gauss-Newton model takes its place: far from the
@@ -127,7 +127,7 @@ class IsotropicObjective:
             model = quadratic_model(self.problem, point.left, exact)
             gradient = model.gradient.reshape(-1)
             found = truncated_cg(
-                reduced_hessian(self.problem, model), self._precondition, gradient, tolerance, MAX_CG_STEPS
+                reduced_hessian(self.problem, model), self._precondition, gradient, tolerance, MAX_CG_STEPS, enough
             )
             spent += found.steps
             if not found.negative_curvature:
