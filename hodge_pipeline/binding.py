@@ -21,8 +21,11 @@ Where = Callable[[Keys], str]
 """Gives `file:line` of a key path."""
 
 
-def bind(cls: type[T], data: Any, where: Where, keys: Keys = ()) -> T:
+def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | None = None) -> T:
     """An instance of a pydantic dataclass from a mapping; nested sections and stages included.
+
+    A stage that has an option `seed` and is not given one takes the section's `seed`, so that a recipe's one seed
+    reaches everything random in it.
 
     Raises `RecipeError`: `file:line: key: what was expected`, with the nearest known name for an unknown key.
     """
@@ -34,29 +37,34 @@ def bind(cls: type[T], data: Any, where: Where, keys: Keys = ()) -> T:
         if key not in known:
             here = (*keys, key)
             raise RecipeError(f"{where(here)}: {_dotted(here)}: unknown option{registry.suggestion(key, list(known))}")
-    values = {key: _value(known[key], value, where, (*keys, key)) for key, value in data.items()}
+    if isinstance(data.get("seed"), int):
+        seed = data["seed"]
+    elif "seed" in known and seed is not None:
+        data = {**data, "seed": seed}
+    values = {key: _value(known[key], value, where, (*keys, key), seed) for key, value in data.items()}
     try:
         return cls(**values)
     except ValidationError as error:
         raise _first_error(error, where, keys) from error
 
 
-def _value(annotation: Any, value: Any, where: Where, keys: Keys) -> Any:
+def _value(annotation: Any, value: Any, where: Where, keys: Keys, seed: int | None) -> Any:
     """A field's value with its stages and sections built; anything else is left to pydantic."""
     if value is None:
         return None
     if get_origin(annotation) in (typing.Union, types.UnionType):
         inner = [arg for arg in get_args(annotation) if registry.kind_of(arg) or _is_section(arg)]
-        return _value(inner[0], value, where, keys) if inner else value
+        return _value(inner[0], value, where, keys, seed) if inner else value
     kind = registry.kind_of(annotation)
     if kind:
-        return bind_stage(kind.name, value, where, keys)
+        return bind_stage(kind.name, value, where, keys, seed)
     if get_origin(annotation) is tuple and isinstance(value, list):
-        return tuple(_value(get_args(annotation)[0], item, where, (*keys, row)) for row, item in enumerate(value))
-    return bind(annotation, value, where, keys) if _is_section(annotation) else value
+        item = get_args(annotation)[0]
+        return tuple(_value(item, each, where, (*keys, row), seed) for row, each in enumerate(value))
+    return bind(annotation, value, where, keys, seed=seed) if _is_section(annotation) else value
 
 
-def bind_stage(kind: str, value: Any, where: Where, keys: Keys) -> Any:
+def bind_stage(kind: str, value: Any, where: Where, keys: Keys, seed: int | None = None) -> Any:
     """The stage that `{stage: name, option: …}`, or the name alone, stands for."""
     options = {"stage": value} if isinstance(value, str) else value
     if not isinstance(options, Mapping) or not isinstance(options.get("stage"), str):
@@ -66,7 +74,7 @@ def bind_stage(kind: str, value: Any, where: Where, keys: Keys) -> Any:
         cls = registry.load(kind, options["stage"])
     except RecipeError as error:
         raise RecipeError(f"{where((*keys, 'stage'))}: {_dotted(keys)}: {error}") from error
-    return bind(cls, {key: item for key, item in options.items() if key != "stage"}, where, keys)
+    return bind(cls, {key: item for key, item in options.items() if key != "stage"}, where, keys, seed=seed)
 
 
 def unbind(value: Any) -> Any:

@@ -110,3 +110,9 @@ def test_every_registered_stage_loads_and_keeps_its_contract(kind: str) -> None:
             assert isinstance(stage, registry.KINDS[kind].protocol)
             with pytest.raises(AttributeError):
                 stage.a_field_that_is_not_there = 1
+
+
+def test_the_seed_of_a_recipe_reaches_every_stage_that_has_one(tmp_path: Path) -> None:
+    recipe = load(tmp_path, SMALL + "seed: 7\nodometry: {registration: {stage: vgicp, seed: 3}}\n")
+    assert recipe.registration.seed == 7  # type: ignore[attr-defined]
+    assert recipe.odometry.registration.seed == 3  # type: ignore[attr-defined]

@@ -1,0 +1,78 @@
+"""What the main job costs: CPU and wall seconds and peak memory of each stage, and how they grow with the frames.
+
+    python benchmarks/main_job.py SEQUENCE [--recipe seven_scenes] [--frames 50 100 200 250] [--repeat 1]
+
+The first N frames of the sequence are run in a fresh process each; the table is Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+SCRIPT = """
+import sys
+from pathlib import Path
+import hodge_pipeline
+from hodge_pipeline.recipe import load_recipe
+import hodge_pipeline.steps as steps, dataclasses
+recipe, source, out, count, *overrides = sys.argv[1:]
+read = steps.read
+def first_frames(job):
+    whole = read(job)
+    return dataclasses.replace(whole, frames=whole.frames[: int(count)])
+steps.read = first_frames
+hodge_pipeline.run(load_recipe(recipe, overrides, Path(source)), out)
+"""
+
+
+def measure(recipe: str, source: Path, frames: int, overrides: list[str]) -> dict[str, Any]:
+    """The report of one run in a fresh process, with `total_cpu_s` and `total_wall_s` of the process tree."""
+    import os
+    import time
+
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        before, begin = os.times(), time.perf_counter()
+        command = [sys.executable, "-c", SCRIPT, recipe, str(source), str(out), str(frames), *overrides]
+        subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+        after = os.times()
+        report: dict[str, Any] = json.loads((out / "report.json").read_text())
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    return {**report, "total_cpu_s": cpu, "total_wall_s": time.perf_counter() - begin}
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("source", type=Path)
+    parser.add_argument("--recipe", default="seven_scenes")
+    parser.add_argument("--frames", type=int, nargs="+", default=[50, 100, 200, 250])
+    parser.add_argument("--repeat", type=int, default=1, help="runs of each; the medians are printed")
+    parser.add_argument("--set", dest="overrides", action="append", default=[])
+    options = parser.parse_args()
+    print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}\n")
+    print("| frames | CPU s | wall s | peak MB | ATE m |")
+    print("|---|---|---|---|---|")
+    last: dict[str, Any] = {}
+    for frames in options.frames:
+        runs = [measure(options.recipe, options.source, frames, options.overrides) for _ in range(options.repeat)]
+        cpu, wall = (statistics.median(run[key] for run in runs) for key in ("total_cpu_s", "total_wall_s"))
+        peak = statistics.median(max(stage["peak_mb"] for stage in run["stages"]) for run in runs)
+        ate = {row["name"]: row["ate_rmse_m"] for row in runs[0]["trajectories"]}.get("result", float("nan"))
+        print(f"| {frames} | {cpu:.1f} | {wall:.1f} | {peak:.0f} | {ate:.4f} |", flush=True)
+        last = runs[0]
+    print(f"\n| stage ({options.frames[-1]} frames) | CPU s | wall s | peak MB |\n|---|---|---|---|")
+    for stage in last["stages"]:
+        print(f"| {stage['name']} | {stage['cpu_s']:.1f} | {stage['wall_s']:.1f} | {stage['peak_mb']:.0f} |")
+
+
+if __name__ == "__main__":
+    main()
