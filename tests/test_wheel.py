@@ -1,0 +1,66 @@
+"""The wheel, installed in an environment of its own outside the checkout: it finds its recipes and runs the demo."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dist")
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(REPOSITORY)]
+    subprocess.run(build, check=True, capture_output=True)
+    (path,) = out.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def hodge(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The command of the wheel. The libraries are those of this environment; the project's own code is the wheel's."""
+    home = tmp_path_factory.mktemp("clean")
+    venv.create(home, with_pip=False)
+    python = home / "bin" / "python"
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps", str(wheel)]
+    subprocess.run(install, check=True, capture_output=True)
+    (site,) = home.glob("lib/python*/site-packages")
+    # as a plain path its own .pth files are not read, so the checkout's editable install stays out
+    (site / "libraries.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
+    where = subprocess.run(
+        [python, "-c", "import hodge_pipeline as p, hodge_adapters as a; print(p.__file__, a.__file__)"],
+        check=True, capture_output=True, text=True, cwd=home,
+    ).stdout  # fmt: skip
+    assert where.count(str(site)) == 2
+    return home / "bin" / "hodge"
+
+
+def test_the_wheel_holds_both_packages_and_the_recipes(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert {"hodge_pipeline/recipes/demo.yaml", "hodge_pipeline/py.typed", "hodge_adapters/tum.py"} <= names
+    assert not [name for name in names if name.startswith(("tests/", "adapters/", "benchmarks/"))]
+
+
+def test_it_finds_its_recipes_and_stages(hodge: Path, tmp_path: Path) -> None:
+    def output(*arguments: str) -> str:
+        return subprocess.run([hodge, *arguments], check=True, capture_output=True, text=True, cwd=tmp_path).stdout
+
+    assert "seven_scenes" in output("recipes")
+    assert "broken" not in output("stages")
+
+
+@pytest.mark.slow
+def test_it_runs_the_demo(hodge: Path, tmp_path: Path) -> None:
+    light = ["clouds.voxel_m=0.08", "outer_iterations=1", "fusion=[{stage: cloud, voxel_m: 0.05}]"]
+    light += ["evaluation.tables=false", "recording.level=summary"]
+    command = [hodge, "demo", "--out", "run", *(word for change in light for word in ("--set", change))]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, env=dict(os.environ))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run/recording.rrd").stat().st_size > 10_000
+    assert "Improved" in done.stdout
