@@ -49,7 +49,7 @@ def _solve(matrix: bsr_matrix, rhs: Floats) -> Floats:
     if matrix.shape[0] < LARGE:
         return factorise(matrix.tocsc(), "NATURAL").solve(rhs)
     try:
-        factor = factorise(matrix.tocsc(), "NATURAL", single=True)
+        factor = factorise(matrix.astype(np.float32).tocsc(), "NATURAL", single=True)
     except GraphError:
         return factorise(matrix.tocsc(), "NATURAL").solve(rhs)
     found = truncated_cg(

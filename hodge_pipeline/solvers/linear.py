@@ -38,7 +38,7 @@ def factorise(matrix: csc_matrix | csr_matrix, ordering: str = "auto", single: b
     A + Aᵀ, which keeps the fill of most graph Laplacians lowest. `single`: in float32, half the memory, good enough to
     precondition with. Raises `GraphError` where the matrix is singular.
     """
-    csc = csc_matrix(matrix, dtype=np.float32 if single else np.float64)
+    csc = csc_matrix(matrix, dtype=np.float32 if single else np.float64, copy=False)
     size = int(csc.shape[0])
     if size == 0:
         return Factor(0, lambda rhs: rhs)

@@ -12,6 +12,8 @@ from hodge_pipeline.types import Floats
 
 SUFFICIENT_DECREASE = 1e-4
 MAX_HALVINGS = 40
+CG_SHARE = 0.1
+"""Of what further steps may still win: where so little is left in a linear system, it is solved."""
 LOOSEST_TOLERANCE, TIGHTEST_TOLERANCE = 0.3, 1e-3
 
 
@@ -83,7 +85,7 @@ def descend(
         if point.cost <= floor:
             return Descent(point, tuple(costs), cg_steps, True, "converged")
         smallest = limits.relative_tolerance * point.cost + floor
-        step = objective.step(point, tolerance, smallest)
+        step = objective.step(point, tolerance, CG_SHARE * smallest)
         cg_steps += step.cg_steps
         new = _line_search(objective, point, step)
         if new is None:
