@@ -69,14 +69,21 @@ def _add_type(types: Types, data: bytes, span: slice, parent: str, depth: int) -
         raise Malformed("its schema nests too deep")
     name = ".".join(filter(None, (parent, _texts(data, span, 1))))
     fields: dict[int, Field] = {}
-    for field in _spans(data, span, 2):
-        numbers = {number: value for number, _, value in _wire(data, field) if isinstance(value, int)}
-        type_name = _texts(data, field, 6).removeprefix(".")
-        repeated = numbers.get(4) == _REPEATED
-        fields[numbers.get(3, 0)] = Field(_texts(data, field, 1), numbers.get(5, 0), repeated, type_name)
+    for field_span in _spans(data, span, 2):
+        number, field = _parse_field(data, field_span)
+        fields[number] = field
     types[name] = fields
     for nested in _spans(data, span, 3):
         _add_type(types, data, nested, name, depth + 1)
+
+
+def _parse_field(data: bytes, span: slice) -> tuple[int, Field]:
+    """The number of a field and its description, a FieldDescriptorProto."""
+    values = {number: value for number, _, value in _wire(data, span)}
+    numbers = {number: value for number, value in values.items() if isinstance(value, int)}
+    name, type_name = (_text(data, values.get(number)) for number in (1, 6))
+    field = Field(name, numbers.get(5, 0), numbers.get(4) == _REPEATED, type_name.removeprefix("."))
+    return numbers.get(3, 0), field
 
 
 def _decode(types: Types, name: str, data: bytes) -> Message:
@@ -162,6 +169,8 @@ def _wire(data: bytes, span: slice) -> Iterator[Wire]:
 
 
 def _varint(data: bytes, at: int, end: int) -> tuple[int, int]:
+    if at < end and data[at] < 0x80:
+        return data[at], at + 1
     value = 0
     for shift in range(0, 70, 7):
         if at >= end:
@@ -179,4 +188,8 @@ def _spans(data: bytes, span: slice, number: int) -> list[slice]:
 
 
 def _texts(data: bytes, span: slice, number: int) -> str:
-    return "".join(data[value].decode("utf-8", "replace") for value in _spans(data, span, number)[-1:])
+    return "".join(_text(data, value) for value in _spans(data, span, number)[-1:])
+
+
+def _text(data: bytes, value: int | slice | None) -> str:
+    return data[value].decode("utf-8", "replace") if isinstance(value, slice) else ""

@@ -102,7 +102,7 @@ def records(read: ReadAt, start: int, end: int) -> Iterator[Record]:
     while at < end:
         head = read(at, min(_RECORD.size, end - at))
         if len(head) < _RECORD.size:
-            yield Record(0, at, end - at, complete=False)
+            yield Record(0, at + _RECORD.size, 0, complete=False)
             return
         opcode, length = _RECORD.unpack(head)
         body = at + _RECORD.size

@@ -1,0 +1,430 @@
+"""Recordings that are cut, damaged or lie: read as far as they go, or refused in one line; never more memory than said.
+
+`HODGE_MCAP_CASES` sets how many random damages are tried (240).
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import struct
+import tracemalloc
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType
+
+from hodge_adapters import mcap_records
+from hodge_adapters.mcap import McapReader
+from hodge_adapters.mcap_records import MAGIC
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Source
+from mcap_data import (
+    CDR,
+    JSON,
+    PROTOBUF,
+    SECOND,
+    Log,
+    calibration,
+    compressed_depth,
+    encode_cdr,
+    foxglove_header,
+    odometry,
+    png,
+    point_cloud,
+    raw_image,
+    ros_header,
+    transforms,
+)
+from readers_data import HEIGHT, WIDTH, depth_values, some_poses
+
+CASES = int(os.environ.get("HODGE_MCAP_CASES", "240"))
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+
+
+def everything(encoding: str = CDR, count: int = 3) -> Log:
+    """Depth raw, as PNG and as RVL, colour, clouds, calibration, odometry and transforms."""
+    log, pose = Log(), some_poses(1)[0]
+    for row in range(count):
+        head, log_ns = foxglove_header(100 + row, "cam"), (100 + row) * SECOND
+        depth = depth_values(row)
+        log.add("/info", "foxglove.CameraCalibration", {**head, **calibration(WIDTH, HEIGHT, 9, 9, 4, 3)}, encoding)
+        log.add("/raw", "foxglove.RawImage", {**head, **raw_image(depth, "16UC1")}, encoding, log_ns)
+        for coding in ("png", "rvl"):
+            image = {**head, **compressed_depth(depth, coding)}
+            log.add(f"/{coding}", "foxglove.CompressedImage", image, encoding, log_ns)
+        colour = raw_image(np.zeros((HEIGHT, WIDTH, 3), np.uint8), "rgb8")
+        log.add("/colour", "foxglove.RawImage", {**head, **colour}, encoding, log_ns)
+        log.add("/odom", "nav_msgs/msg/Odometry", odometry(100 + row, pose), CDR, log_ns)
+        log.add("/tf", "tf2_msgs/msg/TFMessage", transforms((100 + row, "base_link", "cam", pose)), CDR, log_ns)
+        points = {axis: np.arange(4, dtype="<f4") for axis in "xyz"}
+        cloud = {"header": ros_header(100 + row, "cam"), **point_cloud(points, {"x": 0, "y": 4, "z": 8}, 12)}
+        log.add("/points", "sensor_msgs/msg/PointCloud2", cloud, CDR, log_ns)
+    return log
+
+
+def read_all(source: Source) -> int:
+    """Read everything of every frame; how many frames were refused by `SourceError`, one line each."""
+    refused = 0
+    for frame in source.frames:
+        try:
+            for read in (frame.read_depth, frame.read_colour, frame.read_points, frame.encoded_depth):
+                if read is not None:
+                    read()
+        except SourceError as error:
+            assert "\n" not in str(error) and str(source.path) in str(error)
+            refused += 1
+    if source.trajectory is not None:
+        assert se3.is_motion(source.trajectory.world_from_cam, 1e-6).all()
+    return refused
+
+
+def try_all(path: Path) -> None:
+    """Open and read by every topic; only `SourceError` in one line may come of it."""
+    for reader in (McapReader(), McapReader(depth_topic="/rvl"), McapReader(frames="points")):
+        try:
+            read_all(reader.open(path))
+        except SourceError as error:
+            assert "\n" not in str(error) and str(path) in str(error) or "option" in str(error)
+
+
+def damaged(contents: bytes, seed: int) -> bytes:
+    """The same file with one random damage: bits flipped, cut, bytes removed or put in, a number made huge."""
+    rng = np.random.default_rng(seed)
+    out, at = bytearray(contents), int(rng.integers(len(contents)))
+    kind = seed % 6
+    if kind == 0:
+        out[at] ^= 1 << int(rng.integers(8))
+    elif kind == 1:
+        for place in rng.integers(len(out), size=20):
+            out[place] ^= 1 << int(rng.integers(8))
+    elif kind == 2:
+        del out[at:]
+    elif kind == 3:
+        del out[at : at + int(rng.integers(1, 40))]
+    elif kind == 4:
+        out[at : at + 4] = b"\xff\xff\xff\x7f"
+    else:
+        out[at:at] = rng.bytes(int(rng.integers(1, 40)))
+    return bytes(out)
+
+
+def resident_peak() -> float:
+    """The most memory, in bytes, that this process ever held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """Without checksums, so that damage comes through to what they would protect."""
+    folder = tmp_path_factory.mktemp("damage")
+    ways = [
+        (CDR, CompressionType.NONE, {}),
+        (CDR, CompressionType.NONE, {"use_chunking": False}),
+        (PROTOBUF, CompressionType.NONE, {"chunk_size": 1000}),
+        (JSON, CompressionType.NONE, {"chunk_size": 1000}),
+        (CDR, CompressionType.ZSTD, {"chunk_size": 4000}),
+        (CDR, CompressionType.LZ4, {"chunk_size": 4000}),
+    ]
+    paths = [
+        everything(encoding).write(folder / f"{n}.mcap", compression, enable_crcs=False, **options)
+        for n, (encoding, compression, options) in enumerate(ways)
+    ]
+    return [path.read_bytes() for path in paths]
+
+
+def test_random_damage_never_gets_out(recordings: list[bytes], tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    before = resident_peak()
+    for seed in range(CASES):
+        path.write_bytes(damaged(recordings[seed // 6 % len(recordings)], seed))
+        try_all(path)
+    assert resident_peak() - before < 100e6
+
+
+def record_ends(contents: bytes) -> Iterator[tuple[int, int]]:
+    """(opcode, end) of each record at the top of a file."""
+    at = len(MAGIC)
+    while at + 9 <= len(contents) - len(MAGIC):
+        opcode, length = struct.unpack_from("<BQ", contents, at)
+        at += 9 + length
+        yield opcode, at
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_cut_at_every_record(tmp_path: Path, compression: CompressionType) -> None:
+    log = Log()
+    log.add("/info", "foxglove.CameraCalibration", calibration(WIDTH, HEIGHT, 9, 9, 4, 3), CDR)
+    for row in range(5):
+        message = {"header": ros_header(100 + row, "cam"), **raw_image(depth_values(row), "16UC1")}
+        log.add("/raw", IMAGE, message, CDR)
+    contents = log.write(tmp_path / "whole.mcap", compression, chunk_size=1).read_bytes()
+    path, chunks, has_all = tmp_path / "cut.mcap", 0, False
+    for opcode, end in record_ends(contents):
+        chunks, has_all = chunks + (opcode == Opcode.CHUNK), has_all or opcode == Opcode.DATA_END
+        path.write_bytes(contents[:end])
+        if chunks < 2:
+            with pytest.raises(SourceError, match="no depth, clouds, images or poses"):
+                McapReader().open(path)
+            continue
+        source = McapReader().open(path)
+        assert len(source.frames) == chunks - 1 and not read_all(source)
+        unfinished = f"cut.mcap: not finished by its recorder: all {end} bytes were read"
+        assert (unfinished in source.notes) != has_all, "all data is there once its end is"
+        path.write_bytes(contents[: end + 5])
+        cut_off = f"cut.mcap: cut off: whole records up to byte {end} of {end + 5} were read"
+        assert (cut_off in McapReader().open(path).notes) != has_all
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_chunk_that_is_cut_is_read_as_far_as_it_goes(tmp_path: Path, compression: CompressionType) -> None:
+    rng = np.random.default_rng(0)
+    log = Log()
+    log.add("/info", "foxglove.CameraCalibration", calibration(160, 120, 9, 9, 4, 3), CDR)
+    images = [rng.integers(1, 60000, (120, 160)).astype(np.uint16) for _ in range(8)]
+    for row, image in enumerate(images):
+        log.add("/raw", IMAGE, {"header": ros_header(100 + row, "cam"), **raw_image(image, "16UC1")}, CDR)
+    contents = log.write(tmp_path / "whole.mcap", compression, chunk_size=1 << 30).read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(contents[: len(contents) * 2 // 3])
+    # A compressed chunk gives nothing of the block that it breaks off in: 128 KiB for zstd, more for lz4.
+    source = McapReader().open(path)
+    assert 3 <= len(source.frames) <= 5
+    for frame, image in zip(source.frames, images, strict=False):
+        assert np.array_equal(frame.read_depth(), image.astype(np.float32) * np.float32(1e-3))
+    assert any("cut off" in note for note in source.notes)
+
+
+def test_damage_in_the_middle_costs_one_chunk(tmp_path: Path) -> None:
+    path = everything(count=6).write(tmp_path / "log.mcap", CompressionType.ZSTD, chunk_size=1)
+    contents = bytearray(path.read_bytes())
+    whole = McapReader().open(path)
+    starts = [0, *(end for _, end in record_ends(bytes(contents)))]
+    chunks = [start for start in starts if start and contents[start : start + 1] == bytes([Opcode.CHUNK])]
+    flipped = contents.copy()
+    flipped[chunks[20] + 60] ^= 0x10
+    path.write_bytes(flipped)
+    assert any("log.mcap: 1 left out: a chunk" in note for note in McapReader().open(path).notes)
+    longer = contents.copy()
+    longer[chunks[20] + 6] = 0x7F  # The record's length, now past the end of the file.
+    path.write_bytes(longer)
+    source = McapReader().open(path)
+    assert any(f"damaged at byte {chunks[20]}: went on at byte {chunks[21]}" in note for note in source.notes)
+    assert len(source.frames) >= len(whole.frames) - 1
+
+
+def test_checksums_tell_damage_that_nothing_else_would(tmp_path: Path) -> None:
+    log = everything()
+    path = log.write(tmp_path / "log.mcap", CompressionType.NONE, chunk_size=1)
+    contents = bytearray(path.read_bytes())
+    at = contents.index(depth_values(1).tobytes())
+    contents[at + 20] ^= 1
+    path.write_bytes(contents)
+    source = McapReader(depth_topic="/raw").open(path)
+    assert [frame.stamp_s for frame in source.frames] == [100.0, 102.0]
+    assert "log.mcap: 1 left out: a chunk whose checksum does not hold" in source.notes
+
+
+def chunk_file(path: Path, compression: bytes, data: bytes, uncompressed: int) -> Path:
+    """A file with one chunk that says it expands to so many bytes."""
+    body = struct.pack("<QQQII", 0, 0, uncompressed, 0, len(compression)) + compression
+    body += struct.pack("<Q", len(data)) + data
+    header = struct.pack("<BQII", Opcode.HEADER, 8, 0, 0)
+    path.write_bytes(MAGIC + header + struct.pack("<BQ", Opcode.CHUNK, len(body)) + body)
+    return path
+
+
+def zeros_zstd(count: int) -> bytes:
+    """The zstd frame of so many zeros, made block by block."""
+    compressor = zstandard.ZstdCompressor().compressobj()
+    block = bytes(1 << 20)
+    return b"".join([*(compressor.compress(block) for _ in range(count >> 20)), compressor.flush()])
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("declared", [1 << 20, 1 << 40, 1 << 63, 0])
+def test_a_chunk_is_never_expanded_past_what_it_says_or_the_limit(
+    tmp_path: Path, compression: str, declared: int
+) -> None:
+    data = zeros_zstd(1 << 27) if compression == "zstd" else lz4.frame.compress(bytes(1 << 24))
+    path = chunk_file(tmp_path / "bomb.mcap", compression.encode(), data, declared)
+    before = resident_peak()
+    with pytest.raises(SourceError, match=r"bomb\.mcap: no depth"):
+        McapReader().open(path)
+    assert resident_peak() - before < 64e6
+
+
+def test_a_frame_header_of_zstd_is_not_believed(tmp_path: Path) -> None:
+    """A frame whose own header says 2^62 bytes, in a chunk that says 1000."""
+    data = struct.pack("<IBQ", 0xFD2FB528, 0xE0, 1 << 62) + b"\1\0\0"
+    with pytest.raises(SourceError, match=r"no depth.*a chunk that zstd cannot expand"):
+        McapReader().open(chunk_file(tmp_path / "bomb.mcap", b"zstd", data, 1000))
+
+
+def test_an_unknown_compression_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"a chunk compressed by 'brotli': only zstd, lz4 and none are known"):
+        McapReader().open(chunk_file(tmp_path / "log.mcap", b"brotli", b"xyz", 3))
+
+
+LIES = {
+    "rows that are not there": {"height": 1000},
+    "more pixels than a camera has": {"height": 1 << 20, "width": 1 << 20, "step": 1 << 21},
+    "no pixels": {"width": 0},
+    "a step shorter than a row": {"step": 3},
+    "a step of four billion": {"step": 0xFFFFFFFF},
+    "an encoding that nobody knows": {"encoding": "64FC9"},
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_images_that_lie_are_left_out_and_counted(tmp_path: Path, lie: str) -> None:
+    log = Log()
+    for row in range(4):
+        image = raw_image(depth_values(row), "16UC1") | (LIES[lie] if row % 2 else {})
+        log.add("/raw", IMAGE, {"header": ros_header(100 + row, "cam"), **image}, CDR)
+    source = McapReader(camera=(9, 9, 4, 3)).open(log.write(tmp_path / "log.mcap"))
+    assert [frame.stamp_s for frame in source.frames] == [100.0, 102.0]
+    assert any(note.startswith("/raw: 2 left out: a message with") for note in source.notes)
+
+
+def png_that_says(width: int, height: int) -> bytes:
+    """A valid PNG whose header says another size, with its checksum right."""
+    contents = bytearray(png(depth_values()))
+    contents[16:24] = struct.pack(">II", width, height)
+    contents[29:33] = struct.pack(">I", zlib.crc32(contents[12:29]))
+    return bytes(contents)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1 << 31, 1 << 31), (0, 5), (60000, 60000)])
+def test_a_png_bomb_is_left_out(tmp_path: Path, width: int, height: int) -> None:
+    log = Log()
+    contents = {"format": "16UC1; compressedDepth png", "data": bytes(12) + png_that_says(width, height)}
+    for row, data in enumerate((contents, compressed_depth(depth_values()))):
+        log.add("/depth", COMPRESSED, {"header": ros_header(100 + row, "cam"), **data}, CDR)
+    source = McapReader(camera=(9, 9, 4, 3)).open(log.write(tmp_path / "log.mcap"))
+    assert [frame.stamp_s for frame in source.frames] == [101.0] and not read_all(source)
+    assert any(note.startswith("/depth: 1 left out") for note in source.notes)
+
+
+def test_a_png_with_fewer_rows_than_it_says_is_refused_when_read(tmp_path: Path) -> None:
+    log = Log()
+    contents = {"format": "16UC1; compressedDepth png", "data": bytes(12) + png(depth_values())[:-20]}
+    log.add("/depth", COMPRESSED, {"header": ros_header(100, "cam"), **contents}, CDR)
+    source = McapReader(camera=(9, 9, 4, 3)).open(log.write(tmp_path / "log.mcap"))
+    with pytest.raises(SourceError, match=r"log\.mcap: /depth at 100\.000000000 s: the image is truncated or damaged"):
+        source.frames[0].read_depth()
+
+
+def test_rvl_of_another_size_is_refused_when_read(tmp_path: Path) -> None:
+    image = compressed_depth(depth_values(), "rvl")
+    image["data"] = image["data"][:12] + struct.pack("<II", 8000, 8000) + image["data"][20:]
+    log = Log()
+    log.add("/depth", COMPRESSED, {"header": ros_header(100, "cam"), **image}, CDR)
+    source = McapReader(camera=(9, 9, 4, 3)).open(log.write(tmp_path / "log.mcap"))
+    with pytest.raises(SourceError, match=r"/depth at 100\.000000000 s: an RVL code that breaks off"):
+        source.frames[0].read_depth()
+
+
+CLOUD_LIES = {
+    "points that are not there": {"width": 4000},
+    "four billion points": {"width": 0xFFFFFFFF, "height": 0xFFFFFFFF},
+    "points of no size": {"point_step": 0},
+    "points of four billion bytes": {"point_step": 0xFFFFFFFF},
+    "rows shorter than their points": {"row_step": 5},
+    "a field past its point": {"fields": [{"name": a, "offset": 10, "datatype": 7, "count": 1} for a in "xyz"]},
+    "a field of no type": {"fields": [{"name": a, "offset": 0, "datatype": 99, "count": 1} for a in "xyz"]},
+    "one field twice": {"fields": [{"name": a, "offset": 0, "datatype": 7, "count": 1} for a in "xyzz"]},
+    "no z": {"fields": [{"name": a, "offset": 0, "datatype": 7, "count": 1} for a in "xy"]},
+}
+
+
+@pytest.mark.parametrize("lie", CLOUD_LIES)
+def test_clouds_that_lie_are_left_out_and_counted(tmp_path: Path, lie: str) -> None:
+    log = Log()
+    for row in range(2):
+        points = {axis: np.arange(4, dtype="<f4") for axis in "xyz"}
+        cloud = point_cloud(points, {"x": 0, "y": 4, "z": 8}, 12) | (CLOUD_LIES[lie] if row else {})
+        log.add("/points", "sensor_msgs/msg/PointCloud2", {"header": ros_header(100 + row, "cam"), **cloud}, CDR)
+    source = McapReader().open(log.write(tmp_path / "log.mcap"))
+    assert len(source.frames) == 1 and len(source.frames[0].read_points()) == 4
+    assert any(note.startswith("/points: 1 left out: a message with") for note in source.notes)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [b"", b"[]", b"null", b"{", b"[" * 5000, b'{"data": 5}', b'{"timestamp": 3, "data": ""}', b'{"width": "x"}',
+     b'{"timestamp": {"sec": 1e999}, "data": ""}', b'{"data": "%%%", "format": "png"}', b"\xff\xfe"],
+)  # fmt: skip
+def test_json_that_is_something_else(tmp_path: Path, message: bytes) -> None:
+    log = Log()
+    for schema in ("foxglove.CompressedImage", "foxglove.RawImage", "foxglove.FrameTransform", "foxglove.PointCloud"):
+        log.add_bytes(f"/{schema}", schema, JSON, message)
+    with pytest.raises(SourceError, match=r"no depth, clouds, images or poses in .*1 left out: a message with"):
+        McapReader().open(log.write(tmp_path / "log.mcap"))
+
+
+@pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (9, 0, 0, 0), (float("nan"), 0, 0, 1)])
+def test_poses_that_are_none_are_left_out(tmp_path: Path, quaternion: tuple[float, ...]) -> None:
+    log = Log()
+    for row in range(3):
+        message = odometry(100 + row, some_poses(1)[0])
+        if row == 1:
+            message["pose"]["pose"]["orientation"] = dict(zip("xyzw", quaternion, strict=True))
+        log.add("/odom", "nav_msgs/msg/Odometry", message, CDR)
+    source = McapReader().open(log.write(tmp_path / "log.mcap"))
+    assert source.trajectory.stamps_s.tolist() == [100.0, 102.0]
+    assert "/odom: 1 left out: a message with a pose that is no rigid motion" in source.notes
+
+
+def test_a_message_of_an_unknown_channel_is_counted(tmp_path: Path) -> None:
+    name = "nav_msgs/msg/Odometry"
+    data = encode_cdr(name, odometry(1, some_poses(1)[0]))
+    body = struct.pack("<HIQQ", 77, 0, 0, 0) + data
+    message = struct.pack("<BQ", Opcode.MESSAGE, len(body)) + body
+    with pytest.raises(SourceError, match="a message of a channel that the file does not define"):
+        McapReader().open(chunk_file(tmp_path / "log.mcap", b"", message, len(message)))
+
+
+def test_memory_is_that_of_a_chunk(tmp_path: Path) -> None:
+    """Forty megabytes of frames are opened, and each one read, in far less."""
+    rng = np.random.default_rng(0)
+    log = Log()
+    log.add("/info", "foxglove.CameraCalibration", calibration(640, 480, 500, 500, 320, 240), CDR)
+    for row in range(64):
+        image = raw_image(rng.integers(1, 60000, (480, 640)).astype(np.uint16), "16UC1")
+        log.add("/raw", IMAGE, {"header": ros_header(100 + row, "cam"), **image}, CDR)
+    path = log.write(tmp_path / "log.mcap", CompressionType.ZSTD)
+    del log
+    tracemalloc.start()
+    try:
+        source = McapReader().open(path)
+        for frame in source.frames:
+            frame.read_depth()
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(source.frames) == 64 and peak < 10e6, f"{peak / 1e6:.1f} MB"
+
+
+def test_limits_are_what_the_documentation_says() -> None:
+    assert mcap_records.MAX_CHUNK_BYTES == 256 << 20
+
+
+def test_sniffing_never_raises(tmp_path: Path, recordings: list[bytes]) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "short.mcap").write_bytes(MAGIC[:5])
+    (tmp_path / "good.mcap").write_bytes(recordings[0])
+    assert McapReader().sniff(tmp_path / "good.mcap").confidence == 1
+    for name in ("loop", "short.mcap", "absent"):
+        assert McapReader().sniff(tmp_path / name).confidence == 0
+        with suppress(SourceError):
+            McapReader().open(tmp_path / name)
+            raise AssertionError(name)
