@@ -1,0 +1,178 @@
+"""The paper to the letter: embed the viewing graph, extend ω to the surface, solve the cotangent Poisson equation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Literal, TypeAlias
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.complex.checks import check_graph
+from hodge_pipeline.complex.components import describe_components
+from hodge_pipeline.complex.cycles import (
+    Loops,
+    adjusted_edges,
+    fundamental_products,
+    loop_deviation,
+    loop_products,
+    spanning_forest,
+)
+from hodge_pipeline.complex.form import Logarithm, residual_form
+from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
+from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem, path_lengths
+from hodge_pipeline.solvers.paper_surface import (
+    MOST_CHECKED_EDGES,
+    PaperSurface,
+    RotationSystem,
+    homology_metrics,
+    make_surface,
+)
+from hodge_pipeline.types import Floats, Solution, SolverIteration, ViewGraph
+
+STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
+AFFORDABLE_BASIS = 1_000_000  # vertices times edges: a few tenths of a second
+
+AroundLoops: TypeAlias = Callable[[Floats], Floats]
+"""The motions (L, 4, 4) around the loops of one cycle basis, from the motions (E, 4, 4) of the edges."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class PaperSolver:
+    """Poses whose 1-form on the embedding surface has no exact part left (paper, Section 4, step by step).
+
+    1. `ω_ij`, the logarithm of the residual motion of each edge (Section 3.3; around the centroid of its component);
+    2. Algorithm 1: a cyclic order of the edges at each vertex makes the graph a closed surface, cell by cell;
+    3. the cells are cut into triangles, and Algorithm 2 gives each diagonal the integral of ω along a shortest path;
+    4. the Poisson equation with cotangent weights (Eqs. (7)-(9)) gives f, and `T_k ← exp(f_k) T_k`.
+
+    The surface is made once; every inner iteration forms ω anew and solves with the same factor. There are no robust
+    weights and no information matrices: an edge is accepted before the solve, or it counts like any other. `poisson`
+    solves the same equation on the graph alone; `docs/method.md` compares the two.
+    """
+
+    rotation: RotationSystem = Field(
+        "random",
+        description="the cyclic orders of Algorithm 1: random, the paper's, which makes few huge cells; angular, by "
+        "the angle of the neighbours in each vertex's principal plane, which makes smaller cells and less genus",
+    )
+    seed: int = Field(0, ge=0, description="of the random orders; the same seed gives the same poses")
+    paths: Literal["hops", "uncertainty"] = Field(
+        "hops",
+        description="what Algorithm 2's shortest paths are shortest by: the number of edges (the paper), or the sum of "
+        "their standard deviations, from the information of the edges",
+    )
+    log: Logarithm = Field(
+        "pairing",
+        description="logarithm of the residual motion: pairing is the paper's (rotation vector, translation), which "
+        "depends on the edges' directions; se3 does not",
+    )
+    inner_iterations: int = Field(
+        3, ge=1, description="Poisson steps with the same edges: each leaves about 2 % of the error (paper: 1 to 3)"
+    )
+    tolerance: float = Field(
+        1e-10, gt=0, description="stop once the RMS of f over the vertices (radians and metres) is below this"
+    )
+    cycle_basis: Literal["auto", "tree", "shortest"] = Field(
+        "auto",
+        description="the loops over which D is summed: those of a breadth-first tree, or a basis of least total "
+        "length, mostly triangles; auto takes the shortest while vertices × edges is at most a million",
+    )
+
+    def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
+        """Consistent poses; a graph of several components is solved piece by piece, isolated vertices keep their pose.
+
+        Raises `GraphError` for motions or information that are not finite, and for an empty graph.
+        """
+        world_from_cam = np.asarray(world_from_cam, float)
+        check_graph(graph, world_from_cam)
+        problem = make_problem(graph, world_from_cam)
+        pieces = describe_components(problem.component, graph.vertex_ids)
+        if not len(problem.edges):
+            note = "no edge joins two vertices: every pose is as it was at the start"
+            return Solution(world_from_cam.copy(), problem.component, np.zeros(graph.edge_count), notes=(*pieces, note))
+        lengths = path_lengths(graph.select(problem.used), self.paths)
+        surface = make_surface(problem.edges, problem.start, lengths, self.rotation, self.seed)
+        around_loops = self._around_loops(problem)
+        generators = surface.generators() if surface.is_checked else None
+        history = self._iterate(problem, surface, around_loops, generators)
+        measured = loop_deviation(around_loops(problem.i_from_j))
+        return Solution(
+            world_from_cam=history[-1].world_from_cam,
+            component=problem.component,
+            weights=problem.used.astype(float),
+            history=history,
+            metrics={
+                "loops": float(len(measured)),
+                "measured_loop_deviation_sum": float(measured.sum()),
+                "measured_loop_deviation_mean": _mean(measured),
+                "iterations": float(len(history)),
+                **surface.sizes(),
+                **(surface.shares(surface.form(self._form(problem, problem.start))) if surface.is_checked else {}),
+                **homology_metrics(generators, problem.i_from_j, "measured_homology"),
+                **history[-1].metrics,
+            },
+            notes=(*pieces, *self._notes(problem, surface, history)),
+        )
+
+    def _iterate(
+        self, problem: PaperProblem, surface: PaperSurface, around_loops: AroundLoops, generators: Loops | None
+    ) -> tuple[SolverIteration, ...]:
+        solve_poisson = problem.poisson(surface.d0, surface.weights)
+        poses, history = problem.start, []
+        omega = self._form(problem, poses)
+        for _ in range(self.inner_iterations):
+            correction = solve_poisson(surface.form(omega))
+            adjusted = adjusted_edges(problem.edges, poses, correction, pairing=self.log == "pairing")
+            deviation = loop_deviation(around_loops(adjusted))
+            poses = problem.moved(poses, correction, self.log)
+            omega = self._form(problem, poses)
+            step = float(np.sqrt((correction**2).sum(axis=1).mean()))
+            metrics = {
+                **problem.residual_metrics(poses),
+                "step_rms": step,
+                "loop_deviation_sum": float(deviation.sum()),
+                "loop_deviation_mean": _mean(deviation),
+                **homology_metrics(generators, adjusted, "homology"),
+            }
+            objective = float(0.5 * surface.weights[: len(omega)] @ (omega**2).sum(axis=1))
+            history.append(SolverIteration(problem.in_world(poses), objective, metrics))
+            if step < self.tolerance:
+                break
+        return tuple(history)
+
+    def _around_loops(self, problem: PaperProblem) -> AroundLoops:
+        edges, vertex_count = problem.edges, len(problem.component)
+        affordable = vertex_count * len(edges) <= AFFORDABLE_BASIS
+        if self.cycle_basis == "shortest" or (self.cycle_basis == "auto" and affordable):
+            return partial(loop_products, minimum_cycle_basis(edges, vertex_count))
+        return partial(fundamental_products, spanning_forest(edges, vertex_count))
+
+    def _notes(
+        self, problem: PaperProblem, surface: PaperSurface, history: tuple[SolverIteration, ...]
+    ) -> tuple[str, ...]:
+        notes = list(problem.notes())
+        half_turns = int((np.linalg.norm(self._form(problem, problem.start)[:, :3], axis=1) > np.pi - 1e-3).sum())
+        if half_turns:
+            notes.append(f"{half_turns} edges disagree with the start by a half turn: the sign of their ω is arbitrary")
+        if surface.is_checked:
+            notes.extend(surface.connectivity_notes())
+        else:
+            notes.append(
+                f"more than {MOST_CHECKED_EDGES} edges: energy shares, homology loops and connectivity are not computed"
+            )
+        step = history[-1].metrics["step_rms"]
+        if step > STILL_MOVING:
+            notes.append(
+                f"not converged: step {len(history)} still moved the poses by {step:.2g}: more inner_iterations"
+            )
+        return tuple(notes)
+
+    def _form(self, problem: PaperProblem, poses: Floats) -> Floats:
+        return residual_form(problem.edges, problem.i_from_j, poses, self.log)
+
+
+def _mean(values: Floats) -> float:
+    return float(values.mean()) if len(values) else 0.0

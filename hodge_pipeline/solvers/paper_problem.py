@@ -1,0 +1,127 @@
+"""The measured edges of a graph around the centroid of each component, and the Poisson equation on their vertices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.checks import orthonormal
+from hodge_pipeline.complex.coboundary import grounded_laplacian
+from hodge_pipeline.complex.components import connected_components, first_of_component
+from hodge_pipeline.complex.edge_weights import edge_weights
+from hodge_pipeline.complex.form import Logarithm, centroids, shifted
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+
+LEVER_ARM_M = 1.0  # a rotation counts as the displacement that it causes this far away, in a path's uncertainty
+
+
+@dataclass(frozen=True)
+class PaperProblem:
+    """The edges that join two vertices (`used` of all given), and the start poses, centred on their component.
+
+    Far from the world's origin a little rotation would be much translation, and ω would depend on where the origin is.
+    """
+
+    used: Bools
+    edges: Ints
+    i_from_j: Floats
+    component: Ints
+    start: Floats
+    offset: Floats
+    start_in_world: Floats
+
+    def in_world(self, poses: Floats) -> Floats:
+        """The poses away from the centroid again; first vertices are those of the start to the last bit."""
+        out = shifted(poses, self.offset)
+        gauge = first_of_component(self.component)
+        out[gauge] = self.start_in_world[gauge]
+        return out
+
+    def poisson(self, d0: csr_matrix, weights: Floats) -> Callable[[Floats], Floats]:
+        """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω`, of mean zero on each component (Eq. (7)).
+
+        The Laplacian is factorised once; six right-hand sides are solved at a time.
+        """
+        gauge = first_of_component(self.component)
+        factor = factorise(grounded_laplacian(d0, weights, gauge))
+        count = np.bincount(self.component)[:, None]
+
+        def solve(omega: Floats) -> Floats:
+            divergence = d0.T @ (weights[:, None] * omega)
+            f = np.zeros_like(divergence)
+            f[~gauge] = factor.solve(divergence[~gauge])
+            sums = np.stack([np.bincount(self.component, column) for column in f.T], axis=1)
+            return np.asarray(f - (sums / count)[self.component])
+
+        return solve
+
+    def moved(self, poses: Floats, correction: Floats, log: Logarithm) -> Floats:
+        """`exp(f_k) T_k` (V, 4, 4), then each component as one body, so that its first vertex is at its start."""
+        motion = se3.pairing_exp(correction) if log == "pairing" else se3.exp(correction)
+        moved = motion @ poses
+        _, first = np.unique(self.component, return_index=True)
+        back = self.start[first] @ se3.inverse(moved[first])
+        return np.asarray(back[self.component] @ moved)
+
+    def residual_metrics(self, poses: Floats) -> Mapping[str, float]:
+        """Mean and median disagreement of the edges with the poses, metres and radians.
+
+        The translation is the RMS of those that the two cameras see, so it does not depend on the edge's direction.
+        """
+        i, j = self.edges.T
+        poses_say = se3.inverse(poses[i]) @ poses[j]
+        j_from_i = se3.inverse(self.i_from_j)
+        at_i, at_j = poses_say @ j_from_i, j_from_i @ poses_say
+        translation = np.sqrt(((at_i[:, :3, 3] ** 2).sum(axis=1) + (at_j[:, :3, 3] ** 2).sum(axis=1)) / 2)
+        angle = np.linalg.norm(se3.so3_log(at_j[:, :3, :3]), axis=1)
+        return {
+            "translation_residual_mean_m": float(translation.mean()),
+            "translation_residual_median_m": float(np.median(translation)),
+            "rotation_residual_mean_rad": float(angle.mean()),
+            "rotation_residual_median_rad": float(np.median(angle)),
+        }
+
+    def notes(self) -> tuple[str, ...]:
+        """What was ignored."""
+        loops = int((~self.used).sum())
+        return (f"{loops} edges join a vertex to itself and say nothing about poses: ignored",) if loops else ()
+
+
+def make_problem(graph: ViewGraph, world_from_cam: Floats) -> PaperProblem:
+    """The problem of a checked graph; edges that join a vertex to itself are left out."""
+    used = np.asarray(graph.edges[:, 0] != graph.edges[:, 1], bool)
+    edges = graph.edges[used]
+    component = connected_components(edges, graph.vertex_count)
+    offset = centroids(world_from_cam, component)
+    return PaperProblem(
+        used=used,
+        edges=edges,
+        i_from_j=orthonormal(graph.i_from_j[used]),
+        component=component,
+        start=orthonormal(shifted(world_from_cam, -offset)),
+        offset=offset,
+        start_in_world=world_from_cam,
+    )
+
+
+def path_lengths(graph: ViewGraph, kind: Literal["hops", "uncertainty"]) -> Floats:
+    """The length (E,) of each edge for Algorithm 2: 1, or its standard deviation in metres.
+
+    The deviation is the root of the edge's mean variance, rotations counted as displacements 1 m away.
+    """
+    if kind == "hops":
+        return np.ones(graph.edge_count)
+    weights, _ = edge_weights(graph, "information", LEVER_ARM_M)
+    if not (weights > 0).all():
+        bad = int((weights <= 0).sum())
+        raise GraphError(
+            f"paths: uncertainty needs positive information, {bad} of {len(weights)} edges have none: hops"
+        )
+    return np.asarray(1.0 / np.sqrt(weights))
