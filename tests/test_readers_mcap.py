@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import itertools
-import pickle
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -10,66 +9,34 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from mcap.writer import CompressionType, IndexType
 
 from hodge_adapters.mcap import McapReader
 from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_adapters.tum import TumReader
-from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
-from hodge_pipeline.types import Camera, Floats, Frame
+from hodge_pipeline.types import Camera, Frame
 from mcap_data import (
-    CDR,
-    ENCODINGS,
-    JSON,
-    PROTOBUF,
-    SECOND,
     Log,
     calibration,
     compressed_depth,
     compressed_inverse_depth,
+    depth_log,
     foxglove_header,
-    odometry,
     png,
-    pose_message,
     raw_image,
     ros_header,
-    transforms,
+    some_images,
+    write_depth_log,
 )
-from readers_data import HEIGHT, WIDTH, depth_values, some_poses
+from mcap_encoding import CDR, ENCODINGS, JSON, PROTOBUF, SECOND
+from readers_data import HEIGHT, WIDTH, depth_values
 from synthetic import tiny_sequence  # noqa: F401
 
 RAW, COMPRESSED, CALIBRATION = "foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CameraCalibration"
 DEPTH, COLOUR, INFO = "/cam/depth/image", "/cam/color/image", "/cam/depth/camera_info"
 OPTICAL = "cam_optical"
 CAMERA = Camera(WIDTH, HEIGHT, 10, 11, 4, 3)
-
-
-def write_depth_log(
-    path: Path,
-    images: list[dict[str, Any]],
-    schema: str = RAW,
-    encoding: str = CDR,
-    camera: Camera = CAMERA,
-    **options: Any,
-) -> Path:
-    """A recording of these depth images, ten a second from 100 s, with their calibration."""
-    return depth_log(images, schema, encoding, camera).write(path, **options)
-
-
-def depth_log(images: list[dict[str, Any]], schema: str = RAW, encoding: str = CDR, camera: Camera = CAMERA) -> Log:
-    log = Log()
-    for row, image in enumerate(images):
-        head = foxglove_header(100 + row / 10, OPTICAL)
-        info = calibration(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        log.add(INFO, CALIBRATION, {**head, **info}, encoding, log_ns=(100 + row) * SECOND)
-        log.add(DEPTH, schema, {**head, **image}, encoding, log_ns=(100 + row) * SECOND)
-    return log
-
-
-def some_images(count: int = 3) -> list[dict[str, Any]]:
-    return [raw_image(depth_values(row), "16UC1") for row in range(count)]
 
 
 def stored(frame: Frame, units_per_metre: float) -> np.ndarray:
@@ -145,28 +112,6 @@ def test_the_same_depth_of_a_real_scene(data_dir: Path, tmp_path: Path) -> None:
         ), name
 
 
-@pytest.mark.parametrize("compression", list(CompressionType))
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"chunk_size": 1},
-        {"use_chunking": False},
-        {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False},
-        {"repeat_channels": False, "repeat_schemas": False, "index_types": IndexType.NONE, "use_statistics": False},
-        {"enable_crcs": False},
-    ],
-    ids=["default", "chunk for each message", "no chunks", "no index", "no summary", "no checksums"],
-)
-def test_every_kind_of_file(tmp_path: Path, compression: CompressionType, options: dict[str, Any]) -> None:
-    path = write_depth_log(tmp_path / "log.mcap", some_images(), compression=compression, **options)
-    source = check_reader(McapReader(), path)
-    for row, frame in enumerate(source.frames):
-        assert np.array_equal(frame.read_depth(), depth_values(row).astype(np.float32) * np.float32(1e-3))
-    assert len(source.frames) == 3
-    assert not any("left out" in note or "cut off" in note for note in source.notes)
-
-
 def test_colour_by_header_stamp_when_log_times_differ(tmp_path: Path) -> None:
     log = depth_log(some_images(3))
     colours = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
@@ -180,6 +125,16 @@ def test_colour_by_header_stamp_when_log_times_differ(tmp_path: Path) -> None:
     far = McapReader(max_difference_s=0.001).open(tmp_path / "log.mcap")
     assert all(frame.read_colour is None for frame in far.frames)
     assert any("have no colour of /cam/color/image within 0.001 s" in note for note in far.notes)
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_raw_depth_of_a_big_endian_machine(tmp_path: Path, encoding: str) -> None:
+    values = depth_values().astype("u2" if encoding == "16UC1" else "f4")
+    image = raw_image(values.astype(values.dtype.newbyteorder(">")), encoding, pad=4)
+    log = Log()
+    log.add(DEPTH, "sensor_msgs/msg/Image", {"header": ros_header(1, OPTICAL), **image, "is_bigendian": 1}, CDR)
+    source = check_reader(McapReader(camera=(9, 9, 4, 3), depth_scale=1), log.write(tmp_path / "log.mcap"))
+    assert np.array_equal(source.frames[0].read_depth(), values.astype(np.float32))
 
 
 @pytest.mark.parametrize(
@@ -279,140 +234,6 @@ def test_the_rectified_image_has_the_projection_of_p(tmp_path: Path) -> None:
         assert any("lens distortion" in note for note in source.notes) == ("raw" in topic)
 
 
-def camera_on_body() -> Floats:
-    """The optical axes of a camera that looks along a body's x, 10 cm ahead: z ahead, x right, y down."""
-    rotation = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    return se3.from_parts(rotation, np.array([0.1, 0, 0.2]))
-
-
-def test_odometry_moved_to_the_optical_frame(tmp_path: Path) -> None:
-    log, poses = depth_log(some_images(4)), some_poses(4)
-    base_from_link = se3.from_parts(np.eye(3), np.array([0.0, 0.0, 0.3]))
-    links = [(0.0, "link", OPTICAL, camera_on_body()), (0.0, "base_link", "link", base_from_link)]
-    log.add("/tf_static", "tf2_msgs/msg/TFMessage", transforms(*links), CDR)
-    for row, pose in enumerate(poses):
-        log.add("/odom", "nav_msgs/msg/Odometry", odometry(100.05 + row / 10, pose), CDR)
-    source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
-    base_from_cam = base_from_link @ camera_on_body()
-    assert source.frames[0].world_from_cam is None, "before the first odometry"
-    for row in (1, 2, 3):
-        world_from_base = se3.interpolate(poses[row - 1], poses[row], np.array(0.5))
-        np.testing.assert_allclose(source.frames[row].world_from_cam, world_from_base @ base_from_cam, atol=1e-6)
-    np.testing.assert_allclose(source.trajectory.world_from_cam, poses @ base_from_cam, atol=1e-9)
-    assert "1 of 4 frames have no pose within 0.2 s of their stamp" in source.notes
-
-
-def test_odometry_of_a_body_that_nothing_links_to_the_camera(tmp_path: Path) -> None:
-    log = depth_log(some_images(2))
-    for row, pose in enumerate(some_poses(2)):
-        log.add("/odom", "nav_msgs/msg/Odometry", odometry(100 + row / 10, pose), CDR)
-    path = log.write(tmp_path / "log.mcap")
-    source = check_reader(McapReader(), path)
-    assert all(frame.world_from_cam is None for frame in source.frames) and len(source.trajectory) == 2
-    assert any("no transform leads from base_link of /odom to cam_optical" in note for note in source.notes)
-    told = check_reader(McapReader(pose_child=OPTICAL), path)
-    np.testing.assert_allclose(told.frames[1].world_from_cam, some_poses(2)[1], atol=1e-9)
-
-
-@pytest.mark.parametrize("encoding", ENCODINGS)
-def test_bare_poses_are_of_the_camera(tmp_path: Path, encoding: str) -> None:
-    log, poses = depth_log(some_images(3), encoding=encoding), some_poses(3)
-    for row, pose in enumerate(poses):
-        head = foxglove_header(100 + row / 10, "map")
-        log.add("/pose", "foxglove.PoseInFrame", {**head, "pose": pose_message(pose)}, encoding)
-    source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
-    for frame, pose in zip(source.frames, poses, strict=True):
-        np.testing.assert_allclose(frame.world_from_cam, pose, atol=1e-9)
-    assert any("taken as poses of the camera itself" in note for note in source.notes)
-
-
-@pytest.mark.parametrize("encoding", ENCODINGS)
-def test_transforms_in_time_are_interpolated_along_the_chain(tmp_path: Path, encoding: str) -> None:
-    log, poses = depth_log(some_images(3), encoding=encoding), some_poses(4, seed=1)
-    links = [(99.95 + row / 10, "odom", "base", pose) for row, pose in enumerate(poses)]
-    map_from_odom = some_poses(1, seed=2)[0]
-    fixed = [(5.0, "base", OPTICAL, camera_on_body()), (5.0, "map", "odom", map_from_odom)]
-    if encoding == CDR:
-        log.add("/tf_static", "tf2_msgs/msg/TFMessage", transforms(*fixed), CDR)
-        for link in links:
-            log.add("/tf", "tf2_msgs/msg/TFMessage", transforms(link), CDR)
-    else:
-        for seconds, parent, child, pose in [*links, *fixed]:
-            head = foxglove_header(seconds, "")
-            names = {"timestamp": head["timestamp"], "parent_frame_id": parent, "child_frame_id": child}
-            motion = pose_message(pose)
-            parts = {"translation": motion["position"], "rotation": motion["orientation"]}
-            log.add("/tf", "foxglove.FrameTransform", {**names, **parts}, encoding)
-    path = log.write(tmp_path / "log.mcap")
-    in_map = check_reader(McapReader(), path)
-    in_odom = check_reader(McapReader(world_frame="odom"), path)
-    for row in range(3):
-        odom_from_base = se3.interpolate(poses[row], poses[row + 1], np.array(0.5))
-        expected = odom_from_base @ camera_on_body()
-        np.testing.assert_allclose(in_odom.frames[row].world_from_cam, expected, atol=1e-6)
-        np.testing.assert_allclose(in_map.frames[row].world_from_cam, map_from_odom @ expected, atol=1e-6)
-    assert len(in_map.trajectory) == 4
-    assert "poses of cam_optical in map from the transforms" in in_map.notes
-
-
-def split_bag(folder: Path) -> list[bytes]:
-    """Three files of one frame each, the transforms of all in the first."""
-    for row in range(3):
-        log = Log()
-        if row == 0:
-            log.add(
-                INFO, CALIBRATION, {**foxglove_header(100, OPTICAL), **calibration(WIDTH, HEIGHT, 10, 11, 4, 3)}, CDR
-            )
-        log.add(DEPTH, RAW, {**foxglove_header(100 + row, OPTICAL), **some_images(3)[row]}, CDR)
-        log.write(folder / f"bag_{row}.mcap")
-    return [file.read_bytes() for file in sorted(folder.glob("*.mcap"))]
-
-
-def metadata(*names: str) -> str:
-    files = "".join(f"  - {name}\n" for name in names)
-    return f"rosbag2_bagfile_information:\n  storage_identifier: mcap\n  relative_file_paths:\n{files}"
-
-
-def test_a_split_bag(tmp_path: Path) -> None:
-    split_bag(tmp_path)
-    plain = check_reader(McapReader(), tmp_path)
-    assert [frame.stamp_s for frame in plain.frames] == [100.0, 101.0, 102.0] and len(plain.files) == 3
-    (tmp_path / "metadata.yaml").write_text(metadata("bag_0.mcap", "bag_2.mcap", "bag_9.mcap", "../../etc/passwd"))
-    source = check_reader(McapReader(), tmp_path)
-    assert len(source.frames) == 3 and tmp_path / "metadata.yaml" in source.files
-    assert "metadata.yaml: 1 files that are not there left out: bag_9.mcap" in source.notes
-    assert "metadata.yaml: 1 files outside of the folder left out" in source.notes
-    assert "1 files that metadata.yaml does not list read as well: bag_1.mcap" in source.notes
-    (tmp_path / "metadata.yaml").write_text("{broken: [")
-    assert any("metadata.yaml cannot be read" in note for note in check_reader(McapReader(), tmp_path).notes)
-
-
-@pytest.mark.parametrize(
-    ("files", "remedy"),
-    [
-        ({}, "give the folder"),
-        ({"bag_0.mcap.zstd": b""}, r"unpack bag_0\.mcap\.zstd first"),
-        ({"bag_0.db3": b"SQLite"}, "ros2 bag convert"),
-        ({"metadata.yaml": metadata("bag_0.mcap").encode()}, "lists no .mcap file that is there"),
-        ({"a.mcap": b""}, "does not start as an MCAP file"),
-        ({"a.mcap": b"#ROSBAG V2.0\n"}, "does not start as an MCAP file"),
-    ],
-)
-def test_what_is_no_recording(tmp_path: Path, files: dict[str, bytes], remedy: str) -> None:
-    for name, contents in files.items():
-        (tmp_path / name).write_bytes(contents)
-    with pytest.raises(SourceError, match=remedy) as raised:
-        McapReader().open(tmp_path)
-    assert str(tmp_path) in str(raised.value) and "\n" not in str(raised.value)
-
-
-def test_a_recording_of_other_things_names_its_topics(tmp_path: Path) -> None:
-    log = Log()
-    log.add_bytes("/chatter", "std_msgs/msg/String", CDR, b"\0\1\0\0\5\0\0\0text\0")
-    with pytest.raises(SourceError, match=r"no depth, clouds, images or poses in /chatter \(std_msgs/msg/String\)"):
-        McapReader().open(log.write(tmp_path / "log.mcap"))
-
-
 def test_stamps_that_mean_nothing(tmp_path: Path) -> None:
     log = Log()
     for row in range(3):
@@ -437,67 +258,3 @@ def test_frames_in_order_once_each_and_every_nth(tmp_path: Path) -> None:
     assert f"{DEPTH}: 1 messages with the stamp of an earlier one left out" in source.notes
     thinned = McapReader(camera=(10, 10, 4, 3), every=3).open(path)
     assert [(frame.frame_id, frame.stamp_s) for frame in thinned.frames] == [(0, 101.0), (3, 104.0)]
-
-
-def test_schemas_that_are_not_read_are_named(tmp_path: Path) -> None:
-    log = depth_log(some_images(1))
-    log.add_bytes("/idl", "sensor_msgs/msg/Image", "cbor", b"")
-    source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
-    assert any(note.startswith("/idl: left out: cbor messages") for note in source.notes)
-
-
-def test_a_pickled_frame_is_small_and_needs_no_schema(tmp_path: Path) -> None:
-    path = write_depth_log(tmp_path / "log.mcap", some_images(1), encoding=PROTOBUF)
-    frame = McapReader().open(path).frames[0]
-    assert len(pickle.dumps(frame)) < 2000
-
-
-def test_a_file_that_changed_after_it_was_opened(tmp_path: Path) -> None:
-    path = write_depth_log(tmp_path / "log.mcap", some_images(2))
-    frame = McapReader().open(path).frames[1]
-    path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(SourceError, match=r"log\.mcap: /cam/depth/image at 100\.1"):
-        frame.read_depth()
-    path.unlink()
-    with pytest.raises(SourceError, match=r"log\.mcap: cannot be read"):
-        frame.read_depth()
-
-
-def test_odometry_of_a_real_robot(data_dir: Path) -> None:
-    source = check_reader(McapReader(), data_dir / "mcap/evo_nav2_turtlebot/nav2_turtlebot.mcap")
-    assert len(source.trajectory) == 2639 and not source.frames
-    assert "poses of /odom taken, not of /amcl_pose: see option pose_topic" in source.notes
-    assert any("the log's clock differs" in note for note in source.notes)
-    amcl = McapReader(pose_topic="/amcl_pose").open(data_dir / "mcap/evo_nav2_turtlebot/nav2_turtlebot.mcap")
-    # The localised and the dead-reckoned path of one robot are the same curve but for drift.
-    lengths = [
-        np.linalg.norm(np.diff(s.trajectory.world_from_cam[:, :3, 3], axis=0), axis=1).sum() for s in (source, amcl)
-    ]
-    assert len(amcl.trajectory) == 135 and abs(lengths[1] / lengths[0] - 1) < 0.2
-
-
-def test_real_foxglove_images(data_dir: Path) -> None:
-    source = check_reader(McapReader(), data_dir / "mcap/small_misc/custom-camera-model.mcap")
-    assert len(source.frames) == 10 and source.frames[0].read_colour().shape == (360, 520, 3)
-    assert any("'CylinderCameraModel' is no pinhole camera" in note for note in source.notes)
-    assert any("log time is taken" in note for note in source.notes)
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["rosbag2_tests/wbag", "rosbag2_tests/talker", "rosbag2_tests/convert_a", "rosbag2_tests/convert_b",
-     "rosbag2_tests/reindex_test_bags/multiple_files", "small_misc/example.mcap", "small_misc/example_logs.mcap"],
-)  # fmt: skip
-def test_real_bags_without_frames_or_poses(data_dir: Path, name: str) -> None:
-    assert McapReader().sniff(data_dir / "mcap" / name).confidence >= 0.7
-    with pytest.raises(SourceError, match="no depth, clouds, images or poses in"):
-        McapReader().open(data_dir / "mcap" / name)
-
-
-def test_ros_headers(tmp_path: Path) -> None:
-    log = depth_log(some_images(1))
-    image = {"header": ros_header(100, "/" + OPTICAL), **raw_image(np.full((HEIGHT, WIDTH, 3), 9, np.uint8), "rgb8")}
-    log.add(COLOUR, "sensor_msgs/msg/Image", image, CDR)
-    source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
-    assert (source.frames[0].read_colour() == 9).all(), "a leading slash of a frame is the same frame"
-    assert not any("colour is off" in note for note in source.notes)

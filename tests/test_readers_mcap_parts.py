@@ -18,22 +18,17 @@ from hodge_adapters.ros_tf import TransformTree
 from hodge_pipeline import se3
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import PointCloud
-from mcap_data import (
+from mcap_data import Log, foxglove_header, odometry, point_cloud, pose_message, ros_header
+from mcap_encoding import (
     CDR,
     JSON,
     PROTOBUF,
     ROS_SCHEMAS,
-    Log,
     descriptor_set,
     encode_cdr,
     encode_protobuf,
     encode_rvl,
-    foxglove_header,
-    odometry,
     pack_nibbles,
-    point_cloud,
-    pose_message,
-    ros_header,
 )
 from readers_data import some_poses
 

@@ -98,7 +98,7 @@ class McapReader:
         if not frames and poses.trajectory is None:
             raise _nothing(path, recording, notes)
         return Source(
-            name=path.resolve().stem,
+            name=path.stem if path.is_file() else path.resolve().name,
             path=path,
             frames=tuple(_with_pose(frame, pose) for frame, pose in zip(frames, poses.of_frames, strict=True)),
             trajectory=poses.trajectory,

@@ -16,6 +16,7 @@ from hodge_adapters.mcap_complaints import Complaints
 from hodge_adapters.mcap_records import (
     MAGIC,
     MAX_MESSAGE_BYTES,
+    RECORD_HEAD_BYTES,
     Chunk,
     Malformed,
     Place,
@@ -59,7 +60,7 @@ class LogFile:
     schemas: dict[int, Schema] = field(default_factory=dict)
     _is_wanted: dict[int, bool] = field(default_factory=dict)
     _chunk_offsets: list[int] = field(default_factory=list)
-    _finished: bool = False
+    _has_footer: bool = False
 
     def messages(self) -> Iterator[Logged]:
         """The wanted messages. Raises `SourceError` for a file that is no MCAP; all else is complained of."""
@@ -75,8 +76,8 @@ class LogFile:
         if read(0, len(MAGIC)) != MAGIC:
             raise SourceError(f"{self.path}: does not start as an MCAP file: record or copy it again")
         self._read_summary(read, size)
-        at = len(MAGIC)
-        while at < size:
+        at: int | None = len(MAGIC)
+        while at is not None and at < size:
             for record in records(read, at, size):
                 at = record.start + record.length
                 if record.opcode in (Opcode.DATA_END, Opcode.FOOTER) and record.complete:
@@ -84,13 +85,13 @@ class LogFile:
                 yield from self._record(read, record)
                 if not record.complete:
                     at = self._after_damage(record, size)
-        if not self._finished:
+        if at is not None and not self._has_footer:
             self.complaints.say(f"{self.path.name}: not finished by its recorder: all {size} bytes were read")
 
     def _read_summary(self, read: ReadAt, size: int) -> None:
         """Channels and chunks from the end of the file: needed only where their records in front are damaged."""
         span = summary_span(read, size)
-        self._finished = span is not None
+        self._has_footer = span is not None
         for record in records(read, *span) if span else ():
             if record.opcode == Opcode.CHUNK_INDEX and record.length <= _MAX_SMALL_RECORD_BYTES:
                 try:
@@ -102,15 +103,17 @@ class LogFile:
                 self._definition(read, record)
         self._chunk_offsets.sort()
 
-    def _after_damage(self, record: Record, size: int) -> int:
-        """Where to go on after a record that does not end: the next chunk that the summary knows of, else the end."""
-        if not self._finished:
-            read = record.start - 9
-            self.complaints.say(f"{self.path.name}: cut off: whole records up to byte {read} of {size} were read")
-            self._finished = True
-            return size
+    def _after_damage(self, record: Record, size: int) -> int | None:
+        """Where to go on after a record that does not end: the next chunk that the summary knows of, else the end.
+
+        None in a file that was cut off, which has no summary.
+        """
+        damage = record.start - RECORD_HEAD_BYTES
+        if not self._has_footer:
+            self.complaints.say(f"{self.path.name}: cut off: whole records up to byte {damage} of {size} were read")
+            return None
         following = next((offset for offset in self._chunk_offsets if offset >= record.start), size)
-        self.complaints.say(f"{self.path.name}: damaged at byte {record.start - 9}: went on at byte {following}")
+        self.complaints.say(f"{self.path.name}: damaged at byte {damage}: went on at byte {following}")
         return following
 
     def _record(self, read: ReadAt, record: Record) -> Iterator[Logged]:

@@ -35,13 +35,9 @@ def find_poses(
     recording: Recording, camera_frame: str, stamps_s: Floats, options: PoseOptions, notes: list[str]
 ) -> Poses:
     """Poses of the camera at the stamps, from what the recording has; `camera_frame` is empty where it is unknown."""
-    use_transforms = bool(options.world_frame) and not options.topic
-    if recording.poses and not use_transforms:
+    if options.topic or (recording.poses and not options.world_frame):
         topic = _choose(recording, options.topic, notes)
         poses = _from_topic(recording, topic, camera_frame, stamps_s, options, notes)
-    elif options.topic:
-        named_topic(recording.poses, options.topic, "pose_topic")
-        raise AssertionError
     else:
         poses = _from_transforms(recording, camera_frame, stamps_s, options, notes)
     without = int(np.isnan(poses.of_frames[:, 0, 0]).sum())

@@ -27,6 +27,7 @@ MAX_CHUNK_BYTES = 1 << 28
 MAX_MESSAGE_BYTES = MAX_CHUNK_BYTES
 
 _RECORD = struct.Struct("<BQ")
+RECORD_HEAD_BYTES = _RECORD.size
 _CHUNK_START = struct.Struct("<QQQII")
 _FOOTER = struct.Struct("<BQQQI")
 _MAX_NAME_BYTES = 64

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_adapters.mcap import McapReader
+from hodge_pipeline import se3
+from hodge_pipeline.testing import check_reader
+from hodge_pipeline.types import Camera, Floats
+from mcap_data import depth_log, foxglove_header, odometry, pose_message, raw_image, ros_header, some_images, transforms
+from mcap_encoding import CDR, ENCODINGS, PROTOBUF
+from readers_data import HEIGHT, WIDTH, some_poses
+from synthetic import tiny_sequence  # noqa: F401
+
+RAW, COMPRESSED, CALIBRATION = "foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CameraCalibration"
+DEPTH, COLOUR, INFO = "/cam/depth/image", "/cam/color/image", "/cam/depth/camera_info"
+OPTICAL = "cam_optical"
+CAMERA = Camera(WIDTH, HEIGHT, 10, 11, 4, 3)
+
+
+def camera_on_body() -> Floats:
+    """The optical axes of a camera that looks along a body's x, 10 cm ahead: z ahead, x right, y down."""
+    rotation = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    return se3.from_parts(rotation, np.array([0.1, 0, 0.2]))
+
+
+def test_odometry_moved_to_the_optical_frame(tmp_path: Path) -> None:
+    log, poses = depth_log(some_images(4)), some_poses(4)
+    base_from_link = se3.from_parts(np.eye(3), np.array([0.0, 0.0, 0.3]))
+    links = [(0.0, "link", OPTICAL, camera_on_body()), (0.0, "base_link", "link", base_from_link)]
+    log.add("/tf_static", "tf2_msgs/msg/TFMessage", transforms(*links), CDR)
+    for row, pose in enumerate(poses):
+        log.add("/odom", "nav_msgs/msg/Odometry", odometry(100.05 + row / 10, pose), CDR)
+    source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
+    base_from_cam = base_from_link @ camera_on_body()
+    assert source.frames[0].world_from_cam is None, "before the first odometry"
+    for row in (1, 2, 3):
+        world_from_base = se3.interpolate(poses[row - 1], poses[row], np.array(0.5))
+        np.testing.assert_allclose(source.frames[row].world_from_cam, world_from_base @ base_from_cam, atol=1e-6)
+    np.testing.assert_allclose(source.trajectory.world_from_cam, poses @ base_from_cam, atol=1e-9)
+    assert "1 of 4 frames have no pose within 0.2 s of their stamp" in source.notes
+
+
+def test_odometry_of_a_body_that_nothing_links_to_the_camera(tmp_path: Path) -> None:
+    log = depth_log(some_images(2))
+    for row, pose in enumerate(some_poses(2)):
+        log.add("/odom", "nav_msgs/msg/Odometry", odometry(100 + row / 10, pose), CDR)
+    path = log.write(tmp_path / "log.mcap")
+    source = check_reader(McapReader(), path)
+    assert all(frame.world_from_cam is None for frame in source.frames) and len(source.trajectory) == 2
+    assert any("no transform leads from base_link of /odom to cam_optical" in note for note in source.notes)
+    told = check_reader(McapReader(pose_child=OPTICAL), path)
+    np.testing.assert_allclose(told.frames[1].world_from_cam, some_poses(2)[1], atol=1e-9)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_bare_poses_are_of_the_camera(tmp_path: Path, encoding: str) -> None:
+    log, poses = depth_log(some_images(3), encoding=encoding), some_poses(3)
+    for row, pose in enumerate(poses):
+        head = foxglove_header(100 + row / 10, "map")
+        log.add("/pose", "foxglove.PoseInFrame", {**head, "pose": pose_message(pose)}, encoding)
+    source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
+    for frame, pose in zip(source.frames, poses, strict=True):
+        np.testing.assert_allclose(frame.world_from_cam, pose, atol=1e-9)
+    assert any("taken as poses of the camera itself" in note for note in source.notes)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_transforms_in_time_are_interpolated_along_the_chain(tmp_path: Path, encoding: str) -> None:
+    log, poses = depth_log(some_images(3), encoding=encoding), some_poses(4, seed=1)
+    links = [(99.95 + row / 10, "odom", "base", pose) for row, pose in enumerate(poses)]
+    map_from_odom = some_poses(1, seed=2)[0]
+    fixed = [(5.0, "base", OPTICAL, camera_on_body()), (5.0, "map", "odom", map_from_odom)]
+    if encoding == CDR:
+        log.add("/tf_static", "tf2_msgs/msg/TFMessage", transforms(*fixed), CDR)
+        for link in links:
+            log.add("/tf", "tf2_msgs/msg/TFMessage", transforms(link), CDR)
+    else:
+        for seconds, parent, child, pose in [*links, *fixed]:
+            head = foxglove_header(seconds, "")
+            names = {"timestamp": head["timestamp"], "parent_frame_id": parent, "child_frame_id": child}
+            motion = pose_message(pose)
+            parts = {"translation": motion["position"], "rotation": motion["orientation"]}
+            if encoding == PROTOBUF:
+                log.add("/tf", "foxglove.FrameTransform", {**names, **parts}, encoding)
+            else:
+                log.add("/tf", "foxglove.FrameTransforms", {"transforms": [{**names, **parts}]}, encoding)
+    path = log.write(tmp_path / "log.mcap")
+    in_map = check_reader(McapReader(), path)
+    in_odom = check_reader(McapReader(world_frame="odom"), path)
+    for row in range(3):
+        odom_from_base = se3.interpolate(poses[row], poses[row + 1], np.array(0.5))
+        expected = odom_from_base @ camera_on_body()
+        np.testing.assert_allclose(in_odom.frames[row].world_from_cam, expected, atol=1e-6)
+        np.testing.assert_allclose(in_map.frames[row].world_from_cam, map_from_odom @ expected, atol=1e-6)
+    assert len(in_map.trajectory) == 4
+    assert "poses of cam_optical in map from the transforms" in in_map.notes
+
+
+def test_odometry_of_a_real_robot(data_dir: Path) -> None:
+    source = check_reader(McapReader(), data_dir / "mcap/evo_nav2_turtlebot/nav2_turtlebot.mcap")
+    assert len(source.trajectory) == 2639 and not source.frames
+    assert "poses of /odom taken, not of /amcl_pose: see option pose_topic" in source.notes
+    assert any("the log's clock differs" in note for note in source.notes)
+    amcl = McapReader(pose_topic="/amcl_pose").open(data_dir / "mcap/evo_nav2_turtlebot/nav2_turtlebot.mcap")
+    # The localised and the dead-reckoned path of one robot are the same curve but for drift.
+    lengths = [
+        np.linalg.norm(np.diff(s.trajectory.world_from_cam[:, :3, 3], axis=0), axis=1).sum() for s in (source, amcl)
+    ]
+    assert len(amcl.trajectory) == 135 and abs(lengths[1] / lengths[0] - 1) < 0.2
+
+
+def test_ros_headers(tmp_path: Path) -> None:
+    log = depth_log(some_images(1))
+    image = {"header": ros_header(100, "/" + OPTICAL), **raw_image(np.full((HEIGHT, WIDTH, 3), 9, np.uint8), "rgb8")}
+    log.add(COLOUR, "sensor_msgs/msg/Image", image, CDR)
+    source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
+    assert (source.frames[0].read_colour() == 9).all(), "a leading slash of a frame is the same frame"
+    assert not any("colour is off" in note for note in source.notes)
