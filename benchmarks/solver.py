@@ -139,7 +139,7 @@ def row(task: tuple[str, str | int, int]) -> list[str]:
         isotropic = graph
     else:
         file = load_g2o(path)
-        graph, dimension = file.graph, file.dimension
+        graph, dimension = file.graph, file.graph.dimension
         raw = np.roll(information_for_file(graph.information), (3, 3), axis=(1, 2))
         isotropic = graph if dimension == 2 else dataclasses.replace(graph, information=raw)
     plain_s, plain = timed(lambda: solve(isotropic, objective="isotropic"), repeats)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +27,7 @@ from hodge_pipeline.evaluation.summary import graph_summary, trajectory_rows, wo
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.job import Job, versions
 from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
-from hodge_pipeline.types import Floats, Solution, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import Floats, Solution, Source, Trajectory
 
 EDGE_COLUMNS = (
     "i", "j", "source", "status", "fitness", "rmse_m", "correspondences", "weight", "residual_m", "residual_deg",
@@ -48,7 +49,7 @@ def write_graph(folder: Path, source: Source, last: Round) -> None:
     """`graph.g2o` (vertices by frame number, or by row where frames have names) and `edges.csv`."""
     graph = last.graph
     ids = graph.vertex_ids if graph.vertex_ids.dtype.kind == "i" else np.arange(graph.vertex_count)
-    numbered = ViewGraph(ids, *(getattr(graph, name) for name in list(vars(graph))[1:]))
+    numbered = dataclasses.replace(graph, vertex_ids=ids)
     trajectory = Trajectory(np.arange(graph.vertex_count, dtype=float), last.world_from_cam)
     whole = Source(source.name, source.path, trajectory=trajectory, graph=numbered)
     registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)

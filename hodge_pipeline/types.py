@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -106,6 +106,8 @@ class ViewGraph:
     - `fitness (E,)`: share of cloud j with a correspondence; `rmse_m (E,)`: their RMS distance; NaN where unknown.
     - `source (E,)`: where the edge comes from (sequential, overlap, sift, colmap, g2o, …).
     - `correspondences (E,)`: how many; 0 where unknown.
+    - `dimension`: 2 for a graph in the plane z = 0, lifted, with no information out of it; it stays one when written.
+    - `fixed`: rows of the vertices that the source holds at the poses it gives them.
     """
 
     vertex_ids: NDArray[np.generic]
@@ -116,6 +118,8 @@ class ViewGraph:
     rmse_m: Floats
     source: NDArray[np.str_]
     correspondences: Ints
+    dimension: int = 3
+    fixed: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def vertex_count(self) -> int:
@@ -135,6 +139,9 @@ class ViewGraph:
         i_from_j: Floats,
         information: Floats | None = None,
         source: str = "given",
+        *,
+        dimension: int = 3,
+        fixed: Ints | None = None,
     ) -> ViewGraph:
         """A graph of measured edges; the information defaults to the identity, what was not seen to NaN or 0."""
         count = len(edges)
@@ -147,12 +154,14 @@ class ViewGraph:
             rmse_m=np.full(count, np.nan),
             source=np.full(count, source),
             correspondences=np.zeros(count, np.int64),
+            dimension=dimension,
+            fixed=np.zeros(0, np.int64) if fixed is None else np.asarray(fixed, np.int64),
         )
 
     def select(self, rows: Ints | Bools) -> ViewGraph:
         """The graph with these edges only, in this order; every vertex is kept."""
-        return ViewGraph(
-            vertex_ids=self.vertex_ids,
+        return replace(
+            self,
             edges=self.edges[rows],
             i_from_j=self.i_from_j[rows],
             information=self.information[rows],

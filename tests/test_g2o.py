@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -47,17 +48,18 @@ def random_graph(seed: int, planar: bool = False) -> tuple[ViewGraph, np.ndarray
 def test_a_round_trip_keeps_ids_order_and_values(tmp_path_factory, seed, planar):
     graph, poses = random_graph(seed, planar)
     path = tmp_path_factory.mktemp("g2o") / "graph.g2o"
-    write_g2o(path, graph, poses, dimension=2 if planar else 3, fixed=np.array([1, 3]))
+    graph = dataclasses.replace(graph, dimension=2 if planar else 3, fixed=np.array([1, 3]))
+    write_g2o(path, graph, poses)
     back = load_g2o(path)
-    assert back.dimension == (2 if planar else 3)
-    assert back.fixed.tolist() == [1, 3]
+    assert back.graph.dimension == (2 if planar else 3)
+    assert back.graph.fixed.tolist() == [1, 3]
     np.testing.assert_array_equal(back.graph.vertex_ids, graph.vertex_ids)
     np.testing.assert_array_equal(back.graph.edges, graph.edges)
     np.testing.assert_allclose(back.graph.i_from_j, graph.i_from_j, atol=1e-14)
     np.testing.assert_allclose(
         back.graph.information, 0.5 * (graph.information + np.swapaxes(graph.information, 1, 2)), atol=1e-12
     )
-    np.testing.assert_allclose(back.world_from_vertex, poses, atol=1e-14)
+    np.testing.assert_allclose(back.trajectory.world_from_cam, poses, atol=1e-14)
 
 
 def test_the_information_is_over_half_an_angle(tmp_path):
@@ -71,7 +73,7 @@ def test_edges_alone_name_their_vertices_in_order_of_appearance(tmp_path):
     file = load_g2o(write(tmp_path / "a.g2o", "# a comment", "", EDGE.replace(" ", "\t") + "\r"))
     assert file.graph.vertex_ids.tolist() == [7, 3]
     assert file.graph.edges.tolist() == [[0, 1]]
-    assert file.world_from_vertex is None
+    assert file.trajectory is None
     np.testing.assert_array_equal(file.graph.i_from_j[0, :3, 3], [1, 2, 3])
 
 
@@ -130,7 +132,7 @@ def test_toro_orders_its_information_in_its_own_way(tmp_path):
     file = load_toro(path)
     planar = file.graph.information[0][np.ix_([3, 4, 2], [3, 4, 2])]
     np.testing.assert_array_equal(planar, [[1, 2, 5], [2, 3, 6], [5, 6, 4]])
-    assert file.dimension == 2
+    assert file.graph.dimension == 2
     assert ToroReader().sniff(path).confidence > 0.5
 
 
@@ -154,5 +156,5 @@ def test_real_files(data_dir, name, vertices, edges, dimension):
     assert ToroReader().sniff(path).confidence == 0
     assert source.graph is not None
     assert (source.graph.vertex_count, source.graph.edge_count) == (vertices, edges)
-    assert load_g2o(path).dimension == dimension
+    assert load_g2o(path).graph.dimension == dimension
     assert se3.is_motion(source.graph.i_from_j, 1e-9).all()

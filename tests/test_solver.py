@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from hodge_adapters.g2o import information_for_file, load_g2o
 from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.certificate import certify
 from hodge_pipeline.solvers.full import full_residuals
@@ -57,7 +58,7 @@ def ladder(noise: float, seed: int = 0, rungs: int = 6, planar: bool = False) ->
 
 def as_sesync_reads_it(data_dir, name):
     file = load_g2o(data_dir / "pose_graphs" / "sesync" / f"{name}.g2o")
-    if file.dimension == 2:
+    if file.graph.dimension == 2:
         return file.graph
     return dataclasses.replace(
         file.graph, information=np.roll(information_for_file(file.graph.information), (3, 3), axis=(1, 2))
@@ -224,6 +225,11 @@ def test_repeated_edges_count_each_time():
     double = dataclasses.replace(graph, information=2 * graph.information)
     one, two = solve(twice), solve(double)
     assert one.metrics["objective"] == pytest.approx(two.metrics["objective"], rel=1e-9)
+
+
+def test_many_parallel_edges_join_their_vertices():
+    edges = np.array([(0, 1)] * 256 + [(1, 2)])
+    assert connected_components(edges, 3).tolist() == [0, 0, 0]
 
 
 def test_no_edges_and_one_pose():

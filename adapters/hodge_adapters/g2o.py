@@ -5,7 +5,7 @@ A g2o information matrix is over (translation, q_vec): half an angle. Ours is ov
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,22 +23,6 @@ HALF_ANGLE = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 PLANAR_TWIST = np.array([3, 4, 2])
 """Where (x, y, θ) lie in (φ, ρ)."""
 SKIPPED_TAGS_SHOWN = 5
-
-
-@dataclass(frozen=True)
-class PoseGraphFile:
-    """A pose graph as its file has it, and what `ViewGraph` has no place for.
-
-    - `world_from_vertex (V, 4, 4)`: the file's own vertex poses; None unless every vertex has one.
-    - `fixed`: rows of the vertices that the file fixes.
-    - `dimension`: 2 where the file is planar; the graph is then lifted, with no information out of the plane.
-    """
-
-    graph: ViewGraph
-    world_from_vertex: Floats | None = None
-    fixed: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    dimension: int = 3
-    notes: tuple[str, ...] = ()
 
 
 def upper_triangle(values: Floats, size: int) -> Floats:
@@ -126,18 +110,21 @@ def rows_of_keys(path: Path, vertex_keys: Ints, edge_keys: Ints) -> tuple[Ints, 
     return unique[order], rank[inverse.reshape(-1)[len(vertex_keys) :]].reshape(-1, 2)
 
 
-def assemble(path: Path, half: Half, source: str, fixed_keys: Ints, dimension: int, notes: list[str]) -> PoseGraphFile:
-    """The graph of what the file holds; notes what was incomplete."""
+def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: int, notes: list[str]) -> Source:
+    """What the file holds: the graph, and the vertex poses as a trajectory whose stamps are row numbers, where every
+    vertex has one; notes what was incomplete.
+    """
     ids, edges = rows_of_keys(path, half.vertex_keys, half.edge_keys)
-    poses: Floats | None = half.poses
-    if len(ids) > len(half.vertex_keys):
-        poses = None
-        if len(half.vertex_keys):
-            missing = len(ids) - len(half.vertex_keys)
-            notes.append(f"{missing} of {len(ids)} vertices are named by edges only: no initial poses")
+    named = len(half.vertex_keys)
+    if 0 < named < len(ids):
+        notes.append(f"{len(ids) - named} of {len(ids)} vertices are named by edges only: no initial poses")
     fixed = np.flatnonzero(np.isin(ids, fixed_keys)).astype(np.int64)
-    graph = ViewGraph.from_edges(ids, edges, half.motions, half.information, source)
-    return PoseGraphFile(graph, poses, fixed, dimension, tuple(notes))
+    if len(fixed):
+        notes.append(f"{len(fixed)} vertices are marked FIX")
+    motions, information = half.motions, half.information
+    graph = ViewGraph.from_edges(ids, edges, motions, information, kind, dimension=dimension, fixed=fixed)
+    trajectory = Trajectory(np.arange(named, dtype=float), half.poses) if named == len(ids) else None
+    return Source(path.stem, path, trajectory=trajectory, graph=graph, notes=tuple(notes), files=(path,))
 
 
 def skipped(other: dict[str, int]) -> list[str]:
@@ -154,8 +141,11 @@ KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2
 COLUMNS = {"VERTEX_SE3:QUAT": (7,), "EDGE_SE3:QUAT": (28,), "VERTEX_SE2": (3,), "EDGE_SE2": (9,), "FIX": None}
 
 
-def load_g2o(path: Path | str) -> PoseGraphFile:
-    """The pose graph of a g2o file. Raises `SourceError` with file and line where one is malformed."""
+def load_g2o(path: Path | str) -> Source:
+    """The pose graph of a g2o file, and its vertices as a trajectory where it has them all.
+
+    Raises `SourceError` with file and line where one is malformed.
+    """
     path = Path(path)
     records, other = read_records(path, KEYS, COLUMNS)
     spatial, planar = len(records["EDGE_SE3:QUAT"]), len(records["EDGE_SE2"])
@@ -165,17 +155,7 @@ def load_g2o(path: Path | str) -> PoseGraphFile:
         raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
     dimension = 2 if planar or len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"]) else 3
     half = _planar(records) if dimension == 2 else _spatial(records)
-    return assemble(path, half, "g2o", records["FIX"].keys.reshape(-1), dimension, skipped(other))
-
-
-def as_source(file: PoseGraphFile, path: Path) -> Source:
-    """The file as a `Source`: the graph, and the vertex poses as a trajectory whose stamps are row numbers."""
-    poses = file.world_from_vertex
-    trajectory = None if poses is None else Trajectory(np.arange(len(poses), dtype=float), poses)
-    notes = list(file.notes)
-    if len(file.fixed):
-        notes.append(f"{len(file.fixed)} vertices are marked FIX")
-    return Source(path.stem, path, trajectory=trajectory, graph=file.graph, notes=tuple(notes), files=(path,))
+    return as_source(path, half, "g2o", records["FIX"].keys.reshape(-1), dimension, skipped(other))
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))
@@ -192,21 +172,15 @@ class G2oReader:
 
     def open(self, path: Path) -> Source:
         """The graph, and the vertices as a trajectory whose stamps are row numbers, where the file has them all."""
-        return as_source(load_g2o(path), Path(path))
+        return load_g2o(path)
 
 
-def write_g2o(
-    path: Path | str,
-    graph: ViewGraph,
-    world_from_vertex: Floats | None = None,
-    *,
-    dimension: int = 3,
-    fixed: Ints | None = None,
-) -> None:
+def write_g2o(path: Path | str, graph: ViewGraph, world_from_vertex: Floats | None = None) -> None:
     """One g2o file, written atomically: ids, order and values survive a round trip to the last bit of a float64.
 
-    `dimension=2` writes SE2 lines of a graph in the plane. Raises `SourceError` where ids are no integers.
+    A graph of dimension 2 becomes SE2 lines. Raises `SourceError` where ids are no integers.
     """
+    dimension = graph.dimension
     path = Path(path)
     if not np.issubdtype(graph.vertex_ids.dtype, np.integer):
         raise SourceError(f"{path}: g2o vertices need integer ids, not {graph.vertex_ids.dtype}: number them first")
@@ -215,8 +189,7 @@ def write_g2o(
     vertex_tag, edge_tag = ("VERTEX_SE2", "EDGE_SE2") if dimension == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
     if world_from_vertex is not None:
         write_lines(lines, vertex_tag, ids[:, None], _pose_columns(world_from_vertex, dimension))
-    if fixed is not None and len(fixed):
-        write_lines(lines, "FIX", ids[fixed][:, None], np.zeros((len(fixed), 0)))
+    write_lines(lines, "FIX", ids[graph.fixed][:, None], np.zeros((len(graph.fixed), 0)))
     poses, information = _pose_columns(graph.i_from_j, dimension), _information_columns(graph.information, dimension)
     write_lines(lines, edge_tag, ids[graph.edges], np.hstack([poses, information]))
     temporary = path.with_name(path.name + ".part")
@@ -226,7 +199,7 @@ def write_g2o(
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))
 class G2oWriter:
-    """Writes a measured graph as 3-D g2o, with the trajectory's poses where it has one for each vertex."""
+    """Writes a measured graph as g2o, 2-D or 3-D as it is, and the trajectory where it has a pose for each vertex."""
 
     def write(self, path: Path, source: Source) -> None:
         """One file, atomically; see `write_g2o`."""

@@ -86,7 +86,8 @@ def _parse(
         return Records(path, np.array(numbers, np.int64), ints, np.zeros((len(numbers), 0)))
     values = _numbers(path, tag, numbers, [parts[keys] for parts in split], columns)
     records = Records(path, np.array(numbers, np.int64), ints, values)
-    records.refuse(np.asarray(np.isnan(values[:, : columns[0]]).any(axis=1)), f"{tag} holds a nan: remove or mend that line")
+    nan = np.asarray(np.isnan(values[:, : columns[0]]).any(axis=1))
+    records.refuse(nan, f"{tag} holds a nan: remove or mend that line")
     return records
 
 

@@ -15,9 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from hodge_adapters.g2o import (
     Half,
-    PoseGraphFile,
     as_source,
-    assemble,
     lift_information,
     lift_poses,
     skipped,
@@ -81,8 +79,11 @@ def _merge(half: Half, pairs: Ints) -> Half:
     return Half(half.vertex_keys[kept], half.poses[kept], merged, half.motions, half.information)
 
 
-def load_toro(path: Path | str) -> PoseGraphFile:
-    """The pose graph of a TORO file. Raises `SourceError` with file and line where one is malformed."""
+def load_toro(path: Path | str) -> Source:
+    """The pose graph of a TORO file, and its vertices as a trajectory where it has them all.
+
+    Raises `SourceError` with file and line where one is malformed.
+    """
     path = Path(path)
     records, other = read_records(path, KEYS, COLUMNS)
     spatial, planar = len(records["EDGE3"]), len(records["EDGE2"])
@@ -95,7 +96,7 @@ def load_toro(path: Path | str) -> PoseGraphFile:
     if len(equal := records["EQUIV"].keys):
         half = _merge(half, equal)
         notes.append(f"{len(equal)} EQUIV lines: those vertices are merged")
-    return assemble(path, half, "toro", np.zeros(0, np.int64), 2 if planar else 3, notes)
+    return as_source(path, half, "toro", np.zeros(0, np.int64), 2 if planar else 3, notes)
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))
@@ -111,4 +112,4 @@ class ToroReader:
 
     def open(self, path: Path) -> Source:
         """The graph, and the vertices as a trajectory whose stamps are row numbers, where the file has them all."""
-        return as_source(load_toro(path), Path(path))
+        return load_toro(path)

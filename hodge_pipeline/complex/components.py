@@ -17,7 +17,7 @@ def connected_components(edges: Ints, vertex_count: int) -> Ints:
     """The component (V,) of each vertex: 0 the largest; of equal ones, that with the first vertex comes first."""
     edges = np.asarray(edges, np.int64).reshape(-1, 2)
     check_edges(edges, vertex_count)
-    ones = np.ones(len(edges), np.int8)
+    ones = np.ones(len(edges), np.int32)  # parallel edges are summed: 256 of them would be none in 8 bits
     adjacency = csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
     count, label = csgraph_components(adjacency, directed=False)
     _, first = np.unique(label, return_index=True)
