@@ -17,6 +17,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Frame
 from mcap_data import (
+    SECOND,
     Log,
     calibration,
     compressed_depth,
@@ -29,7 +30,7 @@ from mcap_data import (
     some_images,
     write_depth_log,
 )
-from mcap_encoding import CDR, ENCODINGS, JSON, PROTOBUF, SECOND
+from mcap_encoding import CDR, ENCODINGS, JSON, PROTOBUF
 from readers_data import HEIGHT, WIDTH, depth_values
 from synthetic import tiny_sequence  # noqa: F401
 
@@ -183,6 +184,15 @@ def test_colour_of_another_size_is_not_on_the_grid(tmp_path: Path) -> None:
     source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
     assert source.frames[0].read_colour is None
     assert any("no colour: depth is 8x6, there is /cam/color/image 4x4" in note for note in source.notes)
+
+
+def test_images_of_another_size_than_most_are_left_out(tmp_path: Path) -> None:
+    small = raw_image(depth_values(0, (2, 2)), "16UC1")
+    colour = raw_image(np.zeros((HEIGHT, WIDTH, 3), np.uint8), "rgb8")
+    log = depth_log([*some_images(3), small, colour])
+    source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
+    assert len(source.frames) == 3
+    assert f"{DEPTH}: 2 images of another size or kind than most left out" in source.notes
 
 
 def test_topics_by_type_and_by_option(tmp_path: Path) -> None:

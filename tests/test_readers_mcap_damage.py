@@ -22,6 +22,7 @@ from hodge_adapters.mcap import McapReader
 from hodge_adapters.mcap_records import MAGIC
 from hodge_pipeline.errors import SourceError
 from mcap_data import (
+    SECOND,
     Log,
     calibration,
     compressed_depth,
@@ -34,7 +35,7 @@ from mcap_data import (
     ros_header,
     transforms,
 )
-from mcap_encoding import CDR, JSON, PROTOBUF, SECOND
+from mcap_encoding import CDR, JSON, PROTOBUF
 from readers_data import HEIGHT, WIDTH, depth_values, some_poses
 
 CASES = int(os.environ.get("HODGE_MCAP_CASES", "240"))

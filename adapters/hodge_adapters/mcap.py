@@ -108,7 +108,7 @@ class McapReader:
 
     def _frames(self, path: Path, recording: Recording, notes: list[str]) -> tuple[list[Frame], str]:
         """All frames, and the coordinate frame of their camera."""
-        depth, colour = split_depth(recording.images)
+        depth, colour = split_depth(recording.images, notes)
         kind = self.frames
         if kind == "auto":
             kind = "depth" if depth else "points" if recording.clouds else "colour"

@@ -125,7 +125,7 @@ def _columns(payload: Payload, layout: CloudLayout, contents: bytes) -> NDArray[
         return np.zeros(0, dtype)
     if len(contents) < layout.row_step * (layout.height - 1) + layout.width * layout.point_step:
         raise payload.error("a cloud with fewer bytes than its size needs")
-    return np.ndarray(shape, dtype, contents, 0, strides).reshape(-1)
+    return np.asarray(np.ndarray(shape, dtype, contents, 0, strides).reshape(-1))
 
 
 def _stacked(columns: NDArray[np.void], names: tuple[str, str, str]) -> Floats32:
@@ -150,7 +150,7 @@ def _colours(columns: NDArray[np.void]) -> Bytes | None:
     if {"red", "green", "blue"} <= names:
         scale = 255 if columns.dtype["red"].kind == "f" else 1
         channels = _stacked(columns, ("red", "green", "blue")) * scale
-        return np.clip(np.nan_to_num(channels), 0, 255).round().astype(np.uint8)
+        return np.asarray(np.clip(np.nan_to_num(channels), 0, 255).round(), np.uint8)
     packed = next((name for name in ("rgb", "rgba") if name in names and columns.dtype[name].itemsize == 4), None)
     if packed is None:
         return None

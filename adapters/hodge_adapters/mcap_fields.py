@@ -126,7 +126,7 @@ def text(message: Message, name: str) -> str:
 
 def part(message: Message, *names: str) -> Message:
     """The message under the first of these names that is there, else an empty one; raises `Malformed`."""
-    value = next((message[name] for name in names if name in message), {})
+    value: Any = next((message[name] for name in names if name in message), {})
     if not isinstance(value, dict):
         raise Malformed(f"no message in its field {names[0]}")
     return value

@@ -10,6 +10,7 @@ import math
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -26,6 +27,8 @@ HEAD_BYTES = 1 << 16
 """Of an encoded image, this much is looked at for its size: room for the thumbnail that may precede it."""
 
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+Pixels: TypeAlias = NDArray[np.uint8 | np.uint16 | np.float32]
+
 _DEPTH_HEADER = struct.Struct("<iff")
 _RVL_SIZE = struct.Struct("<II")
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -178,7 +181,7 @@ def _coded_layout(head: bytes, skip: int) -> ImageLayout:
     return ImageLayout(coding, "16UC1" if is_depth else "rgb8", header.width, header.height, skip=skip)
 
 
-def _decoded(payload: Payload, layout: ImageLayout) -> NDArray[np.generic]:
+def _decoded(payload: Payload, layout: ImageLayout) -> Pixels:
     if layout.coding == "raw":
         return _raw_pixels(payload, layout)
     if layout.coding == "rvl":
@@ -196,7 +199,7 @@ def _decoded(payload: Payload, layout: ImageLayout) -> NDArray[np.generic]:
     return np.asarray(stored)
 
 
-def _raw_pixels(payload: Payload, layout: ImageLayout) -> NDArray[np.generic]:
+def _raw_pixels(payload: Payload, layout: ImageLayout) -> Pixels:
     """Pixels (H, W) or (H, W, C), a view of the bytes read; rows may be padded."""
     order = ">" if layout.big_endian else "<"
     kind = {"32FC1": "f4", "16UC1": "u2", "mono16": "u2"}.get(layout.encoding, "u1")
@@ -208,7 +211,7 @@ def _raw_pixels(payload: Payload, layout: ImageLayout) -> NDArray[np.generic]:
         raise payload.error("an image with fewer bytes than its size needs")
     strides = (layout.step, channels * dtype.itemsize, dtype.itemsize)
     pixels = np.ndarray((layout.height, layout.width, channels), dtype, contents, 0, strides)
-    native = pixels.astype(dtype.newbyteorder("="), copy=False)
+    native: Pixels = pixels.astype(dtype.newbyteorder("="), copy=False)
     return native[..., 0] if channels == 1 else native
 
 

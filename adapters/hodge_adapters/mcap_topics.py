@@ -36,13 +36,16 @@ def named_topic(topics: Mapping[str, Item], name: str, what: str) -> tuple[str, 
     return found, topics[found]
 
 
-def split_depth(images: ImageTopics) -> tuple[ImageTopics, ImageTopics]:
+def split_depth(images: ImageTopics, notes: list[str]) -> tuple[ImageTopics, ImageTopics]:
     """(depth topics, colour topics): a topic is what most of its images are, and the others are left out."""
-    depth, colour = {}, {}
+    depth: dict[str, Sequence[Seen[ImageLayout]]] = {}
+    colour: dict[str, Sequence[Seen[ImageLayout]]] = {}
     for topic, seen in images.items():
         is_depth = sum(image.layout.is_depth for image in seen) * 2 >= len(seen)
         size = Counter(image.layout.size for image in seen if image.layout.is_depth == is_depth).most_common(1)[0][0]
         kept = [image for image in seen if image.layout.is_depth == is_depth and image.layout.size == size]
+        if len(kept) < len(seen):
+            notes.append(f"{topic}: {len(seen) - len(kept)} images of another size or kind than most left out")
         (depth if is_depth else colour)[topic] = kept
     return depth, colour
 

@@ -136,7 +136,7 @@ def _read_array(cursor: Cursor, code: str, count: int) -> Any:
     start = cursor.take(size * count)
     if code in "Bb":
         return slice(start, cursor.at)
-    return np.frombuffer(cursor.data, np.dtype(code).newbyteorder(cursor.order), count, start)
+    return np.frombuffer(cursor.data, np.dtype(cursor.order + code), count, start)
 
 
 def _short(name: str) -> str:

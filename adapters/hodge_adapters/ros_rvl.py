@@ -40,9 +40,13 @@ def _numbers(data: bytes) -> NDArray[np.int64]:
     lengths = last - first + 1
     if lengths.max() > _MAX_NIBBLES:
         raise Malformed("an RVL code with a number of more than 32 bits")
-    within = np.arange(last[-1] + 1) - np.repeat(first, lengths)
-    bits = (nibbles[: last[-1] + 1] & 7).astype(np.int64) << (3 * within)
-    return np.asarray(np.add.reduceat(bits, first))
+    bits = nibbles & 7
+    numbers: NDArray[np.int64] = bits[first].astype(np.int64)
+    # The n-th nibble of all numbers at once, of those that have one.
+    for nth in range(1, int(lengths.max())):
+        longer = np.flatnonzero(lengths > nth)
+        numbers[longer] |= bits[first[longer] + nth].astype(np.int64) << (3 * nth)
+    return numbers
 
 
 def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

@@ -90,13 +90,13 @@ class TransformTree:
 
     def _down_from(self, frames: list[str], stamps_s: Floats) -> Floats:
         """The product of the links of these frames, from the last one's parent to the first frame."""
-        product = np.broadcast_to(np.eye(4), (len(stamps_s), 4, 4)).copy()
+        product: Floats = np.broadcast_to(np.eye(4), (len(stamps_s), 4, 4)).copy()
         for frame in frames:
             link = self._link(frame)
             if self._holds_always(frame):
-                product = link.world_from_cam[-1] @ product
+                product = np.asarray(link.world_from_cam[-1] @ product)
             else:
-                product = interpolated_poses(link, stamps_s, self._max_gap_s) @ product
+                product = np.asarray(interpolated_poses(link, stamps_s, self._max_gap_s) @ product)
         return product
 
     def _holds_always(self, frame: str) -> bool:
