@@ -1,0 +1,48 @@
+"""What every fuser shares: which frames it takes, and what it says about those that it leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from hodge_pipeline.errors import HodgeError
+from hodge_pipeline.types import Floats, Frame
+
+
+class Skipped:
+    """A tally of the frames left out: how many for each reason, and the first of them."""
+
+    def __init__(self) -> None:
+        self._frames: dict[str, list[str]] = {}
+
+    def add(self, reason: str, frame: Frame, detail: str = "") -> None:
+        """Count one frame."""
+        self._frames.setdefault(reason, []).append(f"{frame.frame_id}: {detail}" if detail else f"{frame.frame_id}")
+
+    @contextmanager
+    def unreadable(self, frame: Frame) -> Iterator[None]:
+        """Counts the frame where its files cannot be read, and goes on; any other error is raised."""
+        try:
+            yield
+        except (HodgeError, OSError) as error:
+            self.add("cannot be read", frame, str(error))
+
+    def notes(self) -> tuple[str, ...]:
+        """One line for each reason."""
+        return tuple(
+            f"{len(names)} frame{'s' if len(names) > 1 else ''} skipped: {reason} (the first: {names[0]})"
+            for reason, names in self._frames.items()
+        )
+
+
+def posed(frames: Sequence[Frame], world_from_cam: Floats, every: int, skipped: Skipped) -> list[tuple[Frame, Floats]]:
+    """Each `every`-th frame with its pose (4, 4); one whose pose is not finite is counted in `skipped` instead."""
+    taken = []
+    for frame, pose in zip(frames[::every], world_from_cam[::every], strict=True):
+        if np.isfinite(pose).all():
+            taken.append((frame, pose))
+        else:
+            skipped.add("no finite pose", frame)
+    return taken
