@@ -1,0 +1,116 @@
+"""The verified pairs in a COLMAP `database.db`, opened read-only. Real ones hold matches, but no relative pose."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import pycolmap
+
+from hodge_adapters.colmap_edges import Pair, camera_table, positions
+from hodge_adapters.colmap_records import Model
+from hodge_adapters.colmap_relative import Sighting
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats
+
+MAX_IMAGE_ID = 2147483647
+"""A pair's key is `first · this + second`."""
+MAX_KEYPOINT_COLUMNS = 16
+USABLE = (2, 3, 4, 5, 6)
+"""Calibrated, uncalibrated, planar, panoramic, either of the last two: not degenerate, not a watermark."""
+MATRICES = ("F", "E", "H")
+
+
+def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) -> Iterator[Pair]:
+    """Pairs of the model's images with enough verified matches; i is the image with the greater id.
+
+    Raises `SourceError` for a file that is no database of COLMAP, or one that is damaged.
+    """
+    try:
+        # `immutable` needs no write access, not even for a journal beside the file.
+        with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as database:
+            yield from _pairs(database, path, model, min_shared, notes)
+    except (sqlite3.Error, OverflowError) as error:
+        raise SourceError(
+            f"{path}: not a whole COLMAP database ({error}): make it again, or set edges=covisibility"
+        ) from error
+
+
+def _pairs(database: sqlite3.Connection, path: Path, model: Model, min_shared: int, notes: list[str]) -> Iterator[Pair]:
+    row_of_name = {image.name: row for row, image in enumerate(model.images)}
+    row_of_id = {
+        int(image_id): row_of_name[name]
+        for image_id, name in database.execute("SELECT image_id, name FROM images")
+        if name in row_of_name
+    }
+    cameras = camera_table(model)
+    outside = 0
+    rows = database.execute(
+        "SELECT pair_id, rows, config, data, F, E, H FROM two_view_geometries WHERE rows >= ? ORDER BY pair_id",
+        (min_shared,),
+    )
+    for pair_id, count, config, data, *matrices in rows:
+        j, i = (row_of_id.get(image_id) for image_id in divmod(int(pair_id), MAX_IMAGE_ID))
+        if i is None or j is None:
+            outside += 1
+        elif config in USABLE:
+            ids = int(pair_id) % MAX_IMAGE_ID, int(pair_id) // MAX_IMAGE_ID
+            matches = _blob(path, f"pair {pair_id}", data, np.dtype("<u4"), count, 2)
+            keys_i, keys_j = (_keypoints(database, path, image_id) for image_id in ids)
+            yield Pair(
+                i, j, _sighting(path, model, cameras, (i, j), (keys_i, keys_j), matches, config, matrices), "database"
+            )
+    if outside:
+        notes.append(f"{path.name}: {outside} pairs are of images that the model does not have")
+
+
+def _sighting(
+    path: Path,
+    model: Model,
+    cameras: Any,
+    rows: tuple[int, int],
+    keys: tuple[Floats, Floats],
+    matches: Any,
+    config: int,
+    matrices: list[bytes | None],
+) -> Sighting:
+    columns_j, columns_i = matches[:, 0].astype(np.int64), matches[:, 1].astype(np.int64)
+    if len(matches) and (columns_i.max() >= len(keys[0]) or columns_j.max() >= len(keys[1])):
+        raise SourceError(f"{path}: a match names a keypoint that is not there: make the database again")
+    image_i, image_j = model.images[rows[0]], model.images[rows[1]]
+    xyz = np.full((len(matches), 3), np.nan)
+    if len(image_j.point_ids) == len(keys[1]):
+        xyz = positions(model, image_j.point_ids[columns_j])
+    pixels_i, pixels_j = keys[0][columns_i], keys[1][columns_j]
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.config = pycolmap.TwoViewGeometryConfiguration(config)
+    rows_of_match = np.arange(len(matches), dtype=np.uint32)
+    geometry.inlier_matches = np.column_stack([rows_of_match, rows_of_match])
+    for name, blob in zip(MATRICES, matrices, strict=True):
+        if blob is not None and len(blob) == 72:
+            setattr(geometry, name, np.frombuffer(blob, "<f8").reshape(3, 3))
+    return Sighting(cameras[image_i.camera_id], cameras[image_j.camera_id], pixels_i, pixels_j, xyz, geometry)
+
+
+def _keypoints(database: sqlite3.Connection, path: Path, image_id: int) -> Floats:
+    found = database.execute("SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)).fetchone()
+    if found is None:
+        return np.zeros((0, 2))
+    rows, columns, data = found
+    if not 2 <= columns <= MAX_KEYPOINT_COLUMNS:
+        raise SourceError(f"{path}: image {image_id} has keypoints of {columns} columns: make the database again")
+    keys = np.asarray(_blob(path, f"image {image_id}", data, np.dtype("<f4"), rows, columns)[:, :2], np.float64)
+    if not np.isfinite(keys).all():
+        raise SourceError(f"{path}: image {image_id} has a keypoint that is not finite: make the database again")
+    return keys
+
+
+def _blob(path: Path, what: str, data: bytes | None, dtype: np.dtype[Any], rows: int, columns: int) -> Any:
+    if data is None or not isinstance(data, bytes) or len(data) != rows * columns * dtype.itemsize:
+        raise SourceError(f"{path}: {what} says {rows} rows, its data has another size: make the database again")
+    return np.frombuffer(data, dtype).reshape(rows, columns)

@@ -1,0 +1,73 @@
+"""The scale of a COLMAP model, which is arbitrary, in metres: by what a depth sensor saw at the model's points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hodge_adapters import images
+from hodge_adapters.colmap_edges import positions
+from hodge_adapters.colmap_records import NO_POINT, Model
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats, Floats32, ViewGraph
+
+SAMPLED_IMAGES = 12
+LEAST_POINTS = 50
+
+
+def metres_per_unit(
+    model: Model, sensors: Mapping[int, Path], units_per_metre: float, no_depth: tuple[int, ...], notes: list[str]
+) -> float:
+    """The median of sensor depth over model depth at the observations of a few images; 1 where too few."""
+    rows = sorted(sensors)
+    picked = np.unique(np.linspace(0, len(rows) - 1, SAMPLED_IMAGES).round().astype(int))
+    ratios = [np.zeros(0)]
+    for at in picked:
+        try:
+            depth = images.read_depth(sensors[rows[at]], units_per_metre=units_per_metre, no_depth=no_depth)
+        except SourceError:
+            continue  # the frame itself reports it when it is read
+        ratios.append(_ratios(model, rows[at], depth))
+    found = np.concatenate(ratios)
+    if len(found) < LEAST_POINTS:
+        notes.append(f"scale 1 m per unit: only {len(found)} points have sensor depth; set scale")
+        return 1.0
+    scale = float(np.median(found))
+    low, high = np.percentile(found, [25, 75]) / scale
+    notes.append(
+        f"scale {scale:.6g} m per unit, by sensor depth at {len(found)} points (half within {low:.3f}–{high:.3f})"
+    )
+    return scale
+
+
+def scaled_poses(world_from_cam: Floats, scale: float) -> Floats:
+    """The poses with their positions in metres."""
+    scaled = world_from_cam.copy()
+    scaled[:, :3, 3] *= scale
+    return scaled
+
+
+def scaled_graph(graph: ViewGraph, scale: float) -> ViewGraph:
+    """The graph with translations and their information in metres."""
+    unit = np.array([1.0, 1.0, 1.0, scale, scale, scale])
+    return replace(
+        graph, i_from_j=scaled_poses(graph.i_from_j, scale), information=graph.information / np.outer(unit, unit)
+    )
+
+
+def _ratios(model: Model, row: int, depth: Floats32) -> Floats:
+    image = model.images[row]
+    record = model.cameras[image.camera_id]
+    seen = image.point_ids != NO_POINT
+    xyz = positions(model, image.point_ids[seen])
+    expected: Floats = se3.transform(se3.inverse(image.world_from_cam), xyz)[:, 2]
+    grid = np.array([depth.shape[1] / record.width, depth.shape[0] / record.height])
+    columns, rows = np.floor(image.pixels[seen] * grid).astype(np.int64).T
+    good = (columns >= 0) & (rows >= 0) & (columns < depth.shape[1]) & (rows < depth.shape[0]) & (expected > 0)
+    measured: Floats = depth[rows[good], columns[good]].astype(np.float64)
+    ratios: Floats = (measured / expected[good])[measured > 0]
+    return ratios

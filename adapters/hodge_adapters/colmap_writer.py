@@ -1,0 +1,103 @@
+"""Writes posed frames as a COLMAP model without points: three files, which COLMAP and pycolmap open."""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_adapters.colmap_cameras import HALF_PIXEL
+from hodge_adapters.colmap_records import CAMERA_MODELS, to_colmap
+from hodge_pipeline.errors import SourceError, WorkspaceError
+from hodge_pipeline.types import Camera, Floats, Frame, Source
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class ColmapWriter:
+    """Writes a COLMAP model of the frames that have a camera and a pose."""
+
+    form: Literal["bin", "txt"] = Field("bin", description="binary, or text with the digits that restore every number")
+
+    def write(self, path: Path, source: Source) -> None:
+        """A folder with cameras, images and points3D; each file is replaced in one step.
+
+        An image's name is the frame's id, with `.png` where that is a number. Raises `SourceError` where no frame has
+        a camera and a pose, or where y points up, which no camera of COLMAP's does.
+        """
+        frames = [frame for frame in source.frames if frame.camera is not None and frame.world_from_cam is not None]
+        if not frames:
+            raise SourceError(f"{source.path}: no frame with a camera and a pose: COLMAP needs both")
+        cameras = list(dict.fromkeys(frame.camera for frame in frames if frame.camera))
+        if any(camera.fy < 0 for camera in cameras):
+            raise SourceError(
+                f"{source.path}: fy is negative (y points up), which COLMAP has not: turn the images over"
+            )
+        write = _binary_files if self.form == "bin" else _text_files
+        _write_folder(Path(path), write(cameras, frames))
+
+
+def image_name(frame: Frame) -> str:
+    """The name that a frame's image gets in the model."""
+    name = f"{frame.frame_id:06d}.png" if isinstance(frame.frame_id, int) else frame.frame_id
+    return "_".join(name.split())
+
+
+def _params(camera: Camera) -> tuple[float, ...]:
+    return camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL
+
+
+def _poses(frames: list[Frame]) -> Floats:
+    return np.hstack(to_colmap(np.array([frame.world_from_cam for frame in frames])))
+
+
+def _text_files(cameras: list[Camera], frames: list[Frame]) -> dict[str, bytes]:
+    lines = [
+        f"{number} PINHOLE {camera.width} {camera.height} {' '.join(map(repr, _params(camera)))}\n"
+        for number, camera in enumerate(cameras, 1)
+    ]
+    rows = [
+        f"{number} {' '.join(map(repr, pose))} {cameras.index(frame.camera) + 1} {image_name(frame)}\n\n"  # type: ignore[arg-type]
+        for number, (pose, frame) in enumerate(zip(_poses(frames).tolist(), frames, strict=True), 1)
+    ]
+    return {
+        "cameras.txt": ("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n" + "".join(lines)).encode(),
+        "images.txt": ("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points\n" + "".join(rows)).encode(),
+        "points3D.txt": b"# POINT3D_ID X Y Z R G B ERROR TRACK\n",
+    }
+
+
+def _binary_files(cameras: list[Camera], frames: list[Frame]) -> dict[str, bytes]:
+    number_of_pinhole = CAMERA_MODELS["PINHOLE"][0]
+    records = [
+        struct.pack("<IiQQ4d", number, number_of_pinhole, camera.width, camera.height, *_params(camera))
+        for number, camera in enumerate(cameras, 1)
+    ]
+    rows = [
+        struct.pack("<I7dI", number, *pose, cameras.index(frame.camera) + 1)  # type: ignore[arg-type]
+        + image_name(frame).encode()
+        + struct.pack("<xQ", 0)
+        for number, (pose, frame) in enumerate(zip(_poses(frames).tolist(), frames, strict=True), 1)
+    ]
+    return {
+        "cameras.bin": struct.pack("<Q", len(records)) + b"".join(records),
+        "images.bin": struct.pack("<Q", len(rows)) + b"".join(rows),
+        "points3D.bin": struct.pack("<Q", 0),
+    }
+
+
+def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+        for name, contents in files.items():
+            temporary = folder / f".{name}.{os.getpid()}.tmp"
+            temporary.write_bytes(contents)
+            os.replace(temporary, folder / name)
+    except OSError as error:
+        raise WorkspaceError(
+            f"{folder}: cannot be written ({error.strerror}): is the folder above it there?"
+        ) from error

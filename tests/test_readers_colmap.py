@@ -1,0 +1,270 @@
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hodge_adapters.colmap import ColmapReader
+from hodge_adapters.colmap_cameras import pinhole_camera, undistortion
+from hodge_adapters.colmap_records import CAMERA_MODELS, CameraRecord
+from hodge_adapters.colmap_writer import ColmapWriter
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.testing import check_reader
+from hodge_pipeline.types import Camera, Frame, Source
+from readers_data import some_poses, write_colour, write_depth
+
+SIZE = (64, 48)
+
+
+def synthetic(folder: Path, model: str = "SIMPLE_RADIAL", database: bool = False, cameras_per_rig: int = 2):
+    """A rig model with exact observations, written by pycolmap as text and binary."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, cameras_per_rig, 4
+    options.num_points3D = 120
+    options.camera_model_id = getattr(pycolmap.CameraModelId, model)
+    options.camera_params = pycolmap.Camera.create_from_model_name(1, model, 1280.0, 1024, 768).params
+    for name in ("text", "binary"):
+        (folder / name).mkdir(parents=True)
+    base = pycolmap.Database.open(folder / "database.db") if database else None
+    pycolmap.set_random_seed(0)
+    made = pycolmap.synthesize_dataset(options, base) if base else pycolmap.synthesize_dataset(options)
+    if base:
+        base.close()
+    made.write_text(folder / "text")
+    made.write_binary(folder / "binary")
+    return made
+
+
+def edge_errors(source: Source) -> tuple[np.ndarray, np.ndarray]:
+    graph, poses = source.graph, source.trajectory.world_from_cam
+    i, j = graph.edges.T
+    error = se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(poses[i]) @ poses[j])
+    return np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
+
+
+def test_camera_models_are_those_of_pycolmap() -> None:
+    known = {name: number for name, number in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    assert set(known) <= set(CAMERA_MODELS), "a camera model is new in pycolmap: add it"
+    for name, number in known.items():
+        params = pycolmap.Camera.create_from_model_id(1, number, 500.0, 640, 480).params
+        assert CAMERA_MODELS[name] == (number.value, len(params))
+
+
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_poses_of_a_rig_model_are_those_of_pycolmap(tmp_path: Path, form: str) -> None:
+    made = synthetic(tmp_path)
+    source = check_reader(ColmapReader(edges="none"), tmp_path / form)
+    assert len(source.frames) == len(made.images) == 8
+    for frame in source.frames:
+        image = made.find_image_with_name(frame.frame_id)
+        expected = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
+        np.testing.assert_allclose(frame.world_from_cam, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["covisibility", "database"])
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV_FISHEYE", "EUCM"])
+def test_edges_are_estimated_without_the_poses(tmp_path: Path, kind: str, model: str) -> None:
+    synthetic(tmp_path, model, database=True)
+    connection = sqlite3.connect(tmp_path / "database.db")
+    with connection:
+        connection.execute("UPDATE two_view_geometries SET qvec = NULL, tvec = NULL")
+    connection.close()
+    source = check_reader(ColmapReader(edges=kind, min_shared=20), tmp_path / "text")
+    assert source.graph.edge_count >= 10 and set(source.graph.source) == {kind}
+    rotation, translation = edge_errors(source)
+    assert np.median(rotation) < 1e-4 and np.median(translation) < 1e-2
+    # Moved poses must not move the edges: they are measured from the images alone.
+    text = (tmp_path / "text/images.txt").read_text().split("\n")
+    rows = [row for row, line in enumerate(text) if line.endswith(".png")]
+    fields = text[rows[0]].split()
+    text[rows[0]] = " ".join([fields[0], "1 0 0 0 9 9 9", *fields[8:]])
+    (tmp_path / "text/images.txt").write_text("\n".join(text))
+    again = ColmapReader(edges=kind, min_shared=20).open(tmp_path / "text")
+    np.testing.assert_array_equal(again.graph.i_from_j, source.graph.i_from_j)
+
+
+@pytest.mark.parametrize("model", sorted(set(CAMERA_MODELS) - {"EQUIRECTANGULAR"}))
+def test_undistortion_puts_every_ray_where_the_pinhole_says(model: str) -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, model, 60.0, *SIZE)
+    params = camera.params.copy()
+    if len(params) > 4 and model not in ("FOV", "EUCM", "DIVISION"):
+        params[4] = 0.01
+    record = CameraRecord(1, model, *SIZE, tuple(params))
+    pinhole = pinhole_camera(record, SIZE)
+    columns, rows = undistortion(record, SIZE)
+    v, u = 7, 11
+    ray = np.array([[(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy, 1.0]])
+    exact = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=params)
+    distorted = exact.img_from_cam(ray)[0] - 0.5
+    np.testing.assert_allclose([columns[v, u], rows[v, u]], distorted, atol=1e-4)
+    back = exact.cam_from_img(distorted[None] + 0.5)
+    np.testing.assert_allclose(back[0], ray[0, :2], atol=1e-6)
+
+
+def test_a_panorama_is_refused() -> None:
+    with pytest.raises(SourceError, match="panorama"):
+        pinhole_camera(CameraRecord(1, "EQUIRECTANGULAR", 64, 32, (64.0, 32.0)), (64, 32))
+
+
+def posed_source(folder: Path, count: int = 4) -> Source:
+    camera = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
+    poses = some_poses(count)
+    frames = tuple(Frame(f"a{row}.png", float(row), camera, world_from_cam=pose) for row, pose in enumerate(poses))
+    return Source("made", folder, frames)
+
+
+@pytest.mark.parametrize("form", ["bin", "txt"])
+def test_written_models_are_read_again_here_and_by_pycolmap(tmp_path: Path, form: str) -> None:
+    source = posed_source(tmp_path)
+    ColmapWriter(form=form).write(tmp_path / "model", source)
+    back = ColmapReader(edges="none").open(tmp_path / "model")
+    theirs = pycolmap.Reconstruction(tmp_path / "model")
+    for before, after in zip(source.frames, back.frames, strict=True):
+        assert before.frame_id == after.frame_id and before.camera == after.camera
+        np.testing.assert_allclose(after.world_from_cam, before.world_from_cam, atol=1e-12)
+        image = theirs.find_image_with_name(before.frame_id)
+        np.testing.assert_allclose(image.cam_from_world().matrix(), se3.inverse(before.world_from_cam)[:3], atol=1e-12)
+        assert image.camera.principal_point_x == 4.0, "COLMAP's pixel centres are at halves"
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    source = posed_source(tmp_path)
+    with pytest.raises(SourceError, match="no frame"):
+        ColmapWriter().write(tmp_path / "model", replace(source, frames=()))
+    up = replace(source.frames[0], camera=Camera(8, 6, 10.0, -10.0, 3.5, 2.5))
+    with pytest.raises(SourceError, match="negative"):
+        ColmapWriter().write(tmp_path / "model", replace(source, frames=(up,)))
+
+
+def depth_map(path: Path, values: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pycolmap.DepthMap.from_array(values.astype(np.float32), 0.1, 10.0).write(path)
+
+
+def test_colmaps_own_depth_maps(tmp_path: Path) -> None:
+    source = posed_source(tmp_path, 2)
+    (tmp_path / "sparse").mkdir()
+    ColmapWriter().write(tmp_path / "sparse", source)
+    values = np.arange(48, dtype=np.float32).reshape(6, 8) / 10
+    values[0, 0] = -1
+    for frame in source.frames:
+        depth_map(tmp_path / f"stereo/depth_maps/{frame.frame_id}.geometric.bin", values)
+        write_colour(tmp_path / "images" / frame.frame_id)
+    found = check_reader(ColmapReader(scale=2.0), tmp_path)
+    np.testing.assert_allclose(found.frames[0].read_depth(), np.maximum(values, 0) * 2)
+    np.testing.assert_allclose(found.frames[1].world_from_cam[:3, 3], source.frames[1].world_from_cam[:3, 3] * 2)
+    assert found.frames[0].read_colour().shape == (6, 8, 3) and found.graph is None
+    broken = tmp_path / f"stereo/depth_maps/{source.frames[0].frame_id}.geometric.bin"
+    broken.write_bytes(broken.read_bytes()[:-5])
+    with pytest.raises(SourceError, match="copy it again"):
+        ColmapReader().open(tmp_path).frames[0].read_depth()
+
+
+def test_sensor_depth_is_undistorted_like_the_colour(tmp_path: Path) -> None:
+    model = tmp_path / "sparse"
+    ColmapWriter(form="txt").write(model, posed_source(tmp_path, 1))
+    (model / "cameras.txt").write_text("1 OPENCV 64 48 50 50 32 24 -0.2 0.01 0 0\n")
+    v, u = np.mgrid[0:48, 0:64]
+    write_depth(tmp_path / "depth/a0.png", (1000 + 10 * u + 5 * v).astype(np.uint16))
+    frame = check_reader(ColmapReader(scale=1.0), tmp_path).frames[0]
+    columns, rows = undistortion(CameraRecord(1, "OPENCV", 64, 48, (50, 50, 32, 24, -0.2, 0.01, 0, 0)), (64, 48))
+    depth = frame.read_depth()
+    inside = (depth > 0) & (columns > 1) & (rows > 1) & (columns < 62) & (rows < 46)
+    assert inside.sum() > 1000
+    expected = (1000 + 10 * columns + 5 * rows) / 1000
+    assert np.abs(depth - expected)[inside].max() <= 0.0076, "the nearest pixel, half a pixel off at most"
+    assert frame.encoded_depth is None, "its bytes are of the distorted image"
+
+
+def test_scale_from_sensor_depth(tmp_path: Path) -> None:
+    made = synthetic(tmp_path, "PINHOLE")
+    folder = tmp_path / "text"
+    for image in made.images.values():
+        depth = np.zeros((768, 1024), np.uint16)
+        points = [p for p in image.points2D if p.has_point3D()]
+        for point in points:
+            z = (image.cam_from_world() * made.points3D[point.point3D_id].xyz)[2]
+            column, row = np.floor(point.xy).astype(int)
+            depth[row, column] = np.clip(round(z * 500 * 0.3), 0, 65000)
+        write_depth(tmp_path / "depth" / image.name, depth)
+    source = ColmapReader(depth_scale=500.0).open(folder)
+    scale = np.linalg.norm(source.frames[0].world_from_cam[:3, 3]) / np.linalg.norm(
+        made.find_image_with_name(source.frames[0].frame_id).projection_center()
+    )
+    assert scale == pytest.approx(0.3, rel=1e-2)
+    assert any("by sensor depth" in note for note in source.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "edit", "message"),
+    [
+        ("cameras", lambda b: b[:-1], "cut off"),
+        ("images", lambda b: b"\xff" * 8 + b[8:], "more than the file has room for"),
+        ("points3D", lambda b: b + b"\0", "goes on"),
+        ("cameras", lambda b: b[:12] + b"\x63" + b[13:], "unknown model 99"),
+    ],
+)
+def test_damaged_binary_models_name_file_and_byte(tmp_path: Path, name: str, edit, message: str) -> None:
+    synthetic(tmp_path)
+    path = tmp_path / "binary" / f"{name}.bin"
+    path.write_bytes(edit(path.read_bytes()))
+    with pytest.raises(SourceError, match=message) as error:
+        ColmapReader().open(tmp_path / "binary")
+    assert path.name in str(error.value) and "at byte" in str(error.value)
+
+
+def test_a_database_that_is_none_is_named(tmp_path: Path) -> None:
+    synthetic(tmp_path)
+    with pytest.raises(SourceError, match="no database.db"):
+        ColmapReader(edges="database").open(tmp_path / "text")
+    (tmp_path / "database.db").write_bytes(b"SQLite format 3\0" + b"\xff" * 200)
+    with pytest.raises(SourceError, match="database.db"):
+        ColmapReader(edges="database").open(tmp_path / "text")
+
+
+def test_real_models(data_dir: Path) -> None:
+    door = ColmapReader(min_shared=100, max_edges_per_image=1).open(
+        data_dir / "colmap/lund_door/set1_lund_door/colmap_ground_truth"
+    )
+    rotation, translation = edge_errors(door)
+    assert len(rotation) >= 6 and np.degrees(rotation).max() < 0.2 and translation.max() < 0.1
+    assert door.frames[3].read_colour().shape == (1936, 1296, 3)
+    vesta = check_reader(ColmapReader(), data_dir / "colmap/astrovision_vesta/test_2011212_opnav_022", max_decoded=1)
+    assert vesta.graph.edge_count == 6
+    assert len(ColmapReader().open(data_dir / "colmap/unsorted_tiny").frames) == 3
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("palace", "the track of point"),
+        ("t265_fisheye_rig", "blanks instead of commas"),
+        ("lund_door/lund_door_binary/C_1/C_1_1/ba_output", "the track of point"),
+    ],
+)
+def test_real_models_that_contradict_themselves(data_dir: Path, place: str, message: str) -> None:
+    with pytest.raises(SourceError, match=message):
+        ColmapReader().open(data_dir / "colmap" / place)
+    if "track" in message:
+        assert len(ColmapReader(tracks=False).open(data_dir / "colmap" / place).frames) > 0
+
+
+def test_red_kitchen_depth_beside_images(data_dir: Path, tmp_path: Path) -> None:
+    sequence = data_dir / "seven_scenes/redkitchen/seq-01"
+    names = [f"frame-{number:06d}.color.jpg" for number in (0, 20)]
+    for name in names:
+        for file in (name, name.replace("color.jpg", "depth.png")):
+            (tmp_path / "images").mkdir(exist_ok=True)
+            shutil.copy(sequence / file, tmp_path / "images" / file)
+    camera = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+    frames = tuple(Frame(name, 0.0, camera, world_from_cam=np.eye(4)) for name in names)
+    ColmapWriter().write(tmp_path / "sparse", Source("made", tmp_path, frames))
+    source = check_reader(ColmapReader(), tmp_path)
+    depth = source.frames[0].read_depth()
+    assert source.frames[0].camera == camera and depth[depth > 0].min() > 0.4 and depth.max() < 10
