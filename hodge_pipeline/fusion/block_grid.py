@@ -55,18 +55,23 @@ class BlockGrid:
         if not self._reaches(depth_m):
             return False
         depth = o3d.t.geometry.Image(_tensor(depth_m, np.float32))
-        intrinsic = _tensor(camera.matrix, np.float64)
-        extrinsic = _tensor(se3.inverse(world_from_cam), np.float64)
-        near = (1.0, self.max_depth_m, self.truncation_voxels)
-        blocks = self._grid.compute_unique_block_coordinates(depth, intrinsic, extrinsic, *near)
+        pose, reach = _tensor(se3.inverse(world_from_cam), np.float64), (self.max_depth_m, self.truncation_voxels)
+        blocks = self._grid.compute_unique_block_coordinates(
+            depth,
+            _tensor(camera.matrix, np.float64),
+            pose,
+            depth_scale=1.0,
+            depth_max=reach[0],
+            trunc_voxel_multiplier=reach[1],
+        )
         self._make_room(len(blocks))
+        matrix = _floor_matrix(camera, depth_m.shape, depth_m.shape)
         if colour is None:
-            self._grid.integrate(blocks, depth, intrinsic, extrinsic, *near)
+            self._grid.integrate(blocks, depth, matrix, pose, 1.0, *reach)
         else:
             image = o3d.t.geometry.Image(_tensor(colour, np.float32))
-            colour_intrinsic = _tensor(_matrix_at(camera, depth_m.shape, colour.shape), np.float64)
-            self._grid.integrate(blocks, depth, image, intrinsic, colour_intrinsic, extrinsic, *near)
-
+            colour_matrix = _floor_matrix(camera, depth_m.shape, colour.shape)
+            self._grid.integrate(blocks, depth, image, matrix, colour_matrix, pose, 1.0, *reach)
         return True
 
     def _reaches(self, depth_m: Floats32) -> bool:
@@ -110,7 +115,12 @@ def _sorted_triangles(triangles: Any) -> Any:
     return turned[np.lexsort(turned.T[::-1])]
 
 
-def _matrix_at(camera: Camera, depth_shape: tuple[int, ...], colour_shape: tuple[int, ...]) -> Floats:
-    """K for a colour image that has another number of pixels than the depth image."""
-    scale = np.diag([colour_shape[1] / depth_shape[1], colour_shape[0] / depth_shape[0], 1.0])
-    return np.asarray(scale @ camera.matrix)
+def _floor_matrix(camera: Camera, depth_shape: tuple[int, ...], image_shape: tuple[int, ...]) -> Any:
+    """K for an image of this shape and the depth image's field of view, with pixel centres at halves.
+
+    open3d finds the pixel of a voxel by rounding down, so with pixel centres at whole numbers every surface would be
+    fused half a pixel aside: on a wall seen aslant that is a bias in depth.
+    """
+    centre = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    scale = np.diag([image_shape[1] / depth_shape[1], image_shape[0] / depth_shape[0], 1.0])
+    return _tensor(scale @ (camera.matrix + centre), np.float64)

@@ -30,8 +30,8 @@ def depth_points(
 
 def _at(colour: Bytes, depth_shape: tuple[int, ...], stride: int) -> Bytes:
     """The colours of the strided depth pixels; the images may differ in size, not in field of view."""
-    rows = np.arange(0, depth_shape[0], stride) * colour.shape[0] // depth_shape[0]
-    columns = np.arange(0, depth_shape[1], stride) * colour.shape[1] // depth_shape[1]
+    rows = (2 * np.arange(0, depth_shape[0], stride) + 1) * colour.shape[0] // (2 * depth_shape[0])
+    columns = (2 * np.arange(0, depth_shape[1], stride) + 1) * colour.shape[1] // (2 * depth_shape[1])
     return colour[np.ix_(rows, columns)]
 
 
