@@ -115,14 +115,24 @@ def _read_pose(path: Path) -> Floats:
 
 
 def _from_tum(path: Path, frames: Sequence[Frame]) -> tuple[Floats, str]:
-    trajectory = registry.load("readers", "tum")().open(path).trajectory
-    if trajectory is None:
-        raise SourceError(f"{path}: holds no trajectory: expected lines of stamp tx ty tz qx qy qz qw")
+    stamps_s, world_from_cam = _read_tum(path)
     poses = np.full((len(frames), 4, 4), np.nan)
-    stamps = np.array([frame.stamp_s for frame in frames])
-    ours, theirs = associate(stamps, trajectory.stamps_s, MAX_STAMP_DIFFERENCE_S)
-    poses[ours] = trajectory.world_from_cam[theirs]
+    ours, theirs = associate(np.array([frame.stamp_s for frame in frames]), stamps_s, MAX_STAMP_DIFFERENCE_S)
+    poses[ours] = world_from_cam[theirs]
     return _checked(poses, path)
+
+
+def _read_tum(path: Path) -> tuple[Floats, Floats]:
+    """Stamps (M,), ascending, and poses (M, 4, 4)."""
+    try:
+        table = np.loadtxt(path, comments="#", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: cannot be read as lines of stamp tx ty tz qx qy qz qw: {error}") from error
+    if table.shape[1:] != (8,) or not len(table):
+        raise SourceError(f"{path}: has rows of {table.shape[-1]} numbers, expected stamp tx ty tz qx qy qz qw")
+    table = table[np.isfinite(table).all(axis=1) & (np.abs(table[:, 4:]).max(axis=1) > 0)]
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return table[:, 0], se3.from_quat_xyzw(table[:, 1:4], table[:, 4:])
 
 
 def _checked(poses: Floats, place: Path) -> tuple[Floats, str]:

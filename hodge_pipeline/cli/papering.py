@@ -11,7 +11,7 @@ from typing import Annotated, Optional
 import typer
 
 from hodge_pipeline import artifacts
-from hodge_pipeline.cli.console import Terminal, print_table
+from hodge_pipeline.cli.console import Terminal
 from hodge_pipeline.cli.paper_sequences import Found, find_sequences, peer_poses
 from hodge_pipeline.errors import HodgeError, RecipeError
 from hodge_pipeline.evaluation import paper_tables
@@ -75,9 +75,8 @@ def papering(
     artifacts.write_text(out / "paper.md", paper_tables.as_markdown(tables, HEADING))
     artifacts.write_text(out / "paper.csv", paper_tables.as_csv(tables))
     artifacts.write_text(out / "paper.html", paper_tables.as_html(tables, HEADING, pictures))
-    for table in tables:
-        print_table(table.title, table.header, table.rows)
-    print(f"tables   {out / 'paper.html'}")
+    print(paper_tables.as_markdown(tables, HEADING))
+    print(f"The same as a page with pictures: {out / 'paper.html'}")
 
 
 def _peer_of(option: str | None) -> tuple[str, Path | None]:

@@ -108,17 +108,17 @@ def _score_row(results: Results, kind: GraphKind, name: str) -> tuple[str, ...]:
     paper = PAPER_SCORES[kind][name]
     found = results.measured.get(name, {}).get(kind)
     ours = (NAN,) * 4 if found is None else (found.truth, found.peer, found.first, found.third)
-    cells = [cell for pair in zip(_marked(paper), _marked(ours), strict=True) for cell in pair]
+    cells = [cell for pair in zip(_marked(paper, 3), _marked(ours, 4), strict=True) for cell in pair]
     if found is None:
         return (name, *cells, "–", results.missing.get(name, "not measured"))
     return (name, *cells, str(found.pairs), "; ".join(found.notes))
 
 
-def _marked(values: Sequence[float]) -> list[str]:
-    """Three decimals as in the paper, the best of six decimals with a star, a dash where there is none."""
+def _marked(values: Sequence[float], decimals: int) -> list[str]:
+    """The values, the best of six decimals with a star, a dash where there is none."""
     known = [round(value, 6) for value in values if not math.isnan(value)]
     best = max(known) if len(known) > 1 else NAN
-    return ["–" if math.isnan(v) else f"{v:.3f}{'*' if round(v, 6) == best else ''}" for v in values]
+    return ["–" if math.isnan(v) else f"{v:.{decimals}f}{'*' if round(v, 6) == best else ''}" for v in values]
 
 
 def _deviation_table(results: Results) -> Table:

@@ -20,7 +20,7 @@ from hodge_pipeline.complex.cycles import (
     loop_products,
     spanning_forest,
 )
-from hodge_pipeline.complex.form import Logarithm, residual_form
+from hodge_pipeline.complex.form import Logarithm
 from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
 from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem, path_lengths
 from hodge_pipeline.solvers.paper_surface import (
@@ -89,11 +89,13 @@ class PaperSolver:
         world_from_cam = np.asarray(world_from_cam, float)
         check_graph(graph, world_from_cam)
         problem = make_problem(graph, world_from_cam)
+        weights = np.zeros(graph.edge_count)
+        weights[problem.rows] = 1.0
         pieces = describe_components(problem.component, graph.vertex_ids)
         if not len(problem.edges):
             note = "no edge joins two vertices: every pose is as it was at the start"
             return Solution(world_from_cam.copy(), problem.component, np.zeros(graph.edge_count), notes=(*pieces, note))
-        lengths = path_lengths(graph.select(problem.used), self.paths)
+        lengths = path_lengths(graph.select(problem.rows), self.paths)
         surface = make_surface(problem.edges, problem.start, lengths, self.rotation, self.seed)
         around_loops = self._around_loops(problem)
         generators = surface.generators() if surface.is_checked else None
@@ -102,7 +104,7 @@ class PaperSolver:
         return Solution(
             world_from_cam=history[-1].world_from_cam,
             component=problem.component,
-            weights=problem.used.astype(float),
+            weights=weights,
             history=history,
             metrics={
                 "loops": float(len(measured)),
@@ -110,7 +112,7 @@ class PaperSolver:
                 "measured_loop_deviation_mean": _mean(measured),
                 "iterations": float(len(history)),
                 **surface.sizes(),
-                **(surface.shares(surface.form(self._form(problem, problem.start))) if surface.is_checked else {}),
+                **(surface.shares(surface.form(problem.form(problem.start, self.log))) if surface.is_checked else {}),
                 **homology_metrics(generators, problem.i_from_j, "measured_homology"),
                 **history[-1].metrics,
             },
@@ -122,13 +124,13 @@ class PaperSolver:
     ) -> tuple[SolverIteration, ...]:
         solve_poisson = problem.poisson(surface.d0, surface.weights)
         poses, history = problem.start, []
-        omega = self._form(problem, poses)
+        omega = problem.form(poses, self.log)
         for _ in range(self.inner_iterations):
             correction = solve_poisson(surface.form(omega))
             adjusted = adjusted_edges(problem.edges, poses, correction, pairing=self.log == "pairing")
             deviation = loop_deviation(around_loops(adjusted))
             poses = problem.moved(poses, correction, self.log)
-            omega = self._form(problem, poses)
+            omega = problem.form(poses, self.log)
             step = float(np.sqrt((correction**2).sum(axis=1).mean()))
             metrics = {
                 **problem.residual_metrics(poses),
@@ -154,7 +156,7 @@ class PaperSolver:
         self, problem: PaperProblem, surface: PaperSurface, history: tuple[SolverIteration, ...]
     ) -> tuple[str, ...]:
         notes = list(problem.notes())
-        half_turns = int((np.linalg.norm(self._form(problem, problem.start)[:, :3], axis=1) > np.pi - 1e-3).sum())
+        half_turns = int((np.linalg.norm(problem.form(problem.start, self.log)[:, :3], axis=1) > np.pi - 1e-3).sum())
         if half_turns:
             notes.append(f"{half_turns} edges disagree with the start by a half turn: the sign of their ω is arbitrary")
         if surface.is_checked:
@@ -169,9 +171,6 @@ class PaperSolver:
                 f"not converged: step {len(history)} still moved the poses by {step:.2g}: more inner_iterations"
             )
         return tuple(notes)
-
-    def _form(self, problem: PaperProblem, poses: Floats) -> Floats:
-        return residual_form(problem.edges, problem.i_from_j, poses, self.log)
 
 
 def _mean(values: Floats) -> float:

@@ -14,28 +14,43 @@ from hodge_pipeline.complex.checks import orthonormal
 from hodge_pipeline.complex.coboundary import grounded_laplacian
 from hodge_pipeline.complex.components import connected_components, first_of_component
 from hodge_pipeline.complex.edge_weights import edge_weights
-from hodge_pipeline.complex.form import Logarithm, centroids, shifted
+from hodge_pipeline.complex.form import Logarithm, centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.linear import factorise
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 LEVER_ARM_M = 1.0  # a rotation counts as the displacement that it causes this far away, in a path's uncertainty
 
 
 @dataclass(frozen=True)
 class PaperProblem:
-    """The edges that join two vertices (`used` of all given), and the start poses, centred on their component.
+    """The edges that join two vertices, in the order and orientation of the complex, and the centred start poses.
 
-    Far from the world's origin a little rotation would be much translation, and ω would depend on where the origin is.
+    - `rows (E,)` of the graph's edges, sorted by their vertices, so that the surface and its random orders depend
+      neither on the order in which edges were measured nor on their directions;
+    - `edges (E, 2)` and `i_from_j (E, 4, 4)` with i < j; `sign (E,)` is −1 where the measurement ran from j to i.
+
+    The poses are around the centroid of their component: far from the world's origin a little rotation would be much
+    translation, and ω would depend on where the origin is.
     """
 
-    used: Bools
+    rows: Ints
     edges: Ints
     i_from_j: Floats
+    sign: Ints
     component: Ints
     start: Floats
     offset: Floats
     start_in_world: Floats
+    self_loops: int
+
+    def form(self, poses: Floats, log: Logarithm) -> Floats:
+        """ω (E, 6) of the edges i < j: taken in the direction measured, its sign turned where that is j to i."""
+        backwards = self.sign < 0
+        as_measured = np.where(backwards[:, None], self.edges[:, ::-1], self.edges)
+        motions = self.i_from_j.copy()
+        motions[backwards] = se3.inverse(motions[backwards])
+        return np.asarray(self.sign[:, None] * residual_form(as_measured, motions, poses, log))
 
     def in_world(self, poses: Floats) -> Floats:
         """The poses away from the centroid again; first vertices are those of the start to the last bit."""
@@ -90,24 +105,32 @@ class PaperProblem:
 
     def notes(self) -> tuple[str, ...]:
         """What was ignored."""
-        loops = int((~self.used).sum())
-        return (f"{loops} edges join a vertex to itself and say nothing about poses: ignored",) if loops else ()
+        if not self.self_loops:
+            return ()
+        return (f"{self.self_loops} edges join a vertex to itself and say nothing about poses: ignored",)
 
 
 def make_problem(graph: ViewGraph, world_from_cam: Floats) -> PaperProblem:
     """The problem of a checked graph; edges that join a vertex to itself are left out."""
-    used = np.asarray(graph.edges[:, 0] != graph.edges[:, 1], bool)
-    edges = graph.edges[used]
+    low, high = graph.edges.min(axis=1), graph.edges.max(axis=1)
+    order = np.lexsort((high, low))
+    rows = order[(low < high)[order]]
+    edges = np.stack([low[rows], high[rows]], axis=1)
+    backwards = graph.edges[rows, 0] > graph.edges[rows, 1]
+    i_from_j = orthonormal(graph.i_from_j[rows])
+    i_from_j[backwards] = se3.inverse(i_from_j[backwards])
     component = connected_components(edges, graph.vertex_count)
     offset = centroids(world_from_cam, component)
     return PaperProblem(
-        used=used,
+        rows=rows,
         edges=edges,
-        i_from_j=orthonormal(graph.i_from_j[used]),
+        i_from_j=i_from_j,
+        sign=np.where(backwards, -1, 1),
         component=component,
         start=orthonormal(shifted(world_from_cam, -offset)),
         offset=offset,
         start_in_world=world_from_cam,
+        self_loops=graph.edge_count - len(rows),
     )
 
 
