@@ -180,6 +180,8 @@ def test_the_mesh_without_colour_has_the_same_surface() -> None:
     frames, poses = box_frames()
     grey, coloured = (TsdfFuser(voxel_m=0.04, colour=colour).fuse(frames, poses) for colour in (False, True))
     assert grey.colours is None
+    bare = [Frame(f.frame_id, 0.0, CAMERA, f.read_depth) for f in frames]
+    assert TsdfFuser(voxel_m=0.04).fuse(bare, poses).colours is None
     np.testing.assert_array_equal(grey.points_in_world, coloured.points_in_world)
 
 

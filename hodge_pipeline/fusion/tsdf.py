@@ -59,7 +59,7 @@ class TsdfFuser:
             name="mesh",
             points_in_world=points,
             normals_in_world=normals,
-            colours=colours if self.colour else None,
+            colours=colours if self.colour and any(frame.read_colour for frame in frames) else None,
             triangles=triangles,
             notes=(*skipped.notes(), *self._notes(voxel_m, len(triangles))),
         )
@@ -88,6 +88,7 @@ class TsdfFuser:
             depth_m = frame.read_depth()
             colour = frame.read_colour() if self.colour and frame.read_colour else None
             if self.colour and colour is None:
+                # The grid holds colours for all views or for none.
                 colour = np.full((*depth_m.shape, 3), 128, np.uint8)
             if not grid.integrate(depth_m, colour, frame.camera, world_from_cam):
                 skipped.add(f"no depth within max_depth_m = {self.max_depth_m:g}", frame)
