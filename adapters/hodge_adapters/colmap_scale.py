@@ -46,7 +46,7 @@ def metres_per_unit(
 
 def scaled_poses(world_from_cam: Floats, scale: float) -> Floats:
     """The poses with their positions in metres."""
-    scaled = world_from_cam.copy()
+    scaled: Floats = world_from_cam.copy()
     scaled[:, :3, 3] *= scale
     return scaled
 

@@ -1,0 +1,211 @@
+"""A folder of point-cloud fragments, PLY or PCD, in sequence, with an optional Redwood `.log` of poses or pairs."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_adapters.colmap_files import natural
+from hodge_adapters.log_text import read_log_file
+from hodge_adapters.pcd_points import read_pcd
+from hodge_adapters.ply_points import read_ply, write_ply
+from hodge_adapters.point_columns import points_of_columns
+from hodge_adapters.text_rows import listed
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.stages import Sniff
+from hodge_pipeline.types import Frame, PointCloud, Source, Trajectory, ViewGraph
+
+_NUMBER = re.compile(r"(\d{1,15})\D*$")
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class CloudFolderReader:
+    """Reads a folder of fragments, or one file; each is a frame with points and no images."""
+
+    pattern: str = Field("*", description="which files of the folder, such as cloud_bin_*.ply")
+    log: str = Field(
+        "auto",
+        description="Redwood .log in the folder: blocks `i i n` are poses, `i j n` measured pairs; auto: the only one "
+        "there; empty: none",
+    )
+    units_per_metre: float = Field(1.0, gt=0, description="stored units per metre; 1000 for millimetres")
+    every: int = Field(1, ge=1, description="take every n-th fragment")
+
+    def sniff(self, path: Path) -> Sniff:
+        """By the endings of the files."""
+        path = Path(path)
+        try:
+            names = [path.name] if path.is_file() else os.listdir(path)
+        except OSError:
+            return Sniff(0.0, "not a folder that can be read")
+        count = sum(Path(name).suffix.lower() in READERS for name in names)
+        if not count:
+            return Sniff(0.0, f"no {', '.join(READERS)}")
+        return Sniff(0.8 if count * 2 > len(names) else 0.4, f"{count} point clouds among {len(names)} files")
+
+    def open(self, path: Path) -> Source:
+        """Fragments in natural order of their names; id and stamp are the last number in the name, else the row."""
+        path = Path(path)
+        files = [path] if path.is_file() else self._files(path)
+        notes: list[str] = []
+        for file in files:
+            _require(file)
+        numbers = _numbers(files, notes)
+        order = np.argsort(numbers, kind="stable")
+        files, numbers = [files[row] for row in order], [numbers[row] for row in order]
+        log = self._log(path if path.is_dir() else path.parent) if path.is_dir() or self.log != "auto" else None
+        parsed = read_log_file(log) if log else None
+        poses = parsed.poses if parsed else {}
+        without = [number for number in numbers if number not in poses]
+        if poses and without:
+            notes.append(f"{len(without)} of {len(numbers)} fragments have no pose: {listed(without)}")
+        frames = tuple(
+            Frame(
+                frame_id=number,
+                stamp_s=float(number),
+                read_points=partial(read_fragment, file, units_per_metre=self.units_per_metre),
+                world_from_cam=poses.get(number),
+            )
+            for number, file in zip(numbers, files, strict=True)
+        )
+        known = [number for number in numbers if number in poses]
+        trajectory = Trajectory(np.array(known, float), np.array([poses[n] for n in known])) if known else None
+        graph = _graph(numbers, parsed.pairs, parsed.i_from_j, notes) if parsed and len(parsed.pairs) else None
+        found = tuple(filter(None, [log]))
+        return Source(
+            path.resolve().name, path, frames[:: self.every], trajectory, graph, tuple(notes), (*files, *found)
+        )
+
+    def _files(self, path: Path) -> list[Path]:
+        try:
+            found = sorted(file for file in path.glob(self.pattern) if file.suffix.lower() in READERS)
+        except (OSError, ValueError, NotImplementedError) as error:
+            raise SourceError(f"{path}: cannot be listed with pattern {self.pattern!r}: {error}") from error
+        found = [file for file in found if file.is_file()]
+        if not found:
+            raise SourceError(
+                f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it: give a folder of fragments"
+            )
+        return sorted(found, key=lambda file: natural(file.name))
+
+    def _log(self, folder: Path) -> Path | None:
+        if not self.log:
+            return None
+        if self.log != "auto":
+            return folder / self.log
+        logs = sorted(folder.glob("*.log"))
+        return logs[0] if len(logs) == 1 else None
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class PlyWriter:
+    """Writes the points of all frames as one PLY in the world frame."""
+
+    def write(self, path: Path, source: Source) -> None:
+        """One file, atomically. Frames need points; those without a pose are refused where there are several."""
+        frames = [frame for frame in source.frames if frame.read_points is not None]
+        if not frames:
+            raise SourceError(
+                f"{source.path}: no frame with points: PLY holds points; fuse depth images with `hodge run`"
+            )
+        if len(frames) > 1 and any(frame.world_from_cam is None for frame in frames):
+            raise SourceError(f"{source.path}: fragments without poses cannot become one cloud: register them first")
+        clouds = [(frame.read_points(), frame.world_from_cam) for frame in frames if frame.read_points]
+        coloured = all(cloud.colours is not None for cloud, _ in clouds)
+        points = [
+            se3.transform(np.eye(4) if pose is None else pose, cloud.points_in_cam.astype(float))
+            for cloud, pose in clouds
+        ]
+        colours = (
+            np.concatenate([cloud.colours for cloud, _ in clouds if cloud.colours is not None]) if coloured else None
+        )
+        write_ply(path, PointCloud(np.concatenate(points).astype(np.float32), None, colours))
+
+
+def read_fragment(path: Path, *, units_per_metre: float) -> PointCloud:
+    """The points of one file in metres, by its ending."""
+    cloud = READERS[path.suffix.lower()](path)
+    if units_per_metre == 1.0:
+        return cloud
+    return PointCloud(cloud.points_in_cam / np.float32(units_per_metre), cloud.normals_in_cam, cloud.colours)
+
+
+def read_las(path: Path) -> PointCloud:
+    """The points of a LAS or LAZ file, from its lower corner: float32 has no room for map coordinates."""
+    laspy = _import("laspy", path)
+    try:
+        las = laspy.read(path)
+        corner = np.array(las.header.mins)
+        columns: dict[str, Any] = {name: np.asarray(las[name]) - corner[at] for at, name in enumerate("xyz")}
+    except Exception as error:  # a library's own errors, of many kinds
+        raise SourceError(f"{path}: laspy cannot read it ({error}): convert it to PLY") from error
+    return points_of_columns(path, columns)
+
+
+def read_e57(path: Path) -> PointCloud:
+    """The points of the first scan of an E57 file, in the scanner's axes."""
+    pye57 = _import("pye57", path)
+    try:
+        scan = pye57.E57(str(path)).read_scan_raw(0)
+        columns = {name: np.asarray(scan[f"cartesian{name.upper()}"]) for name in "xyz"}
+    except Exception as error:  # a library's own errors, of many kinds
+        raise SourceError(f"{path}: pye57 cannot read it ({error}): convert it to PLY") from error
+    return points_of_columns(path, columns)
+
+
+READERS: Mapping[str, Callable[[Path], PointCloud]] = {
+    ".ply": read_ply,
+    ".pcd": read_pcd,
+    ".las": read_las,
+    ".laz": read_las,
+    ".e57": read_e57,
+}
+LIBRARIES = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
+
+
+def _require(path: Path) -> None:
+    """Raise `SourceError` early where a file's library is not there, or its ending unknown."""
+    ending = path.suffix.lower()
+    if ending not in READERS:
+        raise SourceError(f"{path}: not one of {', '.join(READERS)}: convert it to PLY")
+    if ending in LIBRARIES:
+        _import(LIBRARIES[ending], path)
+
+
+def _import(library: str, path: Path) -> Any:
+    try:
+        return importlib.import_module(library)
+    except ImportError as error:
+        raise SourceError(
+            f"{path}: needs the package {library}: pip install {library}, or convert it to PLY"
+        ) from error
+
+
+def _numbers(files: list[Path], notes: list[str]) -> list[int]:
+    """The last number in each name, or the rows where one has none or two have the same."""
+    found = [_NUMBER.search(file.stem) for file in files]
+    numbers = [int(match[1]) for match in found if match]
+    if len(numbers) == len(files) == len(set(numbers)):
+        return numbers
+    if len(files) > 1:
+        notes.append("names without a number of their own: fragments are numbered in the order of their names")
+    return list(range(len(files)))
+
+
+def _graph(numbers: list[int], pairs: Any, i_from_j: Any, notes: list[str]) -> ViewGraph:
+    row_of = {number: row for row, number in enumerate(numbers)}
+    known = np.array([int(i) in row_of and int(j) in row_of for i, j in pairs], bool)
+    if not known.all():
+        notes.append(f"{int((~known).sum())} pairs of the log name fragments that are not there: left out")
+    edges = np.array([(row_of[int(i)], row_of[int(j)]) for i, j in pairs[known]], np.int64).reshape(-1, 2)
+    return ViewGraph.from_edges(np.array(numbers), edges, i_from_j[known], source="log")

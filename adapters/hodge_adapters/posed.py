@@ -1,0 +1,18 @@
+"""The poses that a source gives, wherever it keeps them, for writers of trajectories."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Source, Trajectory
+
+
+def trajectory_of(source: Source) -> Trajectory:
+    """The source's trajectory, else the poses of its frames. Raises `SourceError` where it has neither."""
+    if source.trajectory is not None:
+        return source.trajectory
+    posed = [(frame.stamp_s, frame.world_from_cam) for frame in source.frames if frame.world_from_cam is not None]
+    if not posed:
+        raise SourceError(f"{source.path}: has no poses to write: convert one that has a trajectory")
+    return Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed]))

@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hodge_adapters.clouds import CloudFolderReader, PlyWriter
+from hodge_adapters.log_text import read_log_file
+from hodge_adapters.pcd_points import expand_lzf, read_pcd
+from hodge_adapters.ply_points import read_ply, write_ply
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.testing import check_reader
+from hodge_pipeline.types import PointCloud
+from readers_data import some_poses
+
+
+def cloud(count: int = 20, seed: int = 0) -> PointCloud:
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(0, 1, (count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colours = rng.integers(0, 256, (count, 3)).astype(np.uint8)
+    return PointCloud(rng.normal(0, 1, (count, 3)).astype(np.float32), normals.astype(np.float32), colours)
+
+
+def as_open3d(points: PointCloud) -> o3d.geometry.PointCloud:
+    made = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.points_in_cam.astype(float)))
+    made.normals = o3d.utility.Vector3dVector(points.normals_in_cam.astype(float))
+    made.colors = o3d.utility.Vector3dVector(points.colours / 255.0)
+    return made
+
+
+def assert_same(found: PointCloud, expected: PointCloud) -> None:
+    np.testing.assert_allclose(found.points_in_cam, expected.points_in_cam, atol=1e-5)
+    np.testing.assert_allclose(found.normals_in_cam, expected.normals_in_cam, atol=1e-5)
+    np.testing.assert_array_equal(found.colours, expected.colours)
+
+
+@pytest.mark.parametrize(
+    ("name", "ascii", "compressed"),
+    [
+        ("a.ply", True, False),
+        ("a.ply", False, False),
+        ("a.pcd", True, False),
+        ("a.pcd", False, False),
+        ("a.pcd", False, True),
+    ],
+)
+def test_what_open3d_writes_is_read(tmp_path: Path, name: str, ascii: bool, compressed: bool) -> None:
+    o3d.io.write_point_cloud(str(tmp_path / name), as_open3d(cloud()), write_ascii=ascii, compressed=compressed)
+    assert_same(CloudFolderReader().open(tmp_path).frames[0].read_points(), cloud())
+
+
+def test_big_endian_ply_after_another_element(tmp_path: Path) -> None:
+    header = "ply\r\nformat binary_big_endian 1.0\r\nelement camera 2\r\nproperty short a\r\nelement vertex 1\r\n"
+    header += "property double x\r\nproperty float y\r\nproperty float z\r\nend_header\r\n"
+    (tmp_path / "a.ply").write_bytes(header.encode() + struct.pack(">hhdff", 7, 8, 1.5, 2.5, 3.5))
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").points_in_cam, [[1.5, 2.5, 3.5]])
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
+    text = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA ascii\n"
+    (tmp_path / "a.pcd").write_text(text + "1 2 3\nnan nan nan\n4 5 inf\n")
+    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd").points_in_cam, [[1, 2, 3]])
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=5, deadline=None)
+def test_written_ply_is_read_to_the_last_bit(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    path = tmp_path_factory.mktemp("ply") / "a.ply"
+    write_ply(path, cloud(seed=seed))
+    found = read_ply(path)
+    np.testing.assert_array_equal(found.points_in_cam, cloud(seed=seed).points_in_cam)
+    theirs = o3d.io.read_point_cloud(str(path))
+    np.testing.assert_array_equal(np.asarray(theirs.points), found.points_in_cam)
+
+
+def test_lzf_by_hand() -> None:
+    assert expand_lzf(b"\x00a\x20\x00", 4) == b"aaaa", "a match runs into what it writes"
+    assert expand_lzf(b"\x02abc", 3) == b"abc"
+    assert expand_lzf(b"\x20\x05", 3) is None, "a match before the beginning"
+    assert expand_lzf(b"\x00a\xe0\xff\x00" * 3, 4) is None, "never past the size that is stated"
+    assert expand_lzf(b"\x05ab", 6) is None
+
+
+def fragments(folder: Path, count: int = 3) -> Path:
+    folder.mkdir()
+    for number in range(count):
+        write_ply(folder / f"cloud_bin_{number * 5}.ply", cloud(seed=number))
+    return folder
+
+
+def log_block(i: int, j: int, pose: np.ndarray) -> str:
+    return f"{i} {j} 3\n" + "\n".join(" ".join(map(repr, row)) for row in pose.tolist()) + "\n"
+
+
+def test_a_folder_with_poses_and_pairs(tmp_path: Path) -> None:
+    folder = fragments(tmp_path / "f")
+    poses = some_poses(3)
+    blocks = [log_block(5 * k, 5 * k, pose) for k, pose in enumerate(poses[:2])]
+    (folder / "all.log").write_text("".join([*blocks, log_block(0, 5, poses[2]), log_block(0, 99, poses[2])]))
+    source = check_reader(CloudFolderReader(), folder)
+    assert [frame.frame_id for frame in source.frames] == [0, 5, 10]
+    np.testing.assert_allclose(source.frames[1].world_from_cam, poses[1], atol=1e-12)
+    assert source.frames[2].world_from_cam is None and len(source.trajectory) == 2
+    assert source.graph.edges.tolist() == [[0, 1]]
+    np.testing.assert_allclose(source.graph.i_from_j[0], poses[2], atol=1e-12)
+    assert any("1 pairs of the log" in note for note in source.notes)
+    assert any("1 of 3 fragments have no pose: 10" in note for note in source.notes)
+    scaled = CloudFolderReader(units_per_metre=1000.0).open(folder).frames[0].read_points()
+    np.testing.assert_allclose(scaled.points_in_cam * 1000, cloud(seed=0).points_in_cam, rtol=1e-5)
+
+
+def test_one_cloud_of_all_fragments(tmp_path: Path) -> None:
+    folder = fragments(tmp_path / "f", 2)
+    with pytest.raises(SourceError, match="without poses"):
+        PlyWriter().write(tmp_path / "all.ply", CloudFolderReader().open(folder))
+    poses = some_poses(2)
+    (folder / "poses.log").write_text(log_block(0, 0, poses[0]) + log_block(5, 5, poses[1]))
+    PlyWriter().write(tmp_path / "all.ply", CloudFolderReader().open(folder))
+    found = read_ply(tmp_path / "all.ply")
+    expected = [se3.transform(pose, cloud(seed=k).points_in_cam) for k, pose in enumerate(poses)]
+    np.testing.assert_allclose(found.points_in_cam, np.concatenate(expected), atol=1e-5)
+    with pytest.raises(SourceError, match="no frame with points"):
+        source = CloudFolderReader().open(folder)
+        PlyWriter().write(tmp_path / "x.ply", replace(source, frames=()))
+
+
+@pytest.mark.parametrize(("name", "package"), [("a.las", "laspy"), ("a.e57", "pye57")])
+def test_other_formats_name_the_package_they_need(tmp_path: Path, name: str, package: str) -> None:
+    pytest.importorskip("importlib")
+    try:
+        __import__(package)
+    except ImportError:
+        (tmp_path / name).write_bytes(b"LASF")
+        with pytest.raises(SourceError, match=f"pip install {package}"):
+            CloudFolderReader().open(tmp_path)
+    else:
+        pytest.skip(f"{package} is installed")
+
+
+@pytest.mark.parametrize(
+    ("name", "contents", "message"),
+    [
+        ("a.ply", b"", "no PLY header"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n",
+            "says 2 points, has 1",
+        ),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no x, y and z"),
+        (
+            "a.ply",
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n",
+            "says 999999999999 points",
+        ),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nend_header\n", "no vertices"),
+        ("a.pcd", b"# .PCD\n", "no PCD header"),
+        ("a.pcd", b"FIELDS x y\nSIZE 4 4\nTYPE F F\nPOINTS 99999999999\nDATA binary\n", "cannot hold"),
+        ("a.pcd", b"FIELDS x y\nSIZE 4\nTYPE F F\nPOINTS 1\nDATA binary\n", "does not fit together"),
+        ("a.pcd", b"FIELDS x\nSIZE 4\nTYPE F\nPOINTS 2\nDATA binary_compressed\n\x01\0\0\0\x08\0\0\0\x00", "damaged"),
+    ],
+)
+def test_damaged_files_are_named(tmp_path: Path, name: str, contents: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(contents)
+    with pytest.raises(SourceError, match=message) as error:
+        CloudFolderReader().open(tmp_path).frames[0].read_points()
+    assert name in str(error.value)
+
+
+def test_real_fragments_overlap_under_the_given_convention(data_dir: Path) -> None:
+    folder = data_dir / "fragments/redkitchen_3dmatch"
+    source = check_reader(CloudFolderReader(), folder)
+    assert [len(frame.read_points()) for frame in source.frames[:2]] == [258342, 268977]
+    log = read_log_file(data_dir / "fragments/pair_estimates/7-scenes-redkitchen-evaluation/gt.log")
+    row = int(np.flatnonzero((log.pairs == (0, 1)).all(axis=1))[0])
+    clouds = [frame.read_points().points_in_cam[::20].astype(float) for frame in source.frames[:2]]
+    shares = []
+    for motion in (log.i_from_j[row], se3.inverse(log.i_from_j[row])):
+        keys = [
+            {tuple(key) for key in np.floor(p / 0.1).astype(int)} for p in (clouds[0], se3.transform(motion, clouds[1]))
+        ]
+        shares.append(len(keys[0] & keys[1]) / len(keys[1]))
+    assert shares[0] > 0.6 and shares[0] > 1.5 * shares[1], "matrix (i, j) moves j into i, not i into j"

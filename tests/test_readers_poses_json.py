@@ -1,0 +1,171 @@
+"""Trajectories and graphs in EuRoC, Redwood, Open3D and nerfstudio files: round trips and conventions."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hodge_adapters.euroc import EurocReader, EurocWriter
+from hodge_adapters.log_text import LogReader, LogWriter
+from hodge_adapters.nerfstudio import NerfstudioReader, NerfstudioWriter
+from hodge_adapters.open3d_json import Open3dPoseGraphWriter, Open3dReader, Open3dTrajectoryWriter
+from hodge_adapters.trajectory_files import KittiPosesReader, TumPosesReader
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.testing import check_reader
+from hodge_pipeline.types import Camera, Frame, Source, Trajectory, ViewGraph
+
+CAMERA = Camera(640, 480, 585.0, 586.0, 319.5, 240.0)
+
+
+def made(count: int = 5, seed: int = 0) -> Source:
+    rng = np.random.default_rng(seed)
+    poses = se3.exp(rng.normal(0, 1.0, (count, 6)) * [1, 1, 1, 100, 100, 100])
+    stamps = 1403715524.9 + np.cumsum(rng.uniform(0.01, 1, count))
+    frames = tuple(Frame(f"rgb/{k}.png", float(k), CAMERA, world_from_cam=pose) for k, pose in enumerate(poses))
+    edges = np.array([(k, k + 1) for k in range(count - 1)] + [(count - 1, 0)])
+    noise = se3.exp(rng.normal(0, 0.1, (count, 6)))
+    motions = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ noise
+    root = rng.normal(0, 1, (count, 6, 6))
+    graph = ViewGraph.from_edges(np.arange(count), edges, motions, root @ root.transpose(0, 2, 1) + np.eye(6), "open3d")
+    return Source("made", Path("made"), frames, Trajectory(stamps, poses), graph)
+
+
+@pytest.mark.parametrize(
+    ("writer", "reader", "name"),
+    [
+        (EurocWriter(), EurocReader(), "data.csv"),
+        (LogWriter(), LogReader(), "trajectory.log"),
+        (Open3dTrajectoryWriter(), Open3dReader(), "camera.json"),
+        (NerfstudioWriter(), NerfstudioReader(), "transforms.json"),
+        (Open3dPoseGraphWriter(), Open3dReader(), "graph.json"),
+    ],
+)
+@given(seed=st.integers(0, 100))
+@settings(max_examples=5, deadline=None)
+def test_round_trips(tmp_path_factory: pytest.TempPathFactory, writer, reader, name: str, seed: int) -> None:
+    path, source = tmp_path_factory.mktemp("trip") / name, made(seed=seed)
+    writer.write(path, source)
+    assert type(guess_reader(path)) is type(reader)
+    back = check_reader(reader, path)
+    np.testing.assert_allclose(back.trajectory.world_from_cam, source.trajectory.world_from_cam, atol=1e-9)
+    if name == "data.csv":
+        np.testing.assert_allclose(back.trajectory.stamps_s, source.trajectory.stamps_s, rtol=0, atol=3e-7)
+    for before, after in zip(source.frames, back.frames, strict=False):
+        assert after.camera == CAMERA
+        np.testing.assert_allclose(after.world_from_cam, before.world_from_cam, atol=1e-9)
+    if back.graph is not None:
+        np.testing.assert_array_equal(back.graph.edges, source.graph.edges)
+        np.testing.assert_allclose(back.graph.i_from_j, source.graph.i_from_j, atol=1e-9)
+        np.testing.assert_allclose(back.graph.information, source.graph.information, rtol=1e-6, atol=1e-6)
+
+
+def test_a_log_of_pairs_round_trips(tmp_path: Path) -> None:
+    source = replace(made(), trajectory=None)
+    LogWriter().write(tmp_path / "pairs.log", source)
+    back = check_reader(LogReader(), tmp_path / "pairs.log").graph
+    np.testing.assert_allclose(back.i_from_j, source.graph.i_from_j, atol=1e-9)
+    np.testing.assert_array_equal(back.vertex_ids[back.edges], source.graph.edges)
+
+
+def test_open3d_reads_what_is_written_and_means_the_same(tmp_path: Path) -> None:
+    source = made()
+    Open3dPoseGraphWriter().write(tmp_path / "graph.json", source)
+    graph = o3d.io.read_pose_graph(str(tmp_path / "graph.json"))
+    np.testing.assert_allclose([node.pose for node in graph.nodes], source.trajectory.world_from_cam, atol=1e-12)
+    edge = graph.edges[1]
+    assert (edge.target_node_id, edge.source_node_id) == (1, 2)
+    np.testing.assert_allclose(edge.transformation, source.graph.i_from_j[1], atol=1e-12)
+    # A small motion on our right costs what the same motion, moved to their left, costs there.
+    xi = np.array([1e-3, 2e-3, -1e-3, 3e-3, 1e-3, 2e-3])
+    left = se3.adjoint(source.graph.i_from_j[1]) @ xi
+    assert left @ edge.information @ left == pytest.approx(xi @ source.graph.information[1] @ xi, rel=1e-9)
+    Open3dTrajectoryWriter().write(tmp_path / "camera.json", source)
+    cameras = o3d.io.read_pinhole_camera_trajectory(str(tmp_path / "camera.json")).parameters
+    np.testing.assert_allclose(cameras[2].extrinsic @ source.trajectory.world_from_cam[2], np.eye(4), atol=1e-9)
+    np.testing.assert_array_equal(cameras[2].intrinsic.intrinsic_matrix, CAMERA.matrix)
+
+
+def test_a_nerfstudio_camera_looks_along_minus_z(tmp_path: Path) -> None:
+    matrix = [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]
+    content = {
+        "w": 8,
+        "h": 6,
+        "fl_x": 9.0,
+        "cx": 4.0,
+        "cy": 3.0,
+        "frames": [{"file_path": "a", "transform_matrix": matrix}],
+    }
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    source = check_reader(NerfstudioReader(), tmp_path)
+    ahead = se3.transform(source.frames[0].world_from_cam, np.array([[0.0, 0, 1]]))
+    np.testing.assert_allclose(ahead, [[5, 6, 6]])
+    assert source.frames[0].camera == Camera(8, 6, 9.0, 9.0, 3.5, 2.5)
+    below = se3.transform(source.frames[0].world_from_cam, np.array([[0.0, 1, 0]]))
+    np.testing.assert_allclose(below, [[5, 5, 7]])
+
+
+@pytest.mark.parametrize(
+    ("reader", "name", "text", "message"),
+    [
+        (EurocReader(), "a.csv", "#timestamp, q_RS_w\n1,0,0,0,0,0,0,0\n", "no line of"),
+        (LogReader(), "a.log", "0 0 1\n1 0 0 0\n0 1 0 0\n0 0 2 0\n0 0 0 1\n", ":1: not"),
+        (LogReader(), "a.log", "0 0 1\n1 0 0 0\n", "no blocks"),
+        (Open3dReader(), "a.json", '{"class_name": "PoseGraph", "nodes": [{"pose": [1]}]}', "node 0: not 16"),
+        (Open3dReader(), "a.json", '{"class_name": "PointCloud"}', "class_name is"),
+        (Open3dReader(), "a.json", "[" * 100000, "JSON"),
+        (NerfstudioReader(), "a.json", '{"frames": [{"transform_matrix": 1}]}', "frame 0"),
+        (NerfstudioReader(), "a.json", '{"frames": [\n,]}', "a.json:2: not JSON"),
+    ],
+)
+def test_what_cannot_be_read_is_named(tmp_path: Path, reader, name: str, text: str, message: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(SourceError, match=message) as error:
+        reader.open(tmp_path / name)
+    assert name in str(error.value)
+
+
+def test_real_euroc_agrees_with_its_estimate(data_dir: Path) -> None:
+    folder = data_dir / "trajectories/evo"
+    truth = check_reader(EurocReader(), folder / "V102_groundtruth.csv").trajectory
+    estimate = check_reader(TumPosesReader(), folder / "V102.txt").trajectory
+    rows = np.searchsorted(truth.stamps_s, estimate.stamps_s[10:60:10])
+    true, found = truth.world_from_cam[rows], estimate.world_from_cam[10:60:10]
+    moved, seen = (se3.log(se3.inverse(poses[:-1]) @ poses[1:])[:, :3] for poses in (true, found))
+    # The angle of a relative rotation is the same in any frame; the order of the quaternion is not.
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.linalg.norm(seen, axis=1), atol=0.05)
+
+
+def test_real_open3d_graph(data_dir: Path) -> None:
+    folder = data_dir / "icl_nuim/livingroom1_redwood"
+    source = check_reader(Open3dReader(), folder / "test_fragments/fragment_optimized_000.json")
+    graph, poses = source.graph, source.trajectory.world_from_cam
+    i, j = graph.edges.T
+    right = np.linalg.norm(se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(poses[i]) @ poses[j]), axis=1)
+    wrong = np.linalg.norm(se3.log(graph.i_from_j @ se3.inverse(poses[i]) @ poses[j]), axis=1)
+    assert np.median(right) < 0.005 and np.median(wrong) > 10 * np.median(right), "the inverse convention must not fit"
+    assert np.diagonal(graph.information, axis1=1, axis2=2).min() > 0
+
+
+def test_real_logs_and_kitti(data_dir: Path) -> None:
+    folder = data_dir / "icl_nuim/livingroom1_redwood"
+    assert len(check_reader(LogReader(), folder / "test_scene/trajectory.log").trajectory) == 211
+    gt = data_dir / "fragments/pair_estimates/7-scenes-redkitchen-evaluation/gt.log"
+    assert check_reader(LogReader(), gt).graph.edge_count == 506
+    kitti = KittiPosesReader(times="KITTI_00_gt_times.txt")
+    assert len(check_reader(kitti, data_dir / "trajectories/evo/KITTI_00_gt.txt").trajectory) == 4541
+
+
+def test_a_source_without_poses_is_refused(tmp_path: Path) -> None:
+    empty = Source("empty", tmp_path, (Frame(0, 0.0, CAMERA),))
+    for writer in (EurocWriter(), LogWriter(), Open3dTrajectoryWriter(), NerfstudioWriter(), Open3dPoseGraphWriter()):
+        with pytest.raises(SourceError, match="no "):
+            writer.write(tmp_path / "x", empty)
