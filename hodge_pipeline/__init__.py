@@ -5,6 +5,11 @@ Three lines do a whole run:
     import hodge_pipeline
     run = hodge_pipeline.run("seven_scenes", "runs/kitchen", source="redkitchen")
     print(run.report, run.result.world_from_cam.shape)
+
+Two solve a pose graph that is already in arrays:
+
+    graph = hodge_pipeline.ViewGraph.from_edges(vertex_ids, edges, i_from_j, information)
+    world_from_cam = hodge_pipeline.solve(graph).world_from_cam
 """
 
 from __future__ import annotations
@@ -14,10 +19,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hodge_pipeline.pipeline import Run, run
     from hodge_pipeline.recipe import Recipe, load_recipe
+    from hodge_pipeline.solvers.hodge import solve
+    from hodge_pipeline.types import Solution, ViewGraph
 
-__all__ = ["Recipe", "Run", "load_recipe", "run"]
+__all__ = ["Recipe", "Run", "Solution", "ViewGraph", "load_recipe", "run", "solve"]
 
-_HOMES = {"Recipe": "recipe", "load_recipe": "recipe", "Run": "pipeline", "run": "pipeline"}
+_HOMES = {
+    "Recipe": "recipe",
+    "load_recipe": "recipe",
+    "Run": "pipeline",
+    "run": "pipeline",
+    "solve": "solvers.hodge",
+    "Solution": "types",
+    "ViewGraph": "types",
+}
 
 
 def __getattr__(name: str) -> Any:

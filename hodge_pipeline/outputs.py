@@ -27,7 +27,7 @@ from hodge_pipeline.evaluation.summary import graph_summary, trajectory_rows, wo
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.job import Job, versions
 from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
-from hodge_pipeline.types import Floats, Solution, Source, Trajectory
+from hodge_pipeline.types import Floats, Solution, Source, Trajectory, ViewGraph
 
 EDGE_COLUMNS = (
     "i", "j", "source", "status", "fitness", "rmse_m", "correspondences", "weight", "residual_m", "residual_deg",
@@ -53,13 +53,20 @@ def write_graph(folder: Path, source: Source, last: Round) -> None:
     trajectory = Trajectory(np.arange(graph.vertex_count, dtype=float), last.world_from_cam)
     whole = Source(source.name, source.path, trajectory=trajectory, graph=numbered)
     registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)
-    artifacts.write_text(folder / "edges.csv", _edge_table(last))
-
-
-def _edge_table(last: Round) -> str:
-    graph, out = last.graph, io.StringIO()
-    translation_m, angle_rad = edge_residuals(graph, last.world_from_cam)
     weights = np.ones(graph.edge_count) if last.solution is None else last.solution.weights
+    rejected = [
+        [graph.vertex_ids[i], graph.vertex_ids[j], reason, "rejected", *[""] * 6]
+        for (i, j), reason in zip(last.rejected_pairs, last.rejected_reasons, strict=True)
+    ]
+    artifacts.write_text(folder / "edges.csv", edge_table(graph, last.world_from_cam, weights, rejected))
+
+
+def edge_table(
+    graph: ViewGraph, world_from_cam: Floats, weights: Floats, rejected: Sequence[Sequence[object]] = ()
+) -> str:
+    """Every edge with its residual under the poses as CSV, then the rows of the pairs that became none."""
+    out = io.StringIO()
+    translation_m, angle_rad = edge_residuals(graph, world_from_cam)
     table = csv.writer(out, lineterminator="\n")
     table.writerow(EDGE_COLUMNS)
     for row, (i, j) in enumerate(graph.edges):
@@ -77,8 +84,7 @@ def _edge_table(last: Round) -> str:
                 f"{np.rad2deg(angle_rad[row]):.5f}",
             ]
         )
-    for (i, j), reason in zip(last.rejected_pairs, last.rejected_reasons, strict=True):
-        table.writerow([graph.vertex_ids[i], graph.vertex_ids[j], reason, "rejected", *[""] * 6])
+    table.writerows(rejected)
     return out.getvalue()
 
 

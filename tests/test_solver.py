@@ -14,6 +14,7 @@ from hodge_pipeline.solvers.certificate import certify
 from hodge_pipeline.solvers.full import full_residuals
 from hodge_pipeline.solvers.hodge import HodgeSolver, solve
 from hodge_pipeline.solvers.objective import best_translations, quadratic_model, residuals, rotation_gradient
+from hodge_pipeline.solvers.priors import Priors
 from hodge_pipeline.solvers.rotations import exponential, project
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.stages import ConsistencySolver
@@ -334,3 +335,38 @@ def test_the_stage_keeps_its_protocol_and_history():
     np.testing.assert_allclose(solution.world_from_cam[0], truth[0], atol=1e-12)
     assert solution.history[-1].objective == solution.metrics["objective"]
     np.testing.assert_array_equal(solution.history[-1].world_from_cam, solution.world_from_cam)
+
+
+def test_priors_are_edges_from_the_world():
+    """Two ends of a rail are known, one of them twice as well: the rail is stretched between them."""
+    edges = np.array([(0, 1), (1, 2)])
+    motion = np.tile(se3.from_parts(np.eye(3), np.array([1.0, 0, 0])), (2, 1, 1))
+    graph = ViewGraph.from_edges(np.array(["a", "b", "c"]), edges, motion)
+    known = np.stack([np.eye(4), se3.from_parts(np.eye(3), np.array([3.0, 0, 0]))])
+    priors = Priors(np.array([0, 2]), known, np.stack([np.eye(6), 2 * np.eye(6)]))
+    solution = solve(graph, priors=priors)
+    force = 1 / (1 + 1 + 1 + 1 / 2)  # springs in a row, and a metre between their natural length and the ends
+    np.testing.assert_allclose(solution.world_from_cam[:, 0, 3], [force, 1 + 2 * force, 2 + 3 * force], atol=1e-7)
+    assert solution.metrics["objective"] == pytest.approx(force**2 * 3.5, rel=1e-6)
+    assert len(solution.weights) == 2
+    with pytest.raises(GraphError, match="prior 1 names vertex row 7"):
+        solve(graph, priors=Priors(np.array([0, 7]), known, priors.information))
+
+
+def test_priors_join_pieces_and_can_be_certified():
+    graph, truth = ladder(0.0)
+    half = graph.select(np.flatnonzero((graph.edges < 6).all(axis=1) | (graph.edges >= 6).all(axis=1)))
+    priors = Priors(np.array([0, 7]), truth[[0, 7]], np.tile(np.eye(6), (2, 1, 1)))
+    solution = solve(half, priors=priors, objective="isotropic", certificate=True)
+    np.testing.assert_allclose(solution.world_from_cam, truth, atol=1e-6)
+    assert solution.component.max() == 0
+    assert solution.metrics["certified"] == 1
+
+
+def test_the_graph_says_what_is_fixed_and_in_which_plane():
+    graph, truth = ladder(0.1, planar=True)
+    held = dataclasses.replace(graph, fixed=np.array([3, 7]), dimension=2)
+    solution = solve(held, start=truth)
+    np.testing.assert_allclose(solution.world_from_cam[[3, 7]], truth[[3, 7]], atol=1e-12)
+    assert solution.metrics["objective_at_start"] > solution.metrics["objective"]
+    assert any("2 fixed vertices have no pose" in note for note in solve(held).notes)

@@ -19,6 +19,8 @@ Examples:
   hodge run tum --source DIR --set registration=ndt --out runs/ndt
   hodge inspect redkitchen                       what is this folder?
   hodge view runs/kitchen                        open the recording in Rerun
+  hodge solve graph.g2o --out solved.g2o         any pose graph, or a run folder
+  hodge solve graph.g2o --certificate --disable 12-87
 """
 
 app = typer.Typer(
@@ -57,6 +59,49 @@ def demo(out: Out, overrides: Overrides = None, overwrite: Overwrite = False, qu
     from hodge_pipeline.cli import running
 
     running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet)
+
+
+@app.command()
+def solve(
+    graph: Annotated[Path, typer.Argument(help="A pose graph (g2o, TORO, …) or a run folder.")],
+    out: Annotated[Optional[Path], typer.Option("--out", help="g2o file: solved poses, edges as read.")] = None,  # noqa: UP045
+    objective: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="full: g2o's chi2, the default; isotropic: SE-Sync's F, which can be certified."),
+    ] = None,
+    start: Annotated[
+        str, typer.Option(help="chordal: from the edges alone; given: from the file's poses.")
+    ] = "chordal",
+    robust: Annotated[bool, typer.Option("--robust", help="Find wrong edges and leave them out.")] = False,
+    certificate: Annotated[bool, typer.Option("--certificate", help="Prove the minimum global (isotropic).")] = False,
+    sesync_units: Annotated[
+        bool, typer.Option("--sesync-units", help="F as SE-Sync counts it: rotations weigh four times as much.")
+    ] = False,
+    disable: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(metavar="A-B", help="Leave out the edges between these vertex ids; may be repeated."),
+    ] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds after which the best so far is given.")] = float("inf"),
+    run_folder: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--run", help="Folder for report, edges and recording."),
+    ] = None,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Solve a pose graph: maximum-likelihood poses, certified where asked for."""
+    from hodge_pipeline.cli import solving
+
+    options = solving.choices(
+        objective,
+        start,
+        disable or [],
+        time_limit,
+        robust=robust,
+        certificate=certificate,
+        sesync_units=sesync_units,
+    )
+    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json)
 
 
 @app.command()

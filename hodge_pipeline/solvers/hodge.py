@@ -17,7 +17,8 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.certificate import Certificate, certify
 from hodge_pipeline.solvers.full import FullObjective
 from hodge_pipeline.solvers.newton import Descent, Limits, Point, descend
-from hodge_pipeline.solvers.objective import IsotropicObjective
+from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
+from hodge_pipeline.solvers.priors import Priors, with_world, without_world
 from hodge_pipeline.solvers.setup import NO_ROWS, InitialName, Setup, prepare
 from hodge_pipeline.types import Floats, Ints, Solution, SolverIteration, ViewGraph
 
@@ -36,6 +37,7 @@ def solve(
     initial: InitialName = "chordal",
     dimension: Literal[2, 3] | None = None,
     fixed: Ints | None = None,
+    priors: Priors | None = None,
     certificate: bool = False,
     max_iterations: int = 100,
     relative_tolerance: float = 1e-9,
@@ -49,16 +51,40 @@ def solve(
       indefinite information matrix is solved as isotropic, and a note says so.
     - `start (V, 4, 4)` sets the gauge of each component; with `initial="given"` the descent begins there, else at
       the chordal rotations, which need no start.
-    - `dimension`: 2 for a graph in the plane; None finds out.
-    - `fixed`: rows of vertices that stay at their start.
+    - `dimension`: 2 for a graph in the plane; None takes the graph's, and 2 where every edge lies in the plane.
+    - `fixed`: rows of vertices that stay at their start; None takes the graph's.
+    - `priors`: what is known of single poses; all that have one share the world's gauge.
+
+    With arrays in hand, in metres and radians, `i_from_j[e]` moving points of frame `edges[e, 1]` into `edges[e, 0]`:
+
+        graph = ViewGraph.from_edges(np.arange(4), edges, i_from_j, information)
+        world_from_cam = solve(graph).world_from_cam
 
     Raises `GraphError` for numbers that are not finite and edges that name no vertex.
     """
-    rows = NO_ROWS if fixed is None else np.asarray(fixed, np.int64)
-    if start is None and (initial == "given" or len(rows)):
+    if start is None and (initial == "given" or (fixed is not None and len(fixed))):
         raise GraphError("fixed vertices and a given initial guess need start poses: pass start")
+    if priors is not None:
+        whole, poses = with_world(graph, priors, start, fixed)
+        solution = solve(
+            whole,
+            start=poses,
+            objective=objective,
+            initial=initial,
+            dimension=dimension,
+            certificate=certificate,
+            max_iterations=max_iterations,
+            relative_tolerance=relative_tolerance,
+            time_limit_s=time_limit_s,
+            keep_history=keep_history,
+        )
+        return without_world(solution, graph)
+    notes: list[str] = []
+    if fixed is None and start is None and len(graph.fixed):
+        notes.append(f"{len(graph.fixed)} fixed vertices have no pose: the first vertex of each piece is held instead")
+    rows = NO_ROWS if start is None else np.asarray(graph.fixed if fixed is None else fixed, np.int64)
     setup = prepare(graph, start, rows, dimension)
-    notes = [*setup.weights.notes, *describe_components(setup.component, graph.vertex_ids)]
+    notes += [*setup.weights.notes, *describe_components(setup.component, graph.vertex_ids)]
     full = objective == "full" and setup.weights.definite
     if objective == "full" and not full:
         notes.append("the full objective has no minimum with indefinite information: isotropic weights are used")
@@ -73,6 +99,8 @@ def solve(
     if not descent.converged:
         notes.append(f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far")
     metrics = _metrics(descent, full)
+    if start is not None:
+        metrics["objective_at_start"] = _cost_at_start(setup, full)
     if certificate and full:
         notes.append("only the isotropic objective can be certified")
     elif certificate:
@@ -82,7 +110,7 @@ def solve(
             if other.point.cost < descent.point.cost:
                 notes.append(f"the start led to a local minimum, F = {descent.point.cost:.9g}: solved again without it")
                 descent, answer = other, _certify(setup, other.point)
-                metrics = _metrics(descent, full)
+                metrics |= _metrics(descent, full)
         notes.append(answer.note)
         metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
     weights = setup.weights.used.astype(float)
@@ -108,6 +136,13 @@ def _certify(setup: Setup, point: Point) -> Certificate:
     if problem.count - problem.free_count > setup.component.max(initial=-1) + 1:
         return Certificate(False, 0.0, math.inf, 0, SEVERAL_FIXED)
     return certify(problem, point.rotations, point.translations, point.cost)
+
+
+def _cost_at_start(setup: Setup, full: bool) -> float:
+    given = setup.initial("given")
+    if full:
+        return FullObjective(setup.problem, setup.weights.information[setup.weights.used]).at(*given).cost
+    return residuals(setup.problem, *given).cost
 
 
 def _metrics(descent: Descent, full: bool) -> dict[str, float]:

@@ -18,7 +18,7 @@ from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loop
 from hodge_pipeline.solvers.hodge import ObjectiveName, solve
 from hodge_pipeline.solvers.newton import Limits, Point, descend
 from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
-from hodge_pipeline.solvers.setup import Setup, prepare
+from hodge_pipeline.solvers.setup import NO_ROWS, Setup, prepare
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 Kernel: TypeAlias = Literal["truncated", "geman_mcclure"]
@@ -52,13 +52,14 @@ def solve_robust(
     threshold: float | None = None,
     objective: ObjectiveName = "full",
     dimension: Literal[2, 3] | None = None,
+    certificate: bool = False,
 ) -> Solution:
     """The poses of the edges that agree, with `weights` 1 for those and 0 for the others (between, for Geman–McClure).
 
     `threshold`: an edge is wrong where its χ² with isotropic weights exceeds this; None takes the 99 % quantile of
-    right edges. The components are those of the edges that are kept.
+    right edges. The graph's fixed vertices stay at their start. The components are those of the edges that are kept.
     """
-    setup = prepare(graph, start, dimension=dimension)
+    setup = prepare(graph, start, NO_ROWS if start is None else graph.fixed, dimension)
     limit = threshold or (CHI2_99_PLANAR if setup.dimension == 2 else CHI2_99_SPATIAL)
     problem = setup.problem
     # the isotropic objective counts a rotation of θ as 2 κ θ²; in the plane κ is the information itself, so twice
@@ -78,6 +79,7 @@ def solve_robust(
         initial="given",
         objective=objective,
         dimension=2 if setup.dimension == 2 else 3,
+        certificate=certificate,
     )
     notes = (
         *(note for note in setup.weights.notes if note not in final.notes),

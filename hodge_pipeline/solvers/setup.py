@@ -75,7 +75,7 @@ def prepare(
     if start is not None and not np.isfinite(start).all():
         row = int(np.argmax(~np.isfinite(start).all(axis=(1, 2))))
         raise GraphError(f"start pose of vertex {graph.vertex_ids[row]} is not finite: mend it or start without")
-    size = (2 if is_planar(graph) else 3) if dimension is None else dimension
+    size = (2 if graph.dimension == 2 or is_planar(graph) else 3) if dimension is None else dimension
     weights = edge_weights(graph, size)
     used = graph.edges[weights.used]
     component = connected_components(used, graph.vertex_count)

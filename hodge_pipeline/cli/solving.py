@@ -1,0 +1,106 @@
+"""The command that solves a pose-graph file: `hodge solve`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, get_args
+
+from hodge_pipeline import registry
+from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.errors import CheckError, RecipeError
+from hodge_pipeline.solve_file import Choices, SolvedFile, solve_file, write_solved
+from hodge_pipeline.solvers.hodge import ObjectiveName
+from hodge_pipeline.solvers.setup import InitialName
+
+
+def choices(
+    objective: str | None,
+    start: str,
+    disable: list[str],
+    time_limit_s: float,
+    *,
+    robust: bool,
+    certificate: bool,
+    sesync_units: bool,
+) -> Choices:
+    """The options as given, checked. Only the isotropic objective has a certificate, so asking for one implies it."""
+    named = objective or ("isotropic" if certificate or sesync_units else "full")
+    for option, value, known in (
+        ("--objective", named, get_args(ObjectiveName)),
+        ("--start", start, ("given", "chordal")),
+    ):
+        if value not in known:
+            raise RecipeError(
+                f"{option} {value}: expected {' or '.join(known)}{registry.suggestion(value, list(known))}"
+            )
+    if named == "full" and (certificate or sesync_units):
+        raise RecipeError("--certificate and --sesync-units are for the isotropic objective: add --objective isotropic")
+    if time_limit_s <= 0:
+        raise RecipeError(f"--time-limit {time_limit_s:g}: expected seconds above zero")
+    initial: InitialName = "given" if start == "given" else "chordal"
+    chosen: ObjectiveName = "isotropic" if named == "isotropic" else "full"
+    return Choices(chosen, initial, robust, certificate, sesync_units, tuple(disable), time_limit_s)
+
+
+def solve(
+    path: Path, options: Choices, *, out: Path | None, run_folder: Path | None, quiet: bool, as_json: bool
+) -> None:
+    """Solve a file, write what was asked for, print a summary; `CheckError` where the result fails its own checks."""
+    if out is not None and not out.parent.is_dir():
+        raise RecipeError(f"--out {out}: there is no folder {out.parent}: make it first")
+    with Terminal(quiet or as_json) as terminal, terminal.stage("solve", 1):
+        solved = solve_file(path, options)
+    if out is not None:
+        write_solved(out, solved)
+    left_out: tuple[str, ...] = ()
+    if run_folder is not None:
+        from hodge_pipeline.solve_report import write_run_folder
+
+        left_out = write_run_folder(run_folder, solved)
+    summary = solved.summary()
+    summary["notes"] += left_out
+    if as_json:
+        from hodge_pipeline.artifacts import json_text
+
+        print(
+            json_text({"source": str(solved.source.path), "out": None if out is None else str(out), **summary}), end=""
+        )
+    elif not quiet:
+        for label, text in _lines(solved, summary, out, run_folder):
+            print(f"{label:<12}{text}")
+    _check(summary)
+
+
+def _lines(
+    solved: SolvedFile, summary: dict[str, Any], out: Path | None, run_folder: Path | None
+) -> list[tuple[str, str]]:
+    """What the summary says, a label and a text each."""
+    name = {"full": "chi2", "isotropic": "F"}[summary["objective"]]
+    before = summary["cost_before"]
+    ignored = f", {summary['edges_ignored']} ignored" if summary["edges_ignored"] else ""
+    lines = [
+        (
+            "graph",
+            f"{solved.source.name}, {summary['dimension']}-D: {summary['poses']} poses, {summary['edges']} edges",
+        ),
+        ("", f"{summary['pieces']} piece{'s' * (summary['pieces'] != 1)}{ignored}"),
+        (name, f"{summary['cost_after']:.12g}" if before is None else f"{before:.12g} -> {summary['cost_after']:.12g}"),
+    ]
+    if summary["certified"] is not None:
+        within = (
+            f"globally optimal, within {summary['gap_bound']:.3g}" if summary["certified"] else "NOT proven optimal"
+        )
+        lines.append(("certificate", within))
+    lines.append(
+        ("time", f"{summary['wall_s']:.3f} s, {summary['cpu_s']:.3f} s of CPU, {summary['newton_steps']} steps")
+    )
+    lines += [("note", note) for note in summary["notes"]]
+    lines += [("written", str(path)) for path in (out, run_folder) if path is not None]
+    return lines
+
+
+def _check(summary: dict[str, Any]) -> None:
+    if summary["certified"] is False:
+        raise CheckError("the result is not proven to be the global minimum: see the notes; try --start chordal")
+    if not summary["converged"]:
+        raise CheckError("the solver stopped before it converged, with the best poses so far: raise --time-limit")

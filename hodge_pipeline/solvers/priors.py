@@ -1,0 +1,77 @@
+"""What is known of single poses: each prior is an edge from the world, one more vertex that is held at the identity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Poses known from elsewhere: vertex rows (P,), `world_from_vertex (P, 4, 4)`, and `information (P, 6, 6)` of ξ =
+    (rotation, translation) in `world_from_vertex · exp(ξ)`; several of one vertex count each.
+    """
+
+    vertices: Ints
+    world_from_vertex: Floats
+    information: Floats
+
+
+def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: Ints | None) -> tuple[ViewGraph, Floats]:
+    """The graph with the world as its last vertex, held at the identity, and start poses (V + 1, 4, 4).
+
+    Without a start every vertex begins at the world's origin, which only a descent from given poses would heed.
+    Raises `GraphError` where a prior names no vertex.
+    """
+    vertices, count = np.asarray(priors.vertices, np.int64), graph.vertex_count
+    outside = (vertices < 0) | (vertices >= count)
+    if outside.any():
+        raise GraphError(
+            f"prior {np.argmax(outside)} names vertex row {vertices[np.argmax(outside)]} of {count}: mend it"
+        )
+    added = ViewGraph.from_edges(
+        np.arange(count + 1),
+        np.column_stack([np.full(len(vertices), count), vertices]),
+        priors.world_from_vertex,
+        np.asarray(priors.information, float).reshape(-1, 6, 6),
+        "prior",
+    )
+    held = np.zeros(0, np.int64) if start is None else graph.fixed if fixed is None else np.asarray(fixed, np.int64)
+    whole = replace(
+        added,
+        vertex_ids=np.append(graph.vertex_ids, np.asarray([_unused(graph)], graph.vertex_ids.dtype)),
+        **{name: np.concatenate([getattr(graph, name), getattr(added, name)]) for name in PER_EDGE},
+        dimension=graph.dimension,
+        fixed=np.append(held, count),
+    )
+    poses = np.tile(np.eye(4), (count + 1, 1, 1))
+    if start is not None:
+        poses[:count] = start
+    return whole, poses
+
+
+PER_EDGE = ("edges", "i_from_j", "information", "fitness", "rmse_m", "source", "correspondences")
+
+
+def _unused(graph: ViewGraph) -> object:
+    """An id for the world that looks like the others; it is shown in messages only."""
+    if graph.vertex_ids.dtype.kind not in "iu" or not graph.vertex_count:
+        return 0
+    return int(graph.vertex_ids.max()) + 1
+
+
+def without_world(solution: Solution, graph: ViewGraph) -> Solution:
+    """The solution of the graph alone; the components are those that edges and priors together join."""
+    _, component = np.unique(solution.component[:-1], return_inverse=True)
+    history = tuple(replace(step, world_from_cam=step.world_from_cam[:-1]) for step in solution.history)
+    return replace(
+        solution,
+        world_from_cam=solution.world_from_cam[:-1],
+        component=component.reshape(-1).astype(np.int64),
+        weights=solution.weights[: graph.edge_count],
+        history=history,
+    )

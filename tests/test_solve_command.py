@@ -1,0 +1,148 @@
+"""`hodge solve` as a user types it, and what it leaves."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import hodge_pipeline
+from hodge_adapters.g2o import load_g2o, write_g2o
+from hodge_pipeline import se3
+from hodge_pipeline.cli.main import app
+from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError
+from hodge_pipeline.solve_file import Choices, disabled_edges, solve_file
+from hodge_pipeline.types import ViewGraph
+
+
+def graph_file(path: Path, planar: bool = False) -> ViewGraph:
+    """Eight vertices with strange ids in a ring with chords; vertex 30 is held."""
+    rng = np.random.default_rng(0)
+    truth_xi, noise = rng.normal(size=(8, 6)), 0.05 * rng.normal(size=(12, 6))
+    information = np.tile(np.diag([9.0, 9, 9, 4, 4, 4]), (12, 1, 1))
+    if planar:
+        truth_xi[:, [0, 1, 5]] = noise[:, [0, 1, 5]] = 0
+        information[:, [0, 1, 5]] = 0
+    truth = se3.exp(truth_xi)
+    edges = np.array([(i, (i + 1) % 8) for i in range(8)] + [(4, 0), (1, 5), (6, 2), (6, 2)])
+    measured = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ se3.exp(noise)
+    ids = np.array([10**15, 30, 5, 41, -2, 7, 8, 100])
+    graph = ViewGraph.from_edges(ids, edges, measured, information, dimension=2 if planar else 3, fixed=np.array([1]))
+    write_g2o(path, graph, truth)
+    return graph
+
+
+def hodge(*arguments: object) -> str:
+    done = CliRunner().invoke(app, ["solve", *map(str, arguments)], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_ids_edges_order_and_held_poses_survive(tmp_path, planar):
+    graph = graph_file(tmp_path / "in.g2o", planar)
+    read = load_g2o(tmp_path / "in.g2o")
+    text = hodge(tmp_path / "in.g2o", "--out", tmp_path / "out.g2o")
+    assert "8 poses, 12 edges" in text
+    assert "1 piece" in text
+    back = load_g2o(tmp_path / "out.g2o")
+    np.testing.assert_array_equal(back.graph.vertex_ids, graph.vertex_ids)
+    np.testing.assert_array_equal(back.graph.edges, graph.edges)
+    np.testing.assert_allclose(back.graph.i_from_j, read.graph.i_from_j, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(back.graph.information, read.graph.information)
+    assert back.graph.dimension == (2 if planar else 3)
+    assert back.graph.fixed.tolist() == [1]
+    np.testing.assert_allclose(back.trajectory.world_from_cam[1], read.trajectory.world_from_cam[1], rtol=0, atol=1e-14)
+    direct = hodge_pipeline.solve(read.graph, start=read.trajectory.world_from_cam)
+    np.testing.assert_allclose(back.trajectory.world_from_cam, direct.world_from_cam, atol=1e-12)
+
+
+def test_a_run_folder_is_left_and_solved_again(tmp_path):
+    graph_file(tmp_path / "in.g2o")
+    first = json.loads(hodge(tmp_path / "in.g2o", "--run", tmp_path / "run", "--disable", "8-5", "--json"))
+    assert first["edges_ignored"] == 2
+    assert first["cost_after"] < first["cost_before"]
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names == {"graph.g2o", "edges.csv", "solved.json", "report.html", "report.json", "recording.rrd"}
+    ignored = [line for line in (tmp_path / "run" / "edges.csv").read_text().splitlines() if ",ignored," in line]
+    assert [line.split(",")[:2] for line in ignored] == [["8", "5"]] * 2
+    again = json.loads(hodge(tmp_path / "run", "--disable", "5-8", "--start", "given", "--json"))
+    assert again["cost_before"] == pytest.approx(first["cost_after"], rel=1e-9)
+    assert again["cost_after"] == pytest.approx(first["cost_after"], rel=1e-9)
+
+
+def test_the_certificate_is_told(tmp_path):
+    graph_file(tmp_path / "in.g2o")
+    assert "globally optimal" in hodge(tmp_path / "in.g2o", "--certificate")
+    assert hodge(tmp_path / "in.g2o", "--certificate", "--quiet") == ""
+    plain = json.loads(hodge(tmp_path / "in.g2o", "--objective", "isotropic", "--json"))
+    sesync = json.loads(hodge(tmp_path / "in.g2o", "--sesync-units", "--json"))
+    assert plain["objective"] == sesync["objective"] == "isotropic"
+    assert sesync["cost_before"] > plain["cost_before"]
+
+
+def test_wrong_edges_are_left_out(tmp_path):
+    graph = graph_file(tmp_path / "good.g2o")
+    motion = graph.i_from_j.copy()
+    motion[8] = motion[8] @ se3.exp(np.full(6, 2.0))
+    graph = dataclasses.replace(graph, i_from_j=motion, information=100 * graph.information)
+    write_g2o(tmp_path / "bad.g2o", graph)
+    answer = json.loads(hodge(tmp_path / "bad.g2o", "--robust", "--json"))
+    assert answer["edges_ignored"] >= 1
+    assert any("edges kept" in note for note in answer["notes"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        (["--disable", "30-8"], GraphError, "--disable 30-8: no edge joins"),
+        (["--disable", "nothing"], GraphError, "no edge joins"),
+        (["--objective", "isotropc"], RecipeError, "did you mean 'isotropic'"),
+        (["--start", "odometry"], RecipeError, "expected given or chordal"),
+        (["--certificate", "--objective", "full"], RecipeError, "add --objective isotropic"),
+        (["--time-limit", "0"], RecipeError, "above zero"),
+        (["--out", "nowhere/a.g2o"], RecipeError, "make it first"),
+        (["--time-limit", "1e-9"], CheckError, "stopped before it converged"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path, arguments, kind, message):
+    graph_file(tmp_path / "in.g2o")
+    with pytest.raises(HodgeError, match=message) as error:
+        hodge(tmp_path / "in.g2o", *arguments)
+    assert type(error.value) is kind
+    assert error.value.exit_code == (3 if kind is CheckError else 1)
+
+
+def test_a_source_without_a_graph_or_poses_is_refused(tmp_path):
+    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    with pytest.raises(SourceError, match="no"):
+        solve_file(tmp_path / "poses.tum", Choices())
+    graph = graph_file(tmp_path / "in.g2o")
+    write_g2o(tmp_path / "edges.g2o", graph)
+    with pytest.raises(SourceError, match="--start chordal"):
+        solve_file(tmp_path / "edges.g2o", Choices(initial="given"))
+    solved = solve_file(tmp_path / "edges.g2o", Choices())
+    assert "cost_before" in solved.summary()
+    assert any("fixed vertices have no pose" in note for note in solved.summary()["notes"])
+
+
+def test_pairs_of_negative_and_worded_ids_are_found():
+    motion = np.tile(np.eye(4), (3, 1, 1))
+    edges = np.array([(0, 1), (1, 2), (2, 1)])
+    numbers = ViewGraph.from_edges(np.array([-2, -3, 4]), edges, motion)
+    assert disabled_edges(numbers, ["-2--3"]).tolist() == [True, False, False]
+    assert disabled_edges(numbers, ["4--3"]).tolist() == [False, True, True]
+    words = ViewGraph.from_edges(np.array(["a-1", "b", "c"]), edges, motion)
+    assert disabled_edges(words, ["a-1-b", "b-c"]).all()
+
+
+def test_toro_files_are_solved_in_the_plane(tmp_path):
+    lines = ["EDGE2 0 1 1 0 0 4 0 4 9 0 0", "EDGE2 1 2 1 0 1.5 4 0 4 9 0 0", "EDGE2 0 2 2 0.2 1.5 4 0 4 9 0 0"]
+    (tmp_path / "a.graph").write_text("\n".join(lines) + "\n")
+    answer = json.loads(hodge(tmp_path / "a.graph", "--out", tmp_path / "a.g2o", "--json"))
+    assert answer["dimension"] == 2
+    assert math.isfinite(answer["cost_after"])
+    assert "VERTEX_SE2 2 " in (tmp_path / "a.g2o").read_text()
