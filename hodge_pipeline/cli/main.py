@@ -18,6 +18,7 @@ Examples:
   hodge run tum --source rgbd_dataset_freiburg1_desk --out runs/desk
   hodge run tum --source DIR --set registration=ndt --out runs/ndt
   hodge inspect redkitchen                       what is this folder?
+  hodge convert redkitchen poses.tum             poses, graphs, models in other formats
   hodge view runs/kitchen                        open the recording in Rerun
   hodge solve graph.g2o --out solved.g2o         any pose graph, or a run folder
   hodge solve graph.g2o --certificate --disable 12-87
@@ -110,6 +111,18 @@ def inspect(source: Path, json: Json = False) -> None:
     from hodge_pipeline.cli import listing
 
     listing.inspect(source, as_json=json)
+
+
+@app.command()
+def convert(
+    source: Path,
+    out: Annotated[Path, typer.Argument(help="Its name means the format: .tum .kitti .csv .g2o .json .ply, a folder.")],
+    to: Annotated[Optional[str], typer.Option("--to", help="The writer by name (see `hodge stages writers`).")] = None,  # noqa: UP045
+) -> None:
+    """Write what a path holds in another format."""
+    from hodge_pipeline.cli import converting
+
+    converting.convert(source, out, to=to)
 
 
 @app.command()

@@ -1,0 +1,68 @@
+"""`hodge convert`: what one reader opens, written by a writer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import registry
+from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.stages import Writer
+from hodge_pipeline.types import Source, Trajectory
+
+BY_NAME = {"transforms.json": "nerfstudio"}
+BY_SUFFIX = {
+    ".tum": "tum",
+    ".txt": "tum",
+    ".kitti": "kitti",
+    ".g2o": "g2o",
+    ".csv": "euroc",
+    ".log": "log",
+    ".ply": "ply",
+    "": "colmap",
+}
+"""Writers by the ending of the output; no ending is a folder."""
+
+
+def convert(source: Path, out: Path, *, to: str | None = None) -> None:
+    """Read a path with the surest reader and write it to another, in the format of its name or of `to`.
+
+    Prints what was written and every note of the reader. Raises `RecipeError` where no writer is meant by the name.
+    """
+    opened = with_trajectory(guess_reader(source).open(source))
+    name = to or writer_name(out, opened)
+    writer: Writer = registry.load("writers", name)()
+    writer.write(out, opened)
+    for note in opened.notes:
+        print(f"note: {note}")
+    print(f"{out}: written as {name}")
+
+
+def writer_name(out: Path, source: Source) -> str:
+    """The writer that an output's name means; `.json` is Open3D's, of the graph where there is one."""
+    known = registry.names("writers")
+    if out.name in BY_NAME:
+        return BY_NAME[out.name]
+    if out.suffix == ".json":
+        return "open3d_trajectory" if source.graph is None else "open3d_pose_graph"
+    name = BY_SUFFIX.get(out.suffix.lower(), out.suffix[1:])
+    if name not in known:
+        raise RecipeError(f"{out}: no writer for '{out.suffix}': name one with --to ({', '.join(known)})")
+    return name
+
+
+def with_trajectory(source: Source) -> Source:
+    """The source, with the poses of its frames as trajectory where it has none of its own.
+
+    Raises `SourceError` where frames of several sequences have stamps that repeat.
+    """
+    posed = [(frame.stamp_s, frame.world_from_cam) for frame in source.frames if frame.world_from_cam is not None]
+    if source.trajectory is not None or not posed:
+        return source
+    stamps = np.array([stamp for stamp, _ in posed])
+    if (np.diff(stamps) <= 0).any():
+        raise SourceError(f"{source.path}: several sequences with stamps of their own: convert one sequence's folder")
+    return replace(source, trajectory=Trajectory(stamps, np.array([pose for _, pose in posed])))
