@@ -42,21 +42,10 @@ def certificate_matrix(problem: Problem, rotations: Floats, translations: Floats
     """
     d, count = problem.dimension, problem.count
     size = d + 1
-    kappa, tau = problem.kappa[:, None, None], problem.tau[:, None, None]
-    blocks = np.zeros((4, len(problem.tau), size, size))
-    ii, jj, ij, ji = blocks
-    ii[:, :d, :d] = kappa * np.eye(d) + tau * (problem.translations[:, :, None] * problem.translations[:, None, :])
-    jj[:, :d, :d] = kappa * np.eye(d)
-    ij[:, :d, :d] = -kappa * problem.rotations
-    ii[:, d, d] = jj[:, d, d] = problem.tau
-    ij[:, d, d] = -problem.tau
-    lever = problem.tau[:, None] * problem.translations
-    ii[:, :d, d] = ii[:, d, :d] = lever
-    ij[:, :d, d] = -lever
-    ji[:] = np.swapaxes(ij, 1, 2)
-    rows = np.concatenate([problem.tail, problem.head, problem.tail, problem.head])
-    columns = np.concatenate([problem.tail, problem.head, problem.head, problem.tail])
-    matrix = BlockPattern.of(rows, columns, (count, count)).assemble(blocks.reshape(-1, size, size))
+    rows = np.stack([problem.tail, problem.head, problem.tail, problem.head])
+    columns = np.stack([problem.tail, problem.head, problem.head, problem.tail])
+    pattern = BlockPattern.of(rows, columns, (count, count))
+    matrix = pattern.assemble(lambda edges: _blocks(problem, edges), (size, size))
     stacked = np.concatenate([np.swapaxes(rotations, 1, 2), translations[:, None, :]], axis=1)
     image = (matrix @ stacked.reshape(-1, d)).reshape(count, size, d)
     multiplier = image[:, :d] @ rotations
@@ -64,6 +53,24 @@ def certificate_matrix(problem: Problem, rotations: Floats, translations: Floats
     diagonal[:, :d, :d] = 0.5 * (multiplier + np.swapaxes(multiplier, 1, 2))
     vertices = np.arange(count + 1, dtype=np.int32)
     return (matrix - bsr_matrix((diagonal, vertices[:-1], vertices), shape=matrix.shape)).tobsr((size, size))
+
+
+def _blocks(problem: Problem, edges: slice) -> Floats:
+    """The blocks ii, jj, ij, ji (4, m, d + 1, d + 1) of some edges, rotation rows first."""
+    d, tau, kappa = problem.dimension, problem.tau[edges], problem.kappa[edges, None, None]
+    moved = problem.translations[edges]
+    blocks = np.zeros((4, len(tau), d + 1, d + 1))
+    ii, jj, ij, ji = blocks
+    ii[:, :d, :d] = kappa * np.eye(d) + tau[:, None, None] * (moved[:, :, None] * moved[:, None, :])
+    jj[:, :d, :d] = kappa * np.eye(d)
+    ij[:, :d, :d] = -kappa * problem.rotations[edges]
+    ii[:, d, d] = jj[:, d, d] = tau
+    ij[:, d, d] = -tau
+    arm = tau[:, None] * moved
+    ii[:, :d, d] = ii[:, d, :d] = arm
+    ij[:, :d, d] = -arm
+    ji[:] = np.swapaxes(ij, 1, 2)
+    return blocks
 
 
 def certify(problem: Problem, rotations: Floats, translations: Floats, cost: float) -> Certificate:

@@ -26,22 +26,29 @@ def chordal_rotations(problem: Problem, pinned: Floats) -> Floats:
     `pinned (n − free, d, d)` are the rotations of the pinned vertices.
     """
     d, free = problem.dimension, problem.free_count
-    kappa = problem.kappa[:, None, None]
-    diagonal = kappa * np.eye(d)
-    forward = -kappa * problem.rotations
-    blocks = np.concatenate([diagonal, diagonal, forward, np.swapaxes(forward, 1, 2)])
-    matrix = problem.symmetric_pattern.assemble(blocks)
+    matrix = problem.structure.symmetric_pattern.assemble(lambda edges: _blocks(problem, edges), (d, d))
     transposed = np.zeros((problem.count, d, d))
     transposed[free:] = np.swapaxes(pinned, 1, 2)
-    onto_tail = -forward @ transposed[problem.head]
-    onto_head = -np.swapaxes(forward, 1, 2) @ transposed[problem.tail]
-    rhs = problem.at_tail @ onto_tail.reshape(-1, d * d) + problem.at_head @ onto_head.reshape(-1, d * d)
-    rhs = rhs[:free].reshape(free * d, d)
-    transposed[:free] = _solve(matrix, rhs).reshape(free, d, d)
+    rhs = np.zeros((problem.count, d, d))
+    tail, head = problem.tail, problem.head
+    onto_pinned = np.flatnonzero((tail >= free) | (head >= free))
+    weighted = problem.kappa[onto_pinned, None, None] * problem.rotations[onto_pinned]
+    tail, head = tail[onto_pinned], head[onto_pinned]
+    np.add.at(rhs, tail, weighted @ transposed[head])
+    np.add.at(rhs, head, np.swapaxes(weighted, 1, 2) @ transposed[tail])
+    transposed[:free] = _solve(matrix, rhs[:free].reshape(free * d, d)).reshape(free, d, d)
     out = np.empty_like(transposed)
     out[free:] = pinned
     out[:free] = project(np.swapaxes(transposed[:free], 1, 2))
     return out
+
+
+def _blocks(problem: Problem, edges: slice) -> Floats:
+    """The blocks ii, jj, ij, ji (4, m, d, d) of some edges."""
+    kappa = problem.kappa[edges, None, None]
+    diagonal = kappa * np.eye(problem.dimension)
+    forward = -kappa * problem.rotations[edges]
+    return np.stack([diagonal, diagonal, forward, np.swapaxes(forward, 1, 2)])
 
 
 def _solve(matrix: bsr_matrix, rhs: Floats) -> Floats:

@@ -29,10 +29,13 @@ MAX_CG_STEPS = 1000
 
 @dataclass(frozen=True)
 class FullResiduals:
-    """`residual (E, p + d)`, `frame (E, p + d, p + d)` = dr / d(ω, v) in world axes, `reach (E, d)` = t_j − t_i."""
+    """`residual (E, p + d)`; dr / d(ω, v) in world axes as its blocks `turn (E, p, p)` and the transpose of
+    `predicted (E, d, d)` = R_i R_ij; `reach (E, d)` = t_j − t_i.
+    """
 
     residual: Floats
-    frame: Floats
+    turn: Floats
+    predicted: Floats
     reach: Floats
     cost_per_edge: Floats
 
@@ -54,19 +57,16 @@ def full_residuals(problem: Problem, information: Floats, rotations: Floats, tra
     missed = reach - np.einsum("eij,ej->ei", at_tail, problem.translations)
     residual = np.empty((len(reach), p + d))
     residual[:, p:] = np.einsum("eji,ej->ei", predicted, missed)
-    frame = np.zeros((len(reach), p + d, p + d))
-    frame[:, p:, p:] = np.swapaxes(predicted, 1, 2)
     if d == 2:
         residual[:, 0] = np.arctan2(error[:, 1, 0], error[:, 0, 0])
-        frame[:, 0, 0] = 1.0
+        turn = np.ones((len(reach), 1, 1))
     else:
         quat = Rotation.from_matrix(error).as_quat()
         quat = np.where(quat[:, 3:] < 0, -quat, quat)
         residual[:, :3] = 2 * quat[:, :3]
-        turn = quat[:, 3, None, None] * np.eye(3) + se3.hat(quat[:, :3])
-        frame[:, :3, :3] = turn @ np.swapaxes(at_head, 1, 2)
+        turn = (quat[:, 3, None, None] * np.eye(3) + se3.hat(quat[:, :3])) @ np.swapaxes(at_head, 1, 2)
     cost = np.einsum("ei,ei->e", residual, np.einsum("eij,ej->ei", information, residual))
-    return FullResiduals(residual, frame, reach, cost)
+    return FullResiduals(residual, turn, predicted, reach, cost)
 
 
 @dataclass
@@ -120,27 +120,38 @@ class FullObjective:
     def normal_equations(self, left: FullResiduals) -> tuple[Floats, bsr_matrix]:
         """Half the gradient (free · (p + d),) and half the Gauss-Newton Hessian."""
         problem, p = self.problem, self.problem.tangent_size
-        weighted = np.swapaxes(left.frame, 1, 2) @ self.information
-        core = weighted @ left.frame
-        force = np.einsum("eij,ej->ei", weighted, left.residual)
-        arm = lever(left.reach)
-        at_tail = force.copy()
-        at_tail[:, :p] -= np.einsum("eji,ej->ei", arm, force[:, p:])
-        gradient = (problem.at_head @ force - problem.at_tail @ at_tail)[: problem.free_count]
-        half = core.copy()
-        half[:, :, :p] -= core[:, :, p:] @ arm
-        tail_tail = half.copy()
-        tail_tail[:, :p] -= np.swapaxes(arm, 1, 2) @ half[:, p:]
-        blocks = np.concatenate([tail_tail, core, -np.swapaxes(half, 1, 2), -half])
-        return gradient.reshape(-1), problem.symmetric_pattern.assemble(blocks)
+        structure, size = problem.structure, problem.tangent_size + problem.dimension
+        at_tail, at_head = np.empty((2, len(problem.tail), size))
+
+        def blocks(edges: slice) -> Floats:
+            frame = _frame(left, edges)
+            weighted = np.swapaxes(frame, 1, 2) @ self.information[edges]
+            core = weighted @ frame
+            force = np.einsum("eij,ej->ei", weighted, left.residual[edges])
+            arm = lever(left.reach[edges])
+            at_head[edges] = at_tail[edges] = force
+            at_tail[edges, :p] -= np.einsum("eji,ej->ei", arm, force[:, p:])
+            half = core.copy()
+            half[:, :, :p] -= core[:, :, p:] @ arm
+            tail_tail = half.copy()
+            tail_tail[:, :p] -= np.swapaxes(arm, 1, 2) @ half[:, p:]
+            return np.stack([tail_tail, core, -np.swapaxes(half, 1, 2), -half])
+
+        hessian = structure.symmetric_pattern.assemble(blocks, (size, size))
+        gradient = (structure.at_head @ at_head - structure.at_tail @ at_tail)[: problem.free_count]
+        return gradient.reshape(-1), hessian
 
     def laplacian_preconditioner(self, rotations: Floats) -> Operator:
         """The isotropic Hessian of consistent edges, inverted exactly up to the levers' share of the rotations."""
         problem = self.problem
         p, d, free = problem.tangent_size, problem.dimension, problem.free_count
-        arms = lever(np.einsum("eij,ej->ei", rotations[problem.tail], problem.translations))
-        arms = problem.tau[:, None, None] * arms
-        coupling = problem.coupling_pattern.assemble(np.concatenate([arms, -arms]))
+
+        def levers(edges: slice) -> Floats:
+            arm = np.einsum("eij,ej->ei", rotations[problem.tail[edges]], problem.translations[edges])
+            arms = problem.tau[edges, None, None] * lever(arm)
+            return np.stack([arms, -arms])
+
+        coupling = problem.structure.coupling_pattern.assemble(levers, (d, p))
         back = coupling.transpose()
         rotation, translation = problem.rotation_factor.solve, problem.translation_factor.solve
         rotation_scale = 2.0 if d == 3 else 1.0
@@ -153,6 +164,15 @@ class FullObjective:
             return np.concatenate([turned, moved], axis=1).reshape(-1)
 
         return apply
+
+
+def _frame(left: FullResiduals, edges: slice) -> Floats:
+    """The derivative of r by (ω, v) (m, p + d, p + d) in world axes."""
+    turn, predicted = left.turn[edges], left.predicted[edges]
+    p, d = turn.shape[-1], predicted.shape[-1]
+    frame = np.zeros((len(turn), p + d, p + d))
+    frame[:, :p, :p], frame[:, p:, p:] = turn, np.swapaxes(predicted, 1, 2)
+    return frame
 
 
 def _solve(

@@ -61,7 +61,7 @@ def best_translations(problem: Problem, rotations: Floats, translations: Floats)
     """The translations (n, d) that minimise F for these rotations; the pinned ones stay."""
     arm = np.einsum("eij,ej->ei", rotations[problem.tail], problem.translations)
     shift = problem.tau[:, None] * (translations[problem.head] - translations[problem.tail] - arm)
-    force = (problem.at_head @ shift - problem.at_tail @ shift)[: problem.free_count]
+    force = (problem.structure.at_head @ shift - problem.structure.at_tail @ shift)[: problem.free_count]
     out: Floats = translations.copy()
     out[: problem.free_count] -= problem.translation_factor.solve(force)
     return out
@@ -71,29 +71,38 @@ def rotation_gradient(problem: Problem, left: Residuals) -> Floats:
     """Half the gradient of F by ω (free, p)."""
     pull = problem.kappa[:, None] * axial(left.turn)
     push = pull - problem.tau[:, None] * cross(left.shift, left.arm)
-    return np.asarray(problem.at_head @ pull - problem.at_tail @ push)[: problem.free_count]
+    return np.asarray(problem.structure.at_head @ pull - problem.structure.at_tail @ push)[: problem.free_count]
 
 
 def quadratic_model(problem: Problem, left: Residuals, exact: bool = True) -> QuadraticModel:
     """The second-order model of F in ω at these residuals; without the residuals' own curvature (Gauss-Newton), and
     so never indefinite, where it need not be exact.
     """
+    p, d, structure = problem.tangent_size, problem.dimension, problem.structure
+    hessian = structure.symmetric_pattern.assemble(lambda edges: _curvature(problem, left, edges, exact), (p, p))
+
+    def arms(edges: slice) -> Floats:
+        levers = problem.tau[edges, None, None] * lever(left.arm[edges])
+        return np.stack([levers, -levers])
+
+    coupling = structure.coupling_pattern.assemble(arms, (d, p))
+    return QuadraticModel(rotation_gradient(problem, left), hessian, coupling, coupling.transpose())
+
+
+def _curvature(problem: Problem, left: Residuals, edges: slice, exact: bool) -> Floats:
+    """The blocks ii, jj, ij, ji (4, m, p, p) of some edges."""
     d, p = problem.dimension, problem.tangent_size
-    kappa, tau, eye = problem.kappa[:, None, None], problem.tau[:, None, None], np.eye(p)
-    trace = np.einsum("eii->e", left.turn)[:, None, None]
-    mixed = kappa * (trace * eye - left.turn if d == 3 else trace)
+    kappa, tau, eye = problem.kappa[edges, None, None], problem.tau[edges, None, None], np.eye(p)
+    turn, shift, arm = left.turn[edges], left.shift[edges], left.arm[edges]
+    trace = np.einsum("eii->e", turn)[:, None, None]
+    mixed = kappa * (trace * eye - turn if d == 3 else trace)
     turned = 0.5 * (mixed + np.swapaxes(mixed, 1, 2)) if exact else 2 * kappa * eye
-    seen = left.shift + left.arm if exact else left.arm
-    levered = tau * np.einsum("ek,ek->e", seen, left.arm)[:, None, None] * eye
+    seen = shift + arm if exact else arm
+    levered = tau * np.einsum("ek,ek->e", seen, arm)[:, None, None] * eye
     if d == 3:
-        outer = (0.5 * tau) * (seen[:, :, None] * left.arm[:, None, :])
+        outer = (0.5 * tau) * (seen[:, :, None] * arm[:, None, :])
         levered -= outer + np.swapaxes(outer, 1, 2)
-    blocks = np.concatenate([turned + levered, turned, -mixed, -np.swapaxes(mixed, 1, 2)])
-    arms = tau * lever(left.arm)
-    coupling = problem.coupling_pattern.assemble(np.concatenate([arms, -arms]))
-    return QuadraticModel(
-        rotation_gradient(problem, left), problem.symmetric_pattern.assemble(blocks), coupling, coupling.transpose()
-    )
+    return np.stack([turned + levered, turned, -mixed, -np.swapaxes(mixed, 1, 2)])
 
 
 @dataclass(frozen=True)

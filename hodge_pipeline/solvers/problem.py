@@ -6,6 +6,7 @@ components, so that a planar graph is solved as one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,54 +20,131 @@ from hodge_pipeline.types import Bools, Floats, Ints
 SAME_RATIO = 1e-13
 
 
+CHUNK = 1 << 14
+"""Edges whose blocks are made at a time: they stay in the cache, and memory never holds those of all edges."""
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A chunk of edges: the blocks that they contribute to, and the matrix that sums their contributions into those."""
+
+    edges: slice
+    targets: Ints
+    scatter: csr_matrix
+
+
 @dataclass(frozen=True)
 class BlockPattern:
-    """The structure of a block-sparse matrix that is a sum of contributions: made once, for many data.
+    """The structure of a block-sparse matrix that is a sum of contributions of edges: made once, for many data.
 
-    `scatter (blocks, contributions)` sums the contributions into blocks; `indptr`, `indices` are the BSR structure.
+    `indptr`, `indices` are the BSR structure.
     """
 
-    scatter: csr_matrix
+    pieces: tuple[_Piece, ...]
     indptr: NDArray[np.int32]
     indices: NDArray[np.int32]
     shape: tuple[int, int]
 
     @classmethod
     def of(cls, rows: Ints, columns: Ints, shape: tuple[int, int]) -> BlockPattern:
-        """The pattern of contributions to these block rows and columns; those outside the shape are left out."""
-        kept = np.flatnonzero((rows < shape[0]) & (columns < shape[1]))
-        keys = rows[kept] * shape[1] + columns[kept]
-        unique, inverse = np.unique(keys, return_inverse=True)
-        entries = (np.ones(len(kept)), (inverse.reshape(-1), kept))
-        scatter = csr_matrix(entries, shape=(len(unique), len(rows)))
+        """The pattern where edge e contributes to the block rows (k, E) and columns (k, E); those outside the shape
+        are left out.
+        """
+        keys = rows * shape[1] + columns
+        keys[(rows >= shape[0]) | (columns >= shape[1])] = -1
+        unique = np.unique(keys)
+        unique = unique[np.searchsorted(unique, 0) :]
+        pieces = []
+        for begin in range(0, rows.shape[1], CHUNK):
+            edges = slice(begin, min(begin + CHUNK, rows.shape[1]))
+            part = keys[:, edges].reshape(-1)
+            kept = np.flatnonzero(part >= 0)
+            found, inverse = np.unique(part[kept], return_inverse=True)
+            entries = (np.ones(len(kept)), (inverse.reshape(-1), kept))
+            pieces.append(
+                _Piece(
+                    edges, np.searchsorted(unique, found).astype(np.int64), csr_matrix(entries, (len(found), len(part)))
+                )
+            )
         indptr = np.searchsorted(unique, np.arange(shape[0] + 1) * shape[1]).astype(np.int32)
-        return cls(scatter, indptr, (unique % max(shape[1], 1)).astype(np.int32), shape)
+        return cls(tuple(pieces), indptr, (unique % max(shape[1], 1)).astype(np.int32), shape)
 
-    def assemble(self, contributions: Floats) -> bsr_matrix:
-        """The matrix with these blocks (contributions, r, c)."""
-        count, rows, columns = contributions.shape
-        data = (self.scatter @ contributions.reshape(count, rows * columns)).reshape(-1, rows, columns)
+    def assemble(self, blocks: Callable[[slice], Floats], size: tuple[int, int]) -> bsr_matrix:
+        """The matrix with blocks of this size; `blocks(edges)` gives the contributions (k, m, r, c) of some edges."""
+        rows, columns = size
+        data = np.zeros((len(self.indices), rows * columns))
+        for piece in self.pieces:
+            data[piece.targets] += piece.scatter @ blocks(piece.edges).reshape(-1, rows * columns)
         shape = (self.shape[0] * rows, self.shape[1] * columns)
-        return bsr_matrix((data, self.indices, self.indptr), shape=shape)
+        return bsr_matrix((data.reshape(-1, rows, columns), self.indices, self.indptr), shape=shape)
 
 
 @dataclass(frozen=True)
-class Problem:
-    """Edges, weights and the pinned vertices of one pose graph.
+class Structure:
+    """Which vertices the edges join: all that stays when measurements and weights change.
 
     - `order (n,)`: the graph's vertex at each position; the first `free_count` positions are unknown.
-    - `tail`, `head (E,)`: positions of i and j; `rotations (E, d, d)`, `translations (E, d)`: i_from_j.
-    - `kappa`, `tau (E,)`: positive weights of the isotropic objective (SE-Sync, equation 11).
+    - `tail`, `head (E,)`: positions of i and j.
     """
 
     order: Ints
     free_count: int
     tail: Ints
     head: Ints
+
+    @cached_property
+    def at_tail(self) -> csr_matrix:
+        """The matrix (n, E) that sums edge values at the vertex i of each."""
+        return _indicator(self.tail, len(self.order))
+
+    @cached_property
+    def at_head(self) -> csr_matrix:
+        """The matrix (n, E) that sums edge values at the vertex j of each."""
+        return _indicator(self.head, len(self.order))
+
+    @cached_property
+    def symmetric_pattern(self) -> BlockPattern:
+        """Of a matrix over the free vertices, contributions in the order ii, jj, ij, ji."""
+        rows = np.stack([self.tail, self.head, self.tail, self.head])
+        columns = np.stack([self.tail, self.head, self.head, self.tail])
+        return BlockPattern.of(rows, columns, (self.free_count, self.free_count))
+
+    @cached_property
+    def coupling_pattern(self) -> BlockPattern:
+        """Of a matrix from the vertex i of each edge to its residual's two ends, contributions in the order ji, ii."""
+        rows, columns = np.stack([self.head, self.tail]), np.stack([self.tail, self.tail])
+        return BlockPattern.of(rows, columns, (self.free_count, self.free_count))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Edges and weights of one pose graph: `rotations (E, d, d)`, `translations (E, d)` of i_from_j, κ and τ (E,)."""
+
+    structure: Structure
     rotations: Floats
     translations: Floats
     kappa: Floats
     tau: Floats
+
+    @property
+    def order(self) -> Ints:
+        """The graph's vertex (n,) at each position."""
+        return self.structure.order
+
+    @property
+    def free_count(self) -> int:
+        """How many positions, the first ones, are unknown."""
+        return self.structure.free_count
+
+    @property
+    def tail(self) -> Ints:
+        """The position (E,) of the vertex i of each edge."""
+        return self.structure.tail
+
+    @property
+    def head(self) -> Ints:
+        """The position (E,) of the vertex j of each edge."""
+        return self.structure.head
 
     @property
     def dimension(self) -> int:
@@ -84,16 +162,6 @@ class Problem:
         return len(self.order)
 
     @cached_property
-    def at_tail(self) -> csr_matrix:
-        """The matrix (n, E) that sums edge values at the vertex i of each."""
-        return _indicator(self.tail, self.count)
-
-    @cached_property
-    def at_head(self) -> csr_matrix:
-        """The matrix (n, E) that sums edge values at the vertex j of each."""
-        return _indicator(self.head, self.count)
-
-    @cached_property
     def rotation_factor(self) -> Factor:
         """The scalar Laplacian of κ, factorised once."""
         return factorise(laplacian(self.tail, self.head, self.kappa, self.free_count), "NATURAL")
@@ -106,19 +174,6 @@ class Problem:
             solve, scale = self.rotation_factor.solve, 1 / ratio[0]
             return Factor(self.free_count, lambda rhs: scale * solve(rhs))
         return factorise(laplacian(self.tail, self.head, self.tau, self.free_count), "NATURAL")
-
-    @cached_property
-    def symmetric_pattern(self) -> BlockPattern:
-        """Of a matrix over the free vertices, contributions in the order ii, jj, ij, ji."""
-        rows = np.concatenate([self.tail, self.head, self.tail, self.head])
-        columns = np.concatenate([self.tail, self.head, self.head, self.tail])
-        return BlockPattern.of(rows, columns, (self.free_count, self.free_count))
-
-    @cached_property
-    def coupling_pattern(self) -> BlockPattern:
-        """Of a matrix from the vertex i of each edge to its residual's two ends, contributions in the order ji, ii."""
-        rows, columns = np.concatenate([self.head, self.tail]), np.concatenate([self.tail, self.tail])
-        return BlockPattern.of(rows, columns, (self.free_count, self.free_count))
 
 
 def _indicator(vertices: Ints, count: int) -> csr_matrix:
@@ -148,7 +203,8 @@ def make_problem(
     elimination = fill_reducing_order(laplacian(tail, head, np.ones(len(edges)), len(free)))
     order = np.concatenate([free[elimination], rest])
     position[order] = np.arange(len(order))
-    return Problem(order, len(free), position[edges[:, 0]], position[edges[:, 1]], rotations, translations, kappa, tau)
+    structure = Structure(order, len(free), position[edges[:, 0]], position[edges[:, 1]])
+    return Problem(structure, rotations, translations, kappa, tau)
 
 
 def pinned_vertices(component: Ints, fixed: Ints) -> Bools:
