@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from complex_graphs import FIGURE_EIGHT, TRIANGLE, complete, graphs, random_motions
 from hodge_pipeline import se3
+from hodge_pipeline.complex.decomposition import gradient_fit
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.paper_surface import make_surface
@@ -203,3 +204,19 @@ def test_one_vertex_without_edges_keeps_its_pose() -> None:
     graph = ViewGraph.from_edges(np.arange(1), np.zeros((0, 2), np.int64), np.zeros((0, 4, 4)))
     start = random_motions(0, 1)
     np.testing.assert_array_equal(PaperSolver().solve(graph, start).world_from_cam, start)
+
+
+def test_the_surface_is_the_graph_with_weights_between_edges() -> None:
+    # each diagonal's residual is the sum of its path's residuals, so with F the extension of a form to the surface the
+    # Poisson equation is least squares on the graph alone, in the norm FᵀF / √3 instead of a diagonal one
+    edges = complete(9)
+    truth = random_motions(9, 9, 0.5)
+    surface = make_surface(edges, truth, np.ones(len(edges)), "random", 2)
+    assert surface.sizes()["diagonals"] > 20
+    omega = np.random.default_rng(0).normal(size=(len(edges), 6))
+    extension = surface.form(np.eye(len(edges)))
+    d0 = surface.d0[: len(edges)].toarray()
+    root = extension @ d0
+    expected = np.linalg.lstsq(root, extension @ omega, rcond=None)[0]
+    found = gradient_fit(surface.d0, surface.form(omega), surface.weights)
+    np.testing.assert_allclose(d0 @ found, d0 @ expected, atol=1e-10)

@@ -1,0 +1,112 @@
+"""The same ω through the embedding surface and through the plain graph Laplacian: accuracy, spread, size, time.
+
+    python benchmarks/paper.py runs/paper/redkitchen-distance [round]
+
+reads the registered edges of a finished run (its first round, unless another is given) and prints a Markdown table.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import artifacts
+from hodge_pipeline.evaluation.scores import score_table
+from hodge_pipeline.evaluation.trajectory import absolute_error
+from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.registration.pairs import Registered
+from hodge_pipeline.rounds import true_poses
+from hodge_pipeline.solvers.paper import PaperSolver
+from hodge_pipeline.solvers.poisson import PoissonSolver
+from hodge_pipeline.stages import ConsistencySolver
+from hodge_pipeline.types import Floats, Solution, ViewGraph
+
+SEEDS = 20
+SCORED_SEEDS = 3  # a score costs ten CPU seconds for each set of poses, an ATE nothing
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One round's edges, the poses it started from, the truth."""
+
+    graph: ViewGraph
+    start: Floats
+    truth: Floats
+    clouds: Path
+
+
+def read_problem(run: Path, round_number: int) -> Problem:
+    """The problem that a round of a finished run solved."""
+    recipe = load_recipe(str(run / "recipe.yaml"))
+    assert recipe.source.path is not None and recipe.source.reader is not None
+    source = recipe.source.reader.open(recipe.source.path)
+    stages = run / "stages"
+    found = artifacts.load(stages / f"register-{round_number}" / "registered.npz", Registered)
+    found = found.select(recipe.acceptance.reasons(found) == "")
+    ids = np.array([frame.frame_id for frame in source.frames])
+    if round_number == 1:
+        start = artifacts.load_arrays(stages / "odometry" / "poses.npz")["world_from_cam"]
+    else:
+        start = artifacts.load_solution(stages / f"solve-{round_number - 1}" / "solution.npz").world_from_cam
+    graph = found.as_graph(ids, np.full(len(found.pairs), "run"))
+    return Problem(graph, start, true_poses(source), stages / "clouds")
+
+
+def solve_all(problem: Problem, make: Callable[[int], ConsistencySolver], seeds: int) -> tuple[list[Solution], float]:
+    """The solutions for each seed, and the mean CPU seconds of one."""
+    begin = time.process_time()
+    solutions = [make(seed).solve(problem.graph, problem.start) for seed in range(seeds)]
+    return solutions, (time.process_time() - begin) / seeds
+
+
+def spread(values: list[float], digits: int) -> str:
+    """Mean, and the range where there are several."""
+    mean = f"{np.mean(values):.{digits}f}"
+    return mean if len(values) == 1 else f"{mean} ({min(values):.{digits}f}–{max(values):.{digits}f})"
+
+
+def main() -> None:
+    """Print the table."""
+    run, round_number = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 1
+    problem = read_problem(run, round_number)
+    makers: dict[str, tuple[Callable[[int], ConsistencySolver], int]] = {
+        "graph, pairing": (lambda seed: PoissonSolver(robust="none", log="pairing"), 1),
+        "graph, se(3)": (lambda seed: PoissonSolver(robust="none"), 1),
+        "surface, random, pairing": (lambda seed: PaperSolver(seed=seed), SEEDS),
+        "surface, random, se(3)": (lambda seed: PaperSolver(seed=seed, log="se3"), SEEDS),
+        "surface, angular, pairing": (lambda seed: PaperSolver(rotation="angular"), 1),
+        "surface, angular, se(3)": (lambda seed: PaperSolver(rotation="angular", log="se3"), 1),
+    }
+    found = {name: solve_all(problem, *make) for name, make in makers.items()}
+    sets = {"truth": problem.truth}
+    for name, (solutions, _) in found.items():
+        sets |= {f"{name} {seed}": solution.world_from_cam for seed, solution in enumerate(solutions[:SCORED_SEEDS])}
+    with load_recipe("paper-distance").executor.open() as workers:
+        table = score_table(problem.clouds, sets, "truth", workers)
+    scores = {graph.kind: dict(zip(table.names, graph.mean_score, strict=True)) for graph in table.graphs}
+    truth = ", ".join(f"{kind} {score['truth']:.4f}" for kind, score in scores.items())
+    print(f"V {problem.graph.vertex_count}, E {problem.graph.edge_count}; scores of the true poses: {truth}\n")
+    print("| solver | ATE, m | score, distance | score, IoU | D, step 1 | cells | genus | longest cell | CPU, s |")
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
+    for name, (solutions, cpu_s) in found.items():
+        errors = [absolute_error(one.world_from_cam, problem.truth).rmse_m for one in solutions]
+        of = {
+            kind: [score[f"{name} {seed}"] for seed in range(min(len(solutions), SCORED_SEEDS))]
+            for kind, score in scores.items()
+        }
+        first = [one.history[0].metrics["loop_deviation_sum"] for one in solutions]
+        sizes = [
+            spread([one.metrics[key] for one in solutions], 0) if key in solutions[0].metrics else "–"
+            for key in ("cells", "genus", "longest_cell")
+        ]
+        cells = (spread(errors, 4), spread(of["distance"], 4), spread(of["iou"], 4), spread(first, 3), *sizes)
+        print(f"| {name} | {' | '.join(cells)} | {cpu_s:.2f} |")
+
+
+if __name__ == "__main__":
+    main()
