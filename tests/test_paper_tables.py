@@ -173,4 +173,4 @@ def test_the_picture_shows_every_set_of_poses_from_the_same_places(tmp_path: Pat
     is_red = two[..., 0] - two[..., 1] > 0.1
     half = len(two) // 2
     assert is_red[:half].sum() > 1000
-    assert is_red[half:].sum() == pytest.approx(is_red[:half].sum(), rel=0.1)
+    assert 0.6 < is_red[half:].sum() / is_red[:half].sum() < 1.0, "one frame of six is missing"
