@@ -95,6 +95,51 @@ def test_workers_have_one_thread_and_both_work() -> None:
         assert os.getpid() not in {pid for _, pid in workers.map(process_id, range(4))}
 
 
+def test_a_worker_that_dies_with_nothing_to_do_is_replaced() -> None:
+    with LocalExecutor(workers=2).open() as workers:
+        victim = psutil.Process(next(pid for _, pid in workers.map(process_id, range(4))))
+        victim.kill()
+        psutil.wait_procs([victim], timeout=10)
+        assert sorted(workers.map(square, range(5))) == [(k, k * k) for k in range(5)]
+
+
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    script = tmp_path / "killed.py"
+    script.write_text(
+        textwrap.dedent("""
+        import os, signal, psutil
+        from hodge_pipeline.executors.local import LocalExecutor
+        with LocalExecutor(workers=2).open() as workers:
+            list(workers.map(abs, range(8)))
+            print(*(child.pid for child in psutil.Process().children(recursive=True)), flush=True)
+            os.kill(os.getpid(), signal.SIGKILL)
+        """)
+    )
+    # the pipe is at its end only when every process that inherited it has gone
+    done = subprocess.run([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, timeout=60)
+    assert done.returncode == -signal.SIGKILL
+    assert len(done.stdout.split()) >= 2
+
+
+def test_a_task_of_the_script_itself_is_refused_in_one_line(tmp_path: Path) -> None:
+    script = tmp_path / "own_task.py"
+    script.write_text(
+        textwrap.dedent("""
+        from hodge_pipeline.errors import WorkerError
+        from hodge_pipeline.executors.local import LocalExecutor
+        def own(number):
+            return number
+        with LocalExecutor(workers=2).open() as workers:
+            try:
+                list(workers.map(own, range(3)))
+            except WorkerError as error:
+                print(error)
+        """)
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True)
+    assert "a module of its own" in done.stdout
+
+
 def test_leaving_early_leaves_no_orphans() -> None:
     before = set(psutil.Process().children(recursive=True))
     with LocalExecutor(workers=2).open() as workers:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing.connection import wait as wait_for_end
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -41,7 +44,7 @@ class LocalExecutor:
     @contextmanager
     def open(self) -> Iterator[Workers]:
         """Workers that live until the block is left, then end at once; they start with the first task."""
-        count = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
+        count = _cores() if self.workers is None else self.workers
         if count == 0:
             yield InProcess()
             return
@@ -69,21 +72,25 @@ class SpawnedWorkers:
 
     def map(self, task: Callable[[Task], Result], blocks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
         """(index, result) of each block as it finishes; a block of a worker that died is tried again."""
+        _refuse_main(task, blocks)
         tries = [0] * len(blocks)
         waiting = list(range(len(blocks) - 1, -1, -1))
         running: dict[Future[Any], int] = {}
         while waiting or running:
             # no more than the pool has hands for: when a worker dies, only blocks that were begun are charged a try
             while waiting and len(running) < 2 * self._count:
-                row = waiting.pop()
-                running[self._submit(task, blocks[row])] = row
+                try:
+                    future = self._submit(task, blocks[waiting[-1]])
+                except BrokenProcessPool:  # a worker died with nothing to do, or a moment ago
+                    break
+                running[future] = waiting.pop()
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             lost = [running[future] for future in finished if isinstance(future.exception(), BrokenProcessPool)]
             for future in finished:
                 row = running.pop(future)
                 if row not in lost:
                     yield row, future.result()
-            if lost:
+            if lost or not finished:
                 lost += running.values()
                 running.clear()
                 self._recover(lost, tries)
@@ -103,7 +110,8 @@ class SpawnedWorkers:
         # a submission may start a process, which takes the environment and the main module as they are now
         with _environment(SINGLE_THREADED), _hidden_main():
             if self._pool is None:
-                self._pool = ProcessPoolExecutor(self._count, mp_context=multiprocessing.get_context("spawn"))
+                spawn = multiprocessing.get_context("spawn")
+                self._pool = ProcessPoolExecutor(self._count, mp_context=spawn, initializer=_end_with_parent)
             return self._pool.submit(task, block)
 
     def kill(self) -> None:
@@ -117,6 +125,32 @@ class SpawnedWorkers:
             process.kill()
         for process in processes:
             process.join()
+
+
+def _cores() -> int:
+    """Cores that this process may use; macOS and Windows only say how many there are."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent is killed: workers hold each other's queue open, so they would wait for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_exit_after, args=(parent.sentinel,), daemon=True).start()
+
+
+def _exit_after(sentinel: int) -> None:
+    wait_for_end([sentinel])
+    os._exit(1)
+
+
+def _refuse_main(task: Callable[[Task], Result], blocks: Sequence[Task]) -> None:
+    """One clear line for what a worker could not load, since it never runs the user's script."""
+    if blocks and b"__main__" in pickle.dumps((task, blocks[0])):
+        raise WorkerError(
+            "a stage or function is defined in the script or notebook itself, which workers do not load: "
+            "move it into a module of its own and import it, or use the executor local with workers: 0"
+        )
 
 
 @contextmanager
