@@ -9,12 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from complex_graphs import random_motions
 from hodge_pipeline import se3
 from hodge_pipeline.cli.paper_picture import draw_comparison
 from hodge_pipeline.cli.paper_sequences import find_sequences, peer_poses
-from hodge_pipeline.errors import SourceError
+from hodge_pipeline.cli.papering import papering
+from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.evaluation.paper_tables import (
     PAPER_SCORES,
     SEQUENCES,
@@ -174,3 +177,15 @@ def test_the_picture_shows_every_set_of_poses_from_the_same_places(tmp_path: Pat
     half = len(two) // 2
     assert is_red[:half].sum() > 1000
     assert 0.6 < is_red[half:].sum() / is_red[:half].sum() < 1.0, "one frame of six is missing"
+
+
+def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    runner = CliRunner()
+    app = typer.Typer()
+    app.command()(papering)
+    empty = runner.invoke(app, ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")])
+    assert isinstance(empty.exception, SourceError) and "redkitchen: not present" in str(empty.exception)
+    for peer, message in (("bundlefusion", "NAME=DIR"), (f"x={tmp_path / 'none'}", "no such folder")):
+        refused = runner.invoke(app, ["--data", str(tmp_path / "data"), "--peer", peer])
+        assert isinstance(refused.exception, RecipeError) and message in str(refused.exception)

@@ -13,7 +13,7 @@ import typer
 from hodge_pipeline import artifacts
 from hodge_pipeline.cli.console import Terminal
 from hodge_pipeline.cli.paper_sequences import Found, find_sequences, peer_poses
-from hodge_pipeline.errors import HodgeError, RecipeError
+from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
 from hodge_pipeline.evaluation import paper_tables
 from hodge_pipeline.evaluation.paper_tables import NAN, Measured, Results
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphKind, score_table
@@ -56,7 +56,11 @@ def papering(
     Writes paper.md, paper.html, paper.csv and a picture for each sequence into --out.
     """
     peer_name, peer_folder = _peer_of(peer)
-    found, missing = find_sequences(data or default_data(), frames)
+    data = data or default_data()
+    found, missing = find_sequences(data, frames)
+    if not found:
+        names = "; ".join(f"{name}: {why}" for name, why in missing.items())
+        raise SourceError(f"{data}: holds none of the paper's sequences ({names})")
     out.mkdir(parents=True, exist_ok=True)
     measured: dict[str, dict[GraphKind, Measured]] = {}
     pictures: dict[str, str] = {}
@@ -77,6 +81,9 @@ def papering(
     artifacts.write_text(out / "paper.html", paper_tables.as_html(tables, HEADING, pictures))
     print(paper_tables.as_markdown(tables, HEADING))
     print(f"The same as a page with pictures: {out / 'paper.html'}")
+    failed = [f"{name} {why}" for name, why in missing.items() if why.startswith("failed")]
+    if failed:
+        raise SourceError("; ".join(failed))
 
 
 def _peer_of(option: str | None) -> tuple[str, Path | None]:
