@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -15,17 +13,13 @@ from pydantic.dataclasses import dataclass as stage
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.certificate import Certificate, certify
-from hodge_pipeline.solvers.full import FullObjective
-from hodge_pipeline.solvers.newton import Descent, Limits, Point, descend
-from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
+from hodge_pipeline.solvers.minimise import cost_at_start, metrics_of, minimise
+from hodge_pipeline.solvers.newton import Limits, Point
 from hodge_pipeline.solvers.priors import Priors, with_world, without_world
 from hodge_pipeline.solvers.setup import NO_ROWS, InitialName, Setup, prepare
 from hodge_pipeline.types import Floats, Ints, Solution, SolverIteration, ViewGraph
 
 ObjectiveName: TypeAlias = Literal["isotropic", "full"]
-Watch: TypeAlias = Callable[[Point], None]
-WARM_START_TOLERANCE = 1e-4
-"""The isotropic optimum starts the full objective: nearer than this they differ anyway."""
 SEVERAL_FIXED = "not certified: with several fixed vertices to a component the dual is another one"
 
 
@@ -95,40 +89,26 @@ def solve(
             history.append(SolverIteration(setup.poses(point), point.cost))
 
     limits = Limits(max_iterations, relative_tolerance, time.monotonic() + time_limit_s)
-    descent = _descend(setup, initial, limits, full, watch)
+    descent = minimise(setup, initial, limits, full, watch)
     if not descent.converged:
         notes.append(f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far")
-    metrics = _metrics(descent, full)
+    metrics = metrics_of(descent, full)
     if start is not None:
-        metrics["objective_at_start"] = _cost_at_start(setup, full)
+        metrics["objective_at_start"] = cost_at_start(setup, full)
     if certificate and full:
         notes.append("only the isotropic objective can be certified")
     elif certificate:
         answer = _certify(setup, descent.point)
         if not answer.optimal and initial == "given":
-            other = _descend(setup, "chordal", limits, full, watch)
+            other = minimise(setup, "chordal", limits, full, watch)
             if other.point.cost < descent.point.cost:
                 notes.append(f"the start led to a local minimum, F = {descent.point.cost:.9g}: solved again without it")
                 descent, answer = other, _certify(setup, other.point)
-                metrics |= _metrics(descent, full)
+                metrics |= metrics_of(descent, full)
         notes.append(answer.note)
         metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
     weights = setup.weights.used.astype(float)
     return Solution(setup.poses(descent.point), setup.component, weights, tuple(history), metrics, tuple(notes))
-
-
-def _descend(setup: Setup, initial: InitialName, limits: Limits, full: bool, watch: Watch) -> Descent:
-    """The descent of the isotropic objective, and from there, where wanted, of the full one."""
-    isotropic = IsotropicObjective(setup.problem)
-    loose = replace(limits, relative_tolerance=max(limits.relative_tolerance, WARM_START_TOLERANCE))
-    point = isotropic.at(*setup.initial(initial))
-    warm = descend(isotropic, point, loose if full else limits, setup.rounding, watch)
-    if not full:
-        return warm
-    objective = FullObjective(setup.problem, setup.weights.information[setup.weights.used])
-    first = objective.at(warm.point.rotations, warm.point.translations)
-    descent = descend(objective, first, limits.after(len(warm.costs) - 1), setup.rounding, watch)
-    return replace(descent, cg_steps=descent.cg_steps + warm.cg_steps)
 
 
 def _certify(setup: Setup, point: Point) -> Certificate:
@@ -136,23 +116,6 @@ def _certify(setup: Setup, point: Point) -> Certificate:
     if problem.count - problem.free_count > setup.component.max(initial=-1) + 1:
         return Certificate(False, 0.0, math.inf, 0, SEVERAL_FIXED)
     return certify(problem, point.rotations, point.translations, point.cost)
-
-
-def _cost_at_start(setup: Setup, full: bool) -> float:
-    given = setup.initial("given")
-    if full:
-        return FullObjective(setup.problem, setup.weights.information[setup.weights.used]).at(*given).cost
-    return residuals(setup.problem, *given).cost
-
-
-def _metrics(descent: Descent, full: bool) -> dict[str, float]:
-    return {
-        "objective": descent.point.cost,
-        "chi2" if full else "isotropic": descent.point.cost,
-        "iterations": float(len(descent.costs) - 1),
-        "cg_steps": float(descent.cg_steps),
-        "converged": float(descent.converged),
-    }
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

@@ -48,6 +48,31 @@ def factorise(matrix: csc_matrix | csr_matrix, ordering: str = "auto", single: b
     return Factor(size, factor.solve)
 
 
+def corrected(factor: Factor, ends: Ints, change: Floats) -> Factor:
+    """The factor of a graph Laplacian whose edges `ends (k, 2)` weigh `change (k,)` more: Woodbury's formula.
+
+    Positions beyond the factor's size are pinned. The new matrix must not be singular.
+    """
+    if not len(ends):
+        return factor
+    columns = np.zeros((factor.size + 1, len(ends)))
+    place = np.minimum(ends, factor.size)
+    each = np.arange(len(ends))
+    columns[place[:, 0], each] += 1.0
+    columns[place[:, 1], each] -= 1.0
+    solved = factor.solve(columns[:-1])
+    padded = np.vstack([solved, np.zeros(len(ends))])
+    capacitance = np.eye(len(ends)) + change[:, None] * (padded[place[:, 0]] - padded[place[:, 1]])
+    weighted = np.linalg.solve(capacitance.T, solved.T).T * change
+
+    def solve(rhs: Floats) -> Floats:
+        first = factor.solve(rhs)
+        padded = np.concatenate([first, np.zeros_like(first[:1])])
+        return np.asarray(first - weighted @ (padded[place[:, 0]] - padded[place[:, 1]]))
+
+    return Factor(factor.size, solve)
+
+
 def fill_reducing_order(laplacian: csc_matrix | csr_matrix) -> Ints:
     """Rows of a positive definite graph Laplacian (n,) in the order of elimination.
 

@@ -7,17 +7,19 @@ components, so that a planar graph is solved as one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 
-from hodge_pipeline.solvers.linear import Factor, factorise, fill_reducing_order
+from hodge_pipeline.solvers.linear import Factor, corrected, factorise, fill_reducing_order
 from hodge_pipeline.types import Bools, Floats, Ints
 
 SAME_RATIO = 1e-13
+MOST_CORRECTIONS = 32
+"""Edges whose weights a factor follows by a low-rank correction; a new one costs about as much as this many solves."""
 
 
 CHUNK = 1 << 14
@@ -63,7 +65,9 @@ class BlockPattern:
             entries = (np.ones(len(kept)), (inverse.reshape(-1), kept))
             pieces.append(
                 _Piece(
-                    edges, np.searchsorted(unique, found).astype(np.int64), csr_matrix(entries, (len(found), len(part)))
+                    edges,
+                    np.asarray(np.searchsorted(unique, found), np.int64),
+                    csr_matrix(entries, (len(found), len(part))),
                 )
             )
         indptr = np.searchsorted(unique, np.arange(shape[0] + 1) * shape[1]).astype(np.int32)
@@ -117,14 +121,26 @@ class Structure:
 
 
 @dataclass(frozen=True)
+class Factors:
+    """The Laplacians of κ and of τ, factorised."""
+
+    rotation: Factor
+    translation: Factor
+
+
+@dataclass(frozen=True)
 class Problem:
-    """Edges and weights of one pose graph: `rotations (E, d, d)`, `translations (E, d)` of i_from_j, κ and τ (E,)."""
+    """Edges and weights of one pose graph: `rotations (E, d, d)`, `translations (E, d)` of i_from_j, κ and τ (E,).
+
+    `factors`: where they are known already.
+    """
 
     structure: Structure
     rotations: Floats
     translations: Floats
     kappa: Floats
     tau: Floats
+    factors: Factors | None = None
 
     @property
     def order(self) -> Ints:
@@ -164,11 +180,15 @@ class Problem:
     @cached_property
     def rotation_factor(self) -> Factor:
         """The scalar Laplacian of κ, factorised once."""
+        if self.factors is not None:
+            return self.factors.rotation
         return factorise(laplacian(self.tail, self.head, self.kappa, self.free_count), "NATURAL")
 
     @cached_property
     def translation_factor(self) -> Factor:
         """The scalar Laplacian of τ, factorised once: that of κ, where every edge has the same ratio of the two."""
+        if self.factors is not None:
+            return self.factors.translation
         ratio = self.tau / self.kappa
         if len(ratio) and np.ptp(ratio) <= SAME_RATIO * ratio[0]:
             solve, scale = self.rotation_factor.solve, 1 / ratio[0]
@@ -188,6 +208,22 @@ def laplacian(tail: Ints, head: Ints, weights: Floats, free_count: int) -> csc_m
     values = np.concatenate([weights, weights, -weights, -weights])
     kept = (rows < free_count) & (columns < free_count)
     return csc_matrix((values[kept], (rows[kept], columns[kept])), shape=(free_count, free_count))
+
+
+def reweighted(problem: Problem, scale: Floats) -> Problem:
+    """The problem with its weights times `scale (E,)`, 0 allowed while the edges left keep the vertices together.
+
+    Where few differ from 1, its factors are corrected and not made again.
+    """
+    changed = np.flatnonzero(scale != 1)
+    new = replace(problem, kappa=scale * problem.kappa, tau=scale * problem.tau, factors=None)
+    if len(changed) > MOST_CORRECTIONS:
+        return new
+    change = scale[changed] - 1
+    ends = np.stack([problem.tail[changed], problem.head[changed]], axis=1)
+    rotation = corrected(problem.rotation_factor, ends, change * problem.kappa[changed])
+    translation = corrected(problem.translation_factor, ends, change * problem.tau[changed])
+    return replace(new, factors=Factors(rotation, translation))
 
 
 def make_problem(

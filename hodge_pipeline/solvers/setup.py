@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -46,6 +46,10 @@ class Setup:
         poses = np.broadcast_to(np.eye(4), (len(order), 4, 4)).copy()
         poses[order, :d, :d], poses[order, :d, 3] = point.rotations, point.translations
         return np.asarray(self.gauge @ poses)
+
+    def started(self, start: Floats) -> Setup:
+        """The same with other start poses (V, 4, 4); the vertices that are held must lie where they did."""
+        return replace(self, start=se3.inverse(self.gauge) @ start)
 
     def initial(self, name: InitialName) -> tuple[Floats, Floats]:
         """Rotations (n, d, d) and translations (n, d) in the problem's order to begin with."""

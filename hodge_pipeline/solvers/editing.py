@@ -1,0 +1,183 @@
+"""A pose graph under a person's hands: switch edges off and on, weigh or add them, solve again, take it back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.hodge import ObjectiveName
+from hodge_pipeline.solvers.minimise import metrics_of, minimise
+from hodge_pipeline.solvers.newton import Limits
+from hodge_pipeline.solvers.priors import PER_EDGE
+from hodge_pipeline.solvers.problem import reweighted
+from hodge_pipeline.solvers.setup import InitialName, Setup, prepare
+from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
+
+LIMITS = Limits(max_iterations=100, relative_tolerance=1e-9)
+
+
+@dataclass(frozen=True)
+class _State:
+    """What `undo` comes back to: the edges, their weights relative to their information, the latest solution."""
+
+    graph: ViewGraph
+    weights: Floats
+    solution: Solution
+
+
+@dataclass(frozen=True)
+class _Base:
+    """The set-up of some edges with their factors, which later solves with other weights start from."""
+
+    graph: ViewGraph
+    rows: Ints
+    setup: Setup
+
+    @property
+    def used(self) -> Ints:
+        """Rows of the graph's edges, in the problem's order."""
+        return self.rows[self.setup.weights.used]
+
+
+class GraphEditor:
+    """A graph and its solution, kept together through edits.
+
+        editor = GraphEditor(graph, solve(graph))
+        editor.disable([17])
+        better = editor.solve()
+        editor.undo()
+
+    Edges are named by their rows. A solve after an edit begins at the present poses, with the factors of the
+    first one corrected for the edges that changed; where pieces part or join, or edges are new, the graph is set up
+    again.
+    """
+
+    def __init__(
+        self, graph: ViewGraph, solution: Solution | None = None, *, objective: ObjectiveName = "full"
+    ) -> None:
+        if solution is not None and (
+            solution.world_from_cam.shape != (graph.vertex_count, 4, 4) or len(solution.weights) != graph.edge_count
+        ):
+            raise GraphError("the solution is not of this graph: its poses or weights have another count")
+        self._objective: ObjectiveName = objective
+        self._history: list[_State] = []
+        setup = prepare(graph, None if solution is None else solution.world_from_cam)
+        self._base = _Base(graph, np.arange(graph.edge_count), setup)
+        if solution is None:
+            solution = self._minimum(self._base, setup, "chordal")
+        self._state = _State(graph, np.asarray(solution.weights, float).copy(), solution)
+
+    @property
+    def graph(self) -> ViewGraph:
+        """All edges, disabled ones too."""
+        return self._state.graph
+
+    @property
+    def weights(self) -> Floats:
+        """The weight (E,) of each edge relative to its information; 0: disabled."""
+        return np.array(self._state.weights)
+
+    @property
+    def solution(self) -> Solution:
+        """The latest solution: that of the edges as they were when it was made."""
+        return self._state.solution
+
+    def disable(self, rows: Sequence[int] | Ints) -> None:
+        """Switch edges off."""
+        self.reweight(rows, 0.0)
+
+    def restore(self, rows: Sequence[int] | Ints) -> None:
+        """Give edges their own information again."""
+        self.reweight(rows, 1.0)
+
+    def reweight(self, rows: Sequence[int] | Ints, weight: ArrayLike) -> None:
+        """Let edges count as their information times a weight, one for all or one for each."""
+        chosen = np.asarray(rows, np.int64).reshape(-1)
+        wrong = (chosen < 0) | (chosen >= self.graph.edge_count)
+        if wrong.any():
+            raise GraphError(
+                f"there is no edge {chosen[np.argmax(wrong)]}: rows go from 0 to {self.graph.edge_count - 1}"
+            )
+        values = np.asarray(weight, float)
+        if not np.isfinite(values).all() or (values < 0).any():
+            raise GraphError(f"edge weights must be finite and not negative, got {values.tolist()}")
+        weights = self.weights
+        weights[chosen] = values
+        self._remember(replace(self._state, weights=weights))
+
+    def add(self, edges: Ints, i_from_j: Floats, information: Floats | None = None) -> Ints:
+        """The rows (K,) of new edges, between vertex rows (K, 2) of this graph."""
+        old = self.graph
+        added = ViewGraph.from_edges(old.vertex_ids, edges, i_from_j, information, "added")
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(old, name), getattr(added, name)]) for name in PER_EDGE
+        }
+        graph = replace(old, **columns)
+        weights = np.concatenate([self._state.weights, np.ones(added.edge_count)])
+        self._remember(replace(self._state, graph=graph, weights=weights))
+        return np.arange(old.edge_count, graph.edge_count)
+
+    def undo(self) -> None:
+        """Take back the last edit, and the solve after it. Raises `GraphError` where there is none."""
+        if not self._history:
+            raise GraphError("there is no edit to undo")
+        self._state = self._history.pop()
+
+    def solve(self) -> Solution:
+        """The optimum of the edges as they are now."""
+        base = self._fitting_base()
+        weights, scale = base.setup.weights, self._state.weights
+        information = weights.information
+        if self._objective == "full" and len(changed := np.flatnonzero(scale[base.rows] != 1)):
+            information = information.copy()
+            information[changed] *= scale[base.rows[changed], None, None]
+        setup = replace(
+            base.setup.started(self._state.solution.world_from_cam),
+            problem=reweighted(base.setup.problem, scale[base.used]),
+            weights=replace(weights, information=information),
+        )
+        solution = self._minimum(base, setup, "given")
+        used = np.zeros(self.graph.edge_count)
+        used[base.used] = scale[base.used]
+        self._state = replace(self._state, solution=replace(solution, weights=used))
+        return self._state.solution
+
+    def _minimum(self, base: _Base, setup: Setup, initial: InitialName) -> Solution:
+        full = self._objective == "full" and setup.weights.definite
+        descent = minimise(setup, initial, LIMITS, full, known=initial == "given")
+        notes = (*setup.weights.notes, *describe_components(setup.component, base.graph.vertex_ids))
+        weights = setup.weights.used.astype(float)
+        return Solution(
+            setup.poses(descent.point), setup.component, weights, metrics=metrics_of(descent, full), notes=notes
+        )
+
+    def _remember(self, new: _State) -> None:
+        self._history.append(self._state)
+        self._state = new
+
+    def _fitting_base(self) -> _Base:
+        """The set-up that the present weights are a change of; made anew where the one at hand is not."""
+        if self._base.graph is not self.graph or not self._fits(self._base):
+            everything = self._make_base(np.arange(self.graph.edge_count))
+            fits = self._fits(everything)
+            self._base = everything if fits else self._make_base(np.flatnonzero(self._state.weights > 0))
+        return self._base
+
+    def _fits(self, base: _Base) -> bool:
+        """Whether its edges hold all that count now, and fall into the same pieces."""
+        counted = self._state.weights > 0
+        left_out = counted.copy()
+        left_out[base.rows] = False
+        joining = base.used[counted[base.used]]
+        component = connected_components(self.graph.edges[joining], self.graph.vertex_count)
+        return not left_out.any() and bool(np.array_equal(component, base.setup.component))
+
+    def _make_base(self, rows: Ints) -> _Base:
+        start = self._state.solution.world_from_cam
+        return _Base(self.graph, rows, prepare(self.graph.select(rows), start, self.graph.fixed))
