@@ -5,10 +5,11 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test lint format clean
+.PHONY: help setup demo paper test lint format clean
 help:
 	@echo "make setup   system libraries, $(VENV) and everything in it"
 	@echo "make demo    make a room, reconstruct it: runs/demo"
+	@echo "make paper   the paper's tables for every sequence that is there: runs/paper"
 	@echo "make test    the tests"
 	@echo "make lint    ruff, mypy, import directions"
 
@@ -23,6 +24,9 @@ setup: $(STAMP)
 demo: $(STAMP)
 	$(BIN)/hodge demo --out runs/demo
 	@echo "open runs/demo/report.html, or: $(BIN)/hodge view runs/demo"
+
+paper: $(STAMP)
+	$(BIN)/python -m hodge_pipeline.cli.papering $(PAPER_ARGS)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
