@@ -1,0 +1,155 @@
+"""From frames to clouds: hand answers, order, colours, and what happens to frames that give nothing."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.executors.local import InProcess
+from hodge_pipeline.registration.clouds import CloudOptions, make_cloud, prepare_clouds
+from hodge_pipeline.types import Camera, CloudSet, Frame, PointCloud
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
+WALL_M = 1.995  # the middle of a 3 cm voxel, so that rounding never splits the wall in two
+
+
+class Backwards:
+    """Workers that finish the last block first."""
+
+    def map(self, task: Callable[[Any], Any], blocks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        return ((row, task(blocks[row])) for row in reversed(range(len(blocks))))
+
+
+def wall(z: float) -> np.ndarray:
+    return np.full((CAMERA.height, CAMERA.width), z, np.float32)
+
+
+def unreadable() -> np.ndarray:
+    raise SourceError("depth/7.png: truncated: copy it again")
+
+
+def frame(depth: np.ndarray, frame_id: int = 0, **more: Any) -> Frame:
+    return Frame(frame_id, float(frame_id), CAMERA, read_depth=lambda: depth, **more)
+
+
+def test_a_wall_gives_its_plane_and_normals_towards_the_camera() -> None:
+    cloud, counts = make_cloud(frame(wall(WALL_M)), CloudOptions())
+    assert np.allclose(cloud.points_in_cam[:, 2], WALL_M, atol=1e-6)
+    assert np.allclose(cloud.normals_in_cam, [0, 0, -1], atol=1e-4)
+    assert counts.looked_at == counts.valid == 24 * 32
+    assert counts.points == len(cloud)
+    corner = [-32 / 60 * WALL_M, -24 / 60 * WALL_M]
+    assert np.allclose(cloud.points_in_cam[:, :2].min(axis=0), corner, atol=0.03)
+
+
+def test_one_pixel_is_back_projected_where_the_camera_equation_says() -> None:
+    depth = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    depth[10, 50] = 1.5
+    flipped = Camera(64, 48, 60.0, -60.0, 32.0, 24.0)  # ICL-NUIM: y points up
+    for camera, y in ((CAMERA, (10 - 24) / 60 * 1.5), (flipped, -(10 - 24) / 60 * 1.5)):
+        cloud, counts = make_cloud(Frame(0, 0.0, camera, read_depth=lambda: depth), CloudOptions())
+        assert np.allclose(cloud.points_in_cam, [[(50 - 32) / 60 * 1.5, y, 1.5]], atol=1e-6)
+        assert counts.valid == 1
+        assert np.array_equal(cloud.normals_in_cam, [[0, 0, 0]])  # too few points for a plane
+
+
+@pytest.mark.parametrize("z", [0.0, 0.1, 6.5, np.nan, np.inf, -1.0])
+def test_what_is_out_of_range_is_an_empty_cloud_with_a_note(z: float) -> None:
+    cloud, counts = make_cloud(frame(wall(z), frame_id=3), CloudOptions())
+    assert len(cloud) == counts.valid == 0
+    assert "frame 3: no valid measurement" in counts.note
+
+
+def test_colours_are_averaged_and_an_image_of_another_size_is_looked_up() -> None:
+    image = np.zeros((CAMERA.height * 2, CAMERA.width * 2, 3), np.uint8)
+    image[:, CAMERA.width :] = [200, 100, 50]
+    cloud, _ = make_cloud(frame(wall(WALL_M), read_colour=lambda: image), CloudOptions())
+    assert cloud.colours is not None
+    x = cloud.points_in_cam[:, 0]
+    assert (cloud.colours[x < -0.05] == 0).all()
+    assert (cloud.colours[x > 0.05] == [200, 100, 50]).all()
+
+
+def test_a_colour_image_that_cannot_be_read_costs_the_colours_alone() -> None:
+    cloud, counts = make_cloud(frame(wall(WALL_M), frame_id=7, read_colour=unreadable), CloudOptions())
+    assert len(cloud) > 100
+    assert not cloud.colours.any()
+    assert "frame 7: its cloud has no colours: depth/7.png" in counts.note
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_the_order_of_a_scanners_points_does_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (300, 3)).astype(np.float32)
+    clouds = [
+        make_cloud(Frame(0, 0.0, read_points=partial(PointCloud, part)), CloudOptions(voxel_m=0.2))[0].points_in_cam
+        for part in (points, rng.permutation(points))
+    ]
+    assert np.allclose(*clouds, atol=1e-6)
+
+
+def test_a_scanners_range_is_a_distance_and_lost_points_are_dropped() -> None:
+    points = np.array([[-3, 0, 0], [0, 0, -7], [np.nan, 0, 1], [np.inf, 0, 1], [0.05, 0, 0]], np.float32)
+    cloud, counts = make_cloud(Frame(0, 0.0, read_points=lambda: PointCloud(points)), CloudOptions())
+    assert np.array_equal(cloud.points_in_cam, [[-3, 0, 0]])
+    assert (counts.looked_at, counts.valid) == (5, 1)
+
+
+def test_clouds_come_in_the_order_of_the_frames_and_bad_frames_are_said() -> None:
+    frames = [frame(wall(0.5 + 0.1 * k), k) for k in range(40)]
+    frames[7] = Frame(7, 7.0, CAMERA, read_depth=unreadable)
+    frames[9] = frame(wall(0.0), 9)
+    done: list[int] = []
+    clouds, notes = prepare_clouds(frames, CloudOptions(), Backwards(), done.append)
+    depths = [cloud.points_in_cam[:, 2].mean() for row, cloud in enumerate(clouds) if row not in (7, 9)]
+    assert np.allclose(depths, [0.5 + 0.1 * k for k in range(40) if k not in (7, 9)], atol=1e-5)
+    assert clouds.sizes[[7, 9]].tolist() == [0, 0]
+    assert [note.split(":")[0] for note in notes] == ["frame 7", "frame 9"]
+    assert "truncated: copy it again" in notes[0]
+    assert sum(done) == 40
+
+
+def test_no_cloud_at_all_is_an_error_with_the_first_reason() -> None:
+    for frames, reason in (
+        ([Frame(k, 0.0, CAMERA, read_depth=unreadable) for k in range(3)], "none of the 3 frames.*truncated"),
+        ([Frame(0, 0.0)], "needs depth with a camera, or points"),
+        ([], "no frames"),
+    ):
+        with pytest.raises(SourceError, match=reason):
+            prepare_clouds(frames, CloudOptions(), InProcess())
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"min_range_m": 2.0, "max_range_m": 1.0}, {"voxel_m": 1e-9}, {"stride": 0}, {"voxel": 0.1}],
+)
+def test_options_that_mean_nothing_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        CloudOptions(**options)
+
+
+def test_a_real_frame(data_dir: Path, tmp_path: Path) -> None:
+    from hodge_adapters.seven_scenes import SevenScenesReader
+
+    path = data_dir / "seven_scenes" / "redkitchen"
+    if not path.is_dir():
+        pytest.skip(f"no {path}")
+    frames = SevenScenesReader().open(path).frames[:2]
+    clouds, notes = prepare_clouds(frames, CloudOptions(), InProcess())
+    clouds.save(tmp_path)
+    read = CloudSet.open(tmp_path)
+    assert notes == ()
+    assert 8000 < read.sizes[0] < 9500
+    for cloud in read:
+        lengths = np.linalg.norm(cloud.normals_in_cam, axis=1)
+        assert np.allclose(lengths, 1, atol=1e-3)
+        assert (np.einsum("ij,ij->i", cloud.normals_in_cam, cloud.points_in_cam) <= 0).all()
+        assert cloud.colours.any(axis=1).mean() > 0.95

@@ -1,0 +1,160 @@
+"""Pairs in blocks and odometry: the same on any workers, resumed or not; lost and empty frames are said."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.executors.dask import DaskExecutor
+from hodge_pipeline.executors.local import LocalExecutor
+from hodge_pipeline.registration import odometry as odometry_stage
+from hodge_pipeline.registration import pairs as pair_stage
+from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.odometry import OdometryOptions, odometry
+from hodge_pipeline.registration.pairs import Acceptance, Registered, register_pairs
+from hodge_pipeline.stages import Executor
+from hodge_pipeline.types import CloudSet, Floats, PointCloud
+from test_registration import corner
+
+FRAMES = 12
+STEP = np.array([0.01, 0.03, -0.005, 0.03, 0.0, 0.02])
+EMPTY = PointCloud(np.zeros((0, 3), np.float32))
+HERE = LocalExecutor(workers=0)
+
+
+def path_of(count: int) -> Floats:
+    """A camera that turns and moves by the same step from frame to frame."""
+    return se3.exp(np.arange(count)[:, None] * STEP)
+
+
+def seen_from(world_from_cam: Floats, seed: int) -> PointCloud:
+    points, normals, _ = corner(seed, count=3000)
+    cam_from_world = se3.inverse(world_from_cam)
+    rotated = (normals @ cam_from_world[:3, :3].T).astype(np.float32)
+    return PointCloud(se3.transform(cam_from_world, points).astype(np.float32), rotated)
+
+
+def saved(folder: Path, clouds: list[PointCloud]) -> Path:
+    CloudSet.from_clouds(clouds).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    clouds = [seen_from(pose, seed) for seed, pose in enumerate(path_of(FRAMES))]
+    return saved(tmp_path_factory.mktemp("clouds"), clouds)
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pair_stage, "PAIRS_IN_BLOCK", 4)
+    monkeypatch.setattr(odometry_stage, "STEPS_IN_BLOCK", 4)
+
+
+PAIRS = np.array([[k, k + gap] for gap in (1, 2) for k in range(FRAMES - gap)])[::-1]  # not in the order of the blocks
+
+
+def guesses() -> Floats:
+    poses = path_of(FRAMES)
+    return se3.inverse(poses[PAIRS[:, 0]]) @ poses[PAIRS[:, 1]] @ se3.exp(np.full(6, 0.01))
+
+
+def same_bits(a: Registered, b: Registered) -> bool:
+    return all(getattr(a, name).tobytes() == getattr(b, name).tobytes() for name in vars(a))
+
+
+def test_pairs_come_back_in_the_order_given_and_right(folder: Path) -> None:
+    done: list[int] = []
+    with HERE.open() as workers:
+        found = register_pairs(folder, Gicp(), PAIRS, guesses(), workers, done.append)
+    truth = path_of(FRAMES)
+    i, j = found.pairs.T
+    errors = se3.log(se3.inverse(se3.inverse(truth[i]) @ truth[j]) @ found.i_from_j)
+    assert np.array_equal(found.pairs, PAIRS)
+    assert np.abs(errors).max() < 0.01
+    assert sum(done) == len(PAIRS)
+    assert (Acceptance().reasons(found) == "").all()
+    graph = found.as_graph(np.arange(FRAMES), np.full(len(PAIRS), "overlap"))
+    assert (graph.vertex_count, graph.edge_count) == (FRAMES, len(PAIRS))
+
+
+@pytest.mark.parametrize("make", [lambda: LocalExecutor(workers=2), lambda: DaskExecutor(workers=2)])
+def test_every_executor_gives_the_same_bits(folder: Path, make: Callable[[], Executor]) -> None:
+    with HERE.open() as workers:
+        here = register_pairs(folder, Gicp(), PAIRS, guesses(), workers)
+    with make().open() as workers:
+        elsewhere = register_pairs(folder, Gicp(), PAIRS, guesses(), workers)
+    assert same_bits(here, elsewhere)
+
+
+def test_finished_blocks_are_not_registered_again(folder: Path) -> None:
+    kept: dict[int, Registered] = {}
+    with HERE.open() as workers:
+        whole = register_pairs(folder, Gicp(), PAIRS, guesses(), workers, on_block=kept.__setitem__)
+        assert sorted(kept) == list(range(6))
+        some = {block: kept[block] for block in (0, 3, 4)}
+        again: dict[int, Registered] = {}
+        resumed = register_pairs(folder, Gicp(), PAIRS, guesses(), workers, finished=some, on_block=again.__setitem__)
+    assert sorted(again) == [1, 2, 5]
+    assert same_bits(whole, resumed)
+
+
+def test_no_pairs_are_no_edges(folder: Path) -> None:
+    with HERE.open() as workers:
+        none = register_pairs(folder, Gicp(), np.zeros((0, 2), np.int64), np.zeros((0, 4, 4)), workers)
+    assert none.as_graph(np.arange(FRAMES), np.zeros(0, str)).edge_count == 0
+
+
+def test_rejected_pairs_say_why(folder: Path) -> None:
+    far = np.stack([np.eye(4), se3.exp(np.array([0, 0, 0, 90.0, 0, 0]))])
+    with HERE.open() as workers:
+        found = register_pairs(folder, Gicp(), np.array([[0, 1], [0, 2]]), far, workers)
+    assert Acceptance().reasons(found).tolist() == ["", "nothing in common"]
+    assert Acceptance(min_fitness=1.0, max_rmse_m=1e-6).reasons(found)[0] != ""
+    assert Acceptance(min_fitness=0.0, max_rmse_m=1e-6).reasons(found)[0] == "points too far apart"
+
+
+def test_odometry_follows_the_camera(folder: Path) -> None:
+    with HERE.open() as workers:
+        found = odometry(folder, [np.arange(FRAMES)], np.arange(FRAMES) / 30, OdometryOptions(), workers)
+    errors = se3.log(se3.inverse(path_of(FRAMES)) @ found.world_from_cam)
+    assert np.abs(errors).max() < 0.02
+    assert found.notes == ()
+    assert found.steps.pairs.tolist() == [[k, k + 1] for k in range(FRAMES - 1)]
+
+
+def test_empty_frames_are_bridged_and_a_lost_one_is_said(tmp_path: Path) -> None:
+    poses = path_of(8)
+    clouds = [seen_from(pose, seed) for seed, pose in enumerate(poses)]
+    clouds[3] = EMPTY
+    clouds[7] = PointCloud(clouds[7].points_in_cam + np.float32(50))  # nothing in common with the frame before
+    with HERE.open() as workers:
+        found = odometry(saved(tmp_path, clouds), [np.arange(8)], np.arange(8.0), OdometryOptions(), workers)
+    assert [2, 4] in found.steps.pairs.tolist()
+    assert 7 not in found.steps.pairs
+    assert len(found.notes) == 1
+    assert "rows 6 and 7" in found.notes[0]
+    good = [0, 1, 2, 4, 5, 6]
+    assert np.abs(se3.log(se3.inverse(poses[good]) @ found.world_from_cam[good])).max() < 0.02
+    assert np.array_equal(found.world_from_cam[3], found.world_from_cam[2])
+    assert np.abs(se3.log(se3.inverse(poses[7]) @ found.world_from_cam[7])).max() < 0.05  # constant velocity
+
+
+def test_sequences_are_not_joined_and_stand_apart(folder: Path) -> None:
+    halves = [np.arange(6), np.arange(6, FRAMES)]
+    with HERE.open() as workers:
+        found = odometry(folder, halves, np.zeros(FRAMES), OdometryOptions(), workers)
+    assert [5, 6] not in found.steps.pairs.tolist()
+    assert found.world_from_cam[6, 0, 3] - found.world_from_cam[5, 0, 3] > 10
+    assert np.array_equal(found.world_from_cam[6, :3, :3], np.eye(3))
+
+
+def test_odometry_is_the_same_on_two_workers(tmp_path_factory: pytest.TempPathFactory, folder: Path) -> None:
+    runs = []
+    for executor in (HERE, LocalExecutor(workers=2)):
+        with executor.open() as workers:
+            runs.append(odometry(folder, [np.arange(FRAMES)], np.arange(FRAMES) / 30, OdometryOptions(), workers))
+    assert runs[0].world_from_cam.tobytes() == runs[1].world_from_cam.tobytes()
+    assert same_bits(runs[0].steps, runs[1].steps)
