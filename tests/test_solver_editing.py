@@ -138,3 +138,19 @@ def test_a_corrected_factor_is_that_of_the_changed_laplacian():
     found = corrected(factor, ends, (new - weights)[changed])
     rhs = rng.normal(size=(9, 3))
     np.testing.assert_allclose(laplacian(tail, head, new, 9) @ found.solve(rhs), rhs, atol=1e-12)
+
+
+def test_a_change_settles_nearby_first():
+    """On a grid of 90 x 90 the edit is solved in its neighbourhood, then everywhere: the same minimum."""
+    side, rng = 90, np.random.default_rng(1)
+    grid = np.arange(side * side).reshape(side, side)
+    edges = np.concatenate(
+        [np.stack([a.ravel(), b.ravel()], axis=1) for a, b in ((grid[1:], grid[:-1]), (grid[:, 1:], grid[:, :-1]))]
+    )
+    graph = ViewGraph.from_edges(grid.ravel(), edges, se3.exp(0.05 * rng.normal(size=(len(edges), 6))))
+    editor = GraphEditor(graph, objective="isotropic")
+    editor.disable([4000])
+    warm = editor.solve()
+    assert warm.metrics["iterations"] <= 2
+    cold = solve(scaled(graph, editor.weights), objective="isotropic")
+    assert warm.metrics["objective"] == pytest.approx(cold.metrics["objective"], rel=2e-9)

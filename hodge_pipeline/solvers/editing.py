@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.hodge import ObjectiveName
+from hodge_pipeline.solvers.local import settled_nearby
 from hodge_pipeline.solvers.minimise import metrics_of, minimise
 from hodge_pipeline.solvers.newton import Limits
 from hodge_pipeline.solvers.priors import PER_EDGE
@@ -142,7 +143,11 @@ class GraphEditor:
             problem=reweighted(base.setup.problem, scale[base.used]),
             weights=replace(weights, information=information),
         )
-        solution = self._minimum(base, setup, "given")
+        full = self._objective == "full" and weights.definite
+        before = np.zeros_like(scale)
+        before[: len(self._state.solution.weights)] = self._state.solution.weights
+        moved = np.flatnonzero(scale[base.used] != before[base.used])
+        solution = self._minimum(base, settled_nearby(setup, moved, LIMITS, full), "given")
         used = np.zeros(self.graph.edge_count)
         used[base.used] = scale[base.used]
         self._state = replace(self._state, solution=replace(solution, weights=used))
