@@ -27,12 +27,12 @@ class Features:
     def __init__(self, frames: Sequence[Frame], rows: Ints, max_features: int) -> None:
         self._file = tempfile.TemporaryFile(prefix="hodge-sift-")  # noqa: SIM115 - lives as long as the features
         size = max(1, len(rows)) * max_features * DESCRIPTOR_LENGTH
-        self._bytes = np.memmap(self._file, np.uint8, "w+", shape=(size,))
-        self._bytes = self._bytes.reshape(-1, max_features, DESCRIPTOR_LENGTH)
+        column = np.memmap(self._file, np.uint8, "w+", shape=(size,))
+        self._bytes: Bytes = column.reshape(-1, max_features, DESCRIPTOR_LENGTH)
         self._place = {int(row): place for place, row in enumerate(rows)}
         self._points: list[Floats32] = []
         self.complaints: list[str] = []
-        detector = cv2.SIFT_create(nfeatures=max_features)
+        detector = cv2.SIFT_create(nfeatures=max_features)  # type: ignore[attr-defined]
         for place, row in enumerate(rows):
             points, descriptors = self._detect(detector, frames[int(row)])
             points, descriptors = points[:max_features], descriptors[:max_features]  # equal responses can exceed it
