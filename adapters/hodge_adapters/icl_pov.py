@@ -103,7 +103,8 @@ def read_pose(path: Path, units_per_metre: float) -> Floats | None:
         return None
     position, ahead, up = np.array(found)
     right = np.cross(up, ahead)
-    if not np.isfinite([position, ahead, right]).all() or min(np.linalg.norm(ahead), np.linalg.norm(right)) < 1e-9:
+    lengths = np.linalg.norm([ahead, up, right], axis=1)
+    if not np.isfinite([position, ahead, right]).all() or not ((lengths > 1e-9) & (lengths < 1e9)).all():
         return None
     z, x = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
     return se3.from_parts(np.column_stack([x, np.cross(z, x), z]), position / units_per_metre)

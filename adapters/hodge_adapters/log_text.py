@@ -37,15 +37,17 @@ def read_log_file(path: Path) -> LogFile:
     if not rows or len(rows) % 5:
         raise SourceError(f"{path}: {len(rows)} lines are no blocks of `i j n` and a 4x4 matrix: is it a .log?")
     heads = rows[::5]
+    wrong = [row.line for at, row in enumerate(rows) if len(row.fields) < 2 or (at % 5 and len(row.fields) != 4)]
     try:
         keys = np.array([row.fields[:2] for row in heads], np.float64)
-        body = np.array([row.fields for at, row in enumerate(rows) if at % 5], np.float64).reshape(-1, 4, 4)
-    except ValueError as error:
-        raise SourceError(
-            f"{path}:{heads[0].line}: not `i j n` and four rows of four numbers: is it a .log?"
-        ) from error
+        body = np.array([row.fields for at, row in enumerate(rows) if at % 5], np.float64)
+    except ValueError:
+        wrong = wrong or [heads[0].line]
+    if wrong:
+        raise SourceError(f"{path}:{wrong[0]}: not `i j n` and four rows of four numbers: is it a .log?")
+    body = body.reshape(-1, 4, 4)
     sound = (np.floor(keys) == keys) & (keys >= 0) & (keys < MAX_NUMBER)
-    good = sound.all(axis=1) & se3.is_motion(body) if keys.shape[1] == 2 else np.zeros(len(heads), bool)
+    good = sound.all(axis=1) & se3.is_motion(body)
     if not good.all():
         line = heads[int(np.flatnonzero(~good)[0])].line
         raise SourceError(f"{path}:{line}: not `i j n` and a rigid motion: mend or remove the block")

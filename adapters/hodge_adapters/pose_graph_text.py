@@ -13,6 +13,8 @@ import numpy as np
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bools, Floats, Ints
 
+MAX_NUMBER = 1e100
+"""Past it squares and products of numbers overflow."""
 SNIFFED_LINES = 20
 Columns = Mapping[str, tuple[int, ...] | None]
 """How many numbers may follow the keys of a tag; None: those that follow are more keys."""
@@ -86,8 +88,9 @@ def _parse(
         return Records(path, np.array(numbers, np.int64), ints, np.zeros((len(numbers), 0)))
     values = _numbers(path, tag, numbers, [parts[keys] for parts in split], columns)
     records = Records(path, np.array(numbers, np.int64), ints, values)
-    nan = np.asarray(np.isnan(values[:, : columns[0]]).any(axis=1))
-    records.refuse(nan, f"{tag} holds a nan: remove or mend that line")
+    with np.errstate(invalid="ignore"):
+        absurd = np.asarray(~(np.abs(values[:, : columns[0]]) < MAX_NUMBER).all(axis=1))
+    records.refuse(absurd, f"{tag} holds a nan, or a number past {MAX_NUMBER:g}: remove or mend that line")
     return records
 
 

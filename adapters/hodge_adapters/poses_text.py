@@ -116,11 +116,16 @@ def _tum_table(rows: Sequence[Row]) -> tuple[Floats, list[Row]]:
     bad: list[Row] = []
     for row in rows:
         values = to_floats(row.fields)
-        if values and len(values) == 8 and all(map(math.isfinite, values)) and any(values[4:]):
+        if values and len(values) == 8 and all(map(math.isfinite, values)) and _is_quat(values[4:]):
             good.append(values)
         else:
             bad.append(row)
     return np.array(good, np.float64).reshape(-1, 8), bad
+
+
+def _is_quat(values: list[float]) -> bool:
+    # Beyond these the square of the length is no normal number.
+    return 1e-100 < math.hypot(*values) < 1e100
 
 
 def _ordered(table: Floats) -> ParsedTrajectory:
