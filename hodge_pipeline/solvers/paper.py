@@ -21,7 +21,7 @@ from hodge_pipeline.complex.cycles import (
     spanning_forest,
 )
 from hodge_pipeline.complex.form import Logarithm
-from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
+from hodge_pipeline.complex.minimum_cycles import MOST_CANDIDATES, minimum_cycle_basis
 from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem, path_lengths
 from hodge_pipeline.solvers.paper_surface import (
     MOST_CHECKED_EDGES,
@@ -33,7 +33,6 @@ from hodge_pipeline.solvers.paper_surface import (
 from hodge_pipeline.types import Floats, Solution, SolverIteration, ViewGraph
 
 STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
-AFFORDABLE_BASIS = 1_000_000  # vertices times edges: a few tenths of a second
 
 AroundLoops: TypeAlias = Callable[[Floats], Floats]
 """The motions (L, 4, 4) around the loops of one cycle basis, from the motions (E, 4, 4) of the edges."""
@@ -78,7 +77,7 @@ class PaperSolver:
     cycle_basis: Literal["auto", "tree", "shortest"] = Field(
         "auto",
         description="the loops over which D is summed: those of a breadth-first tree, or a basis of least total "
-        "length, mostly triangles; auto takes the shortest while vertices × edges is at most a million",
+        "length, mostly triangles; auto takes the shortest while vertices × edges is at most two million",
     )
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
@@ -147,7 +146,7 @@ class PaperSolver:
 
     def _around_loops(self, problem: PaperProblem) -> AroundLoops:
         edges, vertex_count = problem.edges, len(problem.component)
-        affordable = vertex_count * len(edges) <= AFFORDABLE_BASIS
+        affordable = vertex_count * len(edges) <= MOST_CANDIDATES
         if self.cycle_basis == "shortest" or (self.cycle_basis == "auto" and affordable):
             return partial(loop_products, minimum_cycle_basis(edges, vertex_count))
         return partial(fundamental_products, spanning_forest(edges, vertex_count))
