@@ -37,7 +37,7 @@ CERTIFIED_OPTIMA = {
     "torus3D": 24227.04556,
     "cubicle": 717.125991,
 }
-SYNTHETIC = ("cylinder", "trajectory", "lattice")
+SYNTHETIC = ("cylinder", "trajectory", "lattice", "sphere")
 COLUMNS = (
     "graph", "V / E", "F", "F / optimum − 1", "CPU s", "certified", "CPU s with it", "chi²", "CPU s", "GTSAM CPU s",
     "peak MB",
@@ -69,6 +69,26 @@ def trajectory(count: int) -> tuple[Floats, Ints]:
     return poses, np.concatenate([np.stack([k[:-1], k[1:]], axis=1), returns])
 
 
+def sphere(count: int) -> tuple[Floats, Ints]:
+    """Rings of 44 poses on a sphere, each joined to the next and to three of the ring above."""
+    k = np.arange(count)
+    turn, tilt = 2 * np.pi * k / 44, np.pi * (k + 1) / (count + 1)
+    position = 50 * np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=1)
+    rotation = se3.so3_exp(np.outer(turn, [0, 0, 1])) @ se3.so3_exp(np.outer(tilt, [0, 1, 0]))
+    return se3.from_parts(rotation, position), np.concatenate(
+        [np.stack([k[:-s], k[s:]], axis=1) for s in (1, 43, 44, 45)]
+    )
+
+
+def chained(graph: ViewGraph) -> Floats:
+    """Poses by a walk along the edges from each vertex to the next: a start that leads to a local minimum."""
+    steps = graph.i_from_j[np.flatnonzero(graph.edges[:, 1] - graph.edges[:, 0] == 1)]
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return np.stack(poses)
+
+
 def lattice(count: int) -> tuple[Floats, Ints]:
     """A cube of poses turned at random, each joined to its six neighbours: the worst fill."""
     side = round(count ** (1 / 3))
@@ -83,6 +103,7 @@ SHAPES: dict[str, tuple[Callable[[int], tuple[Floats, Ints]], float, float]] = {
     "cylinder": (cylinder, 0.05, 0.1),
     "trajectory": (trajectory, 0.01, 0.02),
     "lattice": (lattice, 0.05, 0.1),
+    "sphere": (sphere, 0.35, 0.5),
 }
 
 

@@ -10,7 +10,7 @@ from hodge_adapters.g2o import information_for_file, load_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.certificate import certify
+from hodge_pipeline.solvers.certificate import certificate_matrix, certify
 from hodge_pipeline.solvers.full import full_residuals
 from hodge_pipeline.solvers.hodge import HodgeSolver, solve
 from hodge_pipeline.solvers.objective import best_translations, quadratic_model, residuals, rotation_gradient
@@ -177,6 +177,24 @@ def test_a_local_minimum_is_not_certified():
     assert unwound.metrics["objective"] < 1e-12
     assert unwound.metrics["certified"] == 1
     assert any("local minimum" in note for note in unwound.notes)
+
+
+def test_the_smallest_eigenvalue_of_a_local_minimum_is_that_of_the_dense_matrix():
+    count = 12
+    angles = 2 * np.pi * np.arange(count) / count
+    turned = se3.so3_exp(np.outer(angles, [0, 0, 1]))
+    edges = np.array([(i, (i + 1) % count) for i in range(count)])
+    graph = ViewGraph.from_edges(np.arange(count), edges, np.tile(np.eye(4), (count, 1, 1)))
+    wound = solve(graph, start=se3.from_parts(turned, np.zeros(3)), initial="given", objective="isotropic")
+    problem = prepare(graph).problem
+    poses = wound.world_from_cam[problem.order]
+    answer = certify(problem, poses[:, :3, :3], poses[:, :3, 3], wound.metrics["objective"])
+    dense = certificate_matrix(problem, poses[:, :3, :3], poses[:, :3, 3]).toarray().reshape(count, 4, count, 4)
+    rotation = dense[:, :3, :, :3].reshape(3 * count, 3 * count)
+    coupling = dense[:, :3, :, 3].reshape(3 * count, count)
+    complement = rotation - coupling @ np.linalg.pinv(dense[:, 3, :, 3]) @ coupling.T
+    assert answer.smallest_eigenvalue == pytest.approx(np.linalg.eigvalsh(complement)[0], rel=1e-3)
+    assert answer.direction.shape == (count, 3)
 
 
 def test_components_keep_their_own_gauge():

@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass as stage
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.certificate import Certificate, certify
+from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import cost_at_start, metrics_of, minimise
 from hodge_pipeline.solvers.newton import Limits, Point
 from hodge_pipeline.solvers.priors import Priors, with_world, without_world
@@ -20,6 +21,7 @@ from hodge_pipeline.solvers.setup import NO_ROWS, InitialName, Setup, prepare
 from hodge_pipeline.types import Floats, Ints, Solution, SolverIteration, ViewGraph
 
 ObjectiveName: TypeAlias = Literal["isotropic", "full"]
+MOST_ESCAPES = 3
 SEVERAL_FIXED = "not certified: with several fixed vertices to a component the dual is another one"
 
 
@@ -99,14 +101,16 @@ def solve(
         notes.append("only the isotropic objective can be certified")
     elif certificate:
         answer = _certify(setup, descent.point)
-        if not answer.optimal and initial == "given":
-            other = minimise(setup, "chordal", limits, full, watch)
-            if other.point.cost < descent.point.cost:
-                notes.append(f"the start led to a local minimum, F = {descent.point.cost:.9g}: solved again without it")
-                descent, answer = other, _certify(setup, other.point)
-                metrics |= metrics_of(descent, full)
+        for _ in range(MOST_ESCAPES):
+            lower = escape(setup, descent.point, answer, limits, watch)
+            if lower is None:
+                break
+            notes.append(f"a local minimum, F = {descent.point.cost:.9g}, was escaped")
+            descent, answer = lower, _certify(setup, lower.point)
+            metrics |= metrics_of(descent, full)
         notes.append(answer.note)
         metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
+        metrics |= {} if answer.optimal else {"smallest_eigenvalue": answer.smallest_eigenvalue}
     weights = setup.weights.used.astype(float)
     return Solution(setup.poses(descent.point), setup.component, weights, tuple(history), metrics, tuple(notes))
 
