@@ -5,12 +5,13 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo paper test lint format clean
+.PHONY: help setup demo paper test fuzz lint format clean
 help:
 	@echo "make setup   system libraries, $(VENV) and everything in it"
 	@echo "make demo    make a room, reconstruct it: runs/demo"
 	@echo "make paper   the paper's tables for every sequence that is there: runs/paper"
 	@echo "make test    the tests"
+	@echo "make fuzz    every reader on 2000 damaged inputs"
 	@echo "make lint    ruff, mypy, import directions"
 
 $(STAMP): pyproject.toml constraints.txt tools/system-libraries.sh
@@ -30,6 +31,9 @@ paper: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+fuzz: $(STAMP)
+	PYTHONWARNINGS=ignore $(BIN)/python tests/fuzz_readers.py 2000
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
