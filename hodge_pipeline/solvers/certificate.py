@@ -48,7 +48,7 @@ class Certificate:
 
 
 def connection_matrix(problem: Problem) -> bsr_matrix:
-    """M on (rotation rows, translation) of each vertex in the problem's order: F = tr(Xᵀ M X), SE-Sync's equation 15."""
+    """M on (rotation rows, translation) of each vertex, in the problem's order: F = tr(Xᵀ M X) (equation 15)."""
     count, size = problem.count, problem.dimension + 1
     rows = np.stack([problem.tail, problem.head, problem.tail, problem.head])
     columns = np.stack([problem.tail, problem.head, problem.head, problem.tail])

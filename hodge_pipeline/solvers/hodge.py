@@ -92,8 +92,6 @@ def solve(
 
     limits = Limits(max_iterations, relative_tolerance, time.monotonic() + time_limit_s)
     descent = minimise(setup, initial, limits, full, watch)
-    if not descent.converged:
-        notes.append(f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far")
     metrics = metrics_of(descent, full)
     if start is not None:
         metrics["objective_at_start"] = cost_at_start(setup, full)
@@ -111,6 +109,8 @@ def solve(
         notes.append(answer.note)
         metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
         metrics |= {} if answer.optimal else {"smallest_eigenvalue": answer.smallest_eigenvalue}
+    if not descent.converged:
+        notes.append(f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far")
     weights = setup.weights.used.astype(float)
     return Solution(setup.poses(descent.point), setup.component, weights, tuple(history), metrics, tuple(notes))
 
