@@ -81,7 +81,7 @@ class Job:
             self.workspace.note(name, {"title": title, "notes": self.notes[told:], **vars(cost)})
 
     def costs(self) -> list[dict[str, Any]]:
-        """Title, wall_s, cpu_s and peak_mb of each stage so far, those of earlier sessions included."""
+        """Title, wall_s, cpu_s and peak_mb of each stage so far, those finished before it was resumed included."""
         infos = (artifacts.read_json(self.path(name) / KEY_FILE) for name in self.keys if self.path(name).is_dir())
         return [info for info in infos if "title" in info]
 
