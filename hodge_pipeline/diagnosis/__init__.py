@@ -1,0 +1,1 @@
+"""Which edge of a viewing graph is wrong, with the evidence."""

@@ -1,0 +1,123 @@
+"""Which edge is wrong: the diagnosis of a viewing graph on one screen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.diagnosis.consensus import find_consensus
+from hodge_pipeline.diagnosis.energy import energy_shares
+from hodge_pipeline.diagnosis.evidence import Evidence, seems_exhaustive
+from hodge_pipeline.diagnosis.noise import Noise, edge_noise
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.order import order_prior
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
+from hodge_pipeline.diagnosis.robust_poses import left_over
+from hodge_pipeline.diagnosis.short_cycles import cycle_errors, short_cycles
+from hodge_pipeline.diagnosis.testing_cycles import (
+    closing_support,
+    in_no_cycle,
+    judge_cycles,
+    unattributable,
+    witnesses,
+)
+from hodge_pipeline.diagnosis.wording import reasons
+from hodge_pipeline.diagnosis.working_point import recentred, working_point
+from hodge_pipeline.solvers.weights import check_graph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+
+DEFAULTS = DiagnosisOptions()
+
+
+def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosis:
+    """Every edge judged by the cycles it lies in and by the scene that most edges agree on; see `Diagnosis`.
+
+    No edge is trusted for its source. Deterministic for a seed. Raises `GraphError` for numbers that are not finite
+    and edges that name no vertex.
+    """
+    check_graph(graph)
+    prior = np.full(graph.edge_count, 0.5)
+    if options.order_prior:
+        prior = order_prior(graph.edges, graph.vertex_count)
+    point, reach_m = working_point(graph.i_from_j, prior)
+    motions = recentred(graph.i_from_j, point)
+    loops = short_cycles(graph.edges, graph.vertex_count, options.max_cycles_per_edge)
+    angle, moved = cycle_errors(loops, motions)
+    noise = edge_noise(graph, loops, angle, moved, prior, reach_m)
+    cycles = judge_cycles(loops, angle, moved, noise, reach_m)
+    evidence = Evidence(
+        edges=graph.edges,
+        vertex_count=graph.vertex_count,
+        i_from_j=motions,
+        prior=prior,
+        noise=noise,
+        support=closing_support(cycles, prior),
+        alone=in_no_cycle(graph.edges, graph.vertex_count, cycles),
+        reach_m=reach_m,
+        exhaustive=seems_exhaustive(graph.edges, graph.vertex_count),
+    )
+    consensus = find_consensus(evidence, _with_noise(graph, motions, noise), options)
+    undecided = unattributable(graph.edges, graph.vertex_count, cycles)
+    untestable = evidence.alone | (undecided >= 0)
+    probability = np.where(untestable, np.nan, consensus.probability)
+    verdict = _verdicts(probability, untestable, consensus.fit.used, options)
+    kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
+    world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
+    return _report(
+        graph, cycles, probability, verdict, kept, undecided, world_from_cam, consensus.fit.resistance, consensus.runs
+    )
+
+
+def _with_noise(graph: ViewGraph, motions: Floats, noise: Noise) -> ViewGraph:
+    information = np.zeros((graph.edge_count, 6, 6))
+    information[:, range(3), range(3)] = 1 / noise.rotation_rad[:, None] ** 2
+    information[:, range(3, 6), range(3, 6)] = 1 / noise.translation_m[:, None] ** 2
+    return replace(graph, i_from_j=motions, information=information)
+
+
+def _verdicts(probability: Floats, untestable: Bools, used: Bools, options: DiagnosisOptions) -> NDArray[np.str_]:
+    right = (probability >= options.consistent_from) & used
+    wrong = probability < options.wrong_below
+    return np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
+
+
+def _report(
+    graph: ViewGraph,
+    cycles: Cycles,
+    probability: Floats,
+    verdict: NDArray[np.str_],
+    kept: Bools,
+    undecided: Ints,
+    world_from_cam: Floats,
+    resistance: Floats,
+    runs: int,
+) -> Diagnosis:
+    piece = connected_components(graph.edges[kept], graph.vertex_count)
+    same = piece[graph.edges[:, 0]] == piece[graph.edges[:, 1]]
+    angle, moved = left_over(graph, world_from_cam)
+    residual = np.where(same, moved, np.nan), np.where(same, np.degrees(angle), np.nan)
+    telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
+    share = 1 - 1 / (1 + resistance)
+    energy, caveats = energy_shares(graph, world_from_cam, piece, kept)
+    counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
+    tested = f"{len(cycles.loops)} cycles, {int(cycles.closes.sum())} of them close; {runs} alignments"
+    return Diagnosis(
+        verdict=verdict,
+        probability=probability,
+        reason=reasons(graph, cycles, verdict, residual, telling, undecided),
+        kept=kept,
+        residual_m=residual[0],
+        residual_deg=residual[1],
+        leverage=np.where(kept, share, 0.0),
+        cycles=cycles,
+        witnesses_for=telling[0],
+        witnesses_against=telling[1],
+        piece=piece,
+        world_from_cam=world_from_cam,
+        energy=energy,
+        notes=(f"edges: {counts}", tested, *describe_components(piece, graph.vertex_ids), *caveats),
+    )

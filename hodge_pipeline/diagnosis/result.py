@@ -1,0 +1,59 @@
+"""What a diagnosis says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from numpy import str_
+from numpy.typing import NDArray
+
+from hodge_pipeline.complex.cycles import Loops
+from hodge_pipeline.types import Bools, Floats, Ints
+
+CONSISTENT, SUSPECT, WRONG, UNTESTABLE = "consistent", "suspect", "wrong", "untestable"
+WITNESSES = 3
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """The cycles that were listed: their edges, the angle (L,) and displacement (L,) that each leaves, its χ² (L,) in
+    the noise of its edges, and whether it closes (L,).
+    """
+
+    loops: Loops
+    angle_rad: Floats
+    displacement_m: Floats
+    chi2: Floats
+    closes: Bools
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Every edge judged, and the poses of those that agree.
+
+    - `verdict (E,)`: consistent, suspect, wrong or untestable; `probability (E,)` that it is right, NaN where
+      untestable; `reason`: one line for each edge.
+    - `kept (E,)`: edges that are neither wrong nor suspect.
+    - `residual_m`, `residual_deg (E,)`: against the robust poses; NaN between two pieces.
+    - `leverage (E,)`: the share of an edge's own say in where its ends lie, 1 where removing it splits its piece;
+      0 for one that is not kept.
+    - `cycles`; `witnesses_for`, `witnesses_against (E, 3)`: their rows, the most telling first, −1 for none.
+    - `piece (V,)`: 0 the largest; `world_from_cam (V, 4, 4)`: each piece in a frame of its own.
+    - `energy`: share of the 1-form that is exact, co-exact and harmonic, by name; `notes`: caveats, one line each.
+    """
+
+    verdict: NDArray[str_]
+    probability: Floats
+    reason: tuple[str, ...]
+    kept: Bools
+    residual_m: Floats
+    residual_deg: Floats
+    leverage: Floats
+    cycles: Cycles
+    witnesses_for: Ints
+    witnesses_against: Ints
+    piece: Ints
+    world_from_cam: Floats
+    energy: Mapping[str, Mapping[str, tuple[float, float]]]
+    notes: tuple[str, ...]

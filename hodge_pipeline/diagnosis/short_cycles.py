@@ -1,0 +1,163 @@
+"""The cycles that test edges: triangles where there are any, then squares, then the shortest loops of a tree."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_pipeline.complex.cech import flag_complex, orient_edges
+from hodge_pipeline.complex.cycles import Loops, fundamental_loops, loop_products, spanning_forest
+from hodge_pipeline import se3
+from hodge_pipeline.types import Bools, Floats, Ints
+
+NEIGHBOURS = 8
+"""Of each end of an edge that are tried for a square."""
+EDGES_AT_ONCE = 20_000
+LONGEST_ENTRIES = 5_000_000
+
+
+def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
+    """Cycles of the graph such that every edge that lies in one is in one of these, unless that would be too long.
+
+    Pairs of parallel edges, triangles (thinned evenly where there are very many), squares for edges that have none
+    of these, and for the rest the loops that their chords close in a breadth-first tree.
+    """
+    found = [_parallel_pairs(edges, vertex_count), _triangles(edges, vertex_count, most_per_edge)]
+    covered = _covered(found, len(edges))
+    if not covered.all():
+        found.append(_squares(edges, vertex_count, np.flatnonzero(~covered)))
+        covered |= _covered(found[-1:], len(edges))
+    if not covered.all():
+        found.append(_tree_loops(edges, vertex_count, covered))
+    return _joined(found)
+
+
+def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
+    """The angle (L,) in radians and the displacement (L,) in metres that the product of motions along each cycle
+    leaves, the latter at the middle of the cycle's frames.
+    """
+    products = loop_products(loops, i_from_j)
+    middle = _middles(loops, i_from_j)
+    moved = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
+    return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(moved, axis=1)
+
+
+def _middles(loops: Loops, i_from_j: Floats) -> Floats:
+    """The mean (L, 3) of the positions of the first few frames of each cycle, seen from its first."""
+    lengths = loops.lengths
+    total, here = np.zeros((len(loops), 3)), np.broadcast_to(np.eye(4), (len(loops), 4, 4)).copy()
+    for step in range(int(min(lengths.max(initial=0), 4))):
+        rows = np.flatnonzero(lengths > step)
+        entry = loops.offsets[rows] + step
+        motion = i_from_j[loops.edge[entry]].copy()
+        back = loops.sign[entry] < 0
+        motion[back] = se3.inverse(motion[back])
+        total[rows] += here[rows, :3, 3]
+        here[rows] = here[rows] @ motion
+    return total / np.maximum(np.minimum(lengths, 4), 1)[:, None]
+
+
+def _covered(found: list[Loops], edge_count: int) -> Bools:
+    covered = np.zeros(edge_count, bool)
+    for loops in found:
+        covered[loops.edge] = True
+    return covered
+
+
+def _joined(found: list[Loops]) -> Loops:
+    lengths = np.concatenate([loops.lengths for loops in found])
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    return Loops(
+        offsets, np.concatenate([loops.edge for loops in found]), np.concatenate([loops.sign for loops in found])
+    )
+
+
+def _of_equal_length(edge: Ints, sign: Ints) -> Loops:
+    count, length = edge.shape
+    return Loops(np.arange(count + 1, dtype=np.int64) * length, edge.ravel(), sign.ravel())
+
+
+def _parallel_pairs(edges: Ints, vertex_count: int) -> Loops:
+    oriented = orient_edges(edges, vertex_count)
+    order = np.lexsort((np.arange(len(edges)), oriented.row))
+    same = (oriented.row[order][1:] == oriented.row[order][:-1]) & (oriented.row[order][1:] >= 0)
+    first, second = order[:-1][same], order[1:][same]
+    sign = np.stack([oriented.sign[first], -oriented.sign[second]], axis=1)
+    return _of_equal_length(np.stack([first, second], axis=1), sign)
+
+
+def _triangles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
+    """Triangles of the first of parallel edges, thinned by a stride where an edge would be in too many."""
+    complex_ = flag_complex(edges, vertex_count)
+    corners, measured = complex_.simplices[2], _first_measured(edges, vertex_count)
+    limit = max(most_per_edge * len(measured) // 3, 1)
+    corners = corners[:: max(-(-len(corners) // limit), 1)]
+    sides = [complex_.rows_of(corners[:, pair]) for pair in ([0, 1], [1, 2], [0, 2])]
+    edge = np.stack([measured[side] for side in sides], axis=1)
+    forward = np.where(edges[edge, 0] < edges[edge, 1], 1, -1)
+    return _of_equal_length(edge, forward * np.array([1, 1, -1]))
+
+
+def _first_measured(edges: Ints, vertex_count: int) -> Ints:
+    """The first measured edge of each edge of the simple graph."""
+    oriented = orient_edges(edges, vertex_count)
+    first = np.full(len(oriented.edges), -1, np.int64)
+    real = np.flatnonzero(oriented.row >= 0)[::-1]
+    first[oriented.row[real]] = real
+    return first
+
+
+def _squares(edges: Ints, vertex_count: int, wanted: Ints) -> Loops:
+    """Cycles i–j–b–a–i for the wanted edges (i, j), over some neighbours a of i and b of j."""
+    oriented = orient_edges(edges, vertex_count)
+    measured = _first_measured(edges, vertex_count)
+    neighbours = _some_neighbours(oriented.edges, vertex_count)
+    keys = oriented.edges[:, 0] * vertex_count + oriented.edges[:, 1]
+    parts = [
+        _squares_of(edges, wanted[start : start + EDGES_AT_ONCE], neighbours, keys, measured, vertex_count)
+        for start in range(0, len(wanted), EDGES_AT_ONCE)
+    ]
+    return _joined([_of_equal_length(np.zeros((0, 4), np.int64), np.zeros((0, 4), np.int64)), *parts])
+
+
+def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
+    """Up to NEIGHBOURS neighbours (V, NEIGHBOURS) of each vertex, −1 where there are fewer."""
+    tail, head = np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]])
+    order = np.lexsort((np.abs(head - tail), tail))
+    tail, head = tail[order], head[order]
+    rank = np.arange(len(tail)) - np.searchsorted(tail, tail)
+    out = np.full((vertex_count, NEIGHBOURS), -1, np.int64)
+    few = rank < NEIGHBOURS
+    out[tail[few], rank[few]] = head[few]
+    return out
+
+
+def _squares_of(edges: Ints, rows: Ints, neighbours: Ints, keys: Ints, measured: Ints, count: int) -> Loops:
+    i, j = edges[rows].T
+    a = np.repeat(neighbours[i], NEIGHBOURS, axis=1).ravel()
+    b = np.tile(neighbours[j], (1, NEIGHBOURS)).ravel()
+    row, i, j = (np.repeat(x, NEIGHBOURS**2) for x in (rows, i, j))
+    possible = (a >= 0) & (b >= 0) & (a != j) & (b != i) & (a != b) & (i != j)
+    row, i, j, a, b = (x[possible] for x in (row, i, j, a, b))
+    across = _row_of_pair(b, a, keys, count)
+    there = across >= 0
+    row, i, j, a, b, across = (x[there] for x in (row, i, j, a, b, across))
+    sides = np.stack([row, measured[_row_of_pair(j, b, keys, count)], measured[across]], axis=1)
+    edge = np.column_stack([sides, measured[_row_of_pair(a, i, keys, count)]])
+    tails = np.stack([i, j, b, a], axis=1)
+    return _of_equal_length(edge, np.where(edges[edge, 0] == tails, 1, -1))
+
+
+def _row_of_pair(a: Ints, b: Ints, keys: Ints, count: int) -> Ints:
+    key = np.minimum(a, b) * count + np.maximum(a, b)
+    place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+    return np.where(keys[place] == key, place, -1)
+
+
+def _tree_loops(edges: Ints, vertex_count: int, covered: Bools) -> Loops:
+    """The loops of uncovered chords; where tree edges stay uncovered, of all chords, if they are not too long."""
+    forest = spanning_forest(edges, vertex_count)
+    chords = forest.chords[edges[forest.chords, 0] != edges[forest.chords, 1]]
+    depth = forest.depth[edges[chords]].sum(axis=1)
+    affordable = np.cumsum(np.sort(depth + 1)) <= LONGEST_ENTRIES
+    order = np.argsort(depth, kind="stable")[affordable]
+    return fundamental_loops(forest, chords[np.sort(order)])

@@ -1,0 +1,82 @@
+"""Which cycles close, which edges they can test, and which of them speak for or against each edge."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_pipeline.complex.cycles import Loops, fundamental_loops, spanning_forest
+from hodge_pipeline.diagnosis.noise import Noise
+from hodge_pipeline.diagnosis.result import WITNESSES, Cycles
+from hodge_pipeline.types import Bools, Floats, Ints
+
+GATE = 30.0
+LONGEST_ENTRIES = 5_000_000
+
+
+def judge_cycles(loops: Loops, angle: Floats, moved: Floats, noise: Noise, reach_m: float) -> Cycles:
+    """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
+    row = _rows(loops)
+    turn = np.bincount(row, noise.rotation_rad[loops.edge] ** 2, len(loops))
+    shift = np.bincount(row, noise.translation_m[loops.edge] ** 2, len(loops))
+    swing = turn * (reach_m * loops.lengths) ** 2 / 12
+    chi2 = angle**2 / np.maximum(turn, 1e-300) + moved**2 / np.maximum(shift + swing, 1e-300)
+    return Cycles(loops, angle, moved, chi2, chi2 < GATE)
+
+
+def closing_support(cycles: Cycles, prior: Floats) -> Floats:
+    """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
+    row, edge = _rows(cycles.loops), cycles.loops.edge
+    total = np.bincount(row, np.log(prior[edge]), len(cycles.loops))
+    others = np.exp(total[row] - np.log(prior[edge]))
+    strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)[row]
+    return np.bincount(edge, strength * others, len(prior)).astype(float)
+
+
+def in_no_cycle(edges: Ints, vertex_count: int, cycles: Cycles) -> Bools:
+    """Where (E,) no listed cycle passes an edge: bridges, and self-loops, which are no measurement of anything."""
+    alone = np.ones(len(edges), bool)
+    alone[cycles.loops.edge] = False
+    return alone
+
+
+def unattributable(edges: Ints, vertex_count: int, cycles: Cycles) -> Ints:
+    """For each edge (E,) the row of the failing cycle that alone tests it and all its other edges; −1 where there is
+    none. One of its edges is wrong, and nothing says which.
+    """
+    forest = spanning_forest(edges, vertex_count)
+    depth = forest.depth[edges[forest.chords]].sum(axis=1) + 1
+    out = np.full(len(edges), -1, np.int64)
+    failing = np.flatnonzero(~cycles.closes)
+    if depth.sum() > LONGEST_ENTRIES or not len(failing):
+        return out
+    basis = fundamental_loops(forest)
+    passes = np.bincount(basis.edge, minlength=len(edges))
+    # a loop of the basis that shares no edge with another is a block of its own: no other cycle passes its edges
+    single = np.bincount(_rows(basis), passes[basis.edge] == 1, len(basis)) == basis.lengths
+    lonely = np.zeros(len(edges), bool)
+    lonely[basis.edge[single[_rows(basis)]]] = True
+    chosen = cycles.loops.select(failing)
+    row = _rows(chosen)
+    once = np.bincount(row, lonely[chosen.edge], len(chosen)) == chosen.lengths
+    out[chosen.edge[once[row]]] = failing[row[once[row]]]
+    return out
+
+
+def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
+    """For each edge (E, 3) the closing, or failing, cycles whose other edges are the likeliest; −1 for none."""
+    wanted = np.flatnonzero(cycles.closes == closing)
+    loops = cycles.loops.select(wanted)
+    row, edge = _rows(loops), loops.edge
+    logs = np.log(np.clip(np.nan_to_num(probability, nan=0.5), 1e-3, 1.0))
+    others = np.bincount(row, logs[edge], len(loops))[row] - logs[edge]
+    order = np.lexsort((row, -others, edge))
+    ranked = edge[order]
+    rank = np.arange(len(order)) - np.searchsorted(ranked, ranked)
+    out = np.full((len(probability), WITNESSES), -1, np.int64)
+    top = rank < WITNESSES
+    out[ranked[top], rank[top]] = wanted[row[order[top]]]
+    return out
+
+
+def _rows(loops: Loops) -> Ints:
+    return np.repeat(np.arange(len(loops)), loops.lengths)

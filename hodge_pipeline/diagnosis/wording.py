@@ -1,0 +1,70 @@
+"""The verdict of each edge in a line that a person can check."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE, Cycles
+from hodge_pipeline.types import Floats, Ints, ViewGraph
+
+LONGEST_NAMED = 12
+
+
+def name_cycle(graph: ViewGraph, cycles: Cycles, row: int) -> str:
+    """The vertices along a cycle, `3-7-12`, the middle of a long one left out."""
+    loops = cycles.loops
+    entry = slice(loops.offsets[row], loops.offsets[row + 1])
+    tails = graph.edges[loops.edge[entry], np.where(loops.sign[entry] > 0, 0, 1)]
+    names = [str(graph.vertex_ids[vertex]) for vertex in tails]
+    if len(names) > LONGEST_NAMED:
+        names = [*names[:6], f"({len(names) - 9} more)", *names[-3:]]
+    return "-".join(names)
+
+
+def reasons(
+    graph: ViewGraph,
+    cycles: Cycles,
+    verdict: NDArray[np.str_],
+    residual: tuple[Floats, Floats],
+    witnesses: tuple[Ints, Ints],
+    undecided: Ints,
+) -> tuple[str, ...]:
+    """One line for each edge: what the cycles say, and how far it is from the poses."""
+    count = graph.edge_count
+    passing = np.bincount(cycles.loops.edge, minlength=count)
+    closing = np.repeat(cycles.closes, cycles.loops.lengths)
+    closed = np.bincount(cycles.loops.edge, closing, count).astype(np.int64)
+    lines = []
+    for edge in range(count):
+        if undecided[edge] >= 0:
+            lines.append(_undecided(graph, cycles, int(undecided[edge])))
+        elif verdict[edge] == UNTESTABLE:
+            lines.append("no cycle passes it: nothing in the graph can test it")
+        else:
+            good = verdict[edge] == CONSISTENT
+            witness = int(witnesses[0 if good else 1][edge, 0])
+            text = f"{closed[edge]} of {passing[edge]} cycles close"
+            if witness >= 0:
+                text += f"; {name_cycle(graph, cycles, witness)} {_error(cycles, witness)}"
+            lines.append(f"{text}; {_distance(residual[0][edge], residual[1][edge])}")
+    return tuple(lines)
+
+
+def _undecided(graph: ViewGraph, cycles: Cycles, row: int) -> str:
+    length = int(cycles.loops.lengths[row])
+    return (
+        f"the loop {name_cycle(graph, cycles, row)} {_error(cycles, row)}: one of its {length} edges is wrong, and no "
+        "other cycle says which"
+    )
+
+
+def _error(cycles: Cycles, row: int) -> str:
+    verb = "closes to" if cycles.closes[row] else "fails by"
+    return f"{verb} {cycles.displacement_m[row]:.3g} m, {np.degrees(cycles.angle_rad[row]):.2g}°"
+
+
+def _distance(metres: float, degrees: float) -> str:
+    if not np.isfinite(metres):
+        return "its ends lie in different pieces"
+    return f"{metres:.3g} m, {degrees:.2g}° from the poses"
