@@ -47,12 +47,13 @@ def _shares(graph: ViewGraph, world_from_cam: Floats) -> Mapping[str, tuple[floa
     form, weights = orient_edges(graph.edges, graph.vertex_count).pooled(omega, np.ones(graph.edge_count))
     complex_ = flag_complex(graph.edges, graph.vertex_count)
     d0 = coboundary_0(complex_.simplices[1], graph.vertex_count)
-    return hodge_decomposition(d0, complex_.coboundary(1), form, weights).shares()
+    shares: Mapping[str, tuple[float, float]] = hodge_decomposition(d0, complex_.coboundary(1), form, weights).shares()
+    return shares
 
 
 def _centred(world_from_cam: Floats, piece: Ints) -> Floats:
     sizes = np.bincount(piece)
     means = np.stack([np.bincount(piece, world_from_cam[:, axis, 3]) for axis in range(3)], axis=1) / sizes[:, None]
-    centred = world_from_cam.copy()
+    centred: Floats = np.array(world_from_cam)
     centred[:, :3, 3] -= means[piece]
     return centred

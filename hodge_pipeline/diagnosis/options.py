@@ -11,31 +11,39 @@ class DiagnosisOptions:
     """How edges are weighed against each other."""
 
     runs: int = Field(
-        24, gt=0, description="alignments of the scene from perturbed weights; an edge's probability counts its share"
+        default=24,
+        gt=0,
+        description="alignments of the scene from perturbed weights; an edge's probability counts its share",
     )
     edges_budget: int = Field(
-        60_000, gt=0, description="runs × edges at most, so that large graphs take fewer runs (always one)"
+        default=60_000, gt=0, description="runs × edges at most, so that large graphs take fewer runs (always one)"
     )
     perturbation: float = Field(
-        0.7, ge=0, description="spread of the logarithm of the weights from run to run: wide enough to try other answers"
+        default=0.7,
+        ge=0,
+        description="spread of the logarithm of the weights from run to run: wide enough to try other answers",
     )
     cluster_gain: float = Field(
-        3.0,
+        default=3.0,
         ge=0,
         description="nats that agreeing edges between two pieces add per e-fold of their number: they are one event, "
         "since places that look alike give many wrong edges that agree",
     )
     overlap_penalties: tuple[float, ...] = Field(
-        (0.3, 1.0),
+        default=(0.3, 1.0),
         description="tried in turn: weight of 'these two views lie upon each other and no edge says so', used only "
         "where every pair seems to have been tried",
     )
     order_prior: bool = Field(
-        True,
+        default=True,
         description="learn from the graph whether vertices that are near in order are more often joined, and expect "
         "such edges to be right more often; none is trusted",
     )
-    max_cycles_per_edge: int = Field(64, gt=0, description="triangles kept to an edge, so that memory is bounded")
-    consistent_from: float = Field(0.5, gt=0, lt=1, description="probability from which an edge is consistent")
-    wrong_below: float = Field(0.2, gt=0, lt=1, description="probability below which an edge is wrong, not suspect")
-    seed: int = Field(0, ge=0, description="of the perturbations")
+    max_cycles_per_edge: int = Field(
+        default=64, gt=0, description="triangles kept to an edge, so that memory is bounded"
+    )
+    consistent_from: float = Field(default=0.5, gt=0, lt=1, description="probability from which an edge is consistent")
+    wrong_below: float = Field(
+        default=0.2, gt=0, lt=1, description="probability below which an edge is wrong, not suspect"
+    )
+    seed: int = Field(default=0, ge=0, description="of the perturbations")

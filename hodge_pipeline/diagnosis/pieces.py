@@ -62,7 +62,7 @@ def _gains(evidence: Evidence, votes: Votes, weight: Floats, cluster_gain: float
     size = len(votes.edge)
     strength = votes.agreement * weight[votes.edge[votes.vote]]
     counted = votes.agreement * np.minimum(1.0, 0.5 + weight[votes.edge[votes.vote]])
-    gain = np.bincount(votes.hypothesis, strength, size)
+    gain: Floats = np.bincount(votes.hypothesis, strength, size).astype(np.float64)
     gain += cluster_gain * np.log1p(np.bincount(votes.hypothesis, counted, size))
     agreeing = np.bincount(votes.hypothesis, votes.agreement > 0, size)
     alone: Bools = evidence.alone[votes.edge] | (weight[votes.edge] > SINGLE_VOTE_FROM)

@@ -25,7 +25,11 @@ def effective_resistance(edges: Ints, vertex_count: int, used: Bools) -> Floats:
     grounded = first_of_component(component)
     d0 = coboundary_0(edges[rows], vertex_count)
     factor = factorise(grounded_laplacian(d0, np.ones(len(rows)), grounded))
-    through = _exact(factor.solve, grounded, edges) if vertex_count <= EXACT_TO else _sketched(factor.solve, d0, grounded, edges)
+    through = (
+        _exact(factor.solve, grounded, edges)
+        if vertex_count <= EXACT_TO
+        else _sketched(factor.solve, d0, grounded, edges)
+    )
     joined = component[edges[:, 0]] == component[edges[:, 1]]
     own = np.zeros(len(edges), bool)
     own[rows] = True

@@ -1,4 +1,4 @@
-"""Poses of one alignment: the edges that agree with it, solved with heavy-tailed errors, and every edge's χ² to them."""
+"""Poses of one alignment: the edges that agree with it, solved with heavy-tailed errors, and each edge's χ²."""
 
 from __future__ import annotations
 

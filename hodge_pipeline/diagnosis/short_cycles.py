@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import flag_complex, orient_edges
 from hodge_pipeline.complex.cycles import Loops, fundamental_loops, loop_products, spanning_forest
-from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS = 8

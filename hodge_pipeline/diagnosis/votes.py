@@ -109,4 +109,4 @@ def agreed_motions(votes: Votes, chosen: Ints, weight: Floats) -> Floats:
 def _sums(row: Ints, share: Floats, values: Floats, count: int) -> Floats:
     flat = values.reshape(len(values), -1) * share[:, None]
     columns = [np.bincount(row, column, count) for column in flat.T]
-    return np.stack(columns, axis=1).reshape(count, *values.shape[1:])
+    return np.stack(columns, axis=1).astype(np.float64).reshape(count, *values.shape[1:])
