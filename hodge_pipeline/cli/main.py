@@ -8,6 +8,8 @@ from typing import Annotated, Optional
 
 import typer
 
+from hodge_pipeline.cli import refining
+
 HELP = """Globally consistent poses from many scans.
 
 Examples:
@@ -22,11 +24,14 @@ Examples:
   hodge view runs/kitchen                        open the recording in Rerun
   hodge solve graph.g2o --out solved.g2o         any pose graph, or a run folder
   hodge solve graph.g2o --certificate --disable 12-87
+  hodge refine trajectory poses.txt --frames DIR --out runs/better
 """
 
 app = typer.Typer(
     help=HELP, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
 )
+
+app.add_typer(refining.group, name="refine")
 
 Overrides = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well

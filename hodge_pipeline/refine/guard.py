@@ -1,0 +1,94 @@
+"""The guard of every refinement: by its own measures the result is better, as good, or worse; worse is never kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced"]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One quality of the poses, before and after.
+
+    `better` says which way is good; a change the other way by more than `tolerance`, in the measure's own unit, is a
+    change for the worse: what the measure's own noise could do is none.
+    """
+
+    name: str
+    before: float
+    after: float
+    better: Literal["lower", "higher"] = "lower"
+    tolerance: float = 0.0
+    unit: str = ""
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether it got worse by more than the tolerance; a measure that is lost (NaN) is worse."""
+        gain = self.before - self.after if self.better == "lower" else self.after - self.before
+        known_before = self.before == self.before
+        return known_before and not gain >= -self.tolerance
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.before:.4g} -> {self.after:.4g}{self.unit and ' '}{self.unit}"
+
+
+@dataclass(frozen=True)
+class Change:
+    """How far the poses moved against how well the measurements fix them: root mean squares over the poses."""
+
+    translation_m: float
+    rotation_deg: float
+    translation_sigma_m: float
+    rotation_sigma_deg: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the poses moved by more than their own stated uncertainty (one sigma), in either part."""
+        return not (self.translation_m <= self.translation_sigma_m and self.rotation_deg <= self.rotation_sigma_deg)
+
+    def __str__(self) -> str:
+        return (
+            f"poses moved by {self.translation_m * 1000:.3g} mm and {self.rotation_deg:.2g}° (RMS), "
+            f"known to {self.translation_sigma_m * 1000:.3g} mm and {self.rotation_sigma_deg:.2g}°"
+        )
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What becomes of a refinement, why, and the measures behind it.
+
+    - `refined`: the result is written;
+    - `optimal`: it differs from the input by less than its own uncertainty: the input is given back;
+    - `worse`: a measure got worse: the input is given back, and the exit code is 3;
+    - `forced`: as `worse`, but the result is written all the same.
+    """
+
+    outcome: Outcome
+    reason: str
+    measures: tuple[Measure, ...] = ()
+    change: Change | None = None
+
+    @property
+    def keeps_input(self) -> bool:
+        """Whether the input is given back, byte for byte."""
+        return self.outcome in ("optimal", "worse")
+
+    @property
+    def exit_code(self) -> int:
+        """3 where the result failed its own checks, else 0."""
+        return 3 if self.outcome == "worse" else 0
+
+
+def decide(measures: Sequence[Measure], change: Change | None = None, *, force: bool = False) -> Decision:
+    """The decision on a refinement. With `force` a worse result is written; an optimal input is still given back."""
+    measures = tuple(measures)
+    if change is not None and not change.is_significant:
+        return Decision("optimal", f"already optimal: {change}", measures, change)
+    worse = [measure for measure in measures if measure.is_worse]
+    if worse:
+        reason = "worse by its own measures: " + "; ".join(str(measure) for measure in worse)
+        return Decision("forced" if force else "worse", reason, measures, change)
+    return Decision("refined", "; ".join(str(measure) for measure in measures) or "nothing measured", measures, change)
