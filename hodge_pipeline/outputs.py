@@ -26,11 +26,12 @@ from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.summary import graph_summary, trajectory_rows, worst_edges
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.job import Job, versions
-from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.types import Floats, Solution, Source, Trajectory, ViewGraph
 
 EDGE_COLUMNS = (
     "i", "j", "source", "status", "fitness", "rmse_m", "correspondences", "weight", "residual_m", "residual_deg",
+    "verdict", "probability", "why",
 )  # fmt: skip
 
 
@@ -55,16 +56,20 @@ def write_graph(folder: Path, source: Source, last: Round) -> None:
     registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)
     weights = np.ones(graph.edge_count) if last.solution is None else last.solution.weights
     rejected = [
-        [graph.vertex_ids[i], graph.vertex_ids[j], reason, "rejected", *[""] * 6]
+        [graph.vertex_ids[i], graph.vertex_ids[j], reason, "rejected", *[""] * 9]
         for (i, j), reason in zip(last.rejected_pairs, last.rejected_reasons, strict=True)
     ]
-    artifacts.write_text(folder / "edges.csv", edge_table(graph, last.world_from_cam, weights, rejected))
+    artifacts.write_text(folder / "edges.csv", edge_table(graph, last.world_from_cam, weights, rejected, last.verdicts))
 
 
 def edge_table(
-    graph: ViewGraph, world_from_cam: Floats, weights: Floats, rejected: Sequence[Sequence[object]] = ()
+    graph: ViewGraph,
+    world_from_cam: Floats,
+    weights: Floats,
+    rejected: Sequence[Sequence[object]] = (),
+    verdicts: Verdicts | None = None,
 ) -> str:
-    """Every edge with its residual under the poses as CSV, then the rows of the pairs that became none."""
+    """Every edge with its residual under the poses and its verdict as CSV, then the pairs that became no edge."""
     out = io.StringIO()
     translation_m, angle_rad = edge_residuals(graph, world_from_cam)
     table = csv.writer(out, lineterminator="\n")
@@ -82,10 +87,19 @@ def edge_table(
                 f"{weights[row]:.4f}",
                 f"{translation_m[row]:.6f}",
                 f"{np.rad2deg(angle_rad[row]):.5f}",
+                *_verdict_cells(verdicts, row),
             ]
         )
     table.writerows(rejected)
     return out.getvalue()
+
+
+def _verdict_cells(verdicts: Verdicts | None, row: int) -> tuple[str, str, str]:
+    if verdicts is None:
+        return "", "", ""
+    probability = verdicts.probability[row]
+    known = "" if np.isnan(probability) else f"{probability:.6g}"
+    return str(verdicts.verdict[row]), known, str(verdicts.reason[row])
 
 
 def make_report(job: Job, source: Source, rounds: Sequence[Round], scores: ScoreTable | None) -> Report:
@@ -95,6 +109,7 @@ def make_report(job: Job, source: Source, rounds: Sequence[Round], scores: Score
     assert last.solution is not None
     component = last.solution.component
     names = [frame.sequence for frame in source.frames]
+    verdict = None if last.verdicts is None else last.verdicts.verdict
     return Report(
         title=f"{source.name}",
         source=SourceSummary(
@@ -108,8 +123,8 @@ def make_report(job: Job, source: Source, rounds: Sequence[Round], scores: Score
         scores=scores,
         trajectories=trajectory_rows(sets, truth, component, names) if has_truth(source) else (),
         loops=_loop_rows(last.solution),
-        graph=graph_summary(last.graph, component, last.solution.weights, last.rejected_counts),
-        worst_edges=worst_edges(last.graph, last.world_from_cam, last.solution.weights),
+        graph=graph_summary(last.graph, component, last.solution.weights, last.rejected_counts, verdict),
+        worst_edges=worst_edges(last.graph, last.world_from_cam, last.solution.weights, verdict=verdict),
         stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in job.costs()),
         notes=tuple(job.notes),
         versions=versions(),

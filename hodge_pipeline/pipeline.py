@@ -60,6 +60,7 @@ def _run(job: Job) -> Run:
             candidates = steps.propose_edges(job, number, source, clouds, poses)
             registered = steps.register_edges(job, number, candidates, poses, workers)
             rounds.append(steps.solve(job, number, source, candidates, registered, poses))
+        rounds[-1] = steps.judge_edges(job, rounds[-1], len(rounds) - 1)
         scores = steps.evaluate(job, source, rounds, workers)
     models = steps.fuse(job, source, rounds[-1].world_from_cam)
     record(job, source, rounds, models, scores)

@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import binding, recipe_file
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
@@ -58,6 +59,7 @@ class Recipe:
         le=20,
         description="rounds of new edges, registration and solve, each from the poses of the last",
     )
+    diagnosis: DiagnosisOptions = DiagnosisOptions()
     fusion: tuple[Fuser, ...] = Field(default=(), description="each makes one model from the final poses")
     evaluation: EvaluationOptions = EvaluationOptions()
     recording: RecordingOptions = RecordingOptions()

@@ -64,8 +64,11 @@ def _record_round(recorder: Recorder, source: Source, rounds: Sequence[Round], n
     before, this = rounds[number - 1], rounds[number]
     assert this.solution is not None
     rejected = Candidates(this.rejected_pairs, this.rejected_reasons, np.full(len(this.rejected_pairs), np.nan))
+    verdicts = None if this.verdicts is None else this.verdicts.verdict.tolist()
     first = sum(1 + len(one.solution.history) for one in rounds[1:number] if one.solution is not None)
-    return recorder.edges(number, this.graph, before.world_from_cam, rejected=rejected) + recorder.solution(
+    return recorder.edges(
+        number, this.graph, before.world_from_cam, rejected=rejected, verdicts=verdicts
+    ) + recorder.solution(
         number, this.graph, before.world_from_cam, this.solution, source.frames, first_iteration=first
     )
 

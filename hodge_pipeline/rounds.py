@@ -21,10 +21,20 @@ def _no_reasons() -> NDArray[np.str_]:
 
 
 @dataclass(frozen=True)
+class Verdicts:
+    """What the diagnosis says of each edge (E,): its verdict, how probably it is right (NaN: untestable), and why."""
+
+    verdict: NDArray[np.str_]
+    probability: Floats
+    reason: NDArray[np.str_]
+
+
+@dataclass(frozen=True)
 class Round:
     """One outer iteration: its edges, and the poses (N, 4, 4) that they led to. Round 0 is the odometry.
 
-    `rejected_pairs (R, 2)` were registered and not accepted, for `rejected_reasons (R,)`.
+    `rejected_pairs (R, 2)` were registered and not accepted, for `rejected_reasons (R,)`. Only the last round has
+    `verdicts`.
     """
 
     graph: ViewGraph
@@ -33,6 +43,7 @@ class Round:
     solution: Solution | None = None
     rejected_pairs: Ints = field(default_factory=_no_pairs)
     rejected_reasons: NDArray[np.str_] = field(default_factory=_no_reasons)
+    verdicts: Verdicts | None = None
 
     @property
     def rejected_counts(self) -> Mapping[str, int]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import artifacts, se3
+from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphScores, ScoreTable, score_table
 from hodge_pipeline.fusion.ply import write_ply
@@ -20,7 +21,7 @@ from hodge_pipeline.registration import clouds as cloud_stage
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
 from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Source
 
@@ -127,6 +128,18 @@ def solve(
 def vertex_ids(source: Source) -> NDArray[np.generic]:
     """The frames as the source names them: numbers, or words."""
     return np.array([frame.frame_id for frame in source.frames])
+
+
+def judge_edges(job: Job, last: Round, number: int) -> Round:
+    """Round `number`, the last, with the verdict of the diagnosis on each of its edges."""
+    with job.stage("diagnose", "diagnosis", 1, job.recipe.diagnosis, (f"solve-{number}",)) as (folder, advance):
+        if not folder.finished:
+            found = diagnose(last.graph, job.recipe.diagnosis)
+            artifacts.save(folder.path / "graph.npz", last.graph)
+            verdicts = Verdicts(found.verdict, found.probability, np.array(found.reason, dtype=np.str_))
+            artifacts.save(folder.path / "verdicts.npz", verdicts)
+            advance(1)
+    return replace(last, verdicts=artifacts.load(job.path("diagnose") / "verdicts.npz", Verdicts))
 
 
 @dataclass(frozen=True)

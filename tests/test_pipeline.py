@@ -1,5 +1,6 @@
 """The main job on a small rendered sequence: what a run leaves, resume after a kill, bad input."""
 
+import csv
 import json
 import shutil
 import signal
@@ -65,6 +66,19 @@ def test_the_result_is_near_the_truth(run: Run) -> None:
     rows = {row.name: row for row in run.report.trajectories}
     assert rows["result"].ate_rmse_m < 0.03
     assert rows["result"].ate_rmse_m <= rows["odometry"].ate_rmse_m + 0.002
+
+
+def test_every_edge_has_a_verdict_in_the_table_and_the_report(run: Run) -> None:
+    verdicts = run.result.verdicts
+    assert verdicts is not None
+    with (run.folder / "edges.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["status"] != "rejected"]
+    assert [row["verdict"] for row in rows] == verdicts.verdict.tolist()
+    assert [row["probability"] == "" for row in rows] == np.isnan(verdicts.probability).tolist()
+    assert all(row["why"] for row in rows)
+    counts = json.loads((run.folder / "report.json").read_text())["graph"]["verdicts"]
+    assert sum(counts.values()) == len(rows)
+    assert counts["consistent"] == (verdicts.verdict == "consistent").sum() > 0.9 * len(rows)
 
 
 def test_loop_deviation_falls(run: Run) -> None:

@@ -63,6 +63,7 @@ class EdgeRow:
     weight: float
     residual_m: float
     residual_deg: float
+    verdict: str = ""
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,9 @@ class ComponentRow:
 
 @dataclass(frozen=True)
 class GraphSummary:
-    """The viewing graph in numbers: what it joins, where its edges come from, what was rejected and why."""
+    """The viewing graph in numbers: what it joins, where its edges come from, what was rejected and why, and how many
+    edges the diagnosis judged how.
+    """
 
     vertices: int
     edges: int
@@ -83,6 +86,7 @@ class GraphSummary:
     components: tuple[ComponentRow, ...]
     edges_ignored: int = 0
     rejected: Mapping[str, int] = field(default_factory=dict)
+    verdicts: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hodge_pipeline.evaluation.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow
 from hodge_pipeline.evaluation.residuals import edge_residuals
@@ -15,6 +16,7 @@ CENTIMETRES_PER_DEGREE = 1.0
 """How a residual's angle counts beside its translation when edges are ranked: a scene lies about 0.6 m away."""
 
 MAX_RUNS_LISTED = 12
+VERDICTS = ("consistent", "suspect", "wrong", "untestable")
 
 
 def trajectory_rows(
@@ -61,7 +63,11 @@ def _distinct(component: Ints | None, sequence: Sequence[str] | None, count: int
 
 
 def graph_summary(
-    graph: ViewGraph, component: Ints, weights: Floats | None = None, rejected: Mapping[str, int] | None = None
+    graph: ViewGraph,
+    component: Ints,
+    weights: Floats | None = None,
+    rejected: Mapping[str, int] | None = None,
+    verdict: NDArray[np.str_] | None = None,
 ) -> GraphSummary:
     """The viewing graph in numbers; `component (V,)` and `weights (E,)` as the solution has them (0: ignored)."""
     sources, counts = np.unique(graph.source, return_counts=True)
@@ -75,6 +81,7 @@ def graph_summary(
         components=tuple(ComponentRow(len(row), in_runs(row, graph.vertex_ids)) for row in rows),
         edges_ignored=0 if weights is None else int((weights <= 0).sum()),
         rejected=dict(rejected or {}),
+        verdicts={} if verdict is None else {name: int((verdict == name).sum()) for name in VERDICTS},
     )
 
 
@@ -89,7 +96,11 @@ def in_runs(rows: Ints, vertex_ids: Ints | np.ndarray[tuple[int, ...], np.dtype[
 
 
 def worst_edges(
-    graph: ViewGraph, world_from_cam: Floats, weights: Floats | None = None, count: int = 10
+    graph: ViewGraph,
+    world_from_cam: Floats,
+    weights: Floats | None = None,
+    count: int = 10,
+    verdict: NDArray[np.str_] | None = None,
 ) -> tuple[EdgeRow, ...]:
     """The edges furthest from the poses (V, 4, 4), worst first: a centimetre counts like a degree."""
     translation_m, angle_rad = edge_residuals(graph, world_from_cam)
@@ -105,6 +116,7 @@ def worst_edges(
             weight=float(known[row]),
             residual_m=float(translation_m[row]),
             residual_deg=float(np.rad2deg(angle_rad[row])),
+            verdict="" if verdict is None else str(verdict[row]),
         )
         for row in worst
     )

@@ -111,6 +111,7 @@ def _graph(report: Report) -> Table:
         ("edges", str(graph.edges)),
         *((f"edges: {name}", str(count)) for name, count in graph.edges_by_source.items()),
         ("edges ignored by the solver", str(graph.edges_ignored)),
+        *((f"edges judged {verdict}", str(count)) for verdict, count in graph.verdicts.items()),
         ("connected parts", str(len(graph.components))),
         *((f"pairs rejected: {reason}", str(count)) for reason, count in graph.rejected.items()),
     ]
@@ -151,14 +152,16 @@ def worst_edges_table(report: Report) -> Table:
             number(edge.weight, ".2g"),
             number(edge.residual_m * 100, ".1f", " cm"),
             number(edge.residual_deg, ".2f", "°"),
+            edge.verdict or "–",
         )
         for edge in report.worst_edges
     )
     caption = (
         "Measured motions that disagree most with the result, worst first: a wrong edge, or a wrong result there. "
-        "Fitness: share of the cloud that found a partner. Weight: 0 where the solver ignored the edge."
+        "Fitness: share of the cloud that found a partner. Weight: 0 where the solver ignored the edge. "
+        "Verdict: what the cycles through the edge say."
     )
-    header = ("i", "j", "source", "fitness", "weight", "off by", "turned by")
+    header = ("i", "j", "source", "fitness", "weight", "off by", "turned by", "verdict")
     return Table("Worst edges", header, rows, caption, 3)
 
 
