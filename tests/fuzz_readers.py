@@ -30,6 +30,7 @@ from hodge_adapters.log_text import LogReader, LogWriter
 from hodge_adapters.mcap import McapReader
 from hodge_adapters.nerfstudio import NerfstudioReader, NerfstudioWriter
 from hodge_adapters.open3d_json import Open3dPoseGraphWriter, Open3dReader, Open3dTrajectoryWriter
+from hodge_adapters.pair_log import PairLogReader
 from hodge_adapters.ply_points import write_ply
 from hodge_adapters.poses_text import KittiWriter, TumWriter
 from hodge_adapters.seven_scenes import SevenScenesReader
@@ -125,6 +126,13 @@ def redwood(folder: Path) -> Path:
     return folder
 
 
+def pairs(folder: Path) -> Path:
+    some = some_poses(3)
+    graph = ViewGraph.from_edges(np.arange(3), np.array([[0, 1], [1, 2], [2, 0]]), np.stack(list(some)))
+    LogWriter().write(folder / "a.log", Source("pairs", folder, graph=graph))
+    return folder / "a.log"
+
+
 def toro(folder: Path) -> Path:
     lines = [
         "VERTEX2 0 0 0 0",
@@ -210,6 +218,7 @@ TARGETS: dict[str, Target] = {
     "open3d_cameras": Target(Open3dReader(), written(Open3dTrajectoryWriter(), "cameras.json")),
     "euroc": Target(EurocReader(), written(EurocWriter(), "data.csv")),
     "log": Target(LogReader(), written(LogWriter(), "a.log")),
+    "pair_log": Target(PairLogReader(), pairs),
     "tum_poses": Target(TumPosesReader(), written(TumWriter(), "a.tum")),
     "kitti_poses": Target(KittiPosesReader(), written(KittiWriter(), "a.txt")),
     "g2o": Target(G2oReader(), written(G2oWriter(), "a.g2o")),

@@ -21,11 +21,14 @@ MAX_NUMBER = 1 << 53
 
 @plain_dataclass(frozen=True)
 class LogFile:
-    """`poses` world_from_cam by number, and measured `pairs (E, 2)` of numbers with their `i_from_j (E, 4, 4)`."""
+    """`poses` world_from_cam by number; measured `pairs (E, 2)` of numbers with their `i_from_j (E, 4, 4)` and the
+    third number of their heads, `counts (E,)`.
+    """
 
     poses: dict[int, Floats] = field(default_factory=dict)
     pairs: Ints = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     i_from_j: Floats = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    counts: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 def read_log_file(path: Path) -> LogFile:
@@ -33,31 +36,45 @@ def read_log_file(path: Path) -> LogFile:
 
     Raises `SourceError` with `file:line` for a block that is incomplete or no rigid motion, or a pose given twice.
     """
-    rows = read_rows(path)
-    if not rows or len(rows) % 5:
-        raise SourceError(f"{path}: {len(rows)} lines are no blocks of `i j n` and a 4x4 matrix: is it a .log?")
-    heads = rows[::5]
-    wrong = [row.line for at, row in enumerate(rows) if len(row.fields) < 2 or (at % 5 and len(row.fields) != 4)]
-    try:
-        keys = np.array([row.fields[:2] for row in heads], np.float64)
-        body = np.array([row.fields for at, row in enumerate(rows) if at % 5], np.float64)
-    except ValueError:
-        wrong = wrong or [heads[0].line]
-    if wrong:
-        raise SourceError(f"{path}:{wrong[0]}: not `i j n` and four rows of four numbers: is it a .log?")
-    body = body.reshape(-1, 4, 4)
-    sound = (np.floor(keys) == keys) & (keys >= 0) & (keys < MAX_NUMBER)
-    good = sound.all(axis=1) & se3.is_motion(body)
+    numbers, body, lines = read_blocks(path, 4)
+    good = se3.is_motion(body)
     if not good.all():
-        line = heads[int(np.flatnonzero(~good)[0])].line
+        line = lines[int(np.flatnonzero(~good)[0])]
         raise SourceError(f"{path}:{line}: not `i j n` and a rigid motion: mend or remove the block")
     body[:, :3, :3] = se3.project_to_so3(body[:, :3, :3])
-    numbers = keys.astype(np.int64)
     own = numbers[:, 0] == numbers[:, 1]
     if len(np.unique(numbers[own, 0])) < own.sum():
         raise SourceError(f"{path}: a pose is given twice: remove one of its blocks")
     poses = {int(number): pose for number, pose in zip(numbers[own, 0], body[own], strict=True)}
-    return LogFile(poses, numbers[~own], body[~own])
+    return LogFile(poses, numbers[~own, :2], body[~own], numbers[~own, 2])
+
+
+def read_blocks(path: Path, size: int) -> tuple[Ints, Floats, list[int]]:
+    """The heads `i j n` (N, 3), n 0 where a head has none, the matrices (N, size, size), and the line of each head.
+
+    Raises `SourceError` with `file:line` for a block that is incomplete or no numbers.
+    """
+    rows, height = read_rows(path), size + 1
+    if not rows or len(rows) % height:
+        raise SourceError(
+            f"{path}: {len(rows)} lines are no blocks of `i j n` and a {size}x{size} matrix: is it whole?"
+        )
+    heads = rows[::height]
+    wrong = [
+        row.line for at, row in enumerate(rows) if len(row.fields) < 2 or (at % height and len(row.fields) != size)
+    ]
+    try:
+        keys = np.array([[*row.fields[:3], "0"][:3] for row in heads], np.float64)
+        body = np.array([row.fields for at, row in enumerate(rows) if at % height], np.float64)
+    except ValueError:
+        wrong = wrong or [heads[0].line]
+    if wrong:
+        raise SourceError(f"{path}:{wrong[0]}: not `i j n` and {size} rows of {size} numbers: mend the file")
+    sound = ((np.floor(keys) == keys) & (keys >= 0) & (keys < MAX_NUMBER)).all(axis=1)
+    if not sound.all():
+        line = heads[int(np.argmin(sound))].line
+        raise SourceError(f"{path}:{line}: not `i j n` and a {size}x{size} matrix: mend or remove the block")
+    return keys.astype(np.int64), body.reshape(-1, size, size), [row.line for row in heads]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
