@@ -59,7 +59,7 @@ class PairLogReader:
         graph = ViewGraph.from_edges(ids, edges, found.i_from_j, source="pair")
         next_to = found.pairs[:, 1] - found.pairs[:, 0] == 1
         graph = replace(graph, source=np.where(next_to, "sequential", "pair"))
-        files = (path,)
+        files: tuple[Path, ...] = (path,)
         if self.information is not None:
             matrices = read_information(self.information)
             graph = replace(graph, information=_matched(self.information, found.pairs, matrices, notes))
@@ -107,4 +107,4 @@ def _matched(path: Path, pairs: Ints, known: tuple[Ints, Floats], notes: list[st
     if not there.all():
         missing = int((~there).sum())
         notes.append(f"{missing} of {len(pairs)} pairs are not in {path.name}: they get its median matrix")
-    return np.where(there[:, None, None], matrices[first[place]], usual)
+    return np.asarray(np.where(there[:, None, None], matrices[first[place]], usual))
