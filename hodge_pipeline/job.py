@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hodge_pipeline import artifacts, binding
-from hodge_pipeline.monitor import Monitor
+from hodge_pipeline.monitor import Cost, Monitor
 from hodge_pipeline.recipe import Recipe
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Source
@@ -21,7 +21,13 @@ from hodge_pipeline.watch import Watcher
 from hodge_pipeline.workspace import KEY_FILE, StageFolder, Workspace, key_of
 
 LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless")
+RECORDING = "recording"
+"""The title of every stage that only records: such a stage is written whether a job computes or not."""
 log = logging.getLogger("hodge_pipeline")
+
+
+class Unfinished(Exception):
+    """A stage, named by its title, that a job which does not compute would need."""
 
 
 @cache
@@ -38,11 +44,15 @@ def versions() -> dict[str, str]:
 
 @dataclass
 class Job:
-    """What every step of a run shares. `keys` holds the key of each stage so far, by its name."""
+    """What every step of a run shares. `keys` holds the key of each stage so far, by its name.
+
+    A job that does not compute reads finished stages only: one that is not raises `Unfinished`.
+    """
 
     recipe: Recipe
     workspace: Workspace
     watcher: Watcher
+    computes: bool = True
     monitor: Monitor = field(default_factory=Monitor)
     keys: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -66,6 +76,8 @@ class Job:
         key = key_of(name, binding.unbind(options), versions(), [self.keys[stage] for stage in inputs])
         self.keys[name] = key
         told = len(self.notes)
+        if not (self.computes or title == RECORDING or self.workspace.is_finished(name, key)):
+            raise Unfinished(title)
         with self.monitor.measure() as cost, self.workspace.stage(name, key) as folder:
             if folder.finished:
                 log.info("%s: already done", title)
@@ -81,9 +93,18 @@ class Job:
             self.workspace.note(name, {"title": title, "notes": self.notes[told:], **vars(cost)})
 
     def costs(self) -> list[dict[str, Any]]:
-        """Title, wall_s, cpu_s and peak_mb of each stage so far, those finished before it was resumed included."""
-        infos = (artifacts.read_json(self.path(name) / KEY_FILE) for name in self.keys if self.path(name).is_dir())
-        return [info for info in infos if "title" in info]
+        """Title, wall_s, cpu_s and peak_mb of each stage so far, those finished before it was resumed included.
+
+        Stages of one title, such as the parts of the recording, are one entry.
+        """
+        found: dict[str, dict[str, Any]] = {}
+        for name in self.keys:
+            info = artifacts.read_json(self.path(name) / KEY_FILE) if self.path(name).is_dir() else {}
+            if "title" in info:
+                known = found.pop(info["title"], {"title": info["title"], **vars(Cost())})
+                sums = {part: known[part] + info[part] for part in ("wall_s", "cpu_s")}
+                found[info["title"]] = {**known, **sums, "peak_mb": max(known["peak_mb"], info["peak_mb"])}
+        return list(found.values())
 
 
 def source_key(source: Source, reader: Any) -> str:

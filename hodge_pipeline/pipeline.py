@@ -7,9 +7,10 @@ from pathlib import Path
 
 from hodge_pipeline import binding, outputs, steps
 from hodge_pipeline.evaluation.contents import Report
+from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.job import Job, logging_to
 from hodge_pipeline.recipe import Recipe, load_recipe, with_source
-from hodge_pipeline.record import record
+from hodge_pipeline.record import Recording
 from hodge_pipeline.rounds import Round
 from hodge_pipeline.types import Source
 from hodge_pipeline.watch import Nobody, Watcher
@@ -52,17 +53,28 @@ def run(
 
 def _run(job: Job) -> Run:
     source = steps.read(job)
+    with Recording(job, source) as recording:
+        rounds, models, scores = compute(job, source, recording)
+    report = outputs.write(job, source, rounds, models, scores)
+    return Run(job.workspace.folder, source, rounds[-1], report)
+
+
+def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round], dict[str, Path], ScoreTable | None]:
+    """The rounds, the models' files by name, the scores: every stage in order, each recorded once it is done."""
     with job.recipe.executor.open() as workers:
         clouds = steps.prepare_clouds(job, source, workers)
+        recording.clouds(clouds)
         rounds = [steps.odometry(job, source, workers)]
+        recording.odometry(rounds[0])
         for number in range(1, job.recipe.outer_iterations + 1):
             poses = rounds[-1].world_from_cam
             candidates = steps.propose_edges(job, number, source, clouds, poses)
             registered = steps.register_edges(job, number, candidates, poses, workers)
             rounds.append(steps.solve(job, number, source, candidates, registered, poses))
+            recording.round(number, rounds[-1])
         rounds[-1] = steps.judge_edges(job, rounds[-1], len(rounds) - 1)
         scores = steps.evaluate(job, source, rounds, workers)
+        recording.scores(scores)
     models = steps.fuse(job, source, rounds[-1].world_from_cam)
-    record(job, source, rounds, models, scores)
-    report = outputs.write(job, source, rounds, models, scores)
-    return Run(job.workspace.folder, source, rounds[-1], report)
+    recording.models(models)
+    return rounds, models, scores

@@ -1,9 +1,11 @@
-"""A run's artifacts into its recording: every stage, in the order of the run."""
+"""A run's artifacts into its recording: each stage's part as soon as the stage is done, merged at the end."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 
@@ -11,56 +13,131 @@ from hodge_pipeline import artifacts, binding, yaml_file
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.fusion.ply import read_ply
-from hodge_pipeline.job import Job
-from hodge_pipeline.recording.recorder import Recorder
+from hodge_pipeline.job import RECORDING, Job, log
+from hodge_pipeline.recording.merge import find_parts, merge_parts
+from hodge_pipeline.recording.recorder import APPLICATION, Recorder
 from hodge_pipeline.rounds import Round, has_truth, pose_sets, true_poses
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Source
 
 FILE = "recording.rrd"
+Notes = tuple[str, ...]
 
 
-def record(
-    job: Job, source: Source, rounds: Sequence[Round], models: dict[str, Path], scores: ScoreTable | None
-) -> None:
-    """Write `recording.rrd`; with the level `off` there is none."""
-    options = job.recipe.recording
-    if options.level == "off":
-        return
-    with job.stage("record", "recording", 4 + len(rounds), options, tuple(job.keys)) as (folder, advance):
-        if not folder.finished:
-            recorder = Recorder(folder.path, job.workspace.identity, options=options, rounds=len(rounds) - 1)
-            notes = [*recorder.frames(source.name, source.frames, source.notes)]
-            advance(1)
-            notes += recorder.clouds(source.frames, CloudSet.open(job.path("clouds")))
-            advance(1)
-            notes += _record_poses(recorder, source, rounds)
-            for number in range(1, len(rounds)):
-                notes += _record_round(recorder, source, rounds, number)
+class Recording:
+    """The recording of a run in progress: a context that ends with `recording.rrd` in the run folder.
+
+    Each method records one stage, under a key of its own: a resumed run records only what it computes again. Where the
+    run is stopped or fails, what was recorded so far is merged and the error goes on. With the level `off` nothing is
+    written.
+    """
+
+    def __init__(self, job: Job, source: Source) -> None:
+        self._job, self._source = job, source
+        self._stages: list[str] = []
+        self._rounds: list[Round] = []
+
+    def __enter__(self) -> Recording:
+        source = self._source
+        self._part("frames", ("source",), lambda to: to.frames(source.name, source.frames, source.notes))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._job.recipe.recording.level == "off":
+            return
+        if error is None:
+            self._finish()
+        else:
+            self._rescue()
+
+    def clouds(self, clouds: CloudSet) -> None:
+        """The frames' clouds."""
+        self._part("clouds", ("clouds",), lambda to: to.clouds(self._source.frames, clouds))
+
+    def odometry(self, first: Round) -> None:
+        """The poses that the run starts from."""
+        self._rounds = [first]
+        self._part(
+            "odometry", ("odometry",), lambda to: to.poses("odometry", first.world_from_cam, self._source.frames)
+        )
+
+    def round(self, number: int, this: Round) -> None:
+        """The edges of outer round `number`, the pairs that became none, and the solve."""
+        self._rounds.append(this)
+        rounds = tuple(self._rounds)
+        self._part(f"round-{number}", (f"solve-{number}",), lambda to: _record_round(to, self._source, rounds, number))
+
+    def scores(self, scores: ScoreTable | None) -> None:
+        """The errors of the frames and the score tables."""
+        inputs = (f"solve-{len(self._rounds) - 1}", *(["evaluate"] if scores is not None else []))
+        rounds = tuple(self._rounds)
+        self._part("evaluation", inputs, lambda to: _record_evaluation(to, self._source, rounds, scores))
+
+    def models(self, models: dict[str, Path]) -> None:
+        """The fused models; of several the last is seen."""
+        inputs = tuple(f"fuse-{row}" for row in range(len(models)))
+        if models:
+            self._part(
+                "model", inputs, lambda to: tuple(n for path in models.values() for n in to.model(read_ply(path)))
+            )
+
+    def _part(self, name: str, inputs: tuple[str, ...], write: Callable[[Recorder], Notes]) -> None:
+        job, stage = self._job, f"record-{name}"
+        if job.recipe.recording.level == "off":
+            return
+        with job.stage(stage, RECORDING, 1, job.recipe.recording, inputs) as (folder, advance):
+            if not folder.finished:
+                for note in write(self._recorder(folder.path)):
+                    job.note(note)
                 advance(1)
-            for path in models.values():
-                notes += recorder.model(read_ply(path))
-            advance(1)
-            notes += _record_evaluation(recorder, source, rounds, scores)
-            log = (job.workspace.folder / "log.txt").read_text("utf-8").splitlines()
-            recorder.text(yaml_file.dump(binding.unbind(job.recipe)), log)
-            merged = recorder.finish(folder.path / FILE)
-            for note in (*notes, *(merged.notes if merged else ())):
-                job.note(note)
-            advance(1)
-    artifacts.link_or_copy(job.path("record") / FILE, job.workspace.folder / FILE)
+        self._stages.append(stage)
+
+    def _recorder(self, folder: Path) -> Recorder:
+        job = self._job
+        return Recorder(
+            folder, job.workspace.identity, options=job.recipe.recording, rounds=job.recipe.outer_iterations
+        )
+
+    def _finish(self) -> None:
+        job = self._job
+        with job.stage("record", RECORDING, 1, job.recipe.recording, tuple(self._stages)) as (folder, advance):
+            if not folder.finished:
+                for note in self._merge(folder.path, folder.path / FILE):
+                    job.note(note)
+                advance(1)
+        artifacts.link_or_copy(job.path("record") / FILE, job.workspace.folder / FILE)
+
+    def _rescue(self) -> None:
+        """Merge what there is; an error of this is logged, so that the one that stopped the run is seen."""
+        folder = self._job.workspace.folder
+        try:
+            with tempfile.TemporaryDirectory(dir=folder, prefix=".recording-") as scratch:
+                self._merge(Path(scratch), folder / FILE)
+        except Exception as error:
+            log.warning("the recording could not be merged: %s", error)
+
+    def _merge(self, folder: Path, out: Path) -> Notes:
+        """Truth, recipe and log, which belong to the run as a whole, then all parts as one file."""
+        job, recorder = self._job, self._recorder(folder)
+        notes = _record_truth(recorder, self._source, self._rounds)
+        lines = (job.workspace.folder / "log.txt").read_text("utf-8").splitlines()
+        recorder.text(yaml_file.dump(binding.unbind(job.recipe)), lines)
+        folders = [*(job.path(stage) for stage in self._stages), folder]
+        parts = [part for each in folders for part in find_parts(each)]
+        return notes + merge_parts(parts, out, APPLICATION, job.workspace.identity).notes
 
 
-def _record_poses(recorder: Recorder, source: Source, rounds: Sequence[Round]) -> tuple[str, ...]:
-    """The truth is laid onto the result, so that the two are seen to differ and nothing else."""
-    notes = recorder.poses("odometry", rounds[0].world_from_cam, source.frames)
-    truth, result = true_poses(source), rounds[-1]
-    if has_truth(source) and result.solution is not None:
-        laid = absolute_error(truth, np.where(np.isfinite(truth), result.world_from_cam, np.nan)).aligned
-        notes += recorder.poses("truth", laid, source.frames)
-    return notes
+def _record_truth(recorder: Recorder, source: Source, rounds: Sequence[Round]) -> Notes:
+    """The truth, laid onto the last poses, so that the two are seen to differ and nothing else."""
+    if not rounds or not has_truth(source):
+        return ()
+    truth = true_poses(source)
+    laid = absolute_error(truth, np.where(np.isfinite(truth), rounds[-1].world_from_cam, np.nan)).aligned
+    return recorder.poses("truth", laid, source.frames)
 
 
-def _record_round(recorder: Recorder, source: Source, rounds: Sequence[Round], number: int) -> tuple[str, ...]:
+def _record_round(recorder: Recorder, source: Source, rounds: Sequence[Round], number: int) -> Notes:
     before, this = rounds[number - 1], rounds[number]
     assert this.solution is not None
     rejected = Candidates(this.rejected_pairs, this.rejected_reasons, np.full(len(this.rejected_pairs), np.nan))
@@ -73,9 +150,7 @@ def _record_round(recorder: Recorder, source: Source, rounds: Sequence[Round], n
     )
 
 
-def _record_evaluation(
-    recorder: Recorder, source: Source, rounds: Sequence[Round], scores: ScoreTable | None
-) -> tuple[str, ...]:
+def _record_evaluation(recorder: Recorder, source: Source, rounds: Sequence[Round], scores: ScoreTable | None) -> Notes:
     truth = true_poses(source)
     per_frame: dict[str, Floats] = {}
     if has_truth(source):

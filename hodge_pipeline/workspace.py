@@ -88,6 +88,10 @@ class Workspace:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def is_finished(self, name: str, key: str) -> bool:
+        """Whether the stage is there under its key."""
+        return _key_at(self.folder / "stages" / name) == key
+
     @contextmanager
     def stage(self, name: str, key: str) -> Iterator[StageFolder]:
         """The folder of one stage under its key; what the body writes is committed when it leaves without an error.

@@ -6,7 +6,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from hodge_pipeline.stages import Advance
@@ -17,6 +25,8 @@ class Terminal:
 
     def __init__(self, quiet: bool) -> None:
         self._console = Console(stderr=True, quiet=quiet, highlight=False)
+        self._tasks: dict[str, TaskID] = {}
+        self._totals: dict[str, int] = {}
         self._progress = Progress(
             TextColumn("{task.description:<24}"),
             BarColumn(),
@@ -40,9 +50,15 @@ class Terminal:
 
     @contextmanager
     def _bar(self, title: str, total: int) -> Iterator[Advance]:
-        task = self._progress.add_task(title, total=total)
+        """Stages of one title, such as the recording's parts, share a bar."""
+        task = self._tasks.get(title)
+        if task is None:
+            task = self._tasks[title] = self._progress.add_task(title, total=0)
+        before = self._totals[title] = self._totals.get(title, 0)
+        self._totals[title] += total
+        self._progress.update(task, total=self._totals[title])
         yield lambda done: self._progress.advance(task, done)
-        self._progress.update(task, total=total, completed=total)
+        self._progress.update(task, completed=before + total)
 
     def say(self, message: str) -> None:
         """One line above the bars."""

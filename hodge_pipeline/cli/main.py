@@ -159,12 +159,23 @@ def view(run_folder: Path) -> None:
     listing.view(run_folder)
 
 
+@app.command()
+def record(
+    run_folder: Path,
+    level: Annotated[Optional[str], typer.Option(help="summary, normal or full; default: as in the recipe.")] = None,  # noqa: UP045
+    max_megabytes: Annotated[Optional[float], typer.Option(help="Bound on the file; default: the recipe's.")] = None,  # noqa: UP045
+    quiet: Quiet = False,
+) -> None:
+    """Make the recording of a run again, at another size, without computing anything again."""
+    from hodge_pipeline.cli import recording
+
+    recording.record(run_folder, level, max_megabytes, quiet=quiet)
+
+
 def main() -> None:
     """Run the command; what a user can mend is one line and exit code 1 (3: a result that failed its checks)."""
     try:
-        app(standalone_mode=True)
-    except KeyboardInterrupt:
-        sys.exit("stopped; the same command goes on where it stopped")
+        app(standalone_mode=True)  # which ends with 130 on Ctrl-C
     except Exception as error:
         from hodge_pipeline.errors import HodgeError
 

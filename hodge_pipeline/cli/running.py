@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import typer
 
 from hodge_pipeline.cli.console import Terminal, print_table
 from hodge_pipeline.errors import RecipeError
@@ -31,7 +36,7 @@ def run(
     from hodge_pipeline.evaluation.report import as_json as report_json
     from hodge_pipeline.pipeline import run as run_pipeline
 
-    with Terminal(quiet or as_json) as terminal:
+    with resumable(out), Terminal(quiet or as_json) as terminal:
         result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal)
     if as_json:
         from hodge_pipeline.artifacts import json_text
@@ -39,6 +44,29 @@ def run(
         print(json_text(report_json(result.report)), end="")
     elif not quiet:
         _print_summary(result)
+
+
+class Terminated(KeyboardInterrupt):
+    """The system asks the process to end, as Ctrl-C does."""
+
+
+def _terminate(*_: object) -> None:
+    raise Terminated
+
+
+@contextmanager
+def resumable(out: Path) -> Iterator[None]:
+    """Says in one line how a run that was stopped goes on, and exits: 130 after Ctrl-C, 143 after a TERM."""
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        recording = out / "recording.rrd"
+        shown = f"; {recording} shows what was done" if recording.is_file() else ""
+        print(f"stopped: the same command goes on where it stopped{shown}", file=sys.stderr)
+        raise typer.Exit(143 if isinstance(stop, Terminated) else 130) from stop
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def demo(out: Path, overrides: Sequence[str], *, overwrite: bool, quiet: bool) -> None:

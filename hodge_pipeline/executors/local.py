@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -133,7 +134,11 @@ def _cores() -> int:
 
 
 def _end_with_parent() -> None:
-    """End this worker when its parent is killed: workers hold each other's queue open, so they would wait for ever."""
+    """End this worker when its parent is killed: workers hold each other's queue open, so they would wait for ever.
+
+    Ctrl-C reaches every process of a terminal: it is the parent's to deal with.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_exit_after, args=(parent.sentinel,), daemon=True).start()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import rerun as rr
 
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.shapes import evenly
@@ -28,10 +29,15 @@ def log_frames(
     log_notes(stream, 0, thinned)
     _log_names(stream, frames)
     _log_cameras(stream, frames)
+    kept = 0
     for path, reader in ((layout.COLOUR, _colour), (layout.DEPTH, _depth)):
         for chunk_rows, images in _chunks(frames, rows, reader):
             _log_images(stream, path, frame_columns(frames, len(frames), chunk_rows), images)
-    return thinned
+            kept += len(images)
+    wished = sum((frames[row].encoded_colour is not None) + (frames[row].encoded_depth is not None) for row in rows)
+    lost = (f"recording: {wished - kept} images cannot be read and are not shown",) if kept < wished else ()
+    log_notes(stream, 0, lost, level="WARN")
+    return thinned + lost
 
 
 def image_rows(frames: Sequence[Frame], options: RecordingOptions) -> tuple[Ints, tuple[str, ...]]:
@@ -76,11 +82,19 @@ def log_clouds(
 
 
 def _colour(frame: Frame) -> EncodedImage | None:
-    return frame.encoded_colour() if frame.encoded_colour else None
+    return _encoded(frame.encoded_colour)
 
 
 def _depth(frame: Frame) -> EncodedImage | None:
-    return frame.encoded_depth() if frame.encoded_depth else None
+    return _encoded(frame.encoded_depth)
+
+
+def _encoded(read: Callable[[], EncodedImage] | None) -> EncodedImage | None:
+    """The image, None where there is none or it cannot be read: that is counted, and no reason to end a run."""
+    try:
+        return read() if read else None
+    except (SourceError, OSError):
+        return None
 
 
 def _images(frame: Frame) -> list[EncodedImage]:

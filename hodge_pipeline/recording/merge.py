@@ -32,10 +32,17 @@ class Merged:
 def merge(folder: Path, out: Path, application_id: str, recording_id: str) -> Merged:
     """One file of all parts in the folder, in the order of the run.
 
-    A part that a killed writer left is taken where no complete one is there. A damaged part is mended as far as it
-    can be read; the others are not touched by it.
+    A part that a killed writer left is taken where no complete one is there.
     """
-    parts = find_parts(folder)
+    return merge_parts(find_parts(folder), out, application_id, recording_id)
+
+
+def merge_parts(parts: Iterable[Path], out: Path, application_id: str, recording_id: str) -> Merged:
+    """One file of these parts, in the order of the run that their names say.
+
+    A damaged part is mended as far as it can be read; the others are not touched by it.
+    """
+    parts = sorted(parts, key=_place)
     contents = contents_of(parts)
     notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="hodge-recording-") as scratch:
@@ -57,7 +64,12 @@ def find_parts(folder: Path) -> list[Path]:
     complete = [path for path in folder.glob(f"*{layout.PART_SUFFIX}") if not path.name.startswith(".")]
     unfinished = set(folder.glob(f".*{layout.PARTIAL_SUFFIX}")) - {partial_path(path) for path in complete}
     parts = [path for path in (*complete, *unfinished) if layout.parse_part(path.name)[0]]
-    return sorted(parts, key=lambda path: path.name.lstrip("."))
+    return sorted(parts, key=_place)
+
+
+def _place(part: Path) -> str:
+    """Names begin with the number of their stage."""
+    return part.name.lstrip(".")
 
 
 def contents_of(parts: Iterable[Path]) -> Contents:

@@ -16,6 +16,7 @@ from hodge_pipeline.recording.stream import writing
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Model, Solution, ViewGraph
 
 Notes = tuple[str, ...]
+APPLICATION = "hodge-pipeline"
 
 
 class Recorder:
@@ -30,7 +31,7 @@ class Recorder:
         self,
         folder: Path,
         recording_id: str,
-        application_id: str = "hodge-pipeline",
+        application_id: str = APPLICATION,
         options: RecordingOptions | None = None,
         rounds: int = 1,
     ) -> None:
