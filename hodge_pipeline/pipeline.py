@@ -73,6 +73,7 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
             rounds.append(steps.solve(job, number, source, candidates, registered, poses))
             recording.round(number, rounds[-1])
         rounds[-1] = steps.judge_edges(job, rounds[-1], len(rounds) - 1)
+        recording.diagnosis(rounds[-1])
         scores = steps.evaluate(job, source, rounds, workers)
         recording.scores(scores)
     models = steps.fuse(job, source, rounds[-1].world_from_cam)

@@ -68,6 +68,18 @@ class Recording:
         rounds = tuple(self._rounds)
         self._part(f"round-{number}", (f"solve-{number}",), lambda to: _record_round(to, self._source, rounds, number))
 
+    def diagnosis(self, last: Round) -> None:
+        """The last round's edges with the verdict on each."""
+        verdicts = last.verdicts
+        if verdicts is not None:
+            self._rounds[-1] = last
+            graph, poses = last.graph, last.world_from_cam
+            self._part(
+                "diagnosis",
+                ("diagnose",),
+                lambda to: to.diagnosis(graph, poses, verdicts.verdict, verdicts.probability, verdicts.reason),
+            )
+
     def scores(self, scores: ScoreTable | None) -> None:
         """The errors of the frames and the score tables."""
         inputs = (f"solve-{len(self._rounds) - 1}", *(["evaluate"] if scores is not None else []))
@@ -141,11 +153,8 @@ def _record_round(recorder: Recorder, source: Source, rounds: Sequence[Round], n
     before, this = rounds[number - 1], rounds[number]
     assert this.solution is not None
     rejected = Candidates(this.rejected_pairs, this.rejected_reasons, np.full(len(this.rejected_pairs), np.nan))
-    verdicts = None if this.verdicts is None else this.verdicts.verdict.tolist()
     first = sum(1 + len(one.solution.history) for one in rounds[1:number] if one.solution is not None)
-    return recorder.edges(
-        number, this.graph, before.world_from_cam, rejected=rejected, verdicts=verdicts
-    ) + recorder.solution(
+    return recorder.edges(number, this.graph, before.world_from_cam, rejected=rejected) + recorder.solution(
         number, this.graph, before.world_from_cam, this.solution, source.frames, first_iteration=first
     )
 

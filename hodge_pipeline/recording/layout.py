@@ -22,6 +22,7 @@ COLOUR = "/world/camera/image/colour"
 DEPTH = "/world/camera/image/depth"
 TRAJECTORIES = "/world/trajectories"
 EDGES = "/world/edges"
+VERDICTS = "/world/verdicts"
 FILM = "/world/film"
 FILM_EDGES = "/world/film/edges"
 FILM_TRAJECTORY = "/world/film/trajectory"
@@ -32,6 +33,7 @@ RECIPE = "/text/recipe"
 LOG = "/text/log"
 SOURCE = "/text/source"
 SCORES = "/text/scores"
+DIAGNOSIS = "/text/diagnosis"
 LEGEND = "/text/legend"
 
 PART_SUFFIX = ".rrd"
@@ -73,6 +75,11 @@ def edges(outer: int) -> str:
 def rejected(outer: int) -> str:
     """The candidate pairs of an outer round that became no edges."""
     return f"{edges(outer)}/rejected"
+
+
+def verdict(name: str) -> str:
+    """The edges that the diagnosis calls so."""
+    return f"{VERDICTS}/{slug(name)}"
 
 
 def solved_edges(outer: int) -> str:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from hodge_pipeline.recording import frames as frame_log
 from hodge_pipeline.recording import graph as graph_log
 from hodge_pipeline.recording import layout, results
+from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.merge import Merged, merge
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import writing
@@ -100,6 +103,22 @@ class Recorder:
             return notes + graph_log.log_poses(stream, name, solution.world_from_cam, frames, self.options)
 
         return self._part(layout.outer_number(outer, 1), "solution", str(outer), log)
+
+    def diagnosis(
+        self,
+        graph: ViewGraph,
+        world_from_cam: Floats,
+        verdict: NDArray[np.str_],
+        probability: Floats,
+        reason: NDArray[np.str_],
+    ) -> Notes:
+        """The edges (E,) by verdict, under the last poses; the label of each says how probable it is, and why."""
+        return self._part(
+            890,
+            "diagnosis",
+            "",
+            lambda s: log_diagnosis(s, graph, world_from_cam, verdict, probability, reason, self.options),
+        )
 
     def model(self, model: Model) -> Notes:
         """The fused scene."""

@@ -1,0 +1,79 @@
+"""The verdicts on the edges, each with an entity of its own, so that one kind can be shown alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.stream import log_markdown, log_notes
+from hodge_pipeline.types import Floats, Ints, ViewGraph
+
+COLOURS = {
+    "consistent": (60, 115, 225),
+    "untestable": (150, 150, 150),
+    "suspect": (230, 160, 0),
+    "wrong": (230, 60, 160),
+}
+"""Blue, grey, amber, magenta: apart in hue and in brightness; whatever else a verdict may be is white."""
+RADII = {"consistent": -0.4, "untestable": -0.6, "suspect": -1.2, "wrong": -1.6}
+BYTES_EACH = 160
+LISTED = 40
+
+
+def log_diagnosis(
+    stream: rr.RecordingStream,
+    graph: ViewGraph,
+    world_from_cam: Floats,
+    verdict: NDArray[np.str_],
+    probability: Floats,
+    reason: NDArray[np.str_],
+    options: RecordingOptions,
+) -> tuple[str, ...]:
+    """What was thinned, in words; of the edges that are drawn those with a bad verdict come first."""
+    notes: tuple[str, ...] = ()
+    log_markdown(stream, layout.DIAGNOSIS, summary(graph, verdict, probability, reason))
+    lines = shapes.segments(world_from_cam, graph.edges)
+    drawable = np.isfinite(lines).all(axis=(1, 2))
+    for name in sorted(set(verdict.tolist()) | set(COLOURS)):
+        rows = np.flatnonzero((verdict == name) & drawable)
+        kept = options.count(options.edge_lines, len(rows), BYTES_EACH, options.max_bytes("solver") / 2)
+        rows, available = rows[shapes.evenly(len(rows), kept)], len(rows)
+        labels = [_label(graph, int(row), name, probability, reason) for row in rows]
+        colour, radius = COLOURS.get(name, shapes.RESULT_COLOUR), RADII.get(name, -0.8)
+        strips = rr.LineStrips3D(lines[rows], colors=[colour], radii=[radius], labels=labels, show_labels=False)
+        stream.log(layout.verdict(name), strips, static=True)
+        if kept < available:
+            notes += (f"recording: {kept} of {available} edges called {name} drawn",)
+    log_notes(stream, 0, notes)
+    return notes
+
+
+def summary(graph: ViewGraph, verdict: NDArray[np.str_], probability: Floats, reason: NDArray[np.str_]) -> str:
+    """The verdicts counted, and the least probable edges with their reasons, as Markdown."""
+    names, counts = np.unique(verdict, return_counts=True)
+    lines = ["# Which edge is wrong", "", "| verdict | edges |", "|---|---|"]
+    lines += [f"| {name} | {count} |" for name, count in zip(names, counts, strict=True)]
+    listed = [int(row) for row in _least_probable(verdict, probability)]
+    if listed:
+        lines += ["", "## The least probable", "", "| edge | verdict | right with | why |", "|---|---|---|---|"]
+    for row in listed:
+        i, j = graph.vertex_ids[graph.edges[row]]
+        lines += [f"| {i} – {j} | {verdict[row]} | {_percent(probability[row])} | {reason[row]} |"]
+    return "\n".join(lines)
+
+
+def _least_probable(verdict: NDArray[np.str_], probability: Floats) -> Ints:
+    rows = np.flatnonzero(np.isin(verdict, ("wrong", "suspect")))
+    return np.asarray(rows[np.argsort(probability[rows], kind="stable")][:LISTED], np.int64)
+
+
+def _label(graph: ViewGraph, row: int, name: str, probability: Floats, reason: NDArray[np.str_]) -> str:
+    i, j = graph.vertex_ids[graph.edges[row]]
+    return f"{i} – {j}: {graph.source[row]}, {name}, {_percent(probability[row])}: {reason[row]}"
+
+
+def _percent(probability: float) -> str:
+    return "–" if np.isnan(probability) else f"{100 * probability:.3g} %"
