@@ -46,7 +46,8 @@ def versions() -> dict[str, str]:
 class Job:
     """What every step of a run shares. `keys` holds the key of each stage so far, by its name.
 
-    A job that does not compute reads finished stages only: one that is not raises `Unfinished`.
+    A job that does not compute reads finished stages only: one that is not raises `Unfinished`. Without `scoring` the
+    score tables, the slowest part of the end, are left out.
     """
 
     recipe: Recipe
@@ -56,6 +57,7 @@ class Job:
     monitor: Monitor = field(default_factory=Monitor)
     keys: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    scoring: bool = True
 
     def path(self, stage: str) -> Path:
         """Where a stage's artifacts lie."""

@@ -59,7 +59,7 @@ def write_graph(folder: Path, source: Source, last: Round) -> None:
         [graph.vertex_ids[i], graph.vertex_ids[j], reason, "rejected", *[""] * 9]
         for (i, j), reason in zip(last.rejected_pairs, last.rejected_reasons, strict=True)
     ]
-    artifacts.write_text(folder / "edges.csv", edge_table(graph, last.world_from_cam, weights, rejected, last.verdicts))
+    artifacts.write_text(folder / "edges.csv", edge_table(graph, last.world_from_cam, weights, rejected, last))
 
 
 def edge_table(
@@ -67,20 +67,24 @@ def edge_table(
     world_from_cam: Floats,
     weights: Floats,
     rejected: Sequence[Sequence[object]] = (),
-    verdicts: Verdicts | None = None,
+    judged: Round | None = None,
 ) -> str:
-    """Every edge with its residual under the poses and its verdict as CSV, then the pairs that became no edge."""
+    """Every edge with its residual under the poses as CSV, then the pairs that became no edge; the round of a run adds
+    verdicts, and what was switched off by hand.
+    """
     out = io.StringIO()
     translation_m, angle_rad = edge_residuals(graph, world_from_cam)
     table = csv.writer(out, lineterminator="\n")
     table.writerow(EDGE_COLUMNS)
+    verdicts = None if judged is None else judged.verdicts
+    off = np.zeros(graph.edge_count, bool) if judged is None or judged.disabled is None else judged.disabled
     for row, (i, j) in enumerate(graph.edges):
         table.writerow(
             [
                 graph.vertex_ids[i],
                 graph.vertex_ids[j],
                 graph.source[row],
-                "used" if weights[row] > 0 else "ignored",
+                "disabled" if off[row] else "used" if weights[row] > 0 else "ignored",
                 f"{graph.fitness[row]:.4f}",
                 f"{graph.rmse_m[row]:.5f}",
                 graph.correspondences[row],

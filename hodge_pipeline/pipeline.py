@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hodge_pipeline import binding, outputs, steps
+from hodge_pipeline.edited_round import edited_rounds
+from hodge_pipeline.edits import listed_edges
 from hodge_pipeline.evaluation.contents import Report
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.job import Job, logging_to
@@ -14,7 +16,7 @@ from hodge_pipeline.record import Recording
 from hodge_pipeline.rounds import Round
 from hodge_pipeline.types import Source
 from hodge_pipeline.watch import Nobody, Watcher
-from hodge_pipeline.workspace import Workspace
+from hodge_pipeline.workspace import RECIPE_FILE, Workspace
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,18 @@ def run(
         return _run(Job(recipe, workspace, watcher or Nobody()))
 
 
+def solve_again(folder: Path | str, *, watcher: Watcher | None = None) -> Run:
+    """Solve and fuse a finished run once more, with the edits in its folder, and bring all that it left up to date.
+
+    Nothing is registered and no score is measured again: `run` with the same recipe does that. Raises `HodgeError`.
+    """
+    folder = Path(folder)
+    listed_edges(folder)
+    recipe = load_recipe(str(folder / RECIPE_FILE))
+    with Workspace.open(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
+        return _run(Job(recipe, workspace, watcher or Nobody(), scoring=False))
+
+
 def _run(job: Job) -> Run:
     source = steps.read(job)
     with Recording(job, source) as recording:
@@ -72,10 +86,13 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
             registered = steps.register_edges(job, number, candidates, poses, workers)
             rounds.append(steps.solve(job, number, source, candidates, registered, poses))
             recording.round(number, rounds[-1])
+        for edited in edited_rounds(job, source, registered, rounds[-1], len(rounds)):
+            rounds.append(edited)
+            recording.round(len(rounds) - 1, edited)
         rounds[-1] = steps.judge_edges(job, rounds[-1], len(rounds) - 1)
         recording.diagnosis(rounds[-1])
         scores = steps.evaluate(job, source, rounds, workers)
         recording.scores(scores)
-    models = steps.fuse(job, source, rounds[-1].world_from_cam)
+    models = steps.fuse(job, source, rounds[-1].world_from_cam, len(rounds) - 1)
     recording.models(models)
     return rounds, models, scores

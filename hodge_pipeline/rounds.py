@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.types import Candidates, Floats, Ints, Solution, Source, ViewGraph
+from hodge_pipeline.types import Bools, Candidates, Floats, Ints, Solution, Source, ViewGraph
 
 
 def _no_pairs() -> Ints:
@@ -34,7 +34,7 @@ class Round:
     """One outer iteration: its edges, and the poses (N, 4, 4) that they led to. Round 0 is the odometry.
 
     `rejected_pairs (R, 2)` were registered and not accepted, for `rejected_reasons (R,)`. Only the last round has
-    `verdicts`.
+    `verdicts`; `disabled (E,)` are edges that a person switched off.
     """
 
     graph: ViewGraph
@@ -44,6 +44,7 @@ class Round:
     rejected_pairs: Ints = field(default_factory=_no_pairs)
     rejected_reasons: NDArray[np.str_] = field(default_factory=_no_reasons)
     verdicts: Verdicts | None = None
+    disabled: Bools | None = None
 
     @property
     def rejected_counts(self) -> Mapping[str, int]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline import registry
+from hodge_pipeline.edits import joining
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.solvers.hodge import ObjectiveName, solve
@@ -92,12 +93,9 @@ def disabled_edges(graph: ViewGraph, pairs: Sequence[str]) -> Bools:
 
     Raises `GraphError` where a pair has no edge.
     """
-    names = graph.vertex_ids[graph.edges].astype(str)
     found = np.zeros(graph.edge_count, bool)
     for pair in pairs:
-        cuts = [(pair[:k], pair[k + 1 :]) for k in range(1, len(pair)) if pair[k] == "-"]
-        hits = [((names == [a, b]) | (names == [b, a])).all(axis=1) for a, b in cuts]
-        hit = np.any(hits, axis=0) if hits else np.zeros(graph.edge_count, bool)
+        hit = joining(graph, pair)
         if not hit.any():
             raise GraphError(
                 f"--disable {pair}: no edge joins these vertices: give two vertex ids of the file, as 12-87"

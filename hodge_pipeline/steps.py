@@ -162,9 +162,9 @@ class BlockStore:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def fuse(job: Job, source: Source, world_from_cam: Floats) -> dict[str, Path]:
-    """The PLY file of each model, by its name."""
-    last, files = f"solve-{job.recipe.outer_iterations}", {}
+def fuse(job: Job, source: Source, world_from_cam: Floats, number: int) -> dict[str, Path]:
+    """The PLY file of each model, by its name, from the poses of round `number`, the last."""
+    last, files = f"solve-{number}", {}
     for row, fuser in enumerate(job.recipe.fusion):
         name = f"fuse-{row}"
         with job.stage(name, f"fusion {row + 1}", len(source.frames), fuser, ("source", last)) as (folder, advance):
@@ -181,6 +181,9 @@ def fuse(job: Job, source: Source, world_from_cam: Floats) -> dict[str, Path]:
 def evaluate(job: Job, source: Source, rounds: Sequence[Round], workers: Workers) -> ScoreTable | None:
     """The score tables of the true poses (where there are any) and of every round."""
     if not job.recipe.evaluation.tables:
+        return None
+    if not job.scoring:
+        job.note("the scores are not measured again after an edit: hodge run, as before, measures them")
         return None
     truth, sets = true_poses(source), pose_sets(rounds)
     reference = "truth" if has_truth(source) else "result"

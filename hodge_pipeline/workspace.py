@@ -118,6 +118,18 @@ class Workspace:
         artifacts.write_json(path, {**artifacts.read_json(path), **info})
 
 
+@contextmanager
+def holding(folder: Path) -> Iterator[None]:
+    """While the body runs no run uses the folder. Raises `WorkspaceError` where one does already."""
+    try:
+        lock = (folder / ".lock").open("a+")
+    except OSError as error:
+        raise WorkspaceError(f"{folder}: cannot be written ({error.strerror})") from error
+    with lock:
+        _hold(lock, folder)
+        yield
+
+
 def _hold(lock: IO[str], folder: Path) -> None:
     """Take the folder's lock, which ends with the process."""
     try:
@@ -128,7 +140,7 @@ def _hold(lock: IO[str], folder: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         lock.close()
-        raise WorkspaceError(f"{folder}: another run uses this folder: wait for it, or give another --out") from error
+        raise WorkspaceError(f"{folder}: another run uses this folder: wait for it, or name another folder") from error
 
 
 def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool) -> None:

@@ -24,6 +24,8 @@ Examples:
   hodge view runs/kitchen                        open the recording in Rerun
   hodge solve graph.g2o --out solved.g2o         any pose graph, or a run folder
   hodge solve graph.g2o --certificate --disable 12-87
+  hodge edit runs/kitchen --disable 12-87        take an edge out of a run,
+  hodge solve runs/kitchen                       and solve and fuse it again
   hodge refine trajectory poses.txt --frames DIR --out runs/better
 """
 
@@ -108,6 +110,28 @@ def solve(
         sesync_units=sesync_units,
     )
     solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json)
+
+
+@app.command()
+def edit(
+    run_folder: Annotated[Path, typer.Argument(help="A finished run.")],
+    disable: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(metavar="A-B", help="Switch the edges between two frames off; may be repeated, or A-B,C-D."),
+    ] = None,
+    enable: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(metavar="A-B", help="Switch them on: disabled ones again, rejected ones in spite of the reason."),
+    ] = None,
+    undo: Annotated[bool, typer.Option("--undo", help="Take the last edit back.")] = False,
+    listing: Annotated[bool, typer.Option("--list", help="Print every edit so far.")] = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Switch edges of a run off or on; `hodge solve RUN` then solves and fuses again."""
+    from hodge_pipeline.cli import editing
+
+    editing.edit(run_folder, disable or [], enable or [], undo=undo, listing=listing, quiet=quiet, as_json=json)
 
 
 @app.command()

@@ -33,13 +33,18 @@ def run(
     loaded = load_recipe(recipe, overrides, source)
     if loaded.source.path is None:
         raise RecipeError(f"recipe '{recipe}' names no source: add --source PATH")
-    from hodge_pipeline.evaluation.report import as_json as report_json
     from hodge_pipeline.pipeline import run as run_pipeline
 
     with resumable(out), Terminal(quiet or as_json) as terminal:
         result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal)
+    print_result(result, quiet=quiet, as_json=as_json)
+
+
+def print_result(result: Run, *, quiet: bool, as_json: bool) -> None:
+    """Print the report of a run: tables and notes, or JSON."""
     if as_json:
         from hodge_pipeline.artifacts import json_text
+        from hodge_pipeline.evaluation.report import as_json as report_json
 
         print(json_text(report_json(result.report)), end="")
     elif not quiet:

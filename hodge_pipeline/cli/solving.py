@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
 from hodge_pipeline import registry
 from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.edits import read_history
 from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.solve_file import Choices, SolvedFile, solve_file, write_solved
 from hodge_pipeline.solvers.hodge import ObjectiveName
 from hodge_pipeline.solvers.setup import InitialName
+from hodge_pipeline.workspace import RECIPE_FILE
 
 
 def choices(
@@ -45,7 +48,17 @@ def choices(
 def solve(
     path: Path, options: Choices, *, out: Path | None, run_folder: Path | None, quiet: bool, as_json: bool
 ) -> None:
-    """Solve a file, write what was asked for, print a summary; `CheckError` where the result fails its own checks."""
+    """Solve a file, write what was asked for, print a summary; `CheckError` where the result fails its own checks.
+
+    A run folder given alone is solved and fused again, with its edits, and brought up to date.
+    """
+    if out is None and run_folder is None and options == Choices() and (path / RECIPE_FILE).is_file():
+        _solve_run(path, quiet=quiet, as_json=as_json)
+        return
+    if path.is_dir() and (history := read_history(path)).edits:
+        options = replace(options, disable=(*options.disable, *history.disabled))
+        if out is None and not (path / RECIPE_FILE).is_file():
+            run_folder = run_folder or path
     if out is not None and not out.parent.is_dir():
         raise RecipeError(f"--out {out}: there is no folder {out.parent}: make it first")
     with Terminal(quiet or as_json) as terminal, terminal.stage("solve", 1):
@@ -69,6 +82,15 @@ def solve(
         for label, text in _lines(solved, summary, out, run_folder):
             print(f"{label:<12}{text}")
     _check(summary)
+
+
+def _solve_run(folder: Path, *, quiet: bool, as_json: bool) -> None:
+    from hodge_pipeline.cli.running import print_result
+    from hodge_pipeline.pipeline import solve_again
+
+    with Terminal(quiet or as_json) as terminal:
+        result = solve_again(folder, watcher=terminal)
+    print_result(result, quiet=quiet, as_json=as_json)
 
 
 def _lines(
