@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hodge_pipeline import binding, registry, steps
+from hodge_pipeline import artifacts, binding, registry, steps
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.job import Job, Unfinished, log, logging_to
 from hodge_pipeline.pipeline import compute
@@ -22,6 +22,12 @@ def recipe_of(folder: Path) -> Recipe:
     if not (folder / RECIPE_FILE).is_file():
         raise WorkspaceError(f"{folder}: is no run folder: there is no {RECIPE_FILE} in it")
     return load_recipe(str(folder / RECIPE_FILE))
+
+
+def _solved_without_scores(folder: Path) -> bool:
+    """Whether the run ended without scores, as it does when it is solved again after an edit."""
+    report = folder / "report.json"
+    return report.is_file() and artifacts.read_json(report)["scores"] is None
 
 
 def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | None = None) -> tuple[Path, str]:
@@ -39,7 +45,7 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
     if changed.recording.level == "off":
         raise WorkspaceError(f"{folder}: its recipe records nothing: add --level normal")
     with Workspace.open(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
-        job = Job(changed, workspace, watcher or Nobody(), computes=False)
+        job = Job(changed, workspace, watcher or Nobody(), computes=False, scoring=not _solved_without_scores(folder))
         log.info("recording made again from the run folder")
         source = steps.read(job)
         missing = ""

@@ -21,7 +21,7 @@ from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
     "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary",
-    "outer_iterations=1", "evaluation.tables=false", "acceptance.min_fitness=0.6",
+    "outer_iterations=1", "acceptance.min_fitness=0.6",
 )  # fmt: skip
 
 
@@ -88,6 +88,9 @@ def test_an_edge_is_taken_out_the_run_resumes_with_it_and_undo_gives_the_old_pos
     edited = np.loadtxt(folder / "poses.tum")[:, 1:4]
     assert 1e-6 < np.abs(edited - before[:, :3, 3]).max() < 0.1
     assert (folder / "stages/solve-2/solution.npz").is_file()
+    assert report["scores"] is None
+    recorded = hodge("record", folder)
+    assert "evaluation" not in recorded
 
     assert run.source.path is not None
     resumed = hodge_pipeline.run(small_recipe(run.source.path), folder)
@@ -95,6 +98,7 @@ def test_an_edge_is_taken_out_the_run_resumes_with_it_and_undo_gives_the_old_pos
     assert resumed.result.disabled is not None
     assert resumed.result.disabled.sum() == 1
     assert any(pair in note for note in resumed.report.notes)
+    assert resumed.report.scores is not None
 
     assert "(undone)" in hodge("edit", folder, "--undo", "--list")
     again = solve_again(folder)
