@@ -75,6 +75,7 @@ def _run(job: Job) -> Run:
 
 def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round], dict[str, Path], ScoreTable | None]:
     """The rounds, the models' files by name, the scores: every stage in order, each recorded once it is done."""
+    measured = steps.measured(job, source)
     with job.recipe.executor.open() as workers:
         clouds = steps.prepare_clouds(job, source, workers)
         recording.clouds(clouds)
@@ -82,9 +83,9 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
         recording.odometry(rounds[0])
         for number in range(1, job.recipe.outer_iterations + 1):
             poses = rounds[-1].world_from_cam
-            candidates = steps.propose_edges(job, number, source, clouds, poses)
+            candidates = steps.propose_edges(job, number, source, clouds, poses, measured)
             registered = steps.register_edges(job, number, candidates, poses, workers)
-            rounds.append(steps.solve(job, number, source, candidates, registered, poses))
+            rounds.append(steps.solve(job, number, source, candidates, registered, poses, measured))
             recording.round(number, rounds[-1])
         for edited in edited_rounds(job, source, registered, rounds[-1], len(rounds)):
             rounds.append(edited)

@@ -11,6 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import binding, recipe_file
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.measured import MeasuredOptions
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
@@ -53,6 +54,7 @@ class Recipe:
     clouds: CloudOptions = CloudOptions()
     odometry: OdometryOptions = OdometryOptions()
     acceptance: Acceptance = Acceptance()
+    measured: MeasuredOptions = MeasuredOptions()
     outer_iterations: int = Field(
         default=2,
         ge=1,

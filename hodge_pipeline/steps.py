@@ -17,13 +17,14 @@ from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphScores, ScoreTabl
 from hodge_pipeline.fusion.ply import write_ply
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.job import Job, source_key
+from hodge_pipeline.measured import digest, joined, measured_edges, without_measured
 from hodge_pipeline.registration import clouds as cloud_stage
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.stages import Workers
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Source
+from hodge_pipeline.types import Candidates, CloudSet, Floats, Source, ViewGraph
 
 
 def read(job: Job) -> Source:
@@ -43,6 +44,15 @@ def read(job: Job) -> Source:
     return source
 
 
+def measured(job: Job, source: Source) -> ViewGraph:
+    """The edges that come measured, over the frames: they join every round's graph as they are."""
+    graph, notes = measured_edges(source, job.recipe.measured)
+    for note in notes:
+        job.note(note)
+    job.keys["measured"] = digest(graph)
+    return graph
+
+
 def prepare_clouds(job: Job, source: Source, workers: Workers) -> CloudSet:
     """The down-sampled cloud of each frame."""
     options, total = job.recipe.clouds, len(source.frames)
@@ -55,14 +65,17 @@ def prepare_clouds(job: Job, source: Source, workers: Workers) -> CloudSet:
     return CloudSet.open(job.path("clouds"))
 
 
-def propose_edges(job: Job, number: int, source: Source, clouds: CloudSet, world_from_cam: Floats) -> Candidates:
-    """The pairs to register in round `number`, from the poses so far."""
+def propose_edges(
+    job: Job, number: int, source: Source, clouds: CloudSet, world_from_cam: Floats, measured: ViewGraph
+) -> Candidates:
+    """The pairs to register in round `number`, from the poses so far; measured ones are not registered again."""
     name = f"edges-{number}"
     before = "odometry" if number == 1 else f"solve-{number - 1}"
-    with job.stage(name, f"edges, round {number}", 1, job.recipe.edges, ("clouds", before)) as (folder, advance):
+    inputs = ("clouds", "measured", before)
+    with job.stage(name, f"edges, round {number}", 1, job.recipe.edges, inputs) as (folder, advance):
         if not folder.finished:
             candidates = job.recipe.edges.propose(source.frames, clouds, world_from_cam)
-            artifacts.save(folder.path / "candidates.npz", candidates)
+            artifacts.save(folder.path / "candidates.npz", without_measured(candidates, measured))
             advance(1)
     return artifacts.load(job.path(name) / "candidates.npz", Candidates)
 
@@ -106,13 +119,19 @@ def register_edges(
 
 
 def solve(
-    job: Job, number: int, source: Source, candidates: Candidates, registered: Registered, start: Floats
+    job: Job,
+    number: int,
+    source: Source,
+    candidates: Candidates,
+    registered: Registered,
+    start: Floats,
+    measured: ViewGraph,
 ) -> Round:
-    """Round `number`: the accepted edges, and the poses consistent with them from the poses `start`."""
+    """Round `number`: the accepted and the measured edges, and the poses consistent with them from `start`."""
     name, options = f"solve-{number}", (job.recipe.acceptance, job.recipe.solver)
     reasons = job.recipe.acceptance.reasons(registered)
     accepted = reasons == ""
-    graph = registered.select(accepted).as_graph(vertex_ids(source), candidates.source[accepted])
+    graph = joined([registered.select(accepted).as_graph(vertex_ids(source), candidates.source[accepted]), measured])
     with job.stage(name, f"solve, round {number}", 1, options, (f"register-{number}",)) as (folder, advance):
         if not folder.finished:
             solution = job.recipe.solver.solve(graph, start)
