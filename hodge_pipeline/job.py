@@ -47,13 +47,15 @@ class Job:
     """What every step of a run shares. `keys` holds the key of each stage so far, by its name.
 
     A job that does not compute reads finished stages only: one that is not raises `Unfinished`. Without `scoring` the
-    score tables, the slowest part of the end, are left out.
+    score tables, the slowest part of the end, are left out. `live` is the address of a viewer that is shown the
+    recording as it grows.
     """
 
     recipe: Recipe
     workspace: Workspace
     watcher: Watcher
     computes: bool = True
+    live: str | None = None
     monitor: Monitor = field(default_factory=Monitor)
     keys: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)

@@ -36,9 +36,11 @@ def run(
     source: Path | str | None = None,
     overwrite: bool = False,
     watcher: Watcher | None = None,
+    live: str | None = None,
 ) -> Run:
     """Run a recipe (its name, its file or itself) into the folder `out`, going on where an earlier run stopped.
 
+    `live` is the address of a Rerun viewer that shows the run as it happens.
     Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     if isinstance(recipe, str):
@@ -50,7 +52,7 @@ def run(
         Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace,
         logging_to(folder / "log.txt"),
     ):
-        return _run(Job(recipe, workspace, watcher or Nobody()))
+        return _run(Job(recipe, workspace, watcher or Nobody(), live=live))
 
 
 def solve_again(folder: Path | str, *, watcher: Watcher | None = None) -> Run:

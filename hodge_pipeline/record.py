@@ -14,6 +14,7 @@ from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.job import RECORDING, Job, log
+from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge_parts
 from hodge_pipeline.recording.recorder import APPLICATION, Recorder
 from hodge_pipeline.rounds import Round, has_truth, pose_sets, true_poses
@@ -35,6 +36,7 @@ class Recording:
         self._job, self._source = job, source
         self._stages: list[str] = []
         self._rounds: list[Round] = []
+        self._live = None if job.live is None else Live(job.live, APPLICATION, job.workspace.identity)
 
     def __enter__(self) -> Recording:
         source = self._source
@@ -50,6 +52,8 @@ class Recording:
             self._finish()
         else:
             self._rescue()
+        if self._live is not None:
+            self._live.close()
 
     def clouds(self, clouds: CloudSet) -> None:
         """The frames' clouds."""
@@ -104,6 +108,8 @@ class Recording:
                     job.note(note)
                 advance(1)
         self._stages.append(stage)
+        if self._live is not None:
+            self._live.show(self._parts())
 
     def _recorder(self, folder: Path) -> Recorder:
         job = self._job
@@ -135,9 +141,14 @@ class Recording:
         notes = _record_truth(recorder, self._source, self._rounds)
         lines = (job.workspace.folder / "log.txt").read_text("utf-8").splitlines()
         recorder.text(yaml_file.dump(binding.unbind(job.recipe)), lines)
-        folders = [*(job.path(stage) for stage in self._stages), folder]
-        parts = [part for each in folders for part in find_parts(each)]
+        parts = self._parts(folder)
+        if self._live is not None:
+            self._live.show(parts)
         return notes + merge_parts(parts, out, APPLICATION, job.workspace.identity).notes
+
+    def _parts(self, *others: Path) -> list[Path]:
+        folders = [*(self._job.path(stage) for stage in self._stages), *others]
+        return [part for folder in folders for part in find_parts(folder)]
 
 
 def _record_truth(recorder: Recorder, source: Source, rounds: Sequence[Round]) -> Notes:

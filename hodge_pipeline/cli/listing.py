@@ -1,17 +1,14 @@
-"""The commands that only look: inspect, stages, recipes, view."""
+"""The commands that only look: inspect, stages, recipes."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 from hodge_pipeline import registry
-from hodge_pipeline.errors import HodgeError, RecipeError, WorkspaceError
+from hodge_pipeline.errors import HodgeError, RecipeError
 
 
 def inspect(path: Path, *, as_json: bool) -> None:
@@ -75,16 +72,3 @@ def recipes(name: str | None, *, schema: bool) -> None:
     else:
         for known in recipe_file.recipe_names():
             print(f"{known:<24}{recipe_file.load(known).data.get('description', '')}")
-
-
-def view(run_folder: Path) -> None:
-    """Open the recording in the native viewer, and wait for it."""
-    recording = run_folder / "recording.rrd" if run_folder.is_dir() else run_folder
-    if not recording.is_file():
-        raise WorkspaceError(f"{recording}: no recording here: run with --set recording.level=normal")
-    beside = Path(sys.executable).with_name("rerun")
-    program = str(beside) if beside.is_file() else shutil.which("rerun")
-    if program is None:
-        raise WorkspaceError("the program 'rerun' is not installed: pip install rerun-sdk")
-    if subprocess.run([program, str(recording)], check=False).returncode:
-        raise WorkspaceError(f"{recording}: the viewer ended with an error: is there a screen?")

@@ -52,13 +52,14 @@ def run(
     source: Annotated[Optional[Path], typer.Option(help="What to read; overrides source.path.")] = None,  # noqa: UP045
     overrides: Overrides = None,
     overwrite: Overwrite = False,
+    live: Annotated[bool, typer.Option("--live", help="Show the run as it happens in a Rerun viewer.")] = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Run a recipe on a source: poses, fused model, report and recording in --out."""
     from hodge_pipeline.cli import running
 
-    running.run(recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json)
+    running.run(recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live)
 
 
 @app.command()
@@ -176,11 +177,14 @@ def recipes(
 
 
 @app.command()
-def view(run_folder: Path) -> None:
+def view(
+    run_folder: Path,
+    web: Annotated[bool, typer.Option("--web", help="As a page that only this machine can see.")] = False,
+) -> None:
     """Open a run's recording in the Rerun viewer."""
-    from hodge_pipeline.cli import listing
+    from hodge_pipeline.cli import recording
 
-    listing.view(run_folder)
+    recording.view(run_folder, web=web)
 
 
 @app.command()

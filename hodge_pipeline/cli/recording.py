@@ -1,13 +1,15 @@
-"""The commands about recordings: `hodge record`."""
+"""The commands about recordings: `hodge view`, `hodge record`."""
 
 from __future__ import annotations
 
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
 from hodge_pipeline import registry
 from hodge_pipeline.cli.console import Terminal
-from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.errors import RecipeError, WorkspaceError
 from hodge_pipeline.recording.options import Level
 
 
@@ -29,3 +31,28 @@ def record(run_folder: Path, level: str | None, max_megabytes: float | None, *, 
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
         if missing:
             print(f"the run is not finished: it is recorded up to the stage '{missing}'")
+
+
+def view(run_folder: Path, *, web: bool) -> None:
+    """Open the recording in the viewer, or serve it on this machine, and wait until it is closed."""
+    recording = run_folder / "recording.rrd" if run_folder.is_dir() else run_folder
+    if not recording.is_file():
+        raise WorkspaceError(f"{recording}: no recording here: make one with `hodge record RUN --level normal`")
+    from hodge_pipeline.recording import live
+
+    if web:
+        with live.served([recording], opens_browser=True) as (_, page):
+            print(f"{page}\nCtrl-C ends it", flush=True)
+            with suppress(KeyboardInterrupt):
+                while True:
+                    time.sleep(3600)
+    elif not live.has_screen():
+        raise WorkspaceError(f"{recording}: there is no screen here: add --web")
+    else:
+        viewer = live.start([str(recording.resolve()), "--bind", live.HOST, "--port", "auto"])
+        try:
+            failed = viewer.wait()
+        finally:
+            viewer.kill()
+        if failed:
+            raise WorkspaceError(f"{recording}: the viewer ended with an error: try --web")

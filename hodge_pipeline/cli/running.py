@@ -28,6 +28,7 @@ def run(
     overwrite: bool,
     quiet: bool,
     as_json: bool,
+    live: bool = False,
 ) -> None:
     """Run a recipe and print what came out."""
     loaded = load_recipe(recipe, overrides, source)
@@ -35,8 +36,8 @@ def run(
         raise RecipeError(f"recipe '{recipe}' names no source: add --source PATH")
     from hodge_pipeline.pipeline import run as run_pipeline
 
-    with resumable(out), Terminal(quiet or as_json) as terminal:
-        result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal)
+    with resumable(out), Terminal(quiet or as_json) as terminal, _viewer(live, terminal) as address:
+        result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal, live=address)
     print_result(result, quiet=quiet, as_json=as_json)
 
 
@@ -49,6 +50,19 @@ def print_result(result: Run, *, quiet: bool, as_json: bool) -> None:
         print(json_text(report_json(result.report)), end="")
     elif not quiet:
         _print_summary(result)
+
+
+@contextmanager
+def _viewer(live: bool, terminal: Terminal) -> Iterator[str | None]:
+    """The address of a viewer where one is wished for, and a line that says where it is seen."""
+    if not live:
+        yield None
+        return
+    from hodge_pipeline.recording.live import viewer
+
+    with viewer() as (address, where):
+        terminal.say(f"live: {where}")
+        yield address
 
 
 class Terminated(KeyboardInterrupt):

@@ -52,7 +52,7 @@ def merge_parts(parts: Iterable[Path], out: Path, application_id: str, recording
         graph = look_at((), _chunks(readers, poses))
         with writing(out, application_id, recording_id, make_blueprint(contents, room, graph)) as stream:
             for _, reader in readers:
-                _send(stream, reader, poses)
+                send(stream, reader, poses)
             log_notes(stream, 0, notes, level="WARN")
             log_markdown(stream, layout.LEGEND, legend(contents))
     sizes = {part.name: part.stat().st_size for part in parts}
@@ -126,7 +126,7 @@ def _chunks(readers: Iterable[tuple[Path, RrdReader]], entity: str) -> Iterator[
         yield from reader.stream().filter(content=entity)
 
 
-def _send(stream: rr.RecordingStream, reader: RrdReader, poses: str) -> None:
+def send(stream: rr.RecordingStream, reader: RrdReader, poses: str) -> None:
     """The part's chunks; the best trajectory's poses also move the camera that holds images and clouds."""
     for chunk in reader.stream():
         stream.send_chunks(chunk)

@@ -1,0 +1,160 @@
+"""A run in a viewer while it works: each part is sent once it is recorded. Only this machine can listen."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import webbrowser
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from urllib.parse import quote
+
+from rerun.chunk import RrdReader
+
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.recording import binary, layout
+from hodge_pipeline.recording.blueprint import legend, make_blueprint
+from hodge_pipeline.recording.eye import look_at
+from hodge_pipeline.recording.merge import contents_of, send
+from hodge_pipeline.recording.stream import log_markdown, open_stream
+
+HOST = "127.0.0.1"
+PORT = 9876
+WEB_PORT = 9090
+START_S = 15.0
+
+
+class Live:
+    """A viewer that is shown the parts of one recording, in the order in which they are done."""
+
+    def __init__(self, address: str, application_id: str, recording_id: str) -> None:
+        self._stream = open_stream(application_id, recording_id)
+        self._stream.connect_grpc(address)
+        self._sent: set[Path] = set()
+
+    def show(self, parts: Sequence[Path]) -> None:
+        """Send the parts that were not sent yet; the views follow what there is."""
+        contents = contents_of(parts)
+        readers = [(part, RrdReader(part)) for part in parts]
+        poses = layout.poses(contents.trajectory)
+        for part, reader in readers:
+            if part not in self._sent:
+                send(self._stream, reader, poses)
+                self._sent.add(part)
+        room, graph = (
+            look_at(
+                (chunk for _, reader in readers for chunk in reader.stream().filter(content=model)),
+                (chunk for _, reader in readers for chunk in reader.stream().filter(content=poses)),
+            )
+            for model in (layout.MODEL, layout.LEGEND)
+        )
+        log_markdown(self._stream, layout.LEGEND, legend(contents))
+        self._stream.send_blueprint(make_blueprint(contents, room, graph))
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Wait until all is sent."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+
+def has_screen() -> bool:
+    """Whether a window can be opened here."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@contextmanager
+def viewer() -> Iterator[tuple[str, str]]:
+    """The address of a viewer, and a line that says where it is seen: one that runs already, a window of its own, or,
+    without a screen, a page on this machine that ends with the block. Raises `WorkspaceError` where none starts.
+    """
+    address = f"rerun+http://{HOST}:{PORT}/proxy"
+    if answers(PORT):
+        yield address, f"the viewer that listens on {HOST}:{PORT}"
+    elif has_screen():
+        process = start(["--bind", HOST, "--port", str(PORT), "--expect-data-soon"])
+        wait_for(PORT, process)
+        yield address, "a window of its own"
+    else:
+        with served(()) as (address, page):
+            yield address, page
+
+
+@contextmanager
+def served(recordings: Sequence[Path], *, opens_browser: bool = False) -> Iterator[tuple[str, str]]:
+    """The address and the web page of a viewer on this machine that shows the recordings, until the block is left."""
+    port, web_port = free_port(PORT), free_port(WEB_PORT)
+    flags = ["--serve-web", "--bind", HOST, "--port", str(port), "--web-viewer-port", str(web_port)]
+    with (
+        tempfile.TemporaryDirectory(prefix="hodge-viewer-") as scratch,
+        _running(flags, recordings, binary.quiet_environment(Path(scratch))) as process,
+    ):
+        wait_for(port, process)
+        wait_for(web_port, process)
+        address = f"rerun+http://{HOST}:{port}/proxy"
+        page = f"http://{HOST}:{web_port}/?url={quote(address, safe='')}"
+        if opens_browser and has_screen():
+            webbrowser.open(page)
+        yield address, page
+
+
+@contextmanager
+def _running(
+    flags: Sequence[str], recordings: Sequence[Path], environment: dict[str, str]
+) -> Iterator[subprocess.Popen[bytes]]:
+    process = start([*flags, *(str(path.resolve()) for path in recordings)], environment)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=5)
+        process.kill()
+        process.wait()
+
+
+def start(flags: Sequence[str], environment: dict[str, str] | None = None) -> subprocess.Popen[bytes]:
+    """The viewer's program with these flags, out of reach of this terminal's Ctrl-C."""
+    try:
+        return subprocess.Popen(
+            [str(binary.program()), *flags],
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+    except OSError as error:
+        raise WorkspaceError("the program 'rerun' is not installed: pip install rerun-sdk") from error
+
+
+def free_port(wished: int) -> int:
+    """The port that is wished for, or any that is free."""
+    with socket.socket() as probe:
+        try:
+            probe.bind((HOST, wished))
+        except OSError:
+            probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def answers(port: int) -> bool:
+    """Whether somebody listens on this port of this machine."""
+    with socket.socket() as probe:
+        probe.settimeout(0.5)
+        return probe.connect_ex((HOST, port)) == 0
+
+
+def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
+    """Return once the process listens on the port. Raises `WorkspaceError` where it does not."""
+    deadline = time.monotonic() + START_S
+    while not answers(port):
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise WorkspaceError(
+                "the Rerun viewer does not start: is there a screen? `hodge view RUN --web` needs none"
+            )
+        time.sleep(0.1)
