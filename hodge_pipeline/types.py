@@ -47,12 +47,32 @@ class EncodedImage:
 
 
 @dataclass(frozen=True)
+class Landmarks:
+    """What a frame's image can be recognised by: `points_in_cam (n, 3)` metres, SIFT `descriptors (n, 128)` bytes."""
+
+    points_in_cam: Floats32
+    descriptors: Bytes
+
+    def __len__(self) -> int:
+        return len(self.points_in_cam)
+
+    @classmethod
+    def none(cls) -> Landmarks:
+        """No landmark."""
+        return cls(np.zeros((0, 3), np.float32), np.zeros((0, 128), np.uint8))
+
+
+@dataclass(frozen=True)
 class PointCloud:
-    """Points of one frame, in its camera's axes: `points_in_cam (N, 3)` metres, unit normals, 8-bit RGB."""
+    """Points of one frame, in its camera's axes: `points_in_cam (N, 3)` metres, unit normals, 8-bit RGB.
+
+    `landmarks` are other points, of the frame's image; None where nobody asked for them.
+    """
 
     points_in_cam: Floats32
     normals_in_cam: Floats32 | None = None
     colours: Bytes | None = None
+    landmarks: Landmarks | None = None
 
     def __len__(self) -> int:
         return len(self.points_in_cam)
@@ -257,13 +277,24 @@ class CloudSet(Sequence[PointCloud]):
     """The down-sampled cloud of every frame, as memory-mapped columns: opening one costs no copy.
 
     `offsets (N + 1,)` cut `points (P, 3)`, `normals (P, 3)`, `colours (P, 3)` into frames; an empty slice is a frame
-    without a valid measurement.
+    without a valid measurement. `marks (N + 1,)` cut the landmarks' `mark_points (Q, 3)` and `mark_descriptors
+    (Q, 128)` likewise.
     """
 
-    FILES = ("offsets", "points", "normals", "colours")
+    FILES = ("offsets", "points", "normals", "colours", "marks", "mark_points", "mark_descriptors")
 
-    def __init__(self, offsets: Ints, points: Floats32, normals: Floats32, colours: Bytes) -> None:
+    def __init__(
+        self,
+        offsets: Ints,
+        points: Floats32,
+        normals: Floats32,
+        colours: Bytes,
+        marks: Ints,
+        mark_points: Floats32,
+        mark_descriptors: Bytes,
+    ) -> None:
         self.offsets, self.points, self.normals, self.colours = offsets, points, normals, colours
+        self.marks, self.mark_points, self.mark_descriptors = marks, mark_points, mark_descriptors
 
     @classmethod
     def open(cls, folder: Path) -> CloudSet:
@@ -272,8 +303,7 @@ class CloudSet(Sequence[PointCloud]):
 
     @classmethod
     def from_clouds(cls, clouds: Sequence[PointCloud]) -> CloudSet:
-        """One set of these clouds, in order; missing normals and colours become zeros."""
-        sizes = np.array([len(cloud) for cloud in clouds], np.int64)
+        """One set of these clouds, in order; missing normals and colours become zeros, missing landmarks none."""
         empty = np.zeros((0, 3), np.float32)
 
         def zeros(cloud: PointCloud) -> Floats32:
@@ -281,11 +311,15 @@ class CloudSet(Sequence[PointCloud]):
 
         normals = [zeros(c) if c.normals_in_cam is None else c.normals_in_cam for c in clouds]
         colours = [zeros(c) if c.colours is None else c.colours for c in clouds]
+        landmarks = [Landmarks.none() if c.landmarks is None else c.landmarks for c in clouds]
         return cls(
-            np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+            _offsets([len(cloud) for cloud in clouds]),
             np.concatenate([empty, *(c.points_in_cam for c in clouds)]).astype(np.float32),
             np.concatenate([empty, *normals]).astype(np.float32),
             np.concatenate([empty, *colours]).astype(np.uint8),
+            _offsets([len(one) for one in landmarks]),
+            np.concatenate([empty, *(one.points_in_cam for one in landmarks)]).astype(np.float32),
+            np.concatenate([Landmarks.none().descriptors, *(one.descriptors for one in landmarks)]),
         )
 
     def save(self, folder: Path) -> None:
@@ -302,7 +336,9 @@ class CloudSet(Sequence[PointCloud]):
             raise IndexError(row)
         row %= len(self)
         cut = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
-        return PointCloud(self.points[cut], self.normals[cut], self.colours[cut])
+        own = slice(int(self.marks[row]), int(self.marks[row + 1]))
+        landmarks = Landmarks(self.mark_points[own], self.mark_descriptors[own])
+        return PointCloud(self.points[cut], self.normals[cut], self.colours[cut], landmarks)
 
     def __iter__(self) -> Iterator[PointCloud]:
         return (self[row] for row in range(len(self)))
@@ -311,3 +347,7 @@ class CloudSet(Sequence[PointCloud]):
     def sizes(self) -> Ints:
         """Points of each cloud, (N,)."""
         return np.diff(self.offsets)
+
+
+def _offsets(sizes: Sequence[int]) -> Ints:
+    return np.concatenate([[0], np.cumsum(np.array(sizes, np.int64))]).astype(np.int64)

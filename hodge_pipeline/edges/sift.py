@@ -10,10 +10,11 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline.descriptors import match
 from hodge_pipeline.edges.pairs import labelled, usable_rows
 from hodge_pipeline.edges.sequential import SequentialEdges
 from hodge_pipeline.edges.sift_features import Features
-from hodge_pipeline.edges.sift_matching import count_inliers, match
+from hodge_pipeline.edges.sift_matching import count_inliers
 from hodge_pipeline.edges.sift_similarity import global_descriptors, most_similar, vocabulary
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Ints

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.descriptors import root_sift
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, Floats32, Frame, Ints
 
@@ -66,8 +67,7 @@ class Features:
 
     def descriptors(self, row: int) -> Floats32:
         """Unit RootSIFT descriptors (n, 128) (Arandjelović and Zisserman 2012)."""
-        raw = self._bytes[self._place[row], : self.count(row)].astype(np.float32)
-        return np.asarray(np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1.0)))
+        return root_sift(self._bytes[self._place[row], : self.count(row)])
 
     def close(self) -> None:
         """Give the disk space back."""

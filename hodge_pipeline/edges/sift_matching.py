@@ -1,27 +1,14 @@
-"""Matches of two frames' features, and those of them that one relative pose explains."""
+"""How many matches of two frames' features one relative pose explains."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from hodge_pipeline.types import Camera, Floats32, Ints
+from hodge_pipeline.types import Camera, Floats32
 
 CONFIDENCE = 0.999
 MOST_RANSAC_STEPS = 2000
-
-
-def match(descriptors_i: Floats32, descriptors_j: Floats32, ratio: float) -> Ints:
-    """Rows (M, 2) of unit descriptors that are each other's nearest, and by the ratio nearer than the second one."""
-    if len(descriptors_i) < 2 or len(descriptors_j) < 2:
-        return np.zeros((0, 2), np.int64)
-    likeness = descriptors_i @ descriptors_j.T
-    nearest = likeness.argmax(axis=1)
-    mutual = np.flatnonzero(likeness.argmax(axis=0)[nearest] == np.arange(len(nearest)))
-    two_best = np.partition(likeness[mutual], -2, axis=1)[:, -2:]
-    distances = np.sqrt(np.maximum(2.0 - 2.0 * two_best, 0.0))
-    kept = mutual[distances[:, 1] < ratio * distances[:, 0]]
-    return np.stack([kept, nearest[kept]], axis=1).astype(np.int64)
 
 
 def count_inliers(

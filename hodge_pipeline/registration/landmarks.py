@@ -1,0 +1,50 @@
+"""Landmarks of a frame: SIFT features of its image at the depth that the frame measured there."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from hodge_pipeline.types import Bools, Camera, Floats32, Frame, Ints, Landmarks
+
+EDGE_STEP = 0.03
+"""A landmark whose 3x3 pixels differ by more than this share of its depth lies on an edge: its depth is a guess."""
+
+
+def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: float) -> Landmarks:
+    """At most `count` landmarks, the strongest first; none for a frame without image, depth image or camera.
+
+    A colour image of another size than the depth image is taken to show the same view.
+    """
+    if frame.read_colour is None or frame.read_depth is None or frame.camera is None:
+        return Landmarks.none()
+    image, depth = frame.read_colour(), frame.read_depth()
+    detector = cv2.SIFT_create(nfeatures=count)  # type: ignore[attr-defined]
+    found, descriptors = detector.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    if not found:
+        return Landmarks.none()
+    scale = np.array([depth.shape[1] / image.shape[1], depth.shape[0] / image.shape[0]])
+    strongest = np.argsort([-point.response for point in found], kind="stable")[:count]
+    pixels = np.array([found[row].pt for row in strongest]) * scale
+    z, sound = _depth_at(depth, np.round(pixels).astype(np.int64), min_range_m, max_range_m)
+    points = back_projected(pixels[sound].astype(np.float32), z[sound], frame.camera)
+    return Landmarks(points, np.asarray(descriptors)[strongest[sound]].astype(np.uint8))
+
+
+def back_projected(pixels: Floats32, depth_m: Floats32, camera: Camera) -> Floats32:
+    """Points (n, 3) in the camera's axes of pixels (n, 2) at these depths (n,)."""
+    slopes = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return np.column_stack([slopes * depth_m[:, None], depth_m]).astype(np.float32)
+
+
+def _depth_at(depth: Floats32, pixels: Ints, min_range_m: float, max_range_m: float) -> tuple[Floats32, Bools]:
+    """The median depth (n,) of the 3x3 pixels around each, and where it is in range and not on an edge."""
+    height, width = depth.shape
+    steps = np.array([(dv, du) for dv in (-1, 0, 1) for du in (-1, 0, 1)])
+    v = np.clip(pixels[:, 1, None] + steps[:, 0], 0, height - 1)
+    u = np.clip(pixels[:, 0, None] + steps[:, 1], 0, width - 1)
+    window = depth[v, u]
+    middle = np.median(window, axis=1)
+    in_range = (window.min(axis=1) >= min_range_m) & (window.max(axis=1) <= max_range_m)
+    flat = window.max(axis=1) - window.min(axis=1) <= EDGE_STEP * middle
+    return middle.astype(np.float32), np.asarray(in_range & flat)

@@ -1,0 +1,109 @@
+"""The motion between two frames from their landmarks: matches, a consensus of triples, then least squares.
+
+A landmark's error is that of its pixel, sideways, and that of the depth camera, along the ray: a match counts by the
+sum of both covariances, so that far landmarks weigh little and none weighs along its ray as much as across.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.types import Bools, Floats
+
+TRIPLES = 300
+FEWEST_MATCHES = 8
+PIXEL_SIGMA_RAD = 1.5 / 525.0
+"""A pixel and a half of a camera of 60°: the feature's own error, and that of depth and colour taken at two moments."""
+GATE = 3.0
+"""Standard deviations, in each of three axes, at which a match stops to count."""
+STEPS = 8
+
+
+@dataclass(frozen=True)
+class VisualMotion:
+    """`i_from_j (4, 4)`, its information (6, 6) over `i_from_j exp(ξ)`, and how many matches agree with it."""
+
+    i_from_j: Floats
+    information: Floats
+    inliers: int
+    matches: int
+
+
+def depth_sigma(z_m: Floats) -> Floats:
+    """Standard deviation in metres of a structured-light depth (Nguyen, Izadi and Lovell 2012, axial noise)."""
+    return np.asarray(0.0012 + 0.0019 * (z_m - 0.4) ** 2)
+
+
+def covariances(points: Floats) -> Floats:
+    """Covariances (n, 3, 3) of landmarks (n, 3) in their camera's axes: depth along the ray, the pixel across."""
+    z = points[:, 2]
+    ray = points / z[:, None]
+    across, along = (PIXEL_SIGMA_RAD * z) ** 2, depth_sigma(z) ** 2
+    return np.asarray(
+        across[:, None, None] * np.diag([1.0, 1.0, 0.0]) + along[:, None, None] * ray[:, :, None] * ray[:, None, :]
+    )
+
+
+def visual_motion(points_i: Floats, points_j: Floats, seed: int) -> VisualMotion | None:
+    """The motion that most matched landmarks (M, 3) agree on, None where too few do."""
+    count = len(points_i)
+    if count < FEWEST_MATCHES:
+        return None
+    errors_i, errors_j = covariances(points_i), covariances(points_j)
+    rows = np.random.default_rng(seed).integers(0, count, (TRIPLES, 3))
+    guesses = rigid_motions(points_i[rows], points_j[rows])
+    spread = np.sqrt((np.trace(errors_i, axis1=1, axis2=2) + np.trace(errors_j, axis1=1, axis2=2)) / 3)
+    apart = np.linalg.norm(se3.transform(guesses, points_j[None]) - points_i, axis=2) / spread
+    scores = np.maximum(1 - (apart / (2 * GATE)) ** 2, 0).sum(axis=1)
+    motion = guesses[int(np.argmax(scores))]
+    inlier = apart[int(np.argmax(scores))] < 2 * GATE
+    for _ in range(STEPS):
+        if inlier.sum() < FEWEST_MATCHES:
+            return None
+        step, information = _step(points_i[inlier], points_j[inlier], errors_i[inlier], errors_j[inlier], motion)
+        motion = motion @ se3.exp(step)
+        before, inlier = inlier, _agrees(points_i, points_j, errors_i, errors_j, motion)
+        if np.linalg.norm(step) < 1e-5 and (before == inlier).all():
+            break
+    if inlier.sum() < FEWEST_MATCHES:
+        return None
+    return VisualMotion(motion, information, int(inlier.sum()), count)
+
+
+def rigid_motions(points_i: Floats, points_j: Floats) -> Floats:
+    """The rigid motions (H, 4, 4) that move points j (H, n, 3) onto points i best (Arun, Huang and Blostein 1987)."""
+    centre_i, centre_j = points_i.mean(axis=1), points_j.mean(axis=1)
+    moment = np.swapaxes(points_i - centre_i[:, None], 1, 2) @ (points_j - centre_j[:, None])
+    rotation = se3.project_to_so3(moment)
+    return se3.from_parts(rotation, centre_i - np.einsum("hij,hj->hi", rotation, centre_j))
+
+
+def _whitened(
+    points_i: Floats, points_j: Floats, errors_i: Floats, errors_j: Floats, i_from_j: Floats
+) -> tuple[Floats, Floats]:
+    """Inverse covariances (M, 3, 3) of the residuals, and the residuals (M, 3) in i's axes."""
+    turn = i_from_j[:3, :3]
+    weight = np.linalg.inv(errors_i + turn @ errors_j @ turn.T)
+    return weight, points_i - se3.transform(i_from_j, points_j)
+
+
+def _agrees(points_i: Floats, points_j: Floats, errors_i: Floats, errors_j: Floats, i_from_j: Floats) -> Bools:
+    weight, residual = _whitened(points_i, points_j, errors_i, errors_j, i_from_j)
+    return np.asarray(np.einsum("mi,mij,mj->m", residual, weight, residual) < 3 * GATE**2)
+
+
+def _step(
+    points_i: Floats, points_j: Floats, errors_i: Floats, errors_j: Floats, i_from_j: Floats
+) -> tuple[Floats, Floats]:
+    """The Gauss-Newton step ξ (6,) and the information (6, 6), Cauchy weights within the consensus."""
+    weight, residual = _whitened(points_i, points_j, errors_i, errors_j, i_from_j)
+    squares = np.einsum("mi,mij,mj->m", residual, weight, residual)
+    weight = weight / (1 + squares / 3)[:, None, None]
+    turn = i_from_j[:3, :3]
+    jacobian = np.concatenate([-turn @ se3.hat(points_j), np.broadcast_to(turn, (len(points_j), 3, 3))], axis=2)
+    information = np.einsum("mia,mij,mjb->ab", jacobian, weight, jacobian)
+    gradient = np.einsum("mia,mij,mj->a", jacobian, weight, residual)
+    return np.linalg.solve(information + 1e-9 * np.trace(information) * np.eye(6), gradient), information

@@ -1,0 +1,129 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hodge_pipeline import se3
+from hodge_pipeline.descriptors import match, root_sift
+from hodge_pipeline.registration.landmarks import back_projected, find_landmarks
+from hodge_pipeline.registration.rgbd import Rgbd
+from hodge_pipeline.registration.visual import rigid_motions, visual_motion
+from hodge_pipeline.types import Camera, CloudSet, Floats, Frame, Landmarks, PointCloud
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+I_FROM_J = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
+
+
+def points_before(count: int, rng: np.random.Generator) -> Floats:
+    return np.column_stack([rng.uniform(-1, 1, (count, 2)), rng.uniform(1.5, 3, count)])
+
+
+@given(st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6), st.integers(0, 9))
+@settings(max_examples=20, deadline=None)
+def test_exact_landmarks_give_the_motion(xi: list[float], seed: int):
+    motion = se3.exp(np.array(xi))
+    points_j = points_before(40, np.random.default_rng(seed))
+    points_i = se3.transform(motion, points_j)
+    found = visual_motion(points_i[points_i[:, 2] > 0.3], points_j[points_i[:, 2] > 0.3], seed=0)
+    assert found is not None
+    np.testing.assert_allclose(found.i_from_j, motion, atol=1e-6)
+
+
+def test_two_thirds_of_wrong_matches_are_outvoted_and_the_error_has_the_size_that_the_information_says():
+    squares = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        points_j = points_before(150, rng)
+        points_i = se3.transform(I_FROM_J, points_j) + rng.normal(0, 0.006, (150, 3))
+        points_i[:100] = points_before(100, rng)
+        found = visual_motion(points_i, points_j, seed=0)
+        assert found is not None and 40 <= found.inliers <= 65
+        error = se3.log(se3.inverse(I_FROM_J) @ found.i_from_j)
+        assert np.linalg.norm(error[3:]) < 0.02
+        squares.append(error @ found.information @ error / 6)
+    assert 0.2 < np.mean(squares) < 5
+
+
+def test_landmarks_that_agree_on_nothing_give_no_motion_that_counts():
+    rng = np.random.default_rng(3)
+    found = visual_motion(points_before(100, rng), points_before(100, rng), seed=0)
+    assert found is None or found.inliers < Rgbd().min_inliers
+    assert visual_motion(points_before(7, rng), points_before(7, rng), seed=0) is None
+
+
+def test_three_points_give_their_rigid_motion():
+    points_j = points_before(3, np.random.default_rng(0))
+    np.testing.assert_allclose(
+        rigid_motions(se3.transform(I_FROM_J, points_j)[None], points_j[None])[0], I_FROM_J, atol=1e-9
+    )
+
+
+def test_matching_is_mutual_and_refuses_what_looks_like_two():
+    raw = np.zeros((3, 128), np.uint8)
+    raw[0, 0] = raw[1, 5] = raw[2, 9] = 200
+    assert match(root_sift(raw), root_sift(raw[[2, 0, 1]]), 0.8).tolist() == [[0, 1], [1, 2], [2, 0]]
+    assert match(root_sift(raw), root_sift(raw[[0, 0, 1]]), 0.8).tolist() == [[1, 2]]
+    assert match(root_sift(raw), root_sift(raw[:0]), 0.8).shape == (0, 2)
+
+
+def textured_frame(depth_m: float = 2.0) -> Frame:
+    rng = np.random.default_rng(0)
+    coarse = rng.integers(0, 255, (30, 40, 3), dtype=np.uint8)
+    image = np.kron(coarse, np.ones((16, 16, 1), np.uint8))
+    depth = np.full((480, 640), depth_m, np.float32)
+    return Frame(0, 0.0, CAMERA, read_depth=lambda: depth, read_colour=lambda: image)
+
+
+def test_landmarks_lie_at_the_measured_depth_and_never_on_its_edges():
+    found = find_landmarks(textured_frame(), 100, 0.2, 6.0)
+    assert 20 <= len(found) <= 100 and (found.points_in_cam[:, 2] == 2.0).all()
+    depth = np.full((480, 640), 2.0, np.float32)
+    depth[:, 1::2] = 3.0
+    torn = replace(textured_frame(), read_depth=lambda: depth)
+    assert len(find_landmarks(torn, 100, 0.2, 6.0)) == 0
+
+
+@pytest.mark.parametrize("lost", ["read_colour", "read_depth", "camera"])
+def test_a_frame_without_image_depth_or_camera_has_no_landmark(lost: str):
+    assert len(find_landmarks(replace(textured_frame(), **{lost: None}), 100, 0.2, 6.0)) == 0
+
+
+def test_back_projection_is_the_inverse_of_the_camera():
+    points = back_projected(
+        np.array([[319.5, 239.5], [319.5 + 525, 239.5]], np.float32), np.array([2.0, 3.0], np.float32), CAMERA
+    )
+    np.testing.assert_allclose(points, [[0, 0, 2], [3, 0, 3]], atol=1e-6)
+
+
+def frames_of(count: int) -> tuple[PointCloud, PointCloud]:
+    """A plane seen twice, moved within itself by 10 cm, with `count` landmarks on it: geometry alone cannot tell."""
+    rng = np.random.default_rng(1)
+    plane = np.column_stack([rng.uniform(-1, 1, (3000, 2)), np.full(3000, 2.0)]).astype(np.float32)
+    normals = np.tile(np.array([0, 0, -1], np.float32), (3000, 1))
+    descriptors = rng.integers(0, 255, (count, 128), dtype=np.uint8)
+    marks = plane[:count]
+    shifted = marks + np.array([0.1, 0, 0], np.float32)
+    return PointCloud(plane, normals, None, Landmarks(shifted, descriptors)), PointCloud(
+        plane, normals, None, Landmarks(marks, descriptors)
+    )
+
+
+def test_landmarks_hold_where_a_plane_slides_and_few_of_them_leave_it_to_the_surfaces():
+    registrar = Rgbd()
+    target, source = (registrar.prepare(cloud) for cloud in frames_of(40))
+    found = registrar.register(target, source, np.eye(4))
+    np.testing.assert_allclose(found.i_from_j[:3, 3], [0.1, 0, 0], atol=1e-3)
+    assert found.fitness > 0.9 and np.linalg.eigvalsh(found.information).min() > 0
+    target, source = (registrar.prepare(cloud) for cloud in frames_of(10))
+    assert abs(registrar.register(target, source, np.eye(4)).i_from_j[0, 3]) < 0.05
+
+
+def test_landmarks_survive_the_disk(tmp_path: Path):
+    clouds = [*frames_of(5), PointCloud(np.zeros((0, 3), np.float32))]
+    CloudSet.from_clouds(clouds).save(tmp_path)
+    read = CloudSet.open(tmp_path)
+    assert [len(cloud.landmarks or ()) for cloud in read] == [5, 5, 0]
+    np.testing.assert_array_equal(read[1].landmarks.descriptors, clouds[1].landmarks.descriptors)
