@@ -39,7 +39,7 @@ SENSOR_FOLDERS = ("depth", "depths", "depth_images")
 class ColmapReader:
     """Reads a COLMAP model, binary or text, with or without rigs, and what lies beside it.
 
-    An image's pose is the one that its own record holds: models with rigs keep it there as well.
+    In a model with rigs an image has the pose of its rig's frame, moved to its own camera.
     """
 
     images: str = Field("auto", description="folder of the colour images; auto: images/ and the like; none")
@@ -88,7 +88,7 @@ class ColmapReader:
         if folder is None:
             raise SourceError(f"{path}: no COLMAP model: give the folder with cameras.bin and images.bin, or .txt")
         model = load_model(folder, self.tracks)
-        notes: list[str] = []
+        notes = list(model.notes)
         colour_folder = find_folder(folder, self.images, IMAGE_FOLDERS)
         depths = self._depths(folder, colour_folder, model)
         readable = {row: file for row, file in enumerate(depths) if file}

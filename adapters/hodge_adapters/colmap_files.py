@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hodge_adapters import colmap_binary, colmap_text
 from hodge_adapters.colmap_records import Model, check_model, no_points
+from hodge_adapters.colmap_rigs import posed_by_rigs, rig_files
 from hodge_pipeline.errors import SourceError
 
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
@@ -60,7 +61,11 @@ def load_model(folder: Path, tracks: bool) -> Model:
     cameras = read.read_cameras(paths[0])
     images = sorted(read.read_images(paths[1], has_points), key=lambda image: natural(image.name))
     points = read.read_points(paths[2]) if has_points else no_points()
-    model = Model(cameras, images, points, tuple(paths if has_points else paths[:2]))
+    rigs, notes = rig_files(folder, ending or ".bin"), list[str]()
+    if rigs:
+        images = posed_by_rigs(images, rigs, notes)
+    files = (*(paths if has_points else paths[:2]), *rigs)
+    model = Model(cameras, images, points, files, tuple(notes))
     check_model(model, folder)
     return model
 

@@ -74,12 +74,13 @@ class Points:
 
 @dataclass(frozen=True)
 class Model:
-    """A COLMAP model: cameras by id, images in the order of their names, points; `files` it was read from."""
+    """A COLMAP model: cameras by id, images in the order of their names, points; `files` it was read from, `notes`."""
 
     cameras: Mapping[int, CameraRecord]
     images: Sequence[ImageRecord]
     points: Points
     files: tuple[Path, ...]
+    notes: tuple[str, ...] = ()
 
 
 def no_points() -> Points:

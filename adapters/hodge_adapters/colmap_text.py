@@ -26,12 +26,12 @@ MAX_ID = 1 << 53
 def read_cameras(path: Path) -> dict[int, CameraRecord]:
     """Cameras by id from `cameras.txt`."""
     cameras: dict[int, CameraRecord] = {}
-    for line, text in _lines(path):
+    for line, text in lines(path):
         fields = text.split()
-        camera_id, *size = _whole(path, line, [fields[0], *fields[2:4]]) if len(fields) >= 4 else [0]
+        camera_id, *size = whole(path, line, [fields[0], *fields[2:4]]) if len(fields) >= 4 else [0]
         params = to_floats(fields[4:])
         if len(size) < 2 or not params:
-            raise _fault(path, line, text, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
+            raise fault(path, line, text, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
         cameras[camera_id] = camera_record(f"{path}:{line}", camera_id, fields[1], (size[0], size[1]), params)
     return cameras
 
@@ -39,12 +39,12 @@ def read_cameras(path: Path) -> dict[int, CameraRecord]:
 def read_images(path: Path, tracks: bool) -> list[ImageRecord]:
     """Posed images from `images.txt`, with their observations where wanted."""
     images: list[ImageRecord] = []
-    lines = iter(enumerate(read_text(path).split("\n"), 1))
-    for line, raw in lines:
+    numbered = iter(enumerate(read_text(path).split("\n"), 1))
+    for line, raw in numbered:
         text = raw.strip()
         if not text or text.startswith("#"):
             continue
-        _, observations = next(lines, (0, ""))
+        _, observations = next(numbered, (0, ""))
         images.append(_image(path, line, text, observations if tracks else ""))
     return images
 
@@ -52,10 +52,10 @@ def read_images(path: Path, tracks: bool) -> list[ImageRecord]:
 def read_points(path: Path) -> Points:
     """Points and tracks from `points3D.txt`."""
     ids, xyz, tracks = [], [], []
-    for line, text in _lines(path):
+    for line, text in lines(path):
         numbers = _numbers(text)
         if numbers is None or len(numbers) < 8 or len(numbers) % 2:
-            raise _fault(path, line, text, "POINT3D_ID X Y Z R G B ERROR and pairs of IMAGE_ID POINT2D_IDX")
+            raise fault(path, line, text, "POINT3D_ID X Y Z R G B ERROR and pairs of IMAGE_ID POINT2D_IDX")
         ids.append(_id(path, line, numbers[:1])[0])
         xyz.append(numbers[1:4])
         tracks.append(_id(path, line, numbers[8:]).reshape(-1, 2))
@@ -71,8 +71,8 @@ def _image(path: Path, line: int, text: str, observations: str) -> ImageRecord:
     pose = to_floats(fields[1:8])
     if len(fields) < 10 or pose is None:
         hint = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-        raise _fault(path, line, text, hint + (", with blanks instead of commas" if "," in text else ""))
-    image_id, camera_id = _whole(path, line, [fields[0], fields[8]])
+        raise fault(path, line, text, hint + (", with blanks instead of commas" if "," in text else ""))
+    image_id, camera_id = whole(path, line, [fields[0], fields[8]])
     where = f"{path}:{line}: image {fields[9]!r}"
     numbers = _numbers(observations)
     if numbers is None or len(numbers) % 3 or not np.isfinite(numbers).all():
@@ -84,7 +84,8 @@ def _image(path: Path, line: int, text: str, observations: str) -> ImageRecord:
     )
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
+def lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Each line with its number, without comments and empty ones."""
     for line, raw in enumerate(read_text(path).split("\n"), 1):
         text = raw.strip()
         if text and not text.startswith("#"):
@@ -105,11 +106,13 @@ def _id(path: Path, line: int, values: Floats, least: int = 0) -> Ints:
     return values.astype(np.int64)
 
 
-def _whole(path: Path, line: int, fields: list[str]) -> list[int]:
+def whole(path: Path, line: int, fields: list[str]) -> list[int]:
+    """The fields as whole numbers; raises `SourceError`."""
     if not all(field.isascii() and field.isdecimal() and len(field) < 16 for field in fields):
-        raise _fault(path, line, " ".join(fields), "whole numbers for ids and sizes")
+        raise fault(path, line, " ".join(fields), "whole numbers for ids and sizes")
     return [int(field) for field in fields]
 
 
-def _fault(path: Path, line: int, text: str, expected: str) -> SourceError:
+def fault(path: Path, line: int, text: str, expected: str) -> SourceError:
+    """The complaint, with file and line."""
     return SourceError(f"{path}:{line}: `{text[:60]}`: expected {expected}: {REMEDY}")

@@ -1,4 +1,4 @@
-"""Writes posed frames as a COLMAP model without points: three files, which COLMAP and pycolmap open."""
+"""Writes posed frames as a COLMAP model without points, with rigs of one camera each, as COLMAP makes them itself."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.colmap_cameras import HALF_PIXEL
 from hodge_adapters.colmap_records import CAMERA_MODELS, to_colmap
+from hodge_adapters.colmap_rigs import CAMERA
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.types import Camera, Floats, Frame, Source
 
@@ -24,7 +25,7 @@ class ColmapWriter:
     form: Literal["bin", "txt"] = Field("bin", description="binary, or text with the digits that restore every number")
 
     def write(self, path: Path, source: Source) -> None:
-        """A folder with cameras, images and points3D; each file is replaced in one step.
+        """A folder with cameras, rigs, frames, images and points3D; each file is replaced in one step.
 
         An image's name is the frame's id, with `.png` where that is a number. Raises `SourceError` where no frame has
         a camera and a pose, or where y points up, which no camera of COLMAP's does.
@@ -55,17 +56,28 @@ def _poses(frames: list[Frame]) -> Floats:
     return np.hstack(to_colmap(np.array([frame.world_from_cam for frame in frames])))
 
 
+def _camera_ids(cameras: list[Camera], frames: list[Frame]) -> list[int]:
+    """The number of each frame's camera, from 1; it is the number of its rig as well."""
+    numbers = {camera: number for number, camera in enumerate(cameras, 1)}
+    return [numbers[frame.camera] for frame in frames if frame.camera is not None]
+
+
 def _text_files(cameras: list[Camera], frames: list[Frame]) -> dict[str, bytes]:
     lines = [
         f"{number} PINHOLE {camera.width} {camera.height} {' '.join(map(repr, _params(camera)))}\n"
         for number, camera in enumerate(cameras, 1)
     ]
-    rows = [
-        f"{number} {' '.join(map(repr, pose))} {cameras.index(frame.camera) + 1} {image_name(frame)}\n\n"  # type: ignore[arg-type]
-        for number, (pose, frame) in enumerate(zip(_poses(frames).tolist(), frames, strict=True), 1)
-    ]
+    poses = [" ".join(map(repr, pose)) for pose in _poses(frames).tolist()]
+    numbered = list(enumerate(zip(poses, _camera_ids(cameras, frames), frames, strict=True), 1))
+    rows = [f"{number} {pose} {camera} {image_name(frame)}\n\n" for number, (pose, camera, frame) in numbered]
+    rig_frames = [f"{number} {camera} {pose} 1 CAMERA {camera} {number}\n" for number, (pose, camera, _) in numbered]
     return {
         "cameras.txt": ("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n" + "".join(lines)).encode(),
+        "rigs.txt": (
+            "# RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID\n"
+            + "".join(f"{number} 1 CAMERA {number}\n" for number in range(1, len(cameras) + 1))
+        ).encode(),
+        "frames.txt": ("# FRAME_ID RIG_ID RIG_FROM_WORLD NUM_DATA_IDS DATA_IDS\n" + "".join(rig_frames)).encode(),
         "images.txt": ("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points\n" + "".join(rows)).encode(),
         "points3D.txt": b"# POINT3D_ID X Y Z R G B ERROR TRACK\n",
     }
@@ -77,14 +89,20 @@ def _binary_files(cameras: list[Camera], frames: list[Frame]) -> dict[str, bytes
         struct.pack("<IiQQ4d", number, number_of_pinhole, camera.width, camera.height, *_params(camera))
         for number, camera in enumerate(cameras, 1)
     ]
+    numbered = list(enumerate(zip(_poses(frames).tolist(), _camera_ids(cameras, frames), frames, strict=True), 1))
     rows = [
-        struct.pack("<I7dI", number, *pose, cameras.index(frame.camera) + 1)  # type: ignore[arg-type]
-        + image_name(frame).encode()
-        + struct.pack("<xQ", 0)
-        for number, (pose, frame) in enumerate(zip(_poses(frames).tolist(), frames, strict=True), 1)
+        struct.pack("<I7dI", number, *pose, camera) + image_name(frame).encode() + struct.pack("<xQ", 0)
+        for number, (pose, camera, frame) in numbered
+    ]
+    rigs = [struct.pack("<IIiI", number, 1, CAMERA, number) for number in range(1, len(cameras) + 1)]
+    rig_frames = [
+        struct.pack("<II7dIiIQ", number, camera, *pose, 1, CAMERA, camera, number)
+        for number, (pose, camera, _) in numbered
     ]
     return {
         "cameras.bin": struct.pack("<Q", len(records)) + b"".join(records),
+        "rigs.bin": struct.pack("<Q", len(rigs)) + b"".join(rigs),
+        "frames.bin": struct.pack("<Q", len(rig_frames)) + b"".join(rig_frames),
         "images.bin": struct.pack("<Q", len(rows)) + b"".join(rows),
         "points3D.bin": struct.pack("<Q", 0),
     }
