@@ -61,7 +61,7 @@ class Recipe:
         le=20,
         description="rounds of new edges, registration and solve, each from the poses of the last",
     )
-    diagnosis: DiagnosisOptions = DiagnosisOptions()
+    diagnosis: DiagnosisOptions = DiagnosisOptions(runs=8, every_pair_tried=False)
     fusion: tuple[Fuser, ...] = Field(default=(), description="each makes one model from the final poses")
     evaluation: EvaluationOptions = EvaluationOptions()
     recording: RecordingOptions = RecordingOptions()

@@ -58,7 +58,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
         support=closing_support(cycles, prior),
         alone=in_no_cycle(graph.edges, graph.vertex_count, cycles),
         reach_m=reach_m,
-        exhaustive=seems_exhaustive(graph.edges, graph.vertex_count),
+        exhaustive=_every_pair_tried(graph, options),
     )
     consensus = find_consensus(evidence, _with_noise(graph, motions, noise), options)
     undecided = unattributable(graph.edges, graph.vertex_count, cycles)
@@ -70,6 +70,11 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     return _report(
         graph, cycles, probability, verdict, kept, undecided, world_from_cam, consensus.fit.resistance, consensus.runs
     )
+
+
+def _every_pair_tried(graph: ViewGraph, options: DiagnosisOptions) -> bool:
+    told = options.every_pair_tried
+    return seems_exhaustive(graph.edges, graph.vertex_count) if told is None else told
 
 
 def _with_noise(graph: ViewGraph, motions: Floats, noise: Noise) -> ViewGraph:

@@ -34,6 +34,11 @@ class DiagnosisOptions:
         description="tried in turn: weight of 'these two views lie upon each other and no edge says so', used only "
         "where every pair seems to have been tried",
     )
+    every_pair_tried: bool | None = Field(
+        default=None,
+        description="whether every pair of views was tried, so that a missing edge speaks against an overlap; none: "
+        "where a tenth of all pairs has an edge. A run's recipe says false, since it tries a few pairs to a frame",
+    )
     order_prior: bool = Field(
         default=True,
         description="learn from the graph whether vertices that are near in order are more often joined, and expect "
