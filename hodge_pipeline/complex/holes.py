@@ -1,0 +1,56 @@
+"""The loops of a viewing graph that no triangles fill: generators of the first homology of its flag complex."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_pipeline.complex.cech import clique_counts, flag_complex, orient_edges
+from hodge_pipeline.complex.cycles import Loops, fundamental_loops, spanning_forest
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.types import Ints
+
+MOST_TRIANGLES = 100_000
+
+
+def unfilled_loops(edges: Ints, vertex_count: int, most_triangles: int = MOST_TRIANGLES) -> Loops:
+    """One loop for each hole, over the rows of `edges` (E, 2), the shortest first; parallel edges leave no hole.
+
+    The loops that chords close in a breadth-first forest span all cycles. Each triangle is a relation between chords
+    over GF(2); eliminating the chord of the longest loop from each leaves as many chords as there are holes, b1.
+    Raises `GraphError` above `most_triangles`.
+    """
+    oriented = orient_edges(edges, vertex_count)
+    if clique_counts(oriented.edges, vertex_count)[2] > most_triangles:
+        raise GraphError(f"holes are sought in graphs of at most {most_triangles} triangles")
+    forest = spanning_forest(oriented.edges, vertex_count)
+    loops = fundamental_loops(forest)
+    rank = np.full(len(oriented.edges), -1, np.int64)
+    by_length = np.argsort(loops.lengths, kind="stable")
+    rank[forest.chords[by_length]] = np.arange(len(by_length))
+    complex_ = flag_complex(oriented.edges, vertex_count)
+    corners = complex_.simplices[2]
+    sides = np.stack([complex_.rows_of(corners[:, pair]) for pair in ([0, 1], [1, 2], [0, 2])], axis=1)
+    open_ranks = sorted(set(range(len(by_length))) - _filled(rank[sides]))
+    chosen = loops.select(by_length[np.array(open_ranks, np.int64)])
+    return _over_measured(chosen, oriented.row, oriented.sign, len(oriented.edges))
+
+
+def _filled(triangles: Ints) -> set[int]:
+    """The ranks of the chords that triangles (T, 3) eliminate; −1 is an edge of the forest."""
+    reduced: dict[int, set[int]] = {}
+    for triangle in triangles.tolist():
+        left = {rank for rank in triangle if rank >= 0}
+        while left and (pivot := max(left)) in reduced:
+            left ^= reduced[pivot]
+        if left:
+            reduced[max(left)] = left
+    return set(reduced)
+
+
+def _over_measured(loops: Loops, row: Ints, sign: Ints, count: int) -> Loops:
+    """The loops over the first measured edge of each simple one, passed in that edge's own direction."""
+    first = np.full(count, -1, np.int64)
+    real = np.flatnonzero(row >= 0)[::-1]
+    first[row[real]] = real
+    measured = first[loops.edge]
+    return Loops(loops.offsets, measured, loops.sign * sign[measured])
