@@ -26,8 +26,9 @@ from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.summary import graph_summary, trajectory_rows, worst_edges
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.job import Job, versions
+from hodge_pipeline.report_pictures import four_sides, worst_pairs
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
-from hodge_pipeline.types import Floats, Solution, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import CloudSet, Floats, Solution, Source, Trajectory, ViewGraph
 
 EDGE_COLUMNS = (
     "i", "j", "source", "status", "fitness", "rmse_m", "correspondences", "weight", "residual_m", "residual_deg",
@@ -114,6 +115,7 @@ def make_report(job: Job, source: Source, rounds: Sequence[Round], scores: Score
     component = last.solution.component
     names = [frame.sequence for frame in source.frames]
     verdict = None if last.verdicts is None else last.verdicts.verdict
+    worst = worst_edges(last.graph, last.world_from_cam, last.solution.weights, verdict=verdict)
     return Report(
         title=f"{source.name}",
         source=SourceSummary(
@@ -128,12 +130,16 @@ def make_report(job: Job, source: Source, rounds: Sequence[Round], scores: Score
         trajectories=trajectory_rows(sets, truth, component, names) if has_truth(source) else (),
         loops=_loop_rows(last.solution),
         graph=graph_summary(last.graph, component, last.solution.weights, last.rejected_counts, verdict),
-        worst_edges=worst_edges(last.graph, last.world_from_cam, last.solution.weights, verdict=verdict),
+        worst_edges=worst,
         stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in job.costs()),
         notes=tuple(job.notes),
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(job.recipe)),
-        pictures=_pictures(source, rounds, sets),
+        pictures=dataclasses.replace(
+            _pictures(source, rounds, sets),
+            sides=four_sides(CloudSet.open(job.path("clouds")), sets["odometry"], sets["result"], component),
+            worst_pairs=worst_pairs(source, worst),
+        ),
     )
 
 

@@ -117,11 +117,21 @@ class Residuals:
 
 
 @dataclass(frozen=True)
+class Photograph:
+    """A JPEG with its title and what it shows, in a sentence."""
+
+    title: str
+    caption: str
+    jpeg: bytes
+
+
+@dataclass(frozen=True)
 class Pictures:
     """What the plots are drawn from; a plot without its data is left out.
 
     `component (N,)` breaks the paths between parts and sequences. `convergence` holds the objective after each
-    iteration, one series for each solve.
+    iteration, one series for each solve. `sides` shows the scene before and after, `worst_pairs` the frames of the
+    worst edges.
     """
 
     paths: tuple[Path3D, ...] = ()
@@ -129,6 +139,8 @@ class Pictures:
     residuals: tuple[Residuals, ...] = ()
     graph: ViewGraph | None = None
     convergence: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    sides: tuple[Photograph, ...] = ()
+    worst_pairs: tuple[Photograph, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from base64 import b64encode
 from collections.abc import Iterable
 from html import escape
 
-from hodge_pipeline.evaluation.contents import Report
+from hodge_pipeline.evaluation.contents import Photograph, Report
 from hodge_pipeline.evaluation.plots import Plot
 from hodge_pipeline.evaluation.tables import (
     Table,
@@ -18,6 +18,7 @@ from hodge_pipeline.evaluation.tables import (
 )
 from hodge_pipeline.evaluation.verdict import Outcome, judge, percent, suspicions
 
+NARROW = "\u202f"
 SYMBOLS: dict[Outcome, str] = {"improved": "▲", "unchanged": "＝", "worse": "▼", "mixed": "◆", "not measured": "?"}
 
 STYLE = """
@@ -62,7 +63,14 @@ def render(report: Report, plots: Iterable[Plot]) -> str:
     details = [source_table(report), *graph_tables(report), *([stages_table(report)] if report.stages else [])]
     body = [
         *first_page,
+        _photographs(
+            "The scene from four sides",
+            f"The frames' clouds laid together by their poses: {report.before} on the left, {report.after} on "
+            "the right. Walls that are double on the left and single on the right are what the run is for.",
+            report.pictures.sides,
+        ),
         *(_table(table, report.after) for table in tables),
+        _photographs("Frames of the worst edges", "", report.pictures.worst_pairs),
         _plots(plots),
         *(_table(table, report.after) for table in details),
         _versions(report),
@@ -116,7 +124,10 @@ def _tiles(report: Report) -> str:
         seconds = sum(stage.wall_s for stage in report.stages)
         peak = max(stage.peak_mb for stage in report.stages)
         tiles.append((_duration(seconds), f"in all; at most {peak:.0f} MB"))
-    items = "".join(f"<li><strong>{escape(big)}</strong><span>{escape(small)}</span></li>" for big, small in tiles)
+    items = "".join(
+        f"<li><strong>{escape(big)}</strong><span>{escape(small.replace(' %', NARROW + '%'))}</span></li>"
+        for big, small in tiles
+    )
     return f'<ul class="tiles">{items}</ul>' if tiles else ""
 
 
@@ -164,6 +175,20 @@ def _plots(plots: Iterable[Plot]) -> str:
         for plot in plots
     )
     return f'<section class="pictures"><h2>Pictures</h2><div class="plots">{figures}</div></section>' if figures else ""
+
+
+def _photographs(title: str, caption: str, photographs: Iterable[Photograph]) -> str:
+    figures = "".join(
+        f'<figure><h3>{escape(each.title)}</h3><img alt="{escape(each.title)}. {escape(each.caption)}" '
+        f'src="data:image/jpeg;base64,{b64encode(each.jpeg).decode()}"><figcaption>{escape(each.caption)}</figcaption></figure>'
+        for each in photographs
+    )
+    text = f'<p class="caption">{escape(caption)}</p>' if caption else ""
+    return (
+        f'<section class="pictures"><h2>{escape(title)}</h2>{text}<div class="plots">{figures}</div></section>'
+        if figures
+        else ""
+    )
 
 
 def _versions(report: Report) -> str:
