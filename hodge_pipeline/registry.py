@@ -36,6 +36,7 @@ KINDS = {
         Kind("solvers", stages.ConsistencySolver, "make all poses consistent"),
         Kind("refiners", stages.Refiner, "improve the poses after the solve"),
         Kind("fusion", stages.Fuser, "fuse all frames into one model"),
+        Kind("models", stages.ModelReader, "open a model of posed images and tracked points, to be refined"),
         Kind("writers", stages.Writer, "write what another program reads"),
     )
 }

@@ -17,8 +17,11 @@ from hodge_pipeline.types import (
     CloudSet,
     Floats,
     Frame,
+    Ints,
     Model,
+    ModelQuality,
     PointCloud,
+    PositionPriors,
     Registration,
     Solution,
     Source,
@@ -135,4 +138,100 @@ class Writer(Protocol):
 
         `SourceError` where the source has nothing of that kind.
         """
+        ...
+
+
+class TrackedModel(Protocol):
+    """Posed images with the points they track, as structure from motion leaves them; its unit of length is its own.
+
+    What moves is a body: a rig with its cameras held rigid, or a single image. Every method gives a new model and
+    leaves this one as it is; images, cameras, tracks and names stay what they are unless it says otherwise.
+    """
+
+    @property
+    def name(self) -> str:
+        """What a person calls it: the folder it came from."""
+        ...
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that it was read from, to be given back; none where it has been joined or made in memory."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was skipped or repaired so far, one line each."""
+        ...
+
+    @property
+    def frames(self) -> Sequence[Frame]:
+        """The posed images (N), in order, with what can be read of them; positions in the model's unit."""
+        ...
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """The bodies (B), as the model names them."""
+        ...
+
+    @property
+    def world_from_body(self) -> Floats:
+        """Their poses (B, 4, 4)."""
+        ...
+
+    @property
+    def body_of_frame(self) -> Ints:
+        """The body (N,) that carries each image."""
+        ...
+
+    @property
+    def body_from_cam(self) -> Floats:
+        """Where (N, 4, 4) the body carries it."""
+        ...
+
+    @property
+    def quality(self) -> ModelQuality:
+        """How well points and images agree."""
+        ...
+
+    def depth_ratios(self) -> Sequence[Floats]:
+        """For each image with depth, in a few hundred of them: metres that the sensor saw over units that the model
+        has, at the tracked points.
+        """
+        ...
+
+    def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
+        """Relative poses of the bodies, estimated anew from what their images share, and what was left out."""
+        ...
+
+    def scaled(self, factor: float) -> TrackedModel:
+        """The model in another unit of length."""
+        ...
+
+    def moved(self, world_from_body: Floats) -> TrackedModel:
+        """The bodies at these poses (B, 4, 4), the points where their rays then meet; points that are one are merged
+        where measurements say so.
+        """
+        ...
+
+    def adjusted(self, priors: PositionPriors | None = None) -> tuple[TrackedModel, Floats]:
+        """Bundle adjustment of poses and points, cameras held; and the standard errors (B, 2) of each body's rotation
+        and position, radians and units.
+        """
+        ...
+
+    def write(self, folder: Path) -> None:
+        """Write it in its own format into a folder that exists."""
+        ...
+
+
+@runtime_checkable
+class ModelReader(Protocol):
+    """Opens models that track points, and joins several of one scene."""
+
+    def open_models(self, path: Path) -> Sequence[TrackedModel]:
+        """The model at a path, or all the models that one scene fell into. Raises `SourceError`."""
+        ...
+
+    def join(self, models: Sequence[TrackedModel]) -> Sequence[TrackedModel]:
+        """The models again, those that measurements tie together as one: in the gauge and unit of its largest."""
         ...

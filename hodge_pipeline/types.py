@@ -273,6 +273,25 @@ class Model:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class ModelQuality:
+    """How well the points of a model fit its images: pixels between a point seen and projected, images to a point."""
+
+    images: int
+    points: int
+    observations: int
+    mean_reprojection_px: float
+    mean_track_length: float
+
+
+@dataclass(frozen=True)
+class PositionPriors:
+    """Where each body of a model should be: `positions (B, 3)` and their `covariances (B, 3, 3)`; NaN for no opinion."""
+
+    positions: Floats
+    covariances: Floats
+
+
 class CloudSet(Sequence[PointCloud]):
     """The down-sampled cloud of every frame, as memory-mapped columns: opening one costs no copy.
 

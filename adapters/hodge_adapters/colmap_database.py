@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from hodge_adapters.colmap_edges import Pair, camera_table, positions
 from hodge_adapters.colmap_records import Model
 from hodge_adapters.colmap_relative import Sighting
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats
+from hodge_pipeline.types import Floats, Ints
 
 MAX_IMAGE_ID = 2147483647
 """A pair's key is `first · this + second`."""
@@ -39,6 +39,27 @@ def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) 
         raise SourceError(
             f"{path}: not a whole COLMAP database ({error}): make it again, or set edges=covisibility"
         ) from error
+
+
+def database_matches(path: Path, row_of_name: Mapping[str, int]) -> Iterator[tuple[int, int, Ints]]:
+    """Rows i and j of two images by name, and the keypoints (M, 2) of i and of j that are verified to match."""
+    try:
+        with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as database:
+            row_of_id = {
+                int(image_id): row_of_name[name]
+                for image_id, name in database.execute("SELECT image_id, name FROM images")
+                if name in row_of_name
+            }
+            rows = database.execute(
+                "SELECT pair_id, rows, config, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
+            )
+            for pair_id, count, config, data in rows:
+                first, second = (row_of_id.get(image_id) for image_id in divmod(int(pair_id), MAX_IMAGE_ID))
+                if first is not None and second is not None and config in USABLE:
+                    matches = _blob(path, f"pair {pair_id}", data, np.dtype("<u4"), count, 2)
+                    yield first, second, matches.astype(np.int64)
+    except (sqlite3.Error, OverflowError) as error:
+        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
 
 
 def _pairs(database: sqlite3.Connection, path: Path, model: Model, min_shared: int, notes: list[str]) -> Iterator[Pair]:

@@ -79,3 +79,20 @@ def natural(name: str) -> tuple[tuple[int, int, str], ...]:
 def parent_of(name: str) -> str:
     """The folder part of an image's name: cameras of a rig have one each."""
     return os.path.dirname(name)
+
+
+def find_models(path: Path) -> list[Path]:
+    """The folders of all models of one scene: the path itself, or `0`, `1`, … in it or in its `sparse`."""
+    if model_ending(path):
+        return [path]
+    for place in (path, path / "sparse"):
+        numbered = sorted((folder for folder in _folders(place) if folder.name.isdecimal()), key=lambda f: int(f.name))
+        found = [folder for folder in numbered if model_ending(folder)]
+        if found:
+            return found
+    single = find_model(path)
+    return [single] if single else []
+
+
+def _folders(path: Path) -> list[Path]:
+    return [entry for entry in path.iterdir() if entry.is_dir()] if path.is_dir() else []

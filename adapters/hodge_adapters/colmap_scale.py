@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from hodge_adapters import images
+from hodge_adapters.colmap_cameras import HALF_PIXEL, colmap_camera
 from hodge_adapters.colmap_edges import positions
 from hodge_adapters.colmap_records import NO_POINT, Model
 from hodge_pipeline import se3
@@ -16,6 +17,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Floats32, ViewGraph
 
 SAMPLED_IMAGES = 12
+MOST_IMAGES = 200
 LEAST_POINTS = 50
 
 
@@ -59,14 +61,44 @@ def scaled_graph(graph: ViewGraph, scale: float) -> ViewGraph:
     )
 
 
-def _ratios(model: Model, row: int, depth: Floats32) -> Floats:
+def depth_ratios(
+    model: Model,
+    sensors: Mapping[int, Path],
+    units_per_metre: float,
+    no_depth: tuple[int, ...],
+    camera: tuple[float, float, float, float] | None,
+) -> Sequence[Floats]:
+    """Metres by the sensor over units by the model at the observations of each image (by row), of `MOST_IMAGES` evenly.
+
+    `camera`: fx fy cx cy of the depth images; none where their pixels are those of the colour images.
+    """
+    rows = np.array(sorted(sensors), np.int64)
+    if len(rows) > MOST_IMAGES:
+        rows = rows[np.linspace(0, len(rows) - 1, MOST_IMAGES).round().astype(int)]
+    ratios = []
+    for row in rows.tolist():
+        try:
+            depth = images.read_depth(sensors[row], units_per_metre=units_per_metre, no_depth=no_depth)
+        except SourceError:
+            continue  # the frame itself reports it when it is read
+        ratios.append(_ratios(model, row, depth, camera))
+    return ratios
+
+
+def _ratios(
+    model: Model, row: int, depth: Floats32, camera: tuple[float, float, float, float] | None = None
+) -> Floats:
     image = model.images[row]
     record = model.cameras[image.camera_id]
     seen = image.point_ids != NO_POINT
     xyz = positions(model, image.point_ids[seen])
     expected: Floats = se3.transform(se3.inverse(image.world_from_cam), xyz)[:, 2]
     grid = np.array([depth.shape[1] / record.width, depth.shape[0] / record.height])
-    columns, rows = np.floor(image.pixels[seen] * grid).astype(np.int64).T
+    pixels = image.pixels[seen] * grid
+    if camera is not None:
+        rays = np.nan_to_num(np.asarray(colmap_camera(record).cam_from_img(image.pixels[seen])), nan=-1e3)
+        pixels = rays * np.array(camera[:2]) + np.array(camera[2:]) + HALF_PIXEL
+    columns, rows = np.floor(pixels).astype(np.int64).T
     good = (columns >= 0) & (rows >= 0) & (columns < depth.shape[1]) & (rows < depth.shape[0]) & (expected > 0)
     measured: Floats = depth[rows[good], columns[good]].astype(np.float64)
     ratios: Floats = (measured / expected[good])[measured > 0]

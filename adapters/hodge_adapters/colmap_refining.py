@@ -1,0 +1,167 @@
+"""COLMAP models to be refined: found, read with their depth and database, and joined where one scene fell apart."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pycolmap
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_adapters import images
+from hodge_adapters.colmap import ColmapReader
+from hodge_adapters.colmap_depth import sensor_depth
+from hodge_adapters.colmap_files import find_database, find_model, find_models, model_ending
+from hodge_adapters.colmap_ties import similarity, tie_points
+from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, read_reconstruction
+from hodge_adapters.colmap_union import united
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Camera, Frame
+
+MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class ColmapModels:
+    """A COLMAP model, or all that a reconstruction fell into, binary or text, with or without rigs."""
+
+    database: str = Field("auto", description="COLMAP's database; auto: database.db beside or above the model; none")
+    images: str = Field("auto", description="folder of the colour images; auto: images/ and the like; none")
+    depth: str = Field(
+        "none", description="folder of sensor depth named as the colour images (or depth for color); none: no depth"
+    )
+    depth_scale: float = Field(1000.0, gt=0, description="stored units per metre of sensor depth; most sensors: mm")
+    depth_camera: tuple[float, float, float, float] | None = Field(
+        None, description="fx fy cx cy of the depth images; none: their pixels are those of the colour images"
+    )
+    no_depth: tuple[int, ...] = Field((0, 65535), description="stored values of sensor depth that mean none")
+    min_shared: int = Field(30, ge=8, description="points or matches that a pair must share to become an edge")
+    max_edges_per_image: int = Field(
+        20, ge=1, description="pairs for an image where there is no database, those with most shared points first"
+    )
+    seed: int = Field(0, ge=0, description="of RANSAC")
+
+    def open_models(self, path: Path) -> Sequence[ColmapModel]:
+        """The model of a folder; of a folder with `0`, `1`, … all of them. Raises `SourceError`."""
+        folders = find_models(Path(path))
+        if not folders:
+            raise SourceError(f"{path}: no COLMAP model: give the folder with cameras.bin and images.bin, or .txt")
+        return [self._open(folder) for folder in folders]
+
+    def open_reconstructions(self, models: Sequence[pycolmap.Reconstruction]) -> Sequence[ColmapModel]:
+        """The same of models in memory."""
+        out = []
+        for number, model in enumerate(models):
+            with tempfile.TemporaryDirectory() as folder:
+                model.write_binary(folder)
+                out.append(replace(self._open(Path(folder)), name=f"model {number}", files=()))
+        return out
+
+    def join(self, models: Sequence[ColmapModel]) -> Sequence[ColmapModel]:
+        """The largest model takes in, one by one, those that enough tied points place in it."""
+        left = sorted(models, key=lambda model: -model.quality.images)
+        out = []
+        while left:
+            whole, left = left[0], left[1:]
+            grown = True
+            while grown:
+                grown = False
+                for other in left:
+                    joined = _joined(whole, other)
+                    if joined is not None:
+                        whole, grown = joined, True
+                        left = [model for model in left if model is not other]
+                        break
+            out.append(whole)
+        return out
+
+    def _open(self, folder: Path) -> ColmapModel:
+        ending = model_ending(folder)
+        assert ending is not None
+        sensor = self._sensor(folder)
+        source = ColmapReader(
+            images=self.images,
+            depth="none" if sensor is None else str(sensor.absolute()),
+            depth_scale=self.depth_scale,
+            no_depth=self.no_depth,
+            scale=1.0,
+            edges="none",
+        ).open(folder)
+        reconstruction = read_reconstruction(folder)
+        notes = [*source.notes, *_unposed(reconstruction)]
+        frames = {str(frame.frame_id): frame for frame in source.frames}
+        depth = self._depth(sensor, frames)
+        database = self._database(folder, frames, notes)
+        files = (folder / f"{name}{ending}" for name in MODEL_FILES)
+        return ColmapModel(
+            name=str(folder),
+            reconstruction=reconstruction,
+            all_frames={name: self._with_depth(frame, depth.files.get(name)) for name, frame in frames.items()},
+            depth=depth,
+            edges=EdgeOptions(database, self.min_shared, self.max_edges_per_image, self.seed),
+            text=ending == ".txt",
+            files=tuple(file for file in files if file.is_file()),
+            notes=tuple(notes),
+        )
+
+    def _sensor(self, folder: Path) -> Path | None:
+        if self.depth == "none":
+            return None
+        found = next((place for place in (Path(self.depth), folder / self.depth) if place.is_dir()), None)
+        if found is None:
+            raise SourceError(f"{self.depth}: no such folder of depth images: give --depth one that is there")
+        return found
+
+    def _depth(self, sensor: Path | None, frames: dict[str, Frame]) -> DepthOptions:
+        found = {name: sensor_depth(sensor, name, None) for name in frames} if sensor else {}
+        files = {name: path for name, path in found.items() if path}
+        return DepthOptions(files, self.depth_scale, self.no_depth, self.depth_camera)
+
+    def _database(self, folder: Path, frames: dict[str, Frame], notes: list[str]) -> Path | None:
+        if self.database == "none":
+            return None
+        if self.database == "auto":
+            found = find_database(folder)
+            if found is None:
+                notes.append("no database.db beside or above the model: edges come from points that images share")
+            return found
+        found = next((path for path in (Path(self.database), folder / self.database) if path.is_file()), None)
+        if found is None:
+            raise SourceError(f"{self.database}: no such database: give --database one that is there, or none")
+        return found
+
+    def _with_depth(self, frame: Frame, depth: Path | None) -> Frame:
+        """The frame in the camera of its depth, where that is another one than the colour's."""
+        if depth is None or self.depth_camera is None:
+            return frame
+        read = partial(images.read_depth, depth, units_per_metre=self.depth_scale, no_depth=self.no_depth)
+        return replace(frame, camera=Camera(*images.image_size(depth), *self.depth_camera), read_depth=read)
+
+
+def _unposed(reconstruction: pycolmap.Reconstruction) -> list[str]:
+    unposed = reconstruction.num_images() - reconstruction.num_reg_images()
+    return [f"{unposed} images of the model have no pose: they stay without"] if unposed else []
+
+
+def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
+    ties = tie_points(whole.reconstruction, other.reconstruction, whole.edges.database)
+    found = similarity(whole.reconstruction, other.reconstruction, ties)
+    if found is None:
+        return None
+    whole_from_other, agreeing = found
+    moved = pycolmap.Reconstruction(other.reconstruction)
+    moved.transform(whole_from_other)
+    note = f"{other.name} joined to {whole.name} by {agreeing} of {len(ties.ids)} points in both, scale {whole_from_other.scale:.4g}"
+    depth = replace(whole.depth, files={**other.depth.files, **whole.depth.files})
+    return replace(
+        whole,
+        reconstruction=united(whole.reconstruction, moved),
+        all_frames={**other.all_frames, **whole.all_frames},
+        depth=depth,
+        files=(),
+        notes=(*whole.notes, *(line for line in other.notes if line not in whole.notes), note),
+    )

@@ -1,0 +1,180 @@
+"""A COLMAP model to be refined: bodies that move, points that follow them, bundle adjustment, and writing it again.
+
+pycolmap holds the model, so that rigs, cameras, names and colours come out as they went in. A body is one of COLMAP's
+frames: all cameras of a rig at one moment, or a single image.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from hodge_adapters.colmap_bodies import Bodies, bodies_of, body_graph
+from hodge_adapters.colmap_bundle import adjust
+from hodge_adapters.colmap_database import database_pairs
+from hodge_adapters.colmap_edges import covisible_pairs, measured_graph
+from hodge_adapters.colmap_files import load_model
+from hodge_adapters.colmap_points import points_of_rays
+from hodge_adapters.colmap_records import Model
+from hodge_adapters.colmap_scale import depth_ratios
+from hodge_adapters.colmap_ties import merge_matched_points
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats, Frame, Ints, ModelQuality, PositionPriors, ViewGraph
+
+
+@dataclass(frozen=True)
+class DepthOptions:
+    """Depth beside the images: the file of each image by its name, and how to read it."""
+
+    files: dict[str, Path]
+    units_per_metre: float
+    no_depth: tuple[int, ...]
+    camera: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class EdgeOptions:
+    """Where the relative poses come from, and how many points they need."""
+
+    database: Path | None
+    min_shared: int
+    max_edges_per_image: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """See `stages.TrackedModel`. The reconstruction is never changed in place."""
+
+    name: str
+    reconstruction: pycolmap.Reconstruction
+    all_frames: dict[str, Frame]
+    depth: DepthOptions
+    edges: EdgeOptions
+    text: bool = False
+    files: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def records(self) -> Model:
+        """The model as plain arrays, images in natural order of their names."""
+        with tempfile.TemporaryDirectory() as folder:
+            self.reconstruction.write_binary(folder)
+            return replace(load_model(Path(folder), True), files=())
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """The bodies, and which of them carries each image."""
+        return bodies_of(self.reconstruction, [image.image_id for image in self.records.images])
+
+    @cached_property
+    def frames(self) -> Sequence[Frame]:
+        """The posed images, with depth and colour where they are to be read."""
+        return tuple(
+            replace(self.all_frames[image.name], world_from_cam=image.world_from_cam) for image in self.records.images
+        )
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Each body by the name of its first image."""
+        return self.bodies.names
+
+    @property
+    def world_from_body(self) -> Floats:
+        """Poses (B, 4, 4)."""
+        return self.bodies.world_from_body
+
+    @property
+    def body_of_frame(self) -> Ints:
+        """The body (N,) of each image."""
+        return self.bodies.body_of_image
+
+    @property
+    def body_from_cam(self) -> Floats:
+        """Where (N, 4, 4) a body carries its image."""
+        return self.bodies.body_from_cam
+
+    @cached_property
+    def quality(self) -> ModelQuality:
+        """Errors are computed anew: what a file says of them may be older than its poses."""
+        current = self._copy()
+        current.update_point_3d_errors()
+        return ModelQuality(
+            images=current.num_reg_images(),
+            points=current.num_points3D(),
+            observations=current.compute_num_observations(),
+            mean_reprojection_px=float(current.compute_mean_reprojection_error()),
+            mean_track_length=float(current.compute_mean_track_length()),
+        )
+
+    def depth_ratios(self) -> Sequence[Floats]:
+        """Sensor depth over model depth at the observations of each image with depth, of a few hundred evenly."""
+        depth = self.depth
+        files = {row: depth.files[image.name] for row, image in enumerate(self.records.images) if image.name in depth.files}
+        return depth_ratios(self.records, files, depth.units_per_metre, depth.no_depth, depth.camera)
+
+    def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
+        """Edges of the database where there is one, else of covisible images."""
+        notes: list[str] = []
+        options, records = self.edges, self.records
+        if options.database is None:
+            pairs = covisible_pairs(records, options.min_shared, options.max_edges_per_image)
+        else:
+            pairs = database_pairs(options.database, records, options.min_shared, notes)
+        graph = measured_graph(records, pairs, options.min_shared // 2, options.seed, notes)
+        return body_graph(graph, self.bodies), tuple(notes)
+
+    def scaled(self, factor: float) -> ColmapModel:
+        """Positions times the factor."""
+        copy = self._copy()
+        copy.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
+        return replace(self, reconstruction=copy)
+
+    def moved(self, world_from_body: Floats) -> ColmapModel:
+        """Bodies at these poses, points where their rays meet; what the database matched is merged where it fits."""
+        before, copy = self.records, self._copy()
+        for frame_id, pose in zip(self.bodies.frame_ids, world_from_body, strict=True):
+            copy.frames[frame_id].rig_from_world = rigid3d(se3.inverse(pose))
+        poses = world_from_body[self.bodies.body_of_image] @ self.bodies.body_from_cam
+        for point_id, xyz in zip(before.points.ids.tolist(), points_of_rays(before, poses), strict=True):
+            copy.points3D[point_id].xyz = xyz
+        notes = self.notes
+        if self.edges.database is not None:
+            merged = merge_matched_points(copy, self.edges.database)
+            notes = (*notes, f"{merged} pairs of points that a match calls one were merged") if merged else notes
+        copy.update_point_3d_errors()
+        return replace(self, reconstruction=copy, notes=notes)
+
+    def adjusted(self, priors: PositionPriors | None = None) -> tuple[ColmapModel, Floats]:
+        """Bundle adjustment with cameras and rigs held; see `colmap_bundle`."""
+        copy = self._copy()
+        errors = adjust(copy, self.bodies, priors)
+        return replace(self, reconstruction=copy), errors
+
+    def write(self, folder: Path) -> None:
+        """Five files, binary or text as the model was."""
+        (self.reconstruction.write_text if self.text else self.reconstruction.write_binary)(folder)
+
+    def _copy(self) -> pycolmap.Reconstruction:
+        return pycolmap.Reconstruction(self.reconstruction)
+
+
+def rigid3d(b_from_a: Floats) -> pycolmap.Rigid3d:
+    """A motion as pycolmap has it."""
+    return pycolmap.Rigid3d(np.ascontiguousarray(b_from_a[:3]))
+
+
+def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
+    """The model of a folder by pycolmap. Raises `SourceError` where it refuses."""
+    try:
+        return pycolmap.Reconstruction(folder)
+    except Exception as error:  # pycolmap raises what its C++ checks raise: RuntimeError, ValueError, IndexError
+        reason = str(error).strip().splitlines()[-1][:200] if str(error).strip() else type(error).__name__
+        raise SourceError(f"{folder}: COLMAP itself cannot read this model ({reason}): write it again") from error

@@ -1,0 +1,180 @@
+"""Refine a model with tracks: scale, edges, a consistent solve, bundle adjustment, and a judgement of the result."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.evaluation.scores import SIGMA_M
+from hodge_pipeline.evaluation.trajectory import align
+from hodge_pipeline.refine.guard import Change, Decision, Measure, decide
+from hodge_pipeline.refine.model_edges import DepthEdges, depth_edges, held_out_distances, joined_graphs
+from hodge_pipeline.refine.model_options import ModelRefinement
+from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
+from hodge_pipeline.refine.scale import Scale, metric_scale
+from hodge_pipeline.stages import TrackedModel, Workers
+from hodge_pipeline.types import Floats
+
+ADJUSTMENTS = 2
+"""Rounds of merging points and bundle adjustment: what the first brings together the second can merge."""
+CHI2_TOLERANCE = 0.05
+SCORE_TOLERANCE = 0.002
+
+
+@dataclass(frozen=True)
+class RefinedModel:
+    """One model refined, with the models it was made of.
+
+    `start` is the input in metres (where depth tells) and joined; `model` what bundle adjustment made of it. `solved`
+    is None where nothing was measured, and then the model is as it was.
+    """
+
+    inputs: tuple[TrackedModel, ...]
+    start: TrackedModel
+    model: TrackedModel
+    scales: tuple[Scale, ...]
+    final_scale: Scale
+    solved: Solved | None
+    decision: Decision
+    notes: tuple[str, ...]
+
+    @property
+    def kept(self) -> Sequence[TrackedModel]:
+        """The models to be written: the refined one, or the inputs as they came."""
+        return self.inputs if self.decision.keeps_input else (self.model,)
+
+
+def refine_models(models: Sequence[TrackedModel], options: ModelRefinement) -> tuple[RefinedModel, ...]:
+    """Every model refined, those that measurements tie together as one. Nothing is written."""
+    scales = [metric_scale(model.depth_ratios()) for model in models]
+    metric = [in_metres(model, scale) for model, scale in zip(models, scales, strict=True)]
+    out = []
+    with options.executor.open() as workers:
+        for joined in options.model.join(metric):
+            parts = [row for row, model in enumerate(metric) if set(model.body_names) & set(joined.body_names)]
+            found = _refine(joined, options, workers)
+            inputs = tuple(models[row] for row in parts)
+            out.append(_judged(inputs, tuple(scales[row] for row in parts), found, options))
+    return tuple(out)
+
+
+def in_metres(model: TrackedModel, scale: Scale) -> TrackedModel:
+    """The model in metres, or as it is where depth does not tell its scale or finds it right."""
+    return model if scale.is_one or not scale.is_observable else model.scaled(scale.metres_per_unit)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What the refinement of one model found, before it is judged."""
+
+    start: TrackedModel
+    model: TrackedModel
+    solved: Solved | None
+    errors: Floats
+    distances_m: Floats
+    notes: tuple[str, ...]
+
+
+def _refine(start: TrackedModel, options: ModelRefinement, workers: Workers) -> _Found:
+    nothing = np.zeros((2, 0))
+    with tempfile.TemporaryDirectory() as folder:
+        measured, left_out = start.measured()
+        depth = depth_edges(start, options, Path(folder), workers)
+        graph = joined_graphs(measured, depth.graph)
+        notes = (*left_out, *depth.notes)
+        if not graph.edge_count:
+            return _Found(start, start, None, np.full((1, 2), np.nan), nothing, (*notes, "no edge was found"))
+        solved = solve_bodies(graph, start.world_from_body, options.solver)
+        notes = (*notes, *solved.solution.notes)
+        if not solved.kept.any():
+            return _Found(start, start, solved, np.full((1, 2), np.nan), nothing, (*notes, "every edge was rejected"))
+        with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
+        model, errors = _adjusted(start, solved, options.depth_weight if with_depth else 0.0)
+        distances = nothing
+        if len(depth.held_out):
+            poses = np.array([_image_poses(start), _image_poses(model)])
+            distances = held_out_distances(depth, Path(folder), poses, workers)
+    return _Found(start, model, solved, errors, distances, notes)
+
+
+def _adjusted(start: TrackedModel, solved: Solved, weight: float) -> tuple[TrackedModel, Floats]:
+    """Points where rays meet at the solved poses, and bundle adjustment, with the solved positions as priors."""
+    priors = position_priors(solved, weight)
+    model = start.moved(solved.solution.world_from_cam)
+    for number in range(ADJUSTMENTS):
+        adjusted, errors = model.adjusted(priors)
+        if number + 1 < ADJUSTMENTS:
+            model = adjusted.moved(adjusted.world_from_body)
+    return adjusted, errors
+
+
+def _image_poses(model: TrackedModel) -> Floats:
+    return np.array([frame.world_from_cam for frame in model.frames])
+
+
+def _judged(
+    inputs: tuple[TrackedModel, ...], scales: tuple[Scale, ...], found: _Found, options: ModelRefinement
+) -> RefinedModel:
+    model = found.model
+    final = metric_scale(model.depth_ratios()) if any(scale.is_observable for scale in scales) else scales[0]
+    if found.solved is None or not found.solved.kept.any():
+        decision = Decision("worse", found.notes[-1])
+        return RefinedModel(inputs, found.start, model, scales, final, found.solved, decision, found.notes)
+    if final.is_observable:
+        model = in_metres(model, final)
+        final = replace(final, metres_per_unit=1.0) if not final.is_one else final
+    measures = tuple(_measures(inputs, found, model, options))
+    change = _change(inputs, scales, model, found.errors)
+    notes = (*model.notes, *found.notes, *(str(scale) for scale in scales))
+    return RefinedModel(inputs, found.start, model, scales, final, found.solved, decide(measures, change), notes)
+
+
+def _measures(
+    inputs: tuple[TrackedModel, ...], found: _Found, model: TrackedModel, options: ModelRefinement
+) -> Sequence[Measure]:
+    qualities = [one.quality for one in inputs]
+    count = sum(quality.observations for quality in qualities)
+    before_px = sum(quality.mean_reprojection_px * quality.observations for quality in qualities) / max(count, 1)
+    length = count / max(sum(quality.points for quality in qualities), 1)
+    after = model.quality
+    tolerance = options.reprojection_tolerance * before_px
+    out = [
+        Measure("mean reprojection error", before_px, after.mean_reprojection_px, "lower", tolerance, "px"),
+        Measure("mean track length", length, after.mean_track_length, "higher", 0.01 * length, "images"),
+    ]
+    assert found.solved is not None
+    before_chi2 = found.solved.chi2(found.start.world_from_body)
+    after_chi2 = found.solved.chi2(found.model.world_from_body)
+    out.append(Measure("edge chi2", before_chi2, after_chi2, "lower", CHI2_TOLERANCE * max(before_chi2, 1.0)))
+    if found.distances_m.size:
+        scores = np.nanmean(np.exp(-found.distances_m / SIGMA_M), axis=1)
+        name = f"cloud-to-cloud score of {found.distances_m.shape[1]} held-out pairs"
+        out.append(Measure(name, float(scores[0]), float(scores[1]), "higher", SCORE_TOLERANCE))
+    return out
+
+
+def _change(
+    inputs: tuple[TrackedModel, ...], scales: tuple[Scale, ...], model: TrackedModel, errors: Floats
+) -> Change | None:
+    """How far the poses of a single input moved; a join is always a change."""
+    if len(inputs) != 1:
+        return None
+    before, after = inputs[0].world_from_body, model.world_from_body
+    laid = align(before, after).apply(before)
+    moved = se3.log(se3.inverse(laid) @ after)
+    rotation, position = np.sqrt(np.nanmean(errors**2, axis=0))
+    scale = scales[0]
+    if scale.is_observable:  # the size of the whole is as sure as the scale
+        size = np.sqrt(np.mean(np.sum((after[:, :3, 3] - after[:, :3, 3].mean(axis=0)) ** 2, axis=1)))
+        position = float(np.hypot(position, scale.sigma * size))
+    return Change(
+        translation_m=float(np.sqrt(np.mean(np.sum(moved[:, 3:] ** 2, axis=1)))),
+        rotation_deg=float(np.degrees(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=1))))),
+        translation_sigma_m=float(position * np.sqrt(3)),
+        rotation_sigma_deg=float(np.degrees(rotation * np.sqrt(3))),
+    )

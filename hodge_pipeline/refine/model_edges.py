@@ -1,0 +1,96 @@
+"""Edges of a model's bodies by its depth: overlapping clouds registered, some pairs kept out to judge by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.evaluation.scores import edge_distances
+from hodge_pipeline.refine.model_options import ModelRefinement
+from hodge_pipeline.registration.clouds import prepare_clouds
+from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.stages import TrackedModel, Workers
+from hodge_pipeline.types import CloudSet, Floats, Ints, ViewGraph
+
+LEAST_HELD_OUT = 4
+
+
+@dataclass(frozen=True)
+class DepthEdges:
+    """The registered edges between bodies; pairs of images (H, 2) held out, their clouds' folder; and remarks."""
+
+    graph: ViewGraph
+    held_out: Ints
+    images: Ints
+    notes: tuple[str, ...]
+
+
+def depth_edges(model: TrackedModel, options: ModelRefinement, folder: Path, workers: Workers) -> DepthEdges:
+    """Edges between the images that have depth, of a model in metres; their clouds are left in the folder.
+
+    Pairs are proposed and registered from the model's own poses, so drift beyond the registrar's reach is not closed
+    by depth alone.
+    """
+    images = np.array([row for row, frame in enumerate(model.frames) if frame.read_depth is not None], np.int64)
+    if len(images) < 2:
+        return DepthEdges(no_edges(model), np.zeros((0, 2), np.int64), images, ())
+    frames = [model.frames[row] for row in images]
+    poses = np.array([frame.world_from_cam for frame in frames])
+    clouds, notes = prepare_clouds(frames, options.clouds, workers)
+    clouds.save(folder)
+    candidates = options.edges.propose(frames, CloudSet.open(folder), poses)
+    body = model.body_of_frame[images]
+    between = body[candidates.pairs[:, 0]] != body[candidates.pairs[:, 1]]
+    pairs = candidates.pairs[between]
+    held = held_out(len(pairs), options.held_out_share, options.seed)
+    chosen = pairs[~held]
+    guesses = se3.inverse(poses[chosen[:, 0]]) @ poses[chosen[:, 1]]
+    registered = register_pairs(folder, options.registration, chosen, guesses, workers)
+    reasons = options.acceptance.reasons(registered)
+    notes = (*notes, *(f"{(reasons == why).sum()} pairs with depth left out: {why}" for why in np.unique(reasons) if why))
+    accepted = registered.select(reasons == "")
+    names = np.array([str(frame.frame_id) for frame in frames])
+    graph = accepted.as_graph(names, np.full(len(accepted.pairs), "depth"))
+    return DepthEdges(_between_bodies(model, graph, images), pairs[held], images, tuple(notes))
+
+
+def held_out(count: int, share: float, seed: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which of so many pairs are kept out of the solve: a random share, none where they would be too few to judge."""
+    chosen = np.zeros(count, bool)
+    size = round(share * count)
+    if size >= LEAST_HELD_OUT:
+        chosen[np.random.default_rng(seed).permutation(count)[:size]] = True
+    return chosen
+
+
+def held_out_distances(edges: DepthEdges, folder: Path, pose_sets: Floats, workers: Workers) -> Floats:
+    """The cloud-to-cloud distance (S, H) of the pairs held out, under sets of image poses (S, N, 4, 4), metres."""
+    return edge_distances(folder, edges.held_out, pose_sets[:, edges.images], workers)
+
+
+def no_edges(model: TrackedModel) -> ViewGraph:
+    """A graph of the model's bodies that nothing joins."""
+    return ViewGraph.from_edges(np.array(model.body_names), np.zeros((0, 2), np.int64), np.zeros((0, 4, 4)))
+
+
+def joined_graphs(first: ViewGraph, second: ViewGraph) -> ViewGraph:
+    """The edges of both, over the same vertices."""
+    columns = ("edges", "i_from_j", "information", "fitness", "rmse_m", "source", "correspondences")
+    return replace(first, **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in columns})
+
+
+def _between_bodies(model: TrackedModel, graph: ViewGraph, images: Ints) -> ViewGraph:
+    """`B_i Z B_j⁻¹` for the bodies that carry the images; the information is carried over by the adjoint."""
+    rows = images[graph.edges]
+    cam_from_body = se3.inverse(model.body_from_cam[rows[:, 1]])
+    adjoint = se3.adjoint(cam_from_body)
+    return replace(
+        graph,
+        vertex_ids=np.array(model.body_names),
+        edges=model.body_of_frame[rows].reshape(-1, 2),
+        i_from_j=model.body_from_cam[rows[:, 0]] @ graph.i_from_j @ cam_from_body,
+        information=np.swapaxes(adjoint, 1, 2) @ graph.information @ adjoint,
+    )

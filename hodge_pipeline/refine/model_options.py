@@ -1,0 +1,62 @@
+"""What the refinement of a model with tracks can be told: the recipe `colmap-refine`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline import binding, recipe_file
+from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.pairs import Acceptance
+from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, ModelReader, Registrar
+from hodge_pipeline.yaml_file import Document, Keys
+
+OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+RECIPE = "colmap-refine"
+
+
+@dataclass(frozen=True, config=OPTIONS)
+class ModelRefinement:
+    """How a model is refined. Every stage is `{stage: name, option: value, …}`, or its name alone."""
+
+    model: ModelReader = Field(description="what the model is, and what lies beside it")
+    edges: EdgeBuilder = Field(description="which images with depth are registered with each other")
+    registration: Registrar = Field(description="how their clouds are registered")
+    solver: ConsistencySolver = Field(description="how the poses are made consistent with all edges")
+    executor: Executor = Field(description="where pairs are registered")
+    description: str = Field(default="", description="one sentence for `hodge recipes`")
+    seed: int = Field(default=0, ge=0, description="of everything random")
+    clouds: CloudOptions = CloudOptions()
+    acceptance: Acceptance = Acceptance()
+    held_out_share: float = Field(
+        default=0.2,
+        ge=0,
+        le=0.5,
+        description="of the pairs with depth: kept out of registration and solve, to judge the result by",
+    )
+    depth_weight: float = Field(
+        default=1.0,
+        ge=0,
+        description="of the solved positions in the bundle adjustment, against the tracks; 0: tracks alone. Used only "
+        "where depth took part in the solve, since tracks know all that edges from the same images know",
+    )
+    reprojection_tolerance: float = Field(
+        default=0.005, ge=0, description="relative: a mean reprojection error larger by more than this is worse"
+    )
+
+
+def load_model_refinement(name_or_path: str = RECIPE, overrides: Sequence[str] = ()) -> ModelRefinement:
+    """The options of a recipe by name or file, with overrides such as `model.depth=depth`.
+
+    Raises `RecipeError`: `file:line: key: what was expected`.
+    """
+    document = recipe_file.load(name_or_path, overrides)
+    return binding.bind(ModelRefinement, document.data, lambda keys: _origin(document, keys))
+
+
+def _origin(document: Document, keys: Keys) -> str:
+    while keys and keys not in document.origins:
+        keys = keys[:-1]
+    return document.origins.get(keys, "recipe")

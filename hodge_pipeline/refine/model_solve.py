@@ -1,0 +1,91 @@
+"""The poses of a model's bodies that agree with all its edges, and how well the edges fix each position."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.covariance import marginal_covariances
+from hodge_pipeline.stages import ConsistencySolver
+from hodge_pipeline.types import Floats, PositionPriors, Solution, ViewGraph
+
+MEDIAN_CHI2 = 5.348
+"""Of χ² with six degrees of freedom."""
+ROUNDS = 2
+KEPT = 1e-3
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The graph with its information set right, the solution on it, and which of its edges count (E,)."""
+
+    graph: ViewGraph
+    solution: Solution
+
+    @property
+    def kept(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """The edges (E,) that agree with the poses."""
+        return np.asarray(self.solution.weights > KEPT)
+
+    def chi2(self, world_from_body: Floats) -> float:
+        """The mean χ² per degree of freedom of the edges kept, under poses (B, 4, 4): about 1 where they fit."""
+        return float(edge_chi2(self.graph, world_from_body)[self.kept].mean() / 6) if self.kept.any() else float("nan")
+
+
+def edge_chi2(graph: ViewGraph, world_from_body: Floats) -> Floats:
+    """ξᵀ Ω ξ (E,) of the motion that each edge and the poses (B, 4, 4) leave over."""
+    i, j = graph.edges.T
+    xi = se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(world_from_body[i]) @ world_from_body[j])
+    return np.asarray(np.einsum("ei,eij,ej->e", xi, graph.information, xi))
+
+
+def calibrated(graph: ViewGraph, world_from_body: Floats) -> ViewGraph:
+    """The graph with the information of each kind of edge scaled so that half of them lie within the median of χ².
+
+    What a registrar or a two-view geometry says of itself leaves out what its points share (the lens, the sensor's
+    warp), so it is too sure, each kind by a factor of its own.
+    """
+    chi2 = edge_chi2(graph, world_from_body)
+    factor = np.ones(graph.edge_count)
+    for source in np.unique(graph.source):
+        same = graph.source == source
+        middle = float(np.median(chi2[same]))
+        factor[same] = MEDIAN_CHI2 / middle if middle > 0 else 1.0
+    return replace(graph, information=graph.information * factor[:, None, None])
+
+
+def solve_bodies(graph: ViewGraph, world_from_body: Floats, solver: ConsistencySolver) -> Solved:
+    """The consistent poses, from the model's own; the noise of each kind of edge is measured at the poses so far."""
+    poses = world_from_body
+    for _ in range(ROUNDS):
+        right = calibrated(graph, poses)
+        solution = solver.solve(right, poses)
+        poses = solution.world_from_cam
+    return Solved(right, solution)
+
+
+def position_priors(solved: Solved, weight: float) -> PositionPriors | None:
+    """Where the solution puts each body, as sure as its edges are; none of bodies that no edge holds.
+
+    The bodies that fix the gauge are taken to be as sure as the others on average.
+    """
+    poses = solved.solution.world_from_cam
+    kept = solved.graph.select(np.flatnonzero(solved.kept))
+    rows = np.unique(kept.edges)
+    if weight <= 0 or not len(rows):
+        return None
+    try:
+        covariance = marginal_covariances(kept, poses, rows)[:, 3:, 3:]
+    except GraphError:
+        return None
+    turned = poses[rows, :3, :3] @ covariance @ np.swapaxes(poses[rows, :3, :3], 1, 2) / weight
+    held = np.trace(turned, axis1=1, axis2=2) <= 0
+    if held.all():
+        return None
+    turned[held] = turned[~held].mean(axis=0)
+    covariances = np.full((len(poses), 3, 3), np.nan)
+    covariances[rows] = turned
+    return PositionPriors(poses[:, :3, 3].copy(), covariances)

@@ -1,0 +1,81 @@
+"""The metric scale of a model, from what a depth sensor saw at its points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline.types import Floats
+
+LEAST_POINTS = 50
+LEAST_IMAGES = 3
+MAX_SPREAD = 0.15
+"""Half the ratios lie this near to their median, as a share of it, or the depth is not of these images: the depth of a
+sensor agrees to a few per cent, that of other images to some thirty."""
+TO_SIGMA = 1.4826
+"""Of a median of absolute deviations."""
+OF_MEDIAN = 1.2533
+"""The standard error of a median over that of a mean."""
+LEAST_SIGMA = 1e-4
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Metres in one unit of a model, with its relative standard error; 1 and a reason where it cannot be told.
+
+    `spread`: the median deviation of a single point's ratio, as a share.
+    """
+
+    metres_per_unit: float
+    sigma: float
+    points: int
+    images: int
+    spread: float
+    reason: str = ""
+
+    @property
+    def is_observable(self) -> bool:
+        """Whether depth tells it."""
+        return not self.reason
+
+    @property
+    def is_one(self) -> bool:
+        """Whether the model is metric already, as far as depth can tell (two standard errors)."""
+        return self.is_observable and abs(self.metres_per_unit - 1) <= 2 * self.sigma
+
+    def __str__(self) -> str:
+        if not self.is_observable:
+            return f"scale not observable, kept: {self.reason}"
+        return (
+            f"scale {self.metres_per_unit:.6g} m per unit (± {self.sigma:.2%}), by depth at {self.points} points of "
+            f"{self.images} images, half of them within {self.spread:.1%}"
+        )
+
+
+def metric_scale(ratios: Sequence[Floats]) -> Scale:
+    """The median of all ratios metres / units, one array for each image.
+
+    Errors within an image (of its pose, of the sensor's calibration) are shared, so the standard error is that of the
+    median of the images' own medians.
+    """
+    useful = [one for one in ratios if len(one)]
+    found = np.concatenate([np.zeros(0), *useful])
+    if not len(ratios):
+        return _unknown(0, 0, "there is no depth")
+    if len(found) < LEAST_POINTS or len(useful) < LEAST_IMAGES:
+        return _unknown(len(found), len(useful), f"depth at only {len(found)} points of {len(useful)} images")
+    scale = float(np.median(found))
+    spread = float(np.median(np.abs(found / scale - 1)))
+    if not spread <= MAX_SPREAD:
+        reason = f"depth and points disagree (half of the ratios are off by more than {spread:.0%}): depth of other images?"
+        return _unknown(len(found), len(useful), reason)
+    middles = np.array([np.median(one) for one in useful]) / scale
+    deviation = TO_SIGMA * float(np.median(np.abs(middles - np.median(middles))))
+    sigma = max(OF_MEDIAN * deviation / np.sqrt(len(useful)), LEAST_SIGMA)
+    return Scale(scale, sigma, len(found), len(useful), spread)
+
+
+def _unknown(points: int, images: int, reason: str) -> Scale:
+    return Scale(1.0, float("nan"), points, images, float("nan"), reason)
