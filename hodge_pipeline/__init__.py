@@ -10,6 +10,10 @@ Two solve a pose graph that is already in arrays:
 
     graph = hodge_pipeline.ViewGraph.from_edges(vertex_ids, edges, i_from_j, information)
     world_from_cam = hodge_pipeline.solve(graph).world_from_cam
+
+One refines a COLMAP model, given as a folder or as pycolmap's own object:
+
+    refined = hodge_pipeline.refine_colmap(reconstruction, database="database.db", depth="depth").models[0]
 """
 
 from __future__ import annotations
@@ -19,16 +23,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hodge_pipeline.pipeline import Run, run
     from hodge_pipeline.recipe import Recipe, load_recipe
+    from hodge_pipeline.refined_colmap import refine_colmap
     from hodge_pipeline.solvers.hodge import solve
     from hodge_pipeline.types import Solution, ViewGraph
 
-__all__ = ["Recipe", "Run", "Solution", "ViewGraph", "load_recipe", "run", "solve"]
+__all__ = ["Recipe", "Run", "Solution", "ViewGraph", "load_recipe", "refine_colmap", "run", "solve"]
 
 _HOMES = {
     "Recipe": "recipe",
     "load_recipe": "recipe",
     "Run": "pipeline",
     "run": "pipeline",
+    "refine_colmap": "refined_colmap",
     "solve": "solvers.hodge",
     "Solution": "types",
     "ViewGraph": "types",

@@ -154,6 +154,11 @@ class TrackedModel(Protocol):
         ...
 
     @property
+    def native(self) -> Any:
+        """The model as its own library holds it."""
+        ...
+
+    @property
     def files(self) -> tuple[Path, ...]:
         """The files that it was read from, to be given back; none where it has been joined or made in memory."""
         ...
@@ -228,8 +233,10 @@ class TrackedModel(Protocol):
 class ModelReader(Protocol):
     """Opens models that track points, and joins several of one scene."""
 
-    def open_models(self, path: Path) -> Sequence[TrackedModel]:
-        """The model at a path, or all the models that one scene fell into. Raises `SourceError`."""
+    def open_models(self, source: Path | Sequence[Any]) -> Sequence[TrackedModel]:
+        """The model at a path, or all the models that one scene fell into; or models that the format's own library
+        holds in memory. Raises `SourceError`.
+        """
         ...
 
     def join(self, models: Sequence[TrackedModel]) -> Sequence[TrackedModel]:

@@ -286,7 +286,7 @@ class ModelQuality:
 
 @dataclass(frozen=True)
 class PositionPriors:
-    """Where each body of a model should be: `positions (B, 3)` and their `covariances (B, 3, 3)`; NaN for no opinion."""
+    """Where each body of a model should be: `positions (B, 3)` and their `covariances (B, 3, 3)`; NaN: none."""
 
     positions: Floats
     covariances: Floats

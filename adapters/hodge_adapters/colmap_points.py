@@ -39,7 +39,7 @@ def points_of_rays(model: Model, world_from_cam: Floats) -> Floats:
 
 
 def _rays(model: Model, world_from_cam: Floats) -> tuple[Ints, Floats, Floats, Ints]:
-    """For each observation of a track: the row of its image, the camera's centre, the unit ray, the row of its point."""
+    """For each observation of a track: the row of its image, the camera's centre, the unit ray, its point's row."""
     points = model.points
     row_of = {image.image_id: row for row, image in enumerate(model.images)}
     row = np.array([row_of[image_id] for image_id in points.image_ids.tolist()], np.int64)

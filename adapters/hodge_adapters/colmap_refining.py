@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters import images
 from hodge_adapters.colmap import ColmapReader
 from hodge_adapters.colmap_depth import sensor_depth
-from hodge_adapters.colmap_files import find_database, find_model, find_models, model_ending
+from hodge_adapters.colmap_files import find_database, find_models, model_ending
 from hodge_adapters.colmap_ties import similarity, tie_points
 from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, read_reconstruction
 from hodge_adapters.colmap_union import united
@@ -45,21 +45,19 @@ class ColmapModels:
     )
     seed: int = Field(0, ge=0, description="of RANSAC")
 
-    def open_models(self, path: Path) -> Sequence[ColmapModel]:
-        """The model of a folder; of a folder with `0`, `1`, … all of them. Raises `SourceError`."""
-        folders = find_models(Path(path))
+    def open_models(self, source: Path | Sequence[pycolmap.Reconstruction]) -> Sequence[ColmapModel]:
+        """The model of a folder; of a folder with `0`, `1`, … all of them; or of pycolmap. Raises `SourceError`."""
+        if not isinstance(source, (str, Path)):
+            return [self._of_memory(number, model) for number, model in enumerate(source)]
+        folders = find_models(Path(source))
         if not folders:
-            raise SourceError(f"{path}: no COLMAP model: give the folder with cameras.bin and images.bin, or .txt")
+            raise SourceError(f"{source}: no COLMAP model: give the folder with cameras.bin and images.bin, or .txt")
         return [self._open(folder) for folder in folders]
 
-    def open_reconstructions(self, models: Sequence[pycolmap.Reconstruction]) -> Sequence[ColmapModel]:
-        """The same of models in memory."""
-        out = []
-        for number, model in enumerate(models):
-            with tempfile.TemporaryDirectory() as folder:
-                model.write_binary(folder)
-                out.append(replace(self._open(Path(folder)), name=f"model {number}", files=()))
-        return out
+    def _of_memory(self, number: int, model: pycolmap.Reconstruction) -> ColmapModel:
+        with tempfile.TemporaryDirectory() as folder:
+            model.write_binary(folder)
+            return replace(self._open(Path(folder)), name=f"model {number}", files=())
 
     def join(self, models: Sequence[ColmapModel]) -> Sequence[ColmapModel]:
         """The largest model takes in, one by one, those that enough tied points place in it."""
@@ -83,13 +81,10 @@ class ColmapModels:
         ending = model_ending(folder)
         assert ending is not None
         sensor = self._sensor(folder)
-        source = ColmapReader(
-            images=self.images,
-            depth="none" if sensor is None else str(sensor.absolute()),
-            depth_scale=self.depth_scale,
-            no_depth=self.no_depth,
-            scale=1.0,
-            edges="none",
+        plain = ColmapReader(edges="none", scale=1.0)  # type: ignore[call-arg] # the plugin reads Field(1, …) as required
+        depth_of = "none" if sensor is None else str(sensor.absolute())
+        source = replace(
+            plain, images=self.images, depth=depth_of, depth_scale=self.depth_scale, no_depth=self.no_depth
         ).open(folder)
         reconstruction = read_reconstruction(folder)
         notes = [*source.notes, *_unposed(reconstruction)]
@@ -155,7 +150,8 @@ def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
     whole_from_other, agreeing = found
     moved = pycolmap.Reconstruction(other.reconstruction)
     moved.transform(whole_from_other)
-    note = f"{other.name} joined to {whole.name} by {agreeing} of {len(ties.ids)} points in both, scale {whole_from_other.scale:.4g}"
+    points = f"{agreeing} of {len(ties.ids)} points in both"
+    note = f"{other.name} joined to {whole.name} by {points}, scale {whole_from_other.scale:.4g}"
     depth = replace(whole.depth, files={**other.depth.files, **whole.depth.files})
     return replace(
         whole,

@@ -85,9 +85,7 @@ def depth_ratios(
     return ratios
 
 
-def _ratios(
-    model: Model, row: int, depth: Floats32, camera: tuple[float, float, float, float] | None = None
-) -> Floats:
+def _ratios(model: Model, row: int, depth: Floats32, camera: tuple[float, float, float, float] | None = None) -> Floats:
     image = model.images[row]
     record = model.cameras[image.camera_id]
     seen = image.point_ids != NO_POINT

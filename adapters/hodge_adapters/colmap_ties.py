@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -58,7 +59,7 @@ def merge_matched_points(reconstruction: pycolmap.Reconstruction, database: Path
 def tie_points(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, database: Path | None) -> Ties:
     """Points of two models that a match, or an image in both, calls one."""
     of_first, of_second = point_ids_by_name(first), point_ids_by_name(second)
-    pairs = set()
+    pairs: set[tuple[int, int]] = set()
     for name in of_first.keys() & of_second.keys():
         a, b = of_first[name], of_second[name]
         if len(a) == len(b):
@@ -80,7 +81,7 @@ def similarity(
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = NEAR_SHARE * _distance(first), 0
     options.min_inlier_ratio, options.confidence, options.max_num_trials = 0.05, 0.9999, 20_000
-    found = pycolmap.estimate_sim3d_robust(there, here, options)
+    found: Any = pycolmap.estimate_sim3d_robust(there, here, options)
     if found is None or found["num_inliers"] < max(LEAST_TIES, LEAST_TIE_SHARE * len(ties.ids)):
         return None
     return found["tgt_from_src"], int(found["num_inliers"])

@@ -24,6 +24,7 @@ from hodge_adapters.colmap_points import points_of_rays
 from hodge_adapters.colmap_records import Model
 from hodge_adapters.colmap_scale import depth_ratios
 from hodge_adapters.colmap_ties import merge_matched_points
+from hodge_adapters.colmap_uncertainty import standard_errors
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Frame, Ints, ModelQuality, PositionPriors, ViewGraph
@@ -61,6 +62,11 @@ class ColmapModel:
     text: bool = False
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @property
+    def native(self) -> pycolmap.Reconstruction:
+        """The reconstruction itself."""
+        return self.reconstruction
 
     @cached_property
     def records(self) -> Model:
@@ -117,7 +123,9 @@ class ColmapModel:
     def depth_ratios(self) -> Sequence[Floats]:
         """Sensor depth over model depth at the observations of each image with depth, of a few hundred evenly."""
         depth = self.depth
-        files = {row: depth.files[image.name] for row, image in enumerate(self.records.images) if image.name in depth.files}
+        files = {
+            row: depth.files[image.name] for row, image in enumerate(self.records.images) if image.name in depth.files
+        }
         return depth_ratios(self.records, files, depth.units_per_metre, depth.no_depth, depth.camera)
 
     def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
@@ -135,7 +143,7 @@ class ColmapModel:
         """Positions times the factor."""
         copy = self._copy()
         copy.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
-        return replace(self, reconstruction=copy)
+        return replace(self, reconstruction=copy, files=())
 
     def moved(self, world_from_body: Floats) -> ColmapModel:
         """Bodies at these poses, points where their rays meet; what the database matched is merged where it fits."""
@@ -150,13 +158,14 @@ class ColmapModel:
             merged = merge_matched_points(copy, self.edges.database)
             notes = (*notes, f"{merged} pairs of points that a match calls one were merged") if merged else notes
         copy.update_point_3d_errors()
-        return replace(self, reconstruction=copy, notes=notes)
+        return replace(self, reconstruction=copy, files=(), notes=notes)
 
     def adjusted(self, priors: PositionPriors | None = None) -> tuple[ColmapModel, Floats]:
-        """Bundle adjustment with cameras and rigs held; see `colmap_bundle`."""
+        """Bundle adjustment with cameras and rigs held; see `colmap_bundle` and `colmap_uncertainty`."""
         copy = self._copy()
-        errors = adjust(copy, self.bodies, priors)
-        return replace(self, reconstruction=copy), errors
+        adjust(copy, self.bodies, priors)
+        adjusted = replace(self, reconstruction=copy, files=())
+        return adjusted, standard_errors(adjusted.records, adjusted.bodies)
 
     def write(self, folder: Path) -> None:
         """Five files, binary or text as the model was."""

@@ -31,8 +31,7 @@ def _free(wanted: int, taken: object) -> int:
 
 
 def _add_camera(out: pycolmap.Reconstruction, camera: pycolmap.Camera) -> int:
-    here = out.cameras.get(camera.camera_id) if camera.camera_id in out.cameras else None
-    if here is not None and _same_camera(here, camera):
+    if camera.camera_id in out.cameras and _same_camera(out.cameras[camera.camera_id], camera):
         return int(camera.camera_id)
     copy = pycolmap.Camera(
         model=camera.model, width=camera.width, height=camera.height, params=camera.params,
@@ -70,7 +69,7 @@ def _same_rig(a: pycolmap.Rig, b: pycolmap.Rig) -> bool:
         return False
     poses = ((a.non_ref_sensors[sensor], b.non_ref_sensors[sensor]) for sensor in a.non_ref_sensors)
     return all(
-        (one is None) == (other is None) and (one is None or np.allclose(one.matrix(), other.matrix()))
+        one is other is None or (one is not None and other is not None and np.allclose(one.matrix(), other.matrix()))
         for one, other in poses
     )
 

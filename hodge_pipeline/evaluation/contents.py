@@ -100,6 +100,30 @@ class StageRow:
 
 
 @dataclass(frozen=True)
+class MeasureRow:
+    """One quality of the poses before and after a refinement; `better` says which way is good."""
+
+    name: str
+    before: float
+    after: float
+    better: str
+    unit: str
+    is_worse: bool
+
+
+@dataclass(frozen=True)
+class RefinementSummary:
+    """What became of a refinement: `outcome` is refined, optimal, worse or forced; why; and what it rests on."""
+
+    outcome: str
+    headline: str
+    reason: str
+    measures: tuple[MeasureRow, ...] = ()
+    change: str = ""
+    scale: str = ""
+
+
+@dataclass(frozen=True)
 class Path3D:
     """The positions (N, 3) of one set of poses, aligned to be compared; NaN where a frame has none."""
 
@@ -154,6 +178,7 @@ class Report:
     source: SourceSummary
     before: str = "odometry"
     after: str = "result"
+    refinement: RefinementSummary | None = None
     scores: ScoreTable | None = None
     trajectories: tuple[TrajectoryRow, ...] = ()
     loops: tuple[LoopRow, ...] = ()

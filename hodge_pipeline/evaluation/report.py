@@ -66,6 +66,7 @@ def as_json(report: Report) -> dict[str, Any]:
             "after": report.after,
             "changes": [{**asdict(change), "share": change.share} for change in verdict.changes],
         },
+        "refinement": None if report.refinement is None else asdict(report.refinement),
         "source": asdict(report.source),
         "scores": None if report.scores is None else _scores(report.scores),
         "trajectories": [asdict(row) for row in report.trajectories],

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hodge_pipeline.evaluation.contents import Report
+from hodge_pipeline.evaluation.contents import RefinementSummary, Report
 from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
 from hodge_pipeline.evaluation.verdict import GRAPH_NAMES, judge, length, suspicions
 
@@ -43,6 +43,8 @@ def _peak(report: Report) -> float:
 
 def score_tables(report: Report) -> Iterator[Table]:
     """Scores and trajectory errors of each set of poses, where they were measured."""
+    if report.refinement is not None and report.refinement.measures:
+        yield _measures(report.refinement)
     if report.scores is not None:
         yield _scores(report)
     if report.trajectories:
@@ -58,6 +60,16 @@ def graph_tables(report: Report) -> Iterator[Table]:
             yield Table("Connected parts", ("part", "frames", "which"), parts, "Nothing measured joins two parts.", 3)
     if report.loops:
         yield _loops(report)
+
+
+def _measures(refinement: RefinementSummary) -> Table:
+    rows = tuple(
+        (row.name, f"{row.before:.4g}", f"{row.after:.4g}", row.unit, row.better, "worse" if row.is_worse else "ok")
+        for row in refinement.measures
+    )
+    header = ("measure", "before", "after", "unit", "better", "judgement")
+    caption = "Where one is worse by more than its own noise the input is kept. " + refinement.change
+    return Table("Measures", header, rows, caption)
 
 
 def _scores(report: Report) -> Table:

@@ -20,6 +20,9 @@ UNMATCHED_SHARE = 0.01
 NO_MEASURE = "there were neither overlapping clouds nor true poses to compare the poses by."
 
 
+REFINEMENTS: dict[str, Outcome] = {
+    "refined": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
+}  # fmt: skip
 VERBS = {1: "fell", 0: "hardly changed,", -1: "rose"}
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 
@@ -69,8 +72,14 @@ class Verdict:
 
 
 def judge(report: Report) -> Verdict:
-    """The verdict on a report: every measured error counts, and where they disagree it is `mixed`."""
+    """The verdict on a report: every measured error counts, and where they disagree it is `mixed`.
+
+    A refinement has been judged already, by its guard.
+    """
     changes = (*_score_changes(report), *_trajectory_changes(report))
+    if report.refinement is not None:
+        refinement = report.refinement
+        return Verdict(REFINEMENTS[refinement.outcome], refinement.headline, f"{refinement.reason}.", changes)
     if not changes:
         return Verdict("not measured", "Not measured", NO_MEASURE, ())
     signs = {change.sign for change in changes} - {0}

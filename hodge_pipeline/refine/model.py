@@ -13,7 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.refine.guard import Change, Decision, Measure, decide
-from hodge_pipeline.refine.model_edges import DepthEdges, depth_edges, held_out_distances, joined_graphs
+from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, joined_graphs
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
 from hodge_pipeline.refine.scale import Scale, metric_scale
@@ -49,7 +49,9 @@ class RefinedModel:
         return self.inputs if self.decision.keeps_input else (self.model,)
 
 
-def refine_models(models: Sequence[TrackedModel], options: ModelRefinement) -> tuple[RefinedModel, ...]:
+def refine_models(
+    models: Sequence[TrackedModel], options: ModelRefinement, *, force: bool = False
+) -> tuple[RefinedModel, ...]:
     """Every model refined, those that measurements tie together as one. Nothing is written."""
     scales = [metric_scale(model.depth_ratios()) for model in models]
     metric = [in_metres(model, scale) for model, scale in zip(models, scales, strict=True)]
@@ -59,7 +61,7 @@ def refine_models(models: Sequence[TrackedModel], options: ModelRefinement) -> t
             parts = [row for row, model in enumerate(metric) if set(model.body_names) & set(joined.body_names)]
             found = _refine(joined, options, workers)
             inputs = tuple(models[row] for row in parts)
-            out.append(_judged(inputs, tuple(scales[row] for row in parts), found, options))
+            out.append(_judged(inputs, tuple(scales[row] for row in parts), found, options, force))
     return tuple(out)
 
 
@@ -93,8 +95,11 @@ def _refine(start: TrackedModel, options: ModelRefinement, workers: Workers) -> 
         notes = (*notes, *solved.solution.notes)
         if not solved.kept.any():
             return _Found(start, start, solved, np.full((1, 2), np.nan), nothing, (*notes, "every edge was rejected"))
+        is_metric = any(frame.read_depth is not None for frame in start.frames)
         with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
         model, errors = _adjusted(start, solved, options.depth_weight if with_depth else 0.0)
+        if not is_metric:
+            model, errors = _in_the_scale_of(start, model, errors)
         distances = nothing
         if len(depth.held_out):
             poses = np.array([_image_poses(start), _image_poses(model)])
@@ -106,11 +111,21 @@ def _adjusted(start: TrackedModel, solved: Solved, weight: float) -> tuple[Track
     """Points where rays meet at the solved poses, and bundle adjustment, with the solved positions as priors."""
     priors = position_priors(solved, weight)
     model = start.moved(solved.solution.world_from_cam)
-    for number in range(ADJUSTMENTS):
-        adjusted, errors = model.adjusted(priors)
-        if number + 1 < ADJUSTMENTS:
-            model = adjusted.moved(adjusted.world_from_body)
+    adjusted, errors = model.adjusted(priors)
+    for _ in range(ADJUSTMENTS - 1):
+        merged = adjusted.moved(adjusted.world_from_body)
+        if merged.quality.points == adjusted.quality.points:
+            break
+        adjusted, errors = merged.adjusted(priors)
     return adjusted, errors
+
+
+def _in_the_scale_of(start: TrackedModel, model: TrackedModel, errors: Floats) -> tuple[TrackedModel, Floats]:
+    """The model with the size that the start has: nothing measured tells another, unless a rig's baselines do."""
+    if start.body_from_cam[:, :3, 3].any():
+        return model, errors
+    factor = align(model.world_from_body, start.world_from_body, with_scale=True).scale
+    return model.scaled(factor), errors * [1.0, factor]
 
 
 def _image_poses(model: TrackedModel) -> Floats:
@@ -118,7 +133,11 @@ def _image_poses(model: TrackedModel) -> Floats:
 
 
 def _judged(
-    inputs: tuple[TrackedModel, ...], scales: tuple[Scale, ...], found: _Found, options: ModelRefinement
+    inputs: tuple[TrackedModel, ...],
+    scales: tuple[Scale, ...],
+    found: _Found,
+    options: ModelRefinement,
+    force: bool,
 ) -> RefinedModel:
     model = found.model
     final = metric_scale(model.depth_ratios()) if any(scale.is_observable for scale in scales) else scales[0]
@@ -126,12 +145,12 @@ def _judged(
         decision = Decision("worse", found.notes[-1])
         return RefinedModel(inputs, found.start, model, scales, final, found.solved, decision, found.notes)
     if final.is_observable:
-        model = in_metres(model, final)
-        final = replace(final, metres_per_unit=1.0) if not final.is_one else final
+        model, final = model.scaled(final.metres_per_unit), replace(final, metres_per_unit=1.0)
     measures = tuple(_measures(inputs, found, model, options))
     change = _change(inputs, scales, model, found.errors)
+    decision = decide(measures, change, force=force)
     notes = (*model.notes, *found.notes, *(str(scale) for scale in scales))
-    return RefinedModel(inputs, found.start, model, scales, final, found.solved, decide(measures, change), notes)
+    return RefinedModel(inputs, found.start, model, scales, final, found.solved, decision, notes)
 
 
 def _measures(
@@ -149,13 +168,20 @@ def _measures(
     ]
     assert found.solved is not None
     before_chi2 = found.solved.chi2(found.start.world_from_body)
-    after_chi2 = found.solved.chi2(found.model.world_from_body)
+    after_chi2 = found.solved.chi2(model.world_from_body)
     out.append(Measure("edge chi2", before_chi2, after_chi2, "lower", CHI2_TOLERANCE * max(before_chi2, 1.0)))
     if found.distances_m.size:
         scores = np.nanmean(np.exp(-found.distances_m / SIGMA_M), axis=1)
         name = f"cloud-to-cloud score of {found.distances_m.shape[1]} held-out pairs"
         out.append(Measure(name, float(scores[0]), float(scores[1]), "higher", SCORE_TOLERANCE))
     return out
+
+
+def _laid_onto(before: Floats, after: Floats) -> Floats:
+    """The poses before, moved rigidly onto those after: by their orientations, which small sets of positions lack."""
+    turn = se3.project_to_so3((after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2)).sum(axis=0))
+    shift = (after[:, :3, 3] - before[:, :3, 3] @ turn.T).mean(axis=0)
+    return np.asarray(se3.from_parts(turn, shift) @ before)
 
 
 def _change(
@@ -165,7 +191,7 @@ def _change(
     if len(inputs) != 1:
         return None
     before, after = inputs[0].world_from_body, model.world_from_body
-    laid = align(before, after).apply(before)
+    laid = _laid_onto(before, after)
     moved = se3.log(se3.inverse(laid) @ after)
     rotation, position = np.sqrt(np.nanmean(errors**2, axis=0))
     scale = scales[0]

@@ -50,7 +50,10 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, folder: Path, wor
     guesses = se3.inverse(poses[chosen[:, 0]]) @ poses[chosen[:, 1]]
     registered = register_pairs(folder, options.registration, chosen, guesses, workers)
     reasons = options.acceptance.reasons(registered)
-    notes = (*notes, *(f"{(reasons == why).sum()} pairs with depth left out: {why}" for why in np.unique(reasons) if why))
+    notes = (
+        *notes,
+        *(f"{(reasons == why).sum()} pairs with depth left out: {why}" for why in np.unique(reasons) if why),
+    )
     accepted = registered.select(reasons == "")
     names = np.array([str(frame.frame_id) for frame in frames])
     graph = accepted.as_graph(names, np.full(len(accepted.pairs), "depth"))
@@ -78,8 +81,16 @@ def no_edges(model: TrackedModel) -> ViewGraph:
 
 def joined_graphs(first: ViewGraph, second: ViewGraph) -> ViewGraph:
     """The edges of both, over the same vertices."""
-    columns = ("edges", "i_from_j", "information", "fitness", "rmse_m", "source", "correspondences")
-    return replace(first, **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in columns})
+    return replace(
+        first,
+        edges=np.concatenate([first.edges, second.edges]),
+        i_from_j=np.concatenate([first.i_from_j, second.i_from_j]),
+        information=np.concatenate([first.information, second.information]),
+        fitness=np.concatenate([first.fitness, second.fitness]),
+        rmse_m=np.concatenate([first.rmse_m, second.rmse_m]),
+        source=np.concatenate([first.source, second.source]),
+        correspondences=np.concatenate([first.correspondences, second.correspondences]),
+    )
 
 
 def _between_bodies(model: TrackedModel, graph: ViewGraph, images: Ints) -> ViewGraph:

@@ -14,6 +14,8 @@ from hodge_pipeline.types import Floats, PositionPriors, Solution, ViewGraph
 
 MEDIAN_CHI2 = 5.348
 """Of χ² with six degrees of freedom."""
+OUTLIER_CHI2 = 16.812
+"""Its 99 % quantile."""
 ROUNDS = 2
 KEPT = 1e-3
 
@@ -31,8 +33,9 @@ class Solved:
         return np.asarray(self.solution.weights > KEPT)
 
     def chi2(self, world_from_body: Floats) -> float:
-        """The mean χ² per degree of freedom of the edges kept, under poses (B, 4, 4): about 1 where they fit."""
-        return float(edge_chi2(self.graph, world_from_body)[self.kept].mean() / 6) if self.kept.any() else float("nan")
+        """The mean over all edges of χ² per degree of freedom, an outlier's cut off where the solver cuts it."""
+        squares = np.minimum(edge_chi2(self.graph, world_from_body), OUTLIER_CHI2)
+        return float(squares.mean() / 6) if len(squares) else float("nan")
 
 
 def edge_chi2(graph: ViewGraph, world_from_body: Floats) -> Floats:

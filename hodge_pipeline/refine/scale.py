@@ -69,7 +69,9 @@ def metric_scale(ratios: Sequence[Floats]) -> Scale:
     scale = float(np.median(found))
     spread = float(np.median(np.abs(found / scale - 1)))
     if not spread <= MAX_SPREAD:
-        reason = f"depth and points disagree (half of the ratios are off by more than {spread:.0%}): depth of other images?"
+        reason = (
+            f"depth and points disagree (half of the ratios are off by more than {spread:.0%}): depth of other images?"
+        )
         return _unknown(len(found), len(useful), reason)
     middles = np.array([np.median(one) for one in useful]) / scale
     deviation = TO_SIGMA * float(np.median(np.abs(middles - np.median(middles))))

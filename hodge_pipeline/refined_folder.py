@@ -1,0 +1,91 @@
+"""The run folder of a refined model: `sparse/0`, `poses.tum`, `edges.csv`, the report."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import artifacts, binding, registry, yaml_file
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.evaluation.report import write_report
+from hodge_pipeline.outputs import edge_table
+from hodge_pipeline.refine.model import RefinedModel
+from hodge_pipeline.refine.model_options import ModelRefinement
+from hodge_pipeline.refined_report import model_report
+from hodge_pipeline.stages import TrackedModel
+from hodge_pipeline.types import Source, Trajectory
+
+MODELS = "sparse"
+RECIPE_FILE = "recipe.yaml"
+
+
+def check_out(out: Path, model: Path | None) -> None:
+    """Raise `WorkspaceError` where the folder holds anything but an earlier refinement, or is the input itself."""
+    if model is not None and out.resolve() in (model.resolve(), *model.resolve().parents):
+        raise WorkspaceError(f"--out {out}: holds the model to be refined: give another folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / RECIPE_FILE).is_file():
+        raise WorkspaceError(f"--out {out}: is not empty and not a run folder: give another one")
+
+
+def write_run_folder(
+    out: Path,
+    results: Sequence[RefinedModel],
+    options: ModelRefinement,
+    source: str,
+    cost: tuple[float, float],
+) -> None:
+    """Write it all; the models in one step, so that the folder holds those of one run."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        artifacts.write_text(out / RECIPE_FILE, yaml_file.dump(binding.unbind(options)))
+        models = [model for result in results if _is_result(result) for model in result.kept]
+        _write_models(out, models)
+        _write_tables(out, results)
+        write_report(out, model_report(results, options, source, cost))
+    except OSError as error:
+        raise WorkspaceError(f"{out}: cannot be written ({error.strerror}): give another --out") from error
+
+
+def _is_result(result: RefinedModel) -> bool:
+    """Whether anything was measured: where every edge was rejected nothing is written but the report."""
+    return result.solved is not None and bool(result.solved.kept.any())
+
+
+def _write_models(out: Path, models: Sequence[TrackedModel]) -> None:
+    draft = Path(tempfile.mkdtemp(dir=out, prefix=f".{MODELS}."))
+    try:
+        for number, model in enumerate(models):
+            folder = draft / str(number)
+            folder.mkdir()
+            if model.files:
+                for file in model.files:
+                    shutil.copyfile(file, folder / file.name)
+            else:
+                model.write(folder)
+        if (out / MODELS).exists():
+            shutil.rmtree(out / MODELS)
+        if models:
+            os.chmod(draft, 0o755)
+            os.replace(draft, out / MODELS)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _write_tables(out: Path, results: Sequence[RefinedModel]) -> None:
+    for number, result in enumerate(results):
+        if not _is_result(result):
+            continue
+        suffix = "" if len(results) == 1 else f"-{number}"
+        frames = [frame for model in result.kept for frame in model.frames]
+        poses = np.array([frame.world_from_cam for frame in frames])
+        trajectory = Trajectory(np.arange(len(poses), dtype=float), poses)
+        source = Source(result.model.name, out, trajectory=trajectory)
+        registry.load("writers", "tum")().write(out / f"poses{suffix}.tum", source)
+        assert result.solved is not None
+        table = edge_table(result.solved.graph, result.model.world_from_body, result.solved.solution.weights)
+        artifacts.write_text(out / f"edges{suffix}.csv", table)

@@ -1,0 +1,79 @@
+"""The report of a refined model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hodge_pipeline import binding, yaml_file
+from hodge_pipeline.evaluation.contents import (
+    MeasureRow,
+    Path3D,
+    Pictures,
+    RefinementSummary,
+    Report,
+    Residuals,
+    SourceSummary,
+    StageRow,
+)
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.summary import graph_summary, worst_edges
+from hodge_pipeline.job import versions
+from hodge_pipeline.refine.guard import Decision
+from hodge_pipeline.refine.model import RefinedModel
+from hodge_pipeline.refine.model_options import ModelRefinement
+
+HEADLINES = {
+    "refined": "Refined",
+    "optimal": "Already optimal: the input was given back",
+    "worse": "Not better: the input was given back",
+    "forced": "Worse, and written all the same (--force)",
+}
+NO_METRES = "There is no depth that tells the scale: lengths are in the model's own unit, called metres here."
+
+
+def summary_of(decision: Decision, scale: str = "") -> RefinementSummary:
+    """A decision as the report shows it."""
+    rows = (MeasureRow(m.name, m.before, m.after, m.better, m.unit, m.is_worse) for m in decision.measures)
+    change = "" if decision.change is None else f"{decision.change}."
+    headline = HEADLINES[decision.outcome]
+    return RefinementSummary(decision.outcome, headline, decision.reason, tuple(rows), change, scale)
+
+
+def model_report(
+    results: Sequence[RefinedModel], options: ModelRefinement, source: str, cost: tuple[float, float]
+) -> Report:
+    """The report of the first result, which has most images; the others in its notes."""
+    first = results[0]
+    others = [
+        f"model {number} ({result.start.quality.images} images): {result.decision.outcome}, {result.decision.reason}"
+        for number, result in enumerate(results[1:], start=1)
+    ]
+    metric = () if first.final_scale.is_observable else (NO_METRES,)
+    solved = first.solved
+    sets = {"start": first.start.world_from_body, "result": first.model.world_from_body}
+    quality = first.start.quality
+    pictures = Pictures(paths=tuple(Path3D(name, poses[:, :3, 3]) for name, poses in sets.items()))
+    if solved is not None:
+        pictures = Pictures(
+            paths=pictures.paths,
+            component=solved.solution.component,
+            residuals=tuple(Residuals(name, *edge_residuals(solved.graph, poses)) for name, poses in sets.items()),
+            graph=solved.graph,
+        )
+    return Report(
+        title=f"{source}, refined",
+        source=SourceSummary(f"COLMAP model, {quality.points} points", source, quality.images),
+        before="start",
+        refinement=summary_of(first.decision, str(first.scales[0])),
+        graph=None
+        if solved is None
+        else graph_summary(solved.graph, solved.solution.component, solved.solution.weights),
+        worst_edges=()
+        if solved is None
+        else worst_edges(solved.graph, first.model.world_from_body, solved.solution.weights),
+        stages=(StageRow("refine", cost[0], cost[1], float("nan")),),
+        notes=(*metric, *others, *first.notes),
+        versions=versions(),
+        recipe=yaml_file.dump(binding.unbind(options)),
+        pictures=pictures,
+    )

@@ -1,0 +1,188 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from typer.testing import CliRunner
+
+import hodge_pipeline
+from hodge_adapters.colmap_refining import ColmapModels
+from hodge_pipeline import se3
+from hodge_pipeline.cli.main import app
+from hodge_pipeline.errors import CheckError, SourceError, WorkspaceError
+from hodge_pipeline.refine.scale import metric_scale
+from test_readers_colmap import synthetic
+
+NOISE_PX = 0.3
+FREE = ("executor.workers=0",)
+
+
+def noisy(folder: Path, *, database: bool = False) -> Path:
+    """A rig model with pixel noise at its own optimum, as `folder/model`."""
+    synthetic(folder, database=database)
+    model = pycolmap.Reconstruction(folder / "text")
+    rng = np.random.default_rng(0)
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = point.xy + rng.normal(scale=NOISE_PX, size=2)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = options.refine_extra_params = options.refine_sensor_from_rig = False
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    (folder / "model").mkdir()
+    model.write_binary(folder / "model")
+    return folder / "model"
+
+
+def disturbed(model: Path, out: Path, degrees: float = 0.5, share: float = 0.02) -> Path:
+    moved = pycolmap.Reconstruction(model)
+    rng = np.random.default_rng(1)
+    for frame_id in moved.reg_frame_ids():
+        frame = moved.frames[frame_id]
+        xi = rng.normal(size=6)
+        xi[:3] *= np.radians(degrees) / np.linalg.norm(xi[:3])
+        xi[3:] *= share * np.linalg.norm(frame.rig_from_world.translation) / np.linalg.norm(xi[3:])
+        matrix = se3.exp(xi) @ np.vstack([frame.rig_from_world.matrix(), [0, 0, 0, 1]])
+        frame.rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(matrix[:3]))
+    out.mkdir()
+    moved.write_text(out)
+    return out
+
+
+def tracks(model: pycolmap.Reconstruction) -> dict[int, list[tuple[int, int]]]:
+    return {
+        key: sorted((element.image_id, element.point2D_idx) for element in point.track.elements)
+        for key, point in model.points3D.items()
+    }
+
+
+def error_px(folder: Path) -> float:
+    model = pycolmap.Reconstruction(folder)
+    model.update_point_3d_errors()
+    return float(model.compute_mean_reprojection_error())
+
+
+@pytest.mark.parametrize("database", [False, True])
+def test_disturbed_poses_come_back_with_every_rig_name_and_track(tmp_path: Path, database: bool) -> None:
+    model = noisy(tmp_path, database=database)
+    start = disturbed(model, tmp_path / "start")
+    given = "auto" if database else "none"
+    done = hodge_pipeline.refine_colmap(start, database=given, out=tmp_path / "out", overrides=FREE)
+    assert done.exit_code == 0 and done.results[0].decision.outcome == "refined"
+    before, after = pycolmap.Reconstruction(model), pycolmap.Reconstruction(tmp_path / "out/sparse/0")
+    assert error_px(start) > 3 and error_px(tmp_path / "out/sparse/0") <= 1.001 * error_px(model)
+    assert tracks(after) == tracks(before)
+    assert {i: image.name for i, image in after.images.items()} == {i: m.name for i, m in before.images.items()}
+    assert after.num_rigs() == before.num_rigs() and after.num_frames() == before.num_frames()
+    for key, rig in before.rigs.items():
+        for sensor, pose in rig.non_ref_sensors.items():
+            np.testing.assert_allclose(after.rigs[key].non_ref_sensors[sensor].matrix(), pose.matrix(), atol=1e-12)
+    for key, camera in before.cameras.items():
+        np.testing.assert_array_equal(after.cameras[key].params, camera.params)
+    assert (tmp_path / "out/sparse/0/images.txt").is_file(), "text stays text"
+
+
+def test_an_optimal_model_is_given_back_byte_for_byte(tmp_path: Path) -> None:
+    model = noisy(tmp_path)
+    done = hodge_pipeline.refine_colmap(model, out=tmp_path / "out", overrides=FREE)
+    decision = done.results[0].decision
+    assert decision.outcome == "optimal" and not decision.change.is_significant
+    names = sorted(path.name for path in model.iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "out/sparse/0").iterdir())
+    for name in names:
+        assert (tmp_path / "out/sparse/0" / name).read_bytes() == (model / name).read_bytes()
+
+
+def test_a_reconstruction_goes_in_and_comes_out(tmp_path: Path) -> None:
+    model = noisy(tmp_path)
+    start = pycolmap.Reconstruction(disturbed(model, tmp_path / "start"))
+    (refined,) = hodge_pipeline.refine_colmap(start, database="none", overrides=FREE).models
+    refined.update_point_3d_errors()
+    assert refined.compute_mean_reprojection_error() <= 1.001 * error_px(model)
+
+
+def test_a_result_that_is_worse_is_kept_out_unless_forced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from hodge_adapters.colmap_tracked import ColmapModel
+
+    model = noisy(tmp_path)
+    start = disturbed(model, tmp_path / "start")
+    honest = ColmapModel.adjusted
+
+    def made(self: ColmapModel, priors: object = None) -> object:
+        keep = ("name", "all_frames", "depth", "edges", "text", "notes")
+        model, errors = honest(self, priors)
+        copy = model._copy()
+        rng = np.random.default_rng(0)
+        for frame_id, pose in zip(model.bodies.frame_ids, model.world_from_body, strict=True):
+            moved = se3.inverse(pose @ se3.exp(rng.normal(scale=0.3, size=6)))
+            copy.frames[frame_id].rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(moved[:3]))
+        return ColmapModel(reconstruction=copy, **{name: getattr(model, name) for name in keep}), errors
+
+    monkeypatch.setattr(ColmapModel, "adjusted", made)
+    command = ["refine", "colmap", str(start), "--out", str(tmp_path / "out"), "--set", FREE[0], "--quiet"]
+    result = CliRunner().invoke(app, command)
+    assert isinstance(result.exception, CheckError) and result.exception.exit_code == 3
+    assert (tmp_path / "out/sparse/0/images.txt").read_bytes() == (start / "images.txt").read_bytes()
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert report["refinement"]["outcome"] == "worse" and report["verdict"]["outcome"] == "worse"
+    assert CliRunner().invoke(app, [*command, "--force"]).exit_code == 0
+    assert (tmp_path / "out/sparse/0/images.txt").read_bytes() != (start / "images.txt").read_bytes()
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    model = noisy(tmp_path)
+    for option in ("database", "depth"):
+        with pytest.raises(SourceError, match="nowhere"):
+            hodge_pipeline.refine_colmap(model, **{option: tmp_path / "nowhere"})
+    (tmp_path / "depths").mkdir()
+    with pytest.raises(SourceError, match="name the PNGs alike"):
+        hodge_pipeline.refine_colmap(model, depth=tmp_path / "depths")
+    with pytest.raises(SourceError, match="no COLMAP model"):
+        hodge_pipeline.refine_colmap(tmp_path / "depths")
+    with pytest.raises(WorkspaceError, match="give another"):
+        hodge_pipeline.refine_colmap(model, out=model)
+
+
+def test_without_one_edge_nothing_is_written_but_the_report(tmp_path: Path) -> None:
+    model = noisy(tmp_path)
+    out = tmp_path / "out"
+    command = ["refine", "colmap", str(model), "--out", str(out), "--set", "model.min_shared=100000", "--set", FREE[0]]
+    result = CliRunner().invoke(app, command)
+    assert isinstance(result.exception, CheckError) and "nothing was written" in str(result.exception)
+    assert sorted(path.name for path in out.iterdir()) == ["recipe.yaml", "report.html", "report.json"]
+
+
+def test_scale_is_the_median_with_the_error_of_the_images_medians() -> None:
+    rng = np.random.default_rng(0)
+    bias = rng.normal(scale=0.01, size=40)
+    ratios = [0.2 * (1 + one + rng.normal(scale=0.03, size=100)) for one in bias]
+    ratios[0][:20] = 5.0
+    scale = metric_scale(ratios)
+    assert abs(scale.metres_per_unit / 0.2 - 1) < 3 * scale.sigma
+    assert 0.001 < scale.sigma < 0.004, "0.01 · 1.25 / √40 = 0.002"
+    assert not metric_scale([]).is_observable
+    assert "only 20 points" in metric_scale([np.ones(10), np.ones(10)]).reason
+    assert "other images" in metric_scale([np.exp(rng.normal(scale=0.5, size=100)) for _ in range(10)]).reason
+
+
+def test_lund_door(data_dir: Path, tmp_path: Path) -> None:
+    model = data_dir / "colmap/lund_door/set1_lund_door/colmap_ground_truth"
+    start = disturbed(model, tmp_path / "start")
+    done = hodge_pipeline.refine_colmap(start, images="none", out=tmp_path / "out", overrides=FREE)
+    assert done.results[0].decision.outcome == "refined"
+    after = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
+    assert error_px(tmp_path / "out/sparse/0") <= 0.355 and tracks(after) == tracks(pycolmap.Reconstruction(model))
+
+
+def test_sub_models_are_found(tmp_path: Path) -> None:
+    model = noisy(tmp_path)
+    for number in ("10", "2"):
+        (tmp_path / "scene/sparse" / number).mkdir(parents=True)
+        for file in model.iterdir():
+            (tmp_path / "scene/sparse" / number / file.name).write_bytes(file.read_bytes())
+    found = ColmapModels().open_models(tmp_path / "scene")
+    assert [Path(one.name).name for one in found] == ["2", "10"]
