@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.posed import trajectory_of
+from hodge_adapters.posed import length_notes, trajectory_of
 from hodge_adapters.text_rows import Row, listed, read_text, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -62,6 +62,7 @@ class EurocReader:
         seconds, first = np.unique(np.array(stamps, np.float64) / NANO, return_index=True)
         poses = se3.from_quat_xyzw(table[first, :3], table[first][:, [4, 5, 6, 3]])
         notes = ["poses are those of the body in the file (EuRoC's ground truth: the IMU), not of a camera"]
+        notes += length_notes(table[:, 3:], "poses")
         if bad:
             notes.append(f"{len(bad)} lines that are no pose left out: {listed(bad)}")
         if repeated or len(first) < len(stamps):

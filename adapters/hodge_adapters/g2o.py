@@ -13,6 +13,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as stage
 
 from hodge_adapters.pose_graph_text import Records, count_tags, read_records, write_lines
+from hodge_adapters.posed import length_notes
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -155,7 +156,10 @@ def load_g2o(path: Path | str) -> Source:
         raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
     dimension = 2 if planar or len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"]) else 3
     half = _planar(records) if dimension == 2 else _spatial(records)
-    return as_source(path, half, "g2o", records["FIX"].keys.reshape(-1), dimension, skipped(other))
+    notes = skipped(other)
+    for tag, what in (("VERTEX_SE3:QUAT", "vertices"), ("EDGE_SE3:QUAT", "edges")):
+        notes += length_notes(records[tag].values[:, 3:7], what)
+    return as_source(path, half, "g2o", records["FIX"].keys.reshape(-1), dimension, notes)
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

@@ -5,7 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Source, Trajectory
+from hodge_pipeline.types import Floats, Source, Trajectory
+
+UNIT_TOLERANCE = 1e-3
+"""Three decimals of a quaternion leave as much; more is another mistake."""
+
+
+def length_notes(quats: Floats, what: str) -> list[str]:
+    """A note where quaternions (N, 4) are not of length 1: they are normalised."""
+    lengths = np.linalg.norm(quats, axis=1)
+    wrong = np.abs(lengths - 1) > UNIT_TOLERANCE
+    if not wrong.any():
+        return []
+    worst = lengths[np.argmax(np.abs(lengths - 1))]
+    return [f"{int(wrong.sum())} of {len(quats)} {what} have a quaternion of another length than 1 (as {worst:.4g})"]
 
 
 def trajectory_of(source: Source) -> Trajectory:

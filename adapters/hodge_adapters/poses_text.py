@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
+from hodge_adapters.posed import length_notes
 from hodge_adapters.text_rows import Row, listed, read_rows, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -135,6 +136,7 @@ def _ordered(table: Floats) -> ParsedTrajectory:
         notes.append(f"{len(table) - len(stamps)} poses with the stamp of an earlier one left out")
     if (np.diff(table[:, 0]) < 0).any():
         notes.append("poses were not in order of time: sorted")
+    notes += length_notes(table[:, 4:], "poses")
     poses = se3.from_quat_xyzw(table[first, 1:4], table[first, 4:])
     return ParsedTrajectory(Trajectory(stamps, poses), tuple(notes))
 

@@ -22,14 +22,24 @@ def inspect(path: Path, *, as_json: bool) -> None:
         print(json_text(facts), end="")
         return
     for name, value in facts.items():
-        rows = value if isinstance(value, list) else [value]
-        for row, item in enumerate(rows):
-            print(f"{name if row == 0 else '':<24}{_words(item)}")
+        for row, text in enumerate(_rows(value)):
+            print(f"{name if row == 0 else '':<30}{text}")
+
+
+def _rows(value: Any) -> list[str]:
+    """The lines of a fact: one for each of several words, numbers side by side."""
+    if isinstance(value, dict):
+        return [f"{key}: {_words(item)}" for key, item in value.items()]
+    if isinstance(value, list) and any(isinstance(item, (str, dict)) for item in value):
+        return [_words(item) for item in value]
+    return [_words(value)] if value != [] else []
 
 
 def _words(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key} {_words(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return "  ".join(_words(item) for item in value)
     return f"{value:.6g}" if isinstance(value, float) and abs(value) < 1e6 else str(value)
 
 

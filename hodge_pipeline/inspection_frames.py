@@ -1,0 +1,159 @@
+"""What frames and trajectories are like: stamps, poses, cameras, depth, and what is odd about them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Bools, Floats, Floats32, Frame, Trajectory
+
+SAMPLED_FRAMES = 8
+LISTED = 5
+GAP, JUMP = 5.0, 10.0
+"""Times the median step: what counts as a gap in time, and as a jump of the pose."""
+LEAST_JUMP_M, LEAST_JUMP_DEG = 0.1, 20.0
+MOSTLY_EMPTY = 0.9
+PLAUSIBLE_DEPTH_M = (0.1, 30.0)
+"""The median depth of a scene; outside, the scale is probably wrong."""
+
+
+def frame_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
+    """Facts of a sequence of frames as plain data, a few of its depth images read; what is odd goes to the list."""
+    sequences = np.array([frame.sequence for frame in frames])
+    stamps = np.array([frame.stamp_s for frame in frames])
+    names = [str(frame.frame_id) for frame in frames]
+    cameras = Counter(frame.camera for frame in frames)
+    posed = np.array([frame.world_from_cam is not None for frame in frames])
+    poses = np.array([np.eye(4) if frame.world_from_cam is None else frame.world_from_cam for frame in frames])
+    together = (sequences[1:] == sequences[:-1]) if len(frames) > 1 else np.zeros(0, bool)
+    _note_ids(frames, oddities)
+    facts = {
+        "sequences": [name for name in dict.fromkeys(sequences.tolist()) if name],
+        **stamp_facts(stamps, together, names, oddities),
+        "cameras": [
+            f"{c.width}x{c.height} fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g} ({count} frames)"
+            for c, count in sorted(cameras.items(), key=str)
+            if c is not None
+        ],
+        "frames with a pose": int(posed.sum()),
+        "frames with colour": sum(frame.read_colour is not None for frame in frames),
+        "frames with depth": sum(frame.read_depth is not None for frame in frames),
+        "frames with points": sum(frame.read_points is not None for frame in frames),
+        **pose_facts(poses, together & posed[1:] & posed[:-1], names, oddities),
+    }
+    without = len(frames) - facts["frames with depth"]
+    if 0 < without < len(frames) and not facts["frames with points"]:
+        bare = [str(frame.frame_id) for frame in frames if frame.read_depth is None]
+        oddities.append(f"{without} of {len(frames)} frames have no depth: {_listed(bare)}")
+    return {**facts, **_depth_facts(frames, oddities)}
+
+
+def trajectory_facts(trajectory: Trajectory, oddities: list[str]) -> dict[str, Any]:
+    """Facts of a trajectory on its own."""
+    names = [f"{stamp:.6f}".rstrip("0").rstrip(".") for stamp in trajectory.stamps_s]
+    together = np.ones(max(len(trajectory) - 1, 0), bool)
+    return {
+        **stamp_facts(trajectory.stamps_s, together, names, oddities),
+        **pose_facts(trajectory.world_from_cam, together, names, oddities),
+    }
+
+
+def stamp_facts(stamps_s: Floats, together: Bools, names: Sequence[str], oddities: list[str]) -> dict[str, Any]:
+    """First, last and steps of stamps; `together (N - 1,)`: where a stamp and the next are of one sequence."""
+    steps = np.diff(stamps_s)[together]
+    after = np.flatnonzero(together)
+    if (steps == 0).any():
+        same = [names[row] for row in after[steps == 0]]
+        oddities.append(f"{len(same)} stamps are that of the one before: after {_listed(same)}")
+    if (steps < 0).any():
+        oddities.append(f"{int((steps < 0).sum())} stamps are before the one before them: not in order of time")
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    gaps = steps > GAP * usual
+    if usual > 0 and gaps.any():
+        at = after[np.argmax(steps)]
+        oddities.append(
+            f"{int(gaps.sum())} gaps in time of more than {GAP:g} steps; the longest, {steps.max():.6g} s, "
+            f"between {names[at]} and {names[at + 1]}"
+        )
+    return {
+        "first stamp": float(stamps_s[0]),
+        "last stamp": float(stamps_s[-1]),
+        "median step": usual if len(steps) else None,
+        "largest step": float(steps.max()) if len(steps) else None,
+    }
+
+
+def pose_facts(world_from_cam: Floats, together: Bools, names: Sequence[str], oddities: list[str]) -> dict[str, Any]:
+    """Path length and extent of poses (N, 4, 4); `together (N - 1,)`: where a pose and the next belong together."""
+    rows = np.flatnonzero(together)
+    if not len(rows):
+        return {}
+    relative = se3.inverse(world_from_cam[rows]) @ world_from_cam[rows + 1]
+    moved_m = np.linalg.norm(relative[:, :3, 3], axis=1)
+    turned_deg = np.rad2deg(np.linalg.norm(se3.so3_log(relative[:, :3, :3]), axis=1))
+    for size, least, unit in ((moved_m, LEAST_JUMP_M, "m"), (turned_deg, LEAST_JUMP_DEG, "°")):
+        jumps = size > max(JUMP * float(np.median(size)), least)
+        if jumps.any():
+            at = rows[np.argmax(size)]
+            oddities.append(
+                f"{int(jumps.sum())} jumps of the pose, the largest {size.max():.3g} {unit} between {names[at]} and "
+                f"{names[at + 1]}; half of the steps are below {np.median(size):.3g} {unit}"
+            )
+    centres = world_from_cam[np.union1d(rows, rows + 1), :3, 3]
+    return {
+        "path length in metres": float(moved_m.sum()),
+        "extent of the path in metres": [float(side) for side in np.ptp(centres, axis=0)],
+    }
+
+
+def _note_ids(frames: Sequence[Frame], oddities: list[str]) -> None:
+    counts = Counter((frame.sequence, frame.frame_id) for frame in frames)
+    twice = [str(name) for (_, name), count in counts.items() if count > 1]
+    if twice:
+        oddities.append(f"{len(twice)} frame ids are given more than once: {_listed(twice)}")
+
+
+def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
+    """Depth range and invalid share of a few frames, evenly over the sequence, and those that cannot be read."""
+    with_depth = [frame for frame in frames if frame.read_depth is not None or frame.read_points is not None]
+    picked = np.unique(np.linspace(0, len(with_depth) - 1, SAMPLED_FRAMES).round().astype(int)) if with_depth else ()
+    depths, faults = [], []
+    for row in picked:
+        frame = with_depth[row]
+        try:
+            depths.append(_depth(frame).ravel())
+        except SourceError as error:
+            faults.append(str(error))
+            continue
+        share = float((depths[-1] <= 0).mean()) if depths[-1].size else 1.0
+        if share > MOSTLY_EMPTY and frame.read_depth is not None:
+            oddities.append(f"frame {frame.frame_id}: {share:.0%} of its pixels have no depth")
+    values = np.concatenate(depths) if depths else np.zeros(0)
+    valid = values[values > 0]
+    median = float(np.median(valid)) if len(valid) else None
+    if median is not None and not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
+        oddities.append(f"the median depth is {median:.3g} m: is the depth scale right?")
+    return {
+        "frames looked into": len(depths),
+        "depth range in metres": [float(valid.min()), float(valid.max())] if len(valid) else None,
+        "median depth in metres": median,
+        "share without depth": float(1 - len(valid) / len(values)) if len(values) else None,
+        "unreadable among them": faults,
+    }
+
+
+def _depth(frame: Frame) -> Floats32:
+    """The depth image, or the distances of a cloud's points, since a scanner sees all round."""
+    if frame.read_depth is not None:
+        return frame.read_depth()
+    assert frame.read_points is not None
+    return np.asarray(np.linalg.norm(frame.read_points().points_in_cam, axis=1), np.float32)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:LISTED]) + (" …" if len(names) > LISTED else "")

@@ -1,0 +1,160 @@
+"""What `hodge inspect` says of frames, trajectories and graphs, and which oddities it finds."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.artifacts import json_text
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.inspection import inspect
+from hodge_pipeline.inspection_frames import frame_facts
+from hodge_pipeline.inspection_graph import graph_facts
+from hodge_pipeline.types import Camera, Frame, ViewGraph
+
+CAMERA = Camera(4, 3, 10, 10, 2, 1.5)
+
+
+def constant_depth(metres: float) -> np.ndarray:
+    return np.full((3, 4), metres, np.float32)
+
+
+def unreadable() -> np.ndarray:
+    raise SourceError("frame.png: is no PNG")
+
+
+def walk(count: int) -> list[Frame]:
+    """Frames a tenth of a second and a centimetre apart, two metres before a wall."""
+    poses = se3.exp(np.outer(np.arange(count) / 100, [0, 0, 0, 1, 0, 0]))
+    read = partial(constant_depth, 2.0)
+    return [Frame(row, row / 10, CAMERA, read, world_from_cam=pose) for row, pose in enumerate(poses)]
+
+
+def oddities_of(frames: list[Frame]) -> list[str]:
+    found: list[str] = []
+    frame_facts(frames, found)
+    return found
+
+
+def test_a_sound_sequence_has_no_oddities() -> None:
+    found: list[str] = []
+    facts = frame_facts(walk(10), found)
+    assert found == []
+    assert facts["path length in metres"] == pytest.approx(0.09)
+    assert facts["median step"] == pytest.approx(0.1) and facts["frames with depth"] == 10
+    assert facts["depth range in metres"] == [2.0, 2.0] and facts["share without depth"] == 0.0
+    assert facts["cameras"] == ["4x3 fx 10 fy 10 cx 2 cy 1.5 (10 frames)"]
+
+
+@pytest.mark.parametrize(
+    ("row", "change", "expected"),
+    [
+        (4, {"stamp_s": 0.3}, "1 stamps are that of the one before: after 3"),
+        (4, {"stamp_s": 0.25}, "1 stamps are before the one before them"),
+        (9, {"stamp_s": 7.0}, "1 gaps in time of more than 5 steps; the longest, 6.2 s, between 8 and 9"),
+        (5, {"frame_id": 4}, "1 frame ids are given more than once: 4"),
+        (5, {"read_depth": None}, "1 of 10 frames have no depth: 5"),
+        (9, {"world_from_cam": se3.exp(np.array([0, 0, 0, 3.0, 0, 0]))}, "1 jumps of the pose, the largest 2.92 m"),
+        (9, {"world_from_cam": se3.exp(np.array([0, 0, 1.0, 0.09, 0, 0]))}, "1 jumps of the pose, the largest 57.3 °"),
+        (0, {"read_depth": partial(constant_depth, 0.0)}, "frame 0: 100% of its pixels have no depth"),
+    ],
+)
+def test_an_oddity_is_named(row: int, change: dict[str, Any], expected: str) -> None:
+    frames = walk(10)
+    frames[row] = replace(frames[row], **change)
+    assert any(text.startswith(expected) for text in oddities_of(frames)), oddities_of(frames)
+
+
+def test_a_wrong_depth_scale_is_suspected() -> None:
+    frames = [replace(frame, read_depth=partial(constant_depth, 2000.0)) for frame in walk(3)]
+    assert oddities_of(frames) == ["the median depth is 2e+03 m: is the depth scale right?"]
+
+
+def test_frames_that_cannot_be_read_are_told() -> None:
+    frames = walk(3)
+    frames[1] = replace(frames[1], read_depth=unreadable)
+    facts = frame_facts(frames, [])
+    assert facts["unreadable among them"] == ["frame.png: is no PNG"] and facts["frames looked into"] == 2
+
+
+def test_sequences_are_not_compared_with_each_other() -> None:
+    second = [replace(frame, sequence="b", frame_id=f"b{frame.frame_id}") for frame in walk(5)]
+
+    assert oddities_of([*walk(5), *second]) == []
+
+
+def square(*extra: tuple[int, int]) -> ViewGraph:
+    """0 - 1
+    |   |
+    3 - 2, and vertex 4 alone."""
+    edges = np.array([(0, 1), (1, 2), (2, 3), (3, 0), *extra])
+    motions = np.broadcast_to(np.eye(4), (len(edges), 4, 4))
+    return ViewGraph.from_edges(np.arange(10, 15), edges, motions, 2 * np.broadcast_to(np.eye(6), (len(edges), 6, 6)))
+
+
+def test_cycles_of_a_square() -> None:
+    found: list[str] = []
+    facts = graph_facts(square(), found)
+    assert facts["independent cycles"] == facts["cycles that no triangles fill (b1)"] == 1
+    assert facts["connected components"] == 2 and facts["isolated vertices"] == 1
+    assert facts["degree, least median most"] == [0, 2.0, 2]
+    assert found == ["1 of 5 vertices have no edge: 14"]
+
+
+def test_a_diagonal_fills_the_square() -> None:
+    facts = graph_facts(square((0, 2)), [])
+    assert (facts["independent cycles"], facts["triangles"], facts["cycles that no triangles fill (b1)"]) == (2, 2, 0)
+
+
+def test_parallel_edges_and_loops_are_no_cycles() -> None:
+    found: list[str] = []
+    facts = graph_facts(square((1, 0), (2, 2)), found)
+    assert facts["independent cycles"] == 1 and facts["pairs with more than one edge"] == 1
+    assert "1 of 6 edges have both ends at one vertex: 12-12" in found
+    assert "1 edges repeat a pair that has one already" in found
+
+
+def test_information_that_is_none() -> None:
+    graph = square()
+    information = graph.information.copy()
+    information[0] = np.diag([1, 1, 1, 1, 1, -1])
+    information[1] = 0
+    information[2, 0, 0] = np.nan
+    found: list[str] = []
+    graph_facts(replace(graph, information=information), found)
+    assert "1 of 4 edges have indefinite information: 10-11" in found
+    assert "1 of 4 edges have no information at all: 11-12" in found
+    assert "1 of 4 edges have information that is not finite: 12-13" in found
+
+
+def test_a_quaternion_of_another_length_is_noted(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1.5\n")
+    assert inspect(tmp_path / "poses.txt")["notes"] == [
+        "poses.txt: 1 of 2 poses have a quaternion of another length than 1 (as 1.5)"
+    ]
+    row = " ".join(["0"] * 21)
+    (tmp_path / "graph.g2o").write_text(f"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 2 {row}\n")
+    facts = inspect(tmp_path / "graph.g2o")
+    assert "1 of 1 edges have a quaternion of another length than 1 (as 2)" in facts["notes"]
+    assert facts["oddities"] == ["1 of 1 edges have no information at all: 0-1"]
+    assert json.loads(json_text(facts))["graph"]["edges"] == 1
+
+
+def test_a_real_graph(data_dir: Path) -> None:
+    facts = inspect(data_dir / "pose_graphs/sesync/tinyGrid3D.g2o")["graph"]
+    assert (facts["vertices"], facts["edges"], facts["independent cycles"]) == (9, 11, 3)
+
+
+def test_a_long_folder_is_looked_at_in_a_moment(data_dir: Path) -> None:
+    before = time.process_time()
+    facts = inspect(data_dir / "seven_scenes/redkitchen")
+    assert time.process_time() - before < 2
+    assert facts["frames"] == 250 and facts["frames looked into"] == 8 and facts["oddities"] == []
