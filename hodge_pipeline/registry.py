@@ -32,6 +32,7 @@ KINDS = {
         Kind("readers", stages.FrameReader, "open a path of one format"),
         Kind("edges", stages.EdgeBuilder, "propose pairs of frames to register"),
         Kind("registration", stages.Registrar, "register one pair"),
+        Kind("global_registration", stages.GlobalRegistrar, "find where one cloud lies in another, with no guess"),
         Kind("executors", stages.Executor, "where pairs are registered"),
         Kind("solvers", stages.ConsistencySolver, "make all poses consistent"),
         Kind("refiners", stages.Refiner, "improve the poses after the solve"),

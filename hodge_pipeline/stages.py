@@ -18,6 +18,7 @@ from hodge_pipeline.types import (
     Floats,
     Frame,
     Ints,
+    Match,
     Model,
     ModelQuality,
     PointCloud,
@@ -78,6 +79,19 @@ class Registrar(Protocol):
 
     def register(self, target: Any, source: Any, i_from_j: Floats) -> Registration:
         """Moves the prepared cloud j (source) onto i (target), from the guess `i_from_j` (4, 4)."""
+        ...
+
+
+@runtime_checkable
+class GlobalRegistrar(Protocol):
+    """Finds where one cloud lies in another with no guess; what it finds is rough, and may be wrong."""
+
+    def describe(self, cloud: PointCloud) -> Any:
+        """What it needs of one cloud (features): arrays, made once and kept in a file."""
+        ...
+
+    def match(self, target: Any, source: Any) -> Match:
+        """Where the described cloud j (source) lies in i (target); the same answer every time."""
         ...
 
 

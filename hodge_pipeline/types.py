@@ -237,6 +237,18 @@ class Registration:
 
 
 @dataclass(frozen=True)
+class Match:
+    """Where cloud j lies in cloud i, found with no guess: `inliers` of the `matches` between them agree with it.
+
+    The identity with no inlier where nothing was found.
+    """
+
+    i_from_j: Floats
+    inliers: int
+    matches: int
+
+
+@dataclass(frozen=True)
 class SolverIteration:
     """One step of a solver: the poses after it, the objective at them, and what else it measured."""
 

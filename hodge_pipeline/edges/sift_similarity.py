@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
-from hodge_pipeline.edges.sift_features import Features
 from hodge_pipeline.types import Bools, Floats32, Ints
 
 SAMPLED_DESCRIPTORS = 20_000
@@ -12,12 +13,20 @@ LLOYD_STEPS = 12
 BLOCK_ENTRIES = 4_000_000
 
 
-def vocabulary(features: Features, rows: Ints, words: int, seed: int) -> Floats32:
-    """Centres (at most `words`, 128) of the frames' own descriptors, by k-means from a seeded sample."""
+class LocalFeatures(Protocol):
+    """Local features of frames, by their rows."""
+
+    def descriptors(self, row: int) -> Floats32:
+        """Unit descriptors (n, D)."""
+        ...
+
+
+def vocabulary(features: LocalFeatures, rows: Ints, words: int, seed: int) -> Floats32:
+    """Centres (at most `words`, D) of the frames' own descriptors, by k-means from a seeded sample."""
     rng = np.random.default_rng(seed)
     share = max(1, SAMPLED_DESCRIPTORS // max(1, len(rows)))
     sample = [_sampled(features.descriptors(int(row)), share, rng) for row in rows]
-    points = np.concatenate([np.zeros((0, 128), np.float32), *sample])
+    points = np.concatenate(sample) if sample else np.zeros((0, 128), np.float32)
     centres = points[rng.permutation(len(points))[:words]]
     for _ in range(LLOYD_STEPS if len(points) else 0):
         chosen = _nearest(points, centres)
@@ -40,8 +49,8 @@ def _sums(points: Floats32, chosen: Ints, words: int) -> tuple[Floats32, Floats3
     return np.asarray(member.T @ points), member.sum(axis=0)
 
 
-def global_descriptors(features: Features, rows: Ints, centres: Floats32) -> Floats32:
-    """Unit VLAD vectors (R, words · 128) (Jégou et al. 2010); zero for a frame without features."""
+def global_descriptors(features: LocalFeatures, rows: Ints, centres: Floats32) -> Floats32:
+    """Unit VLAD vectors (R, words · D) (Jégou et al. 2010); zero for a frame without features."""
     out = np.zeros((len(rows), centres.size), np.float32)
     for place, row in enumerate(rows):
         points = features.descriptors(int(row))

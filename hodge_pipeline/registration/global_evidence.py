@@ -1,0 +1,115 @@
+"""What speaks for and against a hypothesis: overlap, free space, and directions that the surfaces leave open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import minimum_filter
+
+from hodge_pipeline import se3
+from hodge_pipeline.types import Camera, Floats, Floats32
+
+SLIPPABLE = 0.015
+"""Eigenvalue of the mean normal matrix: normals that differ by less than 7° are one plane."""
+FEWEST_SEEN = 30
+VIEW_WIDTH = 160
+MARGIN_M, MARGIN_PER_M2 = 0.06, 0.006
+"""Depth noise of structured light grows with the square of the distance; a match is off by centimetres."""
+AXES = ("turning about", "sliding along")
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """A depth image made small: the nearest surface around each kept pixel in metres, ∞ where nothing was measured."""
+
+    nearest_m: Floats32
+    stride: int
+    camera: Camera
+
+
+def depth_view(depth: Floats32, camera: Camera) -> DepthView:
+    """Every n-th pixel, about 160 to a row; the nearest of the pixels around it, so that edges accuse nobody."""
+    stride = max(1, depth.shape[1] // VIEW_WIDTH)
+    small = depth[::stride, ::stride]
+    open_ended = np.where(small > 0, small, np.float32(np.inf)).astype(np.float32)
+    return DepthView(minimum_filter(open_ended, 3, mode="nearest"), stride, camera)
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """Of the points projected into a view: how many lie before its surface, and how many on it."""
+
+    before: int
+    on: int
+
+    @property
+    def violation(self) -> float:
+        """The share that the view saw through; NaN where too few lie before or on its surface to tell."""
+        total = self.before + self.on
+        return self.before / total if total >= FEWEST_SEEN else float("nan")
+
+
+def free_space(view: DepthView, points_in_view: Floats) -> FreeSpace:
+    """Points (N, 3) of another frame, under a hypothesis, against this view; those behind its surface do not count."""
+    z = points_in_view[:, 2]
+    front = points_in_view[z > 0.1]
+    camera, z = view.camera, front[:, 2]
+    with np.errstate(over="ignore", invalid="ignore"):
+        column = np.rint((camera.fx * front[:, 0] / z + camera.cx) / view.stride)
+        row = np.rint((camera.fy * front[:, 1] / z + camera.cy) / view.stride)
+    height, width = view.nearest_m.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    z = z[inside]
+    surface = view.nearest_m[row[inside].astype(np.int64), column[inside].astype(np.int64)]
+    margin = MARGIN_M + MARGIN_PER_M2 * z**2
+    measured = np.isfinite(surface)
+    before = measured & (z < surface - margin)
+    on = measured & (np.abs(z - surface) <= margin)
+    return FreeSpace(int(before.sum()), int(on.sum()))
+
+
+def violation(views: tuple[DepthView, DepthView], clouds: tuple[Floats, Floats], i_from_j: Floats) -> float:
+    """The worse of the two shares: points (N, 3) of j that i saw through, and of i that j saw through; NaN: untold."""
+    into_i = free_space(views[0], se3.transform(i_from_j, clouds[1])).violation
+    into_j = free_space(views[1], se3.transform(se3.inverse(i_from_j), clouds[0])).violation
+    return float(np.fmax(into_i, into_j))
+
+
+def free_directions(points: Floats, normals: Floats) -> tuple[str, ...]:
+    """The motions that surfaces (N, 3) with unit normals do not notice, in words: none where they fix all six.
+
+    Slippage (Gelfand and Guibas, SGP 2004): small eigenvalues of the point-to-plane normal matrix, at the centroid and
+    for points of unit RMS radius. A plane leaves three, a sphere three, a cylinder two, a corridor one.
+    """
+    if len(points) < 6:
+        return ("everything",)
+    centred = points - points.mean(axis=0)
+    rows = np.hstack([np.cross(centred, normals), normals])
+    return _slippable(rows.T @ rows, float(np.sqrt((centred**2).sum(axis=1).mean())))
+
+
+def free_directions_of(information: Floats, centroid: Floats, radius_m: float) -> tuple[str, ...]:
+    """The same for what two clouds share, from the information (6, 6) of their registration in the axes of cloud j.
+
+    `centroid (3,)` and RMS `radius_m` are those of cloud j.
+    """
+    shift = se3.adjoint(se3.from_parts(np.eye(3), centroid))
+    return _slippable(shift.T @ information @ shift, radius_m)
+
+
+def _slippable(matrix: Floats, radius_m: float) -> tuple[str, ...]:
+    scale = np.repeat([1 / max(radius_m, 1e-12), 1.0], 3)
+    total = float(np.trace(matrix[3:, 3:]))
+    if not total > 0:
+        return ("everything",)
+    values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale / total)
+    return tuple(_named(vector) for value, vector in zip(values, vectors.T, strict=True) if value < SLIPPABLE)
+
+
+def _named(vector: Floats) -> str:
+    turning, sliding = vector[:3], vector[3:]
+    which = int(np.linalg.norm(sliding) > np.linalg.norm(turning))
+    axis = (turning, sliding)[which]
+    axis = axis / np.linalg.norm(axis) * (1 if axis[np.abs(axis).argmax()] > 0 else -1)
+    return f"{AXES[which]} ({', '.join(f'{x:.2f}' for x in np.round(axis, 2) + 0.0)})"

@@ -1,0 +1,91 @@
+"""Local features of clouds (FPFH, Rusu et al. 2009) at one scale, and matches between two clouds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hodge_pipeline.registration.one_thread import o3d
+from hodge_pipeline.types import Floats, Floats32, Ints, PointCloud
+
+NORMAL_NEIGHBOURS = 30
+FEATURE_NEIGHBOURS = 100
+FEATURE_RADIUS_VOXELS = 5.0
+FEWEST_POINTS = 20
+BLOCK_ENTRIES = 4_000_000
+
+
+@dataclass(frozen=True)
+class DescribedCloud:
+    """Points (N, 3), unit normals (N, 3) and FPFH features (N, 33) of a cloud down-sampled to one scale."""
+
+    points: Floats
+    normals: Floats
+    features: Floats32
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def geometry(self) -> Any:
+        """The open3d cloud."""
+        return _geometry(self.points, self.normals)
+
+    @property
+    def open3d_features(self) -> Any:
+        """The features as open3d wants them."""
+        out = o3d.pipelines.registration.Feature()
+        out.data = np.ascontiguousarray(self.features.T, dtype=np.float64)
+        return out
+
+
+def describe(cloud: PointCloud, voxel_m: float) -> DescribedCloud:
+    """The features of a cloud at a scale of `voxel_m`; none where it has fewer than 20 points at that scale.
+
+    Normals are of 30 neighbours and turned to the cloud's origin; a feature looks at what is within 5 voxels.
+    """
+    points = np.asarray(cloud.points_in_cam, np.float64)
+    coarse = _geometry(points[np.isfinite(points).all(axis=1)], None).voxel_down_sample(voxel_m)
+    if len(coarse.points) < FEWEST_POINTS:
+        nothing = np.zeros((0, 3))
+        return DescribedCloud(nothing, nothing, np.zeros((0, 33), np.float32))
+    coarse.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
+    coarse.orient_normals_towards_camera_location(np.zeros(3))
+    search = o3d.geometry.KDTreeSearchParamHybrid(FEATURE_RADIUS_VOXELS * voxel_m, FEATURE_NEIGHBOURS)
+    features = o3d.pipelines.registration.compute_fpfh_feature(coarse, search)  # type: ignore[call-arg]
+    return DescribedCloud(
+        np.asarray(coarse.points), np.asarray(coarse.normals), np.asarray(features.data).T.astype(np.float32)
+    )
+
+
+def mutual_matches(target: DescribedCloud, source: DescribedCloud) -> Ints:
+    """Rows (M, 2) of target and source points whose features are each other's nearest, the nearest first."""
+    if not len(target) or not len(source):
+        return np.zeros((0, 2), np.int64)
+    nearest, distance = _nearest(source.features, target.features)
+    back, _ = _nearest(target.features, source.features)
+    rows = np.flatnonzero(back[nearest] == np.arange(len(source)))
+    rows = rows[np.argsort(distance[rows], kind="stable")]
+    return np.stack([nearest[rows], rows], axis=1)
+
+
+def _nearest(queries: Floats32, features: Floats32) -> tuple[Ints, Floats32]:
+    """The nearest row to each query, and the squared distance."""
+    squared = (features**2).sum(axis=1)
+    rows, least = [], []
+    step = max(1, BLOCK_ENTRIES // len(features))
+    for start in range(0, len(queries), step):
+        block = queries[start : start + step]
+        distance = squared - 2 * (block @ features.T)
+        rows.append(distance.argmin(axis=1))
+        least.append(distance.min(axis=1) + (block**2).sum(axis=1))
+    return np.concatenate(rows).astype(np.int64), np.concatenate(least)
+
+
+def _geometry(points: Floats, normals: Floats | None) -> Any:
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    if normals is not None:
+        cloud.normals = o3d.utility.Vector3dVector(normals)
+    return cloud

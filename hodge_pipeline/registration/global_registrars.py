@@ -1,0 +1,164 @@
+"""Registration of two clouds with no guess: FPFH matches, and who decides which of them are right."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.registration.consensus import rigid_consensus
+from hodge_pipeline.types import Floats, Floats32, Ints, Match, PointCloud
+
+if TYPE_CHECKING:
+    from hodge_pipeline.registration.global_features import DescribedCloud
+
+TOLERANCE_VOXELS = 1.5
+FEWEST_KISS_VOXELS = 200
+"""KISS-Matcher brings the process down where its own down-sampling leaves it too few points."""
+_VOXEL = "metres: the scale of the features. 0.05 serves rooms; about 1/60 of a scan's extent elsewhere"
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class FpfhConsensus:
+    """Mutual FPFH matches, judged by how many others keep their distances: quick, and the same every time."""
+
+    voxel_m: float = Field(default=0.05, gt=0, description=_VOXEL)
+
+    def describe(self, cloud: PointCloud) -> DescribedCloud:
+        """The features of a cloud."""
+        return _describe(cloud, self.voxel_m)
+
+    def match(self, target: DescribedCloud, source: DescribedCloud) -> Match:
+        """Where the source lies in the target."""
+        rows = _mutual_matches(target, source)
+        found = rigid_consensus(target.points[rows[:, 0]], source.points[rows[:, 1]], TOLERANCE_VOXELS * self.voxel_m)
+        return Match(found.i_from_j, found.count, len(rows))
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class FpfhRansac:
+    """open3d's RANSAC over FPFH matches, at its default settings."""
+
+    voxel_m: float = Field(default=0.05, gt=0, description=_VOXEL)
+    mutual: bool = Field(default=False, description="whether matches are each other's nearest; open3d's default is not")
+    max_iterations: int = Field(default=100_000, ge=1, description="draws at most; open3d's default")
+    seed: int = Field(default=0, ge=0, description="of the draws")
+
+    def describe(self, cloud: PointCloud) -> DescribedCloud:
+        """The features of a cloud."""
+        return _describe(cloud, self.voxel_m)
+
+    def match(self, target: DescribedCloud, source: DescribedCloud) -> Match:
+        """Where the source lies in the target."""
+        if not len(target) or not len(source):
+            return Match(np.eye(4), 0, 0)
+        from hodge_pipeline.registration.one_thread import o3d
+
+        o3d.utility.random.seed(self.seed)
+        registration = o3d.pipelines.registration
+        found = registration.registration_ransac_based_on_feature_matching(
+            source.geometry, target.geometry, source.open3d_features, target.open3d_features, self.mutual,
+            TOLERANCE_VOXELS * self.voxel_m, registration.TransformationEstimationPointToPoint(False), 3,
+            [
+                registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                registration.CorrespondenceCheckerBasedOnDistance(TOLERANCE_VOXELS * self.voxel_m),
+            ],
+            registration.RANSACConvergenceCriteria(self.max_iterations, 0.999),
+        )  # fmt: skip
+        return _from_open3d(found, len(source))
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class FpfhFgr:
+    """open3d's Fast Global Registration (Zhou et al., ECCV 2016) over FPFH matches."""
+
+    voxel_m: float = Field(default=0.05, gt=0, description=_VOXEL)
+    seed: int = Field(default=0, ge=0, description="of its tuple test")
+
+    def describe(self, cloud: PointCloud) -> DescribedCloud:
+        """The features of a cloud."""
+        return _describe(cloud, self.voxel_m)
+
+    def match(self, target: DescribedCloud, source: DescribedCloud) -> Match:
+        """Where the source lies in the target."""
+        if not len(target) or not len(source):
+            return Match(np.eye(4), 0, 0)
+        from hodge_pipeline.registration.one_thread import o3d
+
+        o3d.utility.random.seed(self.seed)
+        registration = o3d.pipelines.registration
+        option = registration.FastGlobalRegistrationOption(
+            maximum_correspondence_distance=TOLERANCE_VOXELS * self.voxel_m
+        )
+        found = registration.registration_fgr_based_on_feature_matching(
+            source.geometry, target.geometry, source.open3d_features, target.open3d_features, option
+        )
+        return _from_open3d(found, len(source))
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class KissMatcher:
+    """KISS-Matcher (Lim et al., ICRA 2025): needs the package kiss-matcher (`pip install hodge-pipeline[kiss]`)."""
+
+    voxel_m: float = Field(default=0.05, gt=0, description=_VOXEL)
+
+    def describe(self, cloud: PointCloud) -> Any:
+        """The points (N, 3) of a cloud, float32: it makes its features for each pair."""
+        _kiss_matcher()
+        points = np.asarray(cloud.points_in_cam, np.float32)
+        return np.ascontiguousarray(points[np.isfinite(points).all(axis=1)])
+
+    def match(self, target: Any, source: Any) -> Match:
+        """Where the source lies in the target."""
+        if min(_voxel_count(cloud, self.voxel_m) for cloud in (target, source)) < FEWEST_KISS_VOXELS:
+            return Match(np.eye(4), 0, 0)
+        library = _kiss_matcher()
+        matcher = library.KISSMatcher(library.KISSMatcherConfig(self.voxel_m))
+        found = matcher.estimate(source, target)
+        rotation = np.asarray(found.rotation, float)
+        motion = np.eye(4)
+        motion[:3, :3], motion[:3, 3] = rotation, np.asarray(found.translation, float).reshape(3)
+        matches = len(matcher.get_initial_correspondences())
+        if not found.valid or not se3.is_motion(motion):
+            return Match(np.eye(4), 0, matches)
+        return Match(
+            se3.from_parts(se3.project_to_so3(rotation), motion[:3, 3]), int(matcher.get_num_final_inliers()), matches
+        )
+
+
+def _voxel_count(points: Floats32, voxel_m: float) -> int:
+    return len(np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0)) if len(points) else 0
+
+
+def _kiss_matcher() -> Any:
+    try:
+        import kiss_matcher
+    except ImportError as error:
+        raise RecipeError(
+            "registrar kiss_matcher needs the package kiss-matcher: pip install kiss-matcher, or take fpfh_consensus"
+        ) from error
+    return kiss_matcher
+
+
+def _describe(cloud: PointCloud, voxel_m: float) -> DescribedCloud:
+    from hodge_pipeline.registration.global_features import describe
+
+    return describe(cloud, voxel_m)
+
+
+def _mutual_matches(target: DescribedCloud, source: DescribedCloud) -> Ints:
+    from hodge_pipeline.registration.global_features import mutual_matches
+
+    return mutual_matches(target, source)
+
+
+def _from_open3d(found: Any, matches: int) -> Match:
+    motion: Floats = np.asarray(found.transformation, float)
+    if not se3.is_motion(motion) or not len(found.correspondence_set):
+        return Match(np.eye(4), 0, matches)
+    motion = se3.from_parts(se3.project_to_so3(motion[:3, :3]), motion[:3, 3])
+    return Match(motion, len(found.correspondence_set), matches)

@@ -1,0 +1,59 @@
+"""How poses are found from nothing."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.global_registrars import FpfhConsensus
+from hodge_pipeline.stages import GlobalRegistrar, Registrar
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class HypothesisLimits:
+    """Which hypotheses become edges that the diagnosis judges; the others are counted, each with its reason."""
+
+    min_inliers: int = Field(default=15, ge=4, description="matches that agree; by chance up to about ten do")
+    min_overlap: float = Field(
+        default=0.2, ge=0, le=1, description="share of the smaller cloud with a point of the other nearby"
+    )
+    max_rmse_m: float = Field(default=0.06, gt=0, description="metres: RMS distance of those points")
+    max_violation: float = Field(
+        default=0.15,
+        ge=0,
+        le=1,
+        description="share of points in view that the other depth image saw through; right pairs have below 0.05",
+    )
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+class GlobalStart:
+    """How frames or scans in no order are joined."""
+
+    use: Literal["auto", "images", "geometry"] = Field(
+        default="auto",
+        description="what pairs are matched by; auto: images where at least half of the frames have colour and depth",
+    )
+    registrar: GlobalRegistrar = Field(default=FpfhConsensus(), description="how two clouds are matched with no guess")
+    refine: Registrar = Field(
+        default=Gicp(distances_m=(0.2, 0.1), source_points=(1000, 2000)),
+        description="how a match is refined before it is judged",
+    )
+    all_pairs_up_to: int = Field(
+        default=30, ge=0, description="frames: up to so many every pair is tried, beyond it the most similar ones"
+    )
+    similar_per_frame: int = Field(
+        default=12, ge=1, description="the most similar frames, by global descriptors, that each frame is matched with"
+    )
+    limits: HypothesisLimits = HypothesisLimits()
+    diagnosis: DiagnosisOptions = Field(
+        default=DiagnosisOptions(order_prior=False),
+        description="who judges the edges together; the order of the frames is no evidence here",
+    )
+    max_features: int = Field(default=1000, ge=50, description="SIFT features of an image")
+    words: int = Field(default=32, ge=1, description="words of the global descriptors' vocabulary")
+    seed: int = Field(default=0, ge=0, description="of the vocabulary's sample")
