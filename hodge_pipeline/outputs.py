@@ -118,6 +118,7 @@ def make_report(job: Job, source: Source, rounds: Sequence[Round], scores: Score
     worst = worst_edges(last.graph, last.world_from_cam, last.solution.weights, verdict=verdict)
     return Report(
         title=f"{source.name}",
+        before=rounds[0].name,
         source=SourceSummary(
             name=source.name,
             path=str(source.path),
@@ -158,13 +159,13 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
     last = rounds[-1]
     assert last.solution is not None
     component = last.solution.component
-    shown = {name: sets[name] for name in ("odometry", "result")}
+    shown = {name: sets[name] for name in (rounds[0].name, "result")}
     if has_truth(source):
         truth = true_poses(source)
         aligned = {name: absolute_error(poses, truth, component).aligned for name, poses in shown.items()}
         shown = {"truth": truth, **aligned}
     paths = [Path3D(name, poses[:, :3, 3]) for name, poses in shown.items()]
-    residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in ("odometry", "result"))
+    residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in (rounds[0].name, "result"))
     convergence = {
         f"round {number}": tuple(step.objective for step in one.solution.history)
         for number, one in enumerate(rounds)

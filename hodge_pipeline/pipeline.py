@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from hodge_pipeline import binding, outputs, steps
+from hodge_pipeline import binding, outputs, starting, steps
 from hodge_pipeline.edited_round import edited_rounds
 from hodge_pipeline.edits import listed_edges
 from hodge_pipeline.evaluation.contents import Report
@@ -81,11 +81,12 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
     with job.recipe.executor.open() as workers:
         clouds = steps.prepare_clouds(job, source, workers)
         recording.clouds(clouds)
-        rounds = [steps.odometry(job, source, workers)]
-        recording.odometry(rounds[0])
+        rounds = [starting.first_poses(job, source, workers)]
+        recording.first_poses(rounds[0])
         for number in range(1, job.recipe.outer_iterations + 1):
             poses = rounds[-1].world_from_cam
-            candidates = steps.propose_edges(job, number, source, clouds, poses, measured)
+            proposed = steps.propose_edges(job, number, source, clouds, poses, measured)
+            candidates = starting.with_start_edges(proposed, rounds[0])
             registered = steps.register_edges(job, number, candidates, poses, workers)
             rounds.append(steps.solve(job, number, source, candidates, registered, poses, measured))
             recording.round(number, rounds[-1])

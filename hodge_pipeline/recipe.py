@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -17,6 +18,7 @@ from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, FrameReader, Fuser, Registrar
+from hodge_pipeline.unordered.options import GlobalStart
 from hodge_pipeline.yaml_file import Document, Keys
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
@@ -52,7 +54,16 @@ class Recipe:
     seed: int = Field(default=0, ge=0, description="of everything random; the same seed gives the same poses")
     source: SourceOptions = SourceOptions()
     clouds: CloudOptions = CloudOptions()
+    start: Literal["odometry", "global"] = Field(
+        default="odometry",
+        description="where the first poses come from: consecutive frames, or `global_start` for frames in no order",
+    )
     odometry: OdometryOptions = OdometryOptions()
+    relocalise: bool = Field(
+        default=False,
+        description="join what odometry leaves apart, by `global_start`: after lost tracking, or several sequences",
+    )
+    global_start: GlobalStart = GlobalStart()
     acceptance: Acceptance = Acceptance()
     measured: MeasuredOptions = MeasuredOptions()
     outer_iterations: int = Field(

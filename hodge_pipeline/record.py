@@ -59,11 +59,11 @@ class Recording:
         """The frames' clouds."""
         self._part("clouds", ("clouds",), lambda to: to.clouds(self._source.frames, clouds))
 
-    def odometry(self, first: Round) -> None:
+    def first_poses(self, first: Round) -> None:
         """The poses that the run starts from."""
         self._rounds = [first]
         self._part(
-            "odometry", ("odometry",), lambda to: to.poses("odometry", first.world_from_cam, self._source.frames)
+            first.name, (first.name,), lambda to: to.poses(first.name, first.world_from_cam, self._source.frames)
         )
 
     def round(self, number: int, this: Round) -> None:

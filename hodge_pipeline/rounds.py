@@ -34,7 +34,8 @@ class Round:
     """One outer iteration: its edges, and the poses (N, 4, 4) that they led to. Round 0 is the odometry.
 
     `rejected_pairs (R, 2)` were registered and not accepted, for `rejected_reasons (R,)`. Only the last round has
-    `verdicts`; `disabled (E,)` are edges that a person switched off.
+    `verdicts`; `disabled (E,)` are edges that a person switched off. `name` is what round 0 is
+    called beside the others.
     """
 
     graph: ViewGraph
@@ -45,6 +46,7 @@ class Round:
     rejected_reasons: NDArray[np.str_] = field(default_factory=_no_reasons)
     verdicts: Verdicts | None = None
     disabled: Bools | None = None
+    name: str = "odometry"
 
     @property
     def rejected_counts(self) -> Mapping[str, int]:
@@ -53,8 +55,8 @@ class Round:
 
 
 def pose_sets(rounds: Sequence[Round]) -> dict[str, Floats]:
-    """The poses by name: odometry, round 1, …, result."""
-    names = ["odometry", *(f"round {number}" for number in range(1, len(rounds) - 1)), "result"]
+    """The poses by name: odometry (or start), round 1, …, result."""
+    names = [rounds[0].name, *(f"round {number}" for number in range(1, len(rounds) - 1)), "result"]
     return {name: one.world_from_cam for name, one in zip(names, rounds, strict=True)}
 
 

@@ -70,7 +70,7 @@ def propose_edges(
 ) -> Candidates:
     """The pairs to register in round `number`, from the poses so far; measured ones are not registered again."""
     name = f"edges-{number}"
-    before = "odometry" if number == 1 else f"solve-{number - 1}"
+    before = _first_stage(job) if number == 1 else f"solve-{number - 1}"
     inputs = ("clouds", "measured", before)
     with job.stage(name, f"edges, round {number}", 1, job.recipe.edges, inputs) as (folder, advance):
         if not folder.finished:
@@ -78,6 +78,11 @@ def propose_edges(
             artifacts.save(folder.path / "candidates.npz", without_measured(candidates, measured))
             advance(1)
     return artifacts.load(job.path(name) / "candidates.npz", Candidates)
+
+
+def _first_stage(job: Job) -> str:
+    """The stage that the first poses come from."""
+    return "start" if "start" in job.keys else "odometry"
 
 
 def odometry(job: Job, source: Source, workers: Workers) -> Round:
@@ -207,7 +212,7 @@ def evaluate(job: Job, source: Source, rounds: Sequence[Round], workers: Workers
     truth, sets = true_poses(source), pose_sets(rounds)
     reference = "truth" if has_truth(source) else "result"
     sets = {"truth": truth, **sets} if has_truth(source) else sets
-    inputs = ("clouds", "odometry", *(f"solve-{number}" for number in range(1, len(rounds))))
+    inputs = ("clouds", _first_stage(job), *(f"solve-{number}" for number in range(1, len(rounds))))
     with job.stage("evaluate", "evaluation", 1, job.recipe.evaluation, inputs) as (folder, advance):
         if not folder.finished:
             table = score_table(job.path("clouds"), sets, reference, workers)

@@ -10,7 +10,7 @@ from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.eye import Eye
 
 BACKGROUND = (24, 26, 32)
-COLOUR_NAMES = {"truth": "green", "odometry": "orange"}
+COLOUR_NAMES = {"truth": "green", "odometry": "orange", "start": "orange"}
 
 
 @dataclass(frozen=True)

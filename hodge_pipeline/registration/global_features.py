@@ -15,6 +15,12 @@ FEATURE_NEIGHBOURS = 100
 FEATURE_RADIUS_VOXELS = 5.0
 FEWEST_POINTS = 20
 BLOCK_ENTRIES = 4_000_000
+DIRECTION_STEP = 0.06
+"""Side of a cell of directions, radians."""
+DEEPER = 1.3
+"""What lies further behind the nearest point of its cell is hidden; a slanted surface is not."""
+SEEN_FROM_ORIGIN = 0.75
+FAR_RADII = 3.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,8 @@ class DescribedCloud:
 def describe(cloud: PointCloud, voxel_m: float) -> DescribedCloud:
     """The features of a cloud at a scale of `voxel_m`; none where it has fewer than 20 points at that scale.
 
-    Normals are of 30 neighbours and turned to the cloud's origin; a feature looks at what is within 5 voxels.
+    Normals are of 30 neighbours and turned to the `viewpoint`, since features know one side from the other; a feature
+    looks at what is within 5 voxels.
     """
     points = np.asarray(cloud.points_in_cam, np.float64)
     coarse = _geometry(points[np.isfinite(points).all(axis=1)], None).voxel_down_sample(voxel_m)
@@ -52,12 +59,29 @@ def describe(cloud: PointCloud, voxel_m: float) -> DescribedCloud:
         nothing = np.zeros((0, 3))
         return DescribedCloud(nothing, nothing, np.zeros((0, 33), np.float32))
     coarse.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
-    coarse.orient_normals_towards_camera_location(np.zeros(3))
+    coarse.orient_normals_towards_camera_location(viewpoint(np.asarray(coarse.points)))
     search = o3d.geometry.KDTreeSearchParamHybrid(FEATURE_RADIUS_VOXELS * voxel_m, FEATURE_NEIGHBOURS)
     features = o3d.pipelines.registration.compute_fpfh_feature(coarse, search)  # type: ignore[call-arg]
     return DescribedCloud(
         np.asarray(coarse.points), np.asarray(coarse.normals), np.asarray(features.data).T.astype(np.float32)
     )
+
+
+def viewpoint(points: Floats) -> Floats:
+    """Where a cloud (N, 3) was seen from: its origin where little hides behind something else there, else its middle.
+
+    The middle as well where the origin is far away, as in map coordinates.
+    """
+    middle = points.mean(axis=0)
+    if np.linalg.norm(middle) > FAR_RADII * np.sqrt(((points - middle) ** 2).sum(axis=1).mean()):
+        return np.asarray(middle)
+    ranges = np.linalg.norm(points, axis=1)
+    directions = points / np.maximum(ranges, 1e-9)[:, None]
+    _, cell = np.unique(np.floor(directions / DIRECTION_STEP).astype(np.int64), axis=0, return_inverse=True)
+    nearest = np.full(int(cell.max()) + 1, np.inf)
+    np.minimum.at(nearest, cell.reshape(-1), ranges)
+    seen = ranges <= nearest[cell.reshape(-1)] * DEEPER
+    return np.zeros(3) if seen.mean() >= SEEN_FROM_ORIGIN else np.asarray(middle)
 
 
 def mutual_matches(target: DescribedCloud, source: DescribedCloud) -> Ints:

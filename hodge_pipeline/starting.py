@@ -1,0 +1,63 @@
+"""The first poses of a run: from consecutive frames (odometry), from nothing, or odometry's pieces joined."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+
+from hodge_pipeline import artifacts, steps
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.edges.pairs import labelled, merge
+from hodge_pipeline.job import Job
+from hodge_pipeline.rounds import Round
+from hodge_pipeline.stages import Workers
+from hodge_pipeline.types import Candidates, Source, ViewGraph
+from hodge_pipeline.unordered.start import Scene, find_start
+
+START = "start"
+
+
+def first_poses(job: Job, source: Source, workers: Workers) -> Round:
+    """Round 0: what the recipe's `start` and `relocalise` ask for."""
+    if job.recipe.start == "global":
+        return _global_start(job, source, None, ("clouds", "source"), workers)
+    first = steps.odometry(job, source, workers)
+    if not job.recipe.relocalise:
+        return first
+    return _global_start(job, source, first.graph, ("odometry", "source"), workers)
+
+
+def _global_start(
+    job: Job, source: Source, given: ViewGraph | None, inputs: tuple[str, ...], workers: Workers
+) -> Round:
+    options, total = job.recipe.global_start, 2 * len(source.frames)
+    with job.stage(START, "start without a guess", total, options, inputs) as (folder, advance):
+        if not folder.finished:
+            scene = Scene(source.frames, job.path("clouds"), steps.vertex_ids(source), given)
+            scratch = folder.path / "scratch"
+            found = find_start(scene, options, scratch, workers, advance)
+            shutil.rmtree(scratch, ignore_errors=True)
+            artifacts.save(folder.path / "graph.npz", found.graph)
+            artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": found.world_from_cam})
+            for note in found.notes:
+                job.note(note)
+    graph = artifacts.load(job.path(START) / "graph.npz", ViewGraph)
+    poses = artifacts.load_arrays(job.path(START) / "poses.npz")["world_from_cam"]
+    return Round(graph, poses, name=START)
+
+
+def with_start_edges(candidates: Candidates, first: Round) -> Candidates:
+    """The candidates, and those edges of the start that join what the candidates leave apart.
+
+    Consecutive frames join nothing here: across a gap they have nothing in common.
+    """
+    if first.name != START:
+        return candidates
+    proven = candidates.pairs[candidates.source != "sequential"]
+    component = connected_components(proven, first.graph.vertex_count)
+    joining = component[first.graph.edges[:, 0]] != component[first.graph.edges[:, 1]]
+    if not joining.any():
+        return candidates
+    pairs = np.unique(np.sort(first.graph.edges[joining], axis=1), axis=0)
+    return merge([candidates, labelled(pairs, START)])[0]

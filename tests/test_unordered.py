@@ -1,0 +1,122 @@
+"""A start from nothing: pieces joined where the evidence joins them, left apart and said where it does not."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.executors.local import LocalExecutor
+from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
+from hodge_pipeline.stages import no_progress
+from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud
+from hodge_pipeline.unordered.options import GlobalStart
+from hodge_pipeline.unordered.pieces import laid_apart
+from hodge_pipeline.unordered.scan_checks import check_scans, unregistrable
+from hodge_pipeline.unordered.start import Scene, Start, find_start
+from test_global_registration import furnished_corner
+
+OPTIONS = CloudOptions(voxel_m=0.05, min_range_m=0.0, max_range_m=100.0)
+
+
+def read(points: Floats) -> PointCloud:
+    return PointCloud(points.astype(np.float32))
+
+
+def scan(name: int, points: Floats) -> Frame:
+    return Frame(name, float(name), read_points=partial(read, points))
+
+
+def started(folder: Path, frames: list[Frame]) -> Start:
+    clouds = folder / "clouds"
+    clouds.mkdir()
+    CloudSet.from_clouds([make_cloud(frame, OPTIONS)[0] for frame in frames]).save(clouds)
+    scene = Scene(frames, clouds, np.array([frame.frame_id for frame in frames]))
+    with LocalExecutor(workers=0).open() as workers:
+        return find_start(scene, GlobalStart(use="geometry"), folder / "scratch", workers, no_progress)
+
+
+def seen_from(pose: Floats, points: Floats) -> Floats:
+    return se3.transform(se3.inverse(pose), points)
+
+
+POSES = se3.exp(
+    np.array([[0.1, 0.2, 0.1, 1.0, 1.0, 1.0], [0.5, -0.7, 1.9, 1.2, 0.8, 1.1], [-0.5, 0.3, -1.2, 0.9, 1.2, 0.9]])
+)
+
+
+def test_scans_of_one_place_are_joined_and_a_stranger_and_a_wall_are_left_apart(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    stranger = rng.uniform(-1, 1, (6, 1, 3)) + 0.25 * unit(rng.normal(size=(6, 3000, 3)))
+    wall = rng.uniform(-1, 1, (20_000, 3)) * [1.5, 1.0, 0.002] + [0, 0, 2.0]
+    frames = [scan(k, seen_from(pose, furnished_corner(k))) for k, pose in enumerate(POSES)]
+    found = started(tmp_path, [*frames, scan(3, stranger.reshape(-1, 3)), scan(4, wall)])
+    assert found.piece.tolist()[:3] == [0, 0, 0]
+    assert len(set(found.piece.tolist())) == 3
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        error = se3.log(
+            se3.inverse(se3.inverse(POSES[i]) @ POSES[j])
+            @ se3.inverse(found.world_from_cam[i])
+            @ found.world_from_cam[j]
+        )
+        assert np.abs(error).max() < 0.02
+    said = "\n".join(found.notes)
+    assert "scan 4: cannot be registered by its shape: its surfaces leave open" in said
+    assert "falls into 3 pieces" in said
+
+
+def unit(vectors: Floats) -> Floats:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def cloud(points: Floats) -> PointCloud:
+    return make_cloud(scan(0, points), OPTIONS)[0]
+
+
+def test_a_plane_names_its_free_directions() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)) * [1.5, 1.0, 0.005] + [0, 0, 2.0]
+    reason = unregistrable(cloud(points))
+    assert reason.count("sliding along") == 2 and "turning about (0.00, -0.00, 1.00)".replace("-", "") in reason
+
+
+def test_a_blob_and_five_points_are_said_to_be_so() -> None:
+    rng = np.random.default_rng(0)
+    assert "no surface" in unregistrable(cloud(rng.normal(size=(40_000, 3)) * 0.3))
+    assert "only 5 points" in unregistrable(cloud(rng.normal(size=(5, 3))))
+    assert unregistrable(cloud(furnished_corner(0))) == ""
+
+
+def test_copies_and_other_units_are_noticed() -> None:
+    corner = furnished_corner(0)
+    clouds = CloudSet.from_clouds([read(corner), read(corner), read(furnished_corner(1)), read(1000 * corner)])
+    notes = check_scans(clouds, np.array([7, 8, 9, 10]))
+    assert any("scan 8: holds the same points as scan 7" in note for note in notes)
+    assert any("scan 10: spans 2e+03 m" in note and "units_per_metre" in note for note in notes)
+
+
+def test_pieces_lie_beside_each_other() -> None:
+    clouds = CloudSet.from_clouds([read(furnished_corner(k)) for k in range(3)])
+    poses = laid_apart(np.array([0, 1, 0]), POSES, clouds)
+    relative = se3.inverse(poses[0]) @ poses[2]
+    assert np.allclose(relative, se3.inverse(POSES[0]) @ POSES[2])
+    assert poses[1, 0, 3] - max(poses[0, 0, 3], poses[2, 0, 3]) > 20
+
+
+def test_six_real_fragments_in_no_order(data_dir: Path, tmp_path: Path) -> None:
+    from hodge_adapters.clouds import CloudFolderReader
+    from hodge_adapters.log_text import read_log_file
+
+    fragments = data_dir / "fragments"
+    frames = CloudFolderReader(log="").open(fragments / "redkitchen_3dmatch").frames
+    order = [3, 5, 0, 2, 4, 1]
+    found = started(tmp_path, [frames[k] for k in order])
+    truth = read_log_file(fragments / "pair_estimates/7-scenes-redkitchen-evaluation/gt.log")
+    poses = dict(zip(order, found.world_from_cam, strict=True))
+    assert (found.piece == 0).all()
+    for (i, j), wanted in zip(truth.pairs.tolist(), truth.i_from_j, strict=True):
+        if i in poses and j in poses:
+            error = se3.inverse(wanted) @ se3.inverse(poses[i]) @ poses[j]
+            assert np.linalg.norm(error[:3, 3]) < 0.07
+            assert np.degrees(np.linalg.norm(se3.so3_log(error[:3, :3]))) < 2.2
