@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -162,16 +162,3 @@ def _with_unworthy(
         free=column(free, ""),  # type: ignore[arg-type]
         reason=column(reason, "too few matches agree"),  # type: ignore[arg-type]
     )
-
-
-def no_views(row: int) -> DepthView | None:
-    """Where frames have no depth images."""
-    return None
-
-
-def listed_reasons(hypotheses: Sequence[Hypotheses]) -> str:
-    """How many were refused and why, in words."""
-    total: Counter[str] = Counter()
-    for one in hypotheses:
-        total.update(one.counts)
-    return ", ".join(f"{count} {reason}" for reason, count in total.most_common())

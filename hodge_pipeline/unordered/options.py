@@ -9,6 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.global_landmarks import LandmarkConsensus
 from hodge_pipeline.registration.global_registrars import FpfhConsensus
 from hodge_pipeline.stages import GlobalRegistrar, Registrar
 
@@ -36,9 +37,10 @@ class GlobalStart:
 
     use: Literal["auto", "images", "geometry"] = Field(
         default="auto",
-        description="what pairs are matched by; auto: images where at least half of the frames have colour and depth",
+        description="what pairs are matched by; auto: images where at least half of the clouds have landmarks",
     )
-    registrar: GlobalRegistrar = Field(default=FpfhConsensus(), description="how two clouds are matched with no guess")
+    registrar: GlobalRegistrar = Field(default=FpfhConsensus(), description="how two clouds are matched by geometry")
+    images: GlobalRegistrar = Field(default=LandmarkConsensus(), description="how two frames are matched by image")
     refine: Registrar = Field(
         default=Gicp(distances_m=(0.2, 0.1), source_points=(1000, 2000)),
         description="how a match is refined before it is judged",
@@ -54,6 +56,5 @@ class GlobalStart:
         default=DiagnosisOptions(order_prior=False),
         description="who judges the edges together; the order of the frames is no evidence here",
     )
-    max_features: int = Field(default=1000, ge=50, description="SIFT features of an image")
     words: int = Field(default=32, ge=1, description="words of the global descriptors' vocabulary")
     seed: int = Field(default=0, ge=0, description="of the vocabulary's sample")

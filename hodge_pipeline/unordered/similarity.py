@@ -8,9 +8,9 @@ import numpy as np
 
 from hodge_pipeline.edges.sift_similarity import global_descriptors, most_similar, vocabulary
 from hodge_pipeline.registration.global_features import DescribedCloud, describe
+from hodge_pipeline.registration.global_landmarks import DescribedImage
 from hodge_pipeline.registration.global_pairs import load_description
 from hodge_pipeline.types import CloudSet, Floats32, Ints
-from hodge_pipeline.unordered.image_matches import ImageDescription
 
 
 class LocalDescriptors:
@@ -22,7 +22,7 @@ class LocalDescriptors:
     def descriptors(self, row: int) -> Floats32:
         """Descriptors (n, D) of one frame."""
         found = load_description(self._described, row)
-        if isinstance(found, ImageDescription):
+        if isinstance(found, DescribedImage):
             return found.descriptors
         if not isinstance(found, DescribedCloud):  # another registrar's own: geometry is compared by FPFH all the same
             found = describe(self._clouds[row], self._voxel_m)
