@@ -53,7 +53,7 @@ class GlobalStart:
     )
     limits: HypothesisLimits = HypothesisLimits()
     diagnosis: DiagnosisOptions = Field(
-        default=DiagnosisOptions(order_prior=False),
+        default=DiagnosisOptions(order_prior=False, every_pair_tried=False),
         description="who judges the edges together; the order of the frames is no evidence here",
     )
     words: int = Field(default=32, ge=1, description="words of the global descriptors' vocabulary")
