@@ -24,6 +24,7 @@ Examples:
   hodge view runs/kitchen                        open the recording in Rerun
   hodge solve graph.g2o --out solved.g2o         any pose graph, or a run folder
   hodge solve graph.g2o --certificate --disable 12-87
+  hodge diagnose runs/kitchen --out why          which edge is wrong?
   hodge edit runs/kitchen --disable 12-87        take an edge out of a run,
   hodge solve runs/kitchen                       and solve and fuse it again
   hodge refine trajectory poses.txt --frames DIR --out runs/better
@@ -111,6 +112,23 @@ def solve(
         sesync_units=sesync_units,
     )
     solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json)
+
+
+@app.command()
+def diagnose(
+    path: Annotated[Path, typer.Argument(help="A finished run, or a pose graph (g2o, TORO, Open3D, pair .log).")],
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--out", help="Folder for edges.csv, poses.tum, diagnosis.html and diagnosis.rrd."),
+    ] = None,
+    top: Annotated[int, typer.Option(min=0, help="Edges to print.")] = 20,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Say which edges are wrong, why, and what to do: by the cycles that they lie in, before any solve."""
+    from hodge_pipeline.cli import diagnosing
+
+    diagnosing.diagnose(path, out, top=top, quiet=quiet, as_json=json)
 
 
 @app.command()

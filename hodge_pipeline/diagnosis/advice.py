@@ -15,7 +15,7 @@ def ranked(diagnosis: Diagnosis) -> Ints:
     """Rows of all edges, the worst first: wrong, suspect, untestable, consistent; in each the least probable."""
     place = np.array([ORDER.index(str(verdict)) for verdict in diagnosis.verdict], np.int64)
     known = np.nan_to_num(diagnosis.probability, nan=0.5)
-    return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), known.round(2), place))
+    return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), known.round(1), place))
 
 
 def advice(diagnosis: Diagnosis, disabled: Bools) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hodge_pipeline.descriptors import match
+from hodge_pipeline.descriptors import match, root_sift
 from hodge_pipeline.edges.sift_matching import CONFIDENCE, MOST_RANSAC_STEPS
 from hodge_pipeline.types import Bytes, Floats32, Ints
 
@@ -52,14 +52,12 @@ def _scaled(image: Bytes) -> Bytes:
 
 
 def _features(image: Bytes) -> tuple[Floats32, Floats32]:
-    """Pixels (n, 2) and unit RootSIFT descriptors (n, 128) (Arandjelović and Zisserman 2012)."""
+    """Pixels (n, 2) and unit descriptors (n, 128)."""
     detector = cv2.SIFT_create(nfeatures=MAX_FEATURES)  # type: ignore[attr-defined]
     points, descriptors = detector.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     if not points:
         return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
-    raw = np.asarray(descriptors, np.float32)
-    root = np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1.0))
-    return np.array([point.pt for point in points], np.float32), root
+    return np.array([point.pt for point in points], np.float32), root_sift(descriptors.astype(np.uint8))
 
 
 def _agreeing(first: Floats32, second: Floats32, pairs: Ints) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 
 from hodge_pipeline.diagnosis.energy_tables import PARTS, EnergyRow
@@ -22,6 +22,7 @@ MARKERS = {CONSISTENT: "s", UNTESTABLE: "D", SUSPECT: "^", WRONG: "X"}
 PART_COLOURS = ("#56b4e9", "#e69f00", "#444444")
 DOTS_PER_INCH = 140
 GAP_SHARE = 0.25
+FEW = 15
 
 
 def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> tuple[Plot, ...]:
@@ -68,7 +69,7 @@ def _matrix(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
     size = float(np.clip(60_000 / graph.vertex_count**2, 0.5, 30))
     for name in (CONSISTENT, UNTESTABLE, SUSPECT, WRONG):
         rows = np.flatnonzero(diagnosis.verdict == name)
-        larger = size if name == CONSISTENT else 3 * size
+        larger = size if name == CONSISTENT else size * (1 + 2 * _rarity(len(rows)))
         label = f"{len(rows)} {name}"
         axes.scatter(high[rows], low[rows], s=larger, c=COLOURS[name], marker=MARKERS[name], linewidths=0, label=label)
     known = np.flatnonzero(np.isfinite(diagnosis.probability))
@@ -81,13 +82,14 @@ def _matrix(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
     axes.set_ylim(graph.vertex_count - 0.5, -0.5)
     axes.set_aspect("equal")
     axes.set_xlabel("frame (row)")
-    _legend(axes)
+    _legend(figure, axes)
 
 
-def _legend(axes: Any) -> None:
-    handles = axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.16), ncols=4)
-    for handle in handles.legend_handles:
-        if hasattr(handle, "set_sizes"):
+def _legend(figure: Figure, axes: Any) -> None:
+    drawn, labels = axes.get_legend_handles_labels()
+    legend = figure.legend(drawn, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=8)
+    for handle in legend.legend_handles:
+        if isinstance(handle, PathCollection):
             handle.set_sizes([25.0])
 
 
@@ -96,7 +98,7 @@ def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
     places = flat(side_by_side(diagnosis.world_from_cam, diagnosis.piece)[:, :3, 3])
     for name in (CONSISTENT, UNTESTABLE, SUSPECT, WRONG):
         rows = np.flatnonzero(diagnosis.verdict == name)
-        thick = 0.5 if name == CONSISTENT else 1.6
+        thick = 0.4 if name == CONSISTENT else 0.4 + 1.2 * _rarity(len(rows))
         style = {CONSISTENT: "-", UNTESTABLE: ":", SUSPECT: "--", WRONG: "-"}[name]
         lines = LineCollection(
             list(places[graph.edges[rows]]), colors=COLOURS[name], linewidths=thick, linestyles=style, label=name
@@ -106,7 +108,12 @@ def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.autoscale_view()
     axes.set_xlabel("m")
-    _legend(axes)
+    _legend(figure, axes)
+
+
+def _rarity(count: int) -> float:
+    """1 for a few edges, towards 0 for very many: what is rare is drawn large."""
+    return min(1.0, FEW / max(count, 1))
 
 
 def side_by_side(world_from_cam: Floats, piece: Ints) -> Floats:

@@ -46,7 +46,7 @@ def reasons(
             witness = int(witnesses[0 if good else 1][edge, 0])
             text = f"{closed[edge]} of {passing[edge]} cycles close"
             if witness >= 0:
-                text += f"; {name_cycle(graph, cycles, witness)} {_error(cycles, witness)}"
+                text += f"; {name_cycle(graph, cycles, witness)} {cycle_error(cycles, witness)}"
             lines.append(f"{text}; {_distance(residual[0][edge], residual[1][edge])}")
     return tuple(lines)
 
@@ -54,12 +54,13 @@ def reasons(
 def _undecided(graph: ViewGraph, cycles: Cycles, row: int) -> str:
     length = int(cycles.loops.lengths[row])
     return (
-        f"the loop {name_cycle(graph, cycles, row)} {_error(cycles, row)}: one of its {length} edges is wrong, and no "
-        "other cycle says which"
+        f"the loop {name_cycle(graph, cycles, row)} {cycle_error(cycles, row)}: one of its {length} edges is wrong, "
+        "and no other cycle says which"
     )
 
 
-def _error(cycles: Cycles, row: int) -> str:
+def cycle_error(cycles: Cycles, row: int) -> str:
+    """Whether a cycle closes, and by how much it does not, in words."""
     verb = "closes to" if cycles.closes[row] else "fails by"
     return f"{verb} {cycles.displacement_m[row]:.3g} m, {np.degrees(cycles.angle_rad[row]):.2g}°"
 

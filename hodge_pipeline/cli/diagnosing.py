@@ -1,0 +1,107 @@
+"""`hodge diagnose`: which edge of a run or a pose graph is wrong, why, and what to do about it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hodge_pipeline.cli.console import Terminal
+
+if TYPE_CHECKING:
+    from hodge_pipeline.diagnose_path import Diagnosed
+
+HEADER = ("edge", "verdict", "right", "why", "what to do")
+
+
+def diagnose(path: Path, out: Path | None, *, top: int, quiet: bool, as_json: bool) -> None:
+    """Judge every edge, print the worst, and leave the rest in a folder where one is given."""
+    from hodge_pipeline.diagnose_path import diagnose_subject, open_subject, write_diagnosed
+
+    with Terminal(quiet or as_json) as terminal:
+        with terminal.stage("diagnosis", 1):
+            found = diagnose_subject(open_subject(path))
+        if out is not None:
+            with terminal.stage("pictures and recording", 1):
+                write_diagnosed(out, found)
+    if as_json:
+        from hodge_pipeline.artifacts import json_text
+
+        print(json_text(_as_json(found, out)), end="")
+    elif not quiet:
+        _print(found, out, top)
+
+
+def _print(found: Diagnosed, out: Path | None, top: int) -> None:
+    from hodge_pipeline.diagnosis.page import sentence
+
+    rows = [_cells(found, int(row)) for row in found.rows[:top]]
+    if sys.stdout.isatty():
+        _print_rich(rows)
+    else:
+        widths = [max((len(cells[column]) for cells in rows), default=0) for column in range(3)]
+        for cells in rows:
+            first = "  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=False))
+            print(f"{first}  {cells[3]}  -> {cells[4]}")
+    left = found.subject.graph.edge_count - len(rows)
+    if left > 0:
+        print(f"… and {left} more edges, none of them worse" + ("" if out is None else f": {out / 'edges.csv'}"))
+    print(f"verdict  {sentence(found.subject.graph, found.diagnosis)}")
+    for note in found.notes:
+        print(f"note     {note}")
+    for command in found.commands:
+        print(f"next     {command}")
+    if out is not None:
+        print(f"report   {out / 'diagnosis.html'}")
+
+
+def _cells(found: Diagnosed, row: int) -> tuple[str, ...]:
+    graph, diagnosis = found.subject.graph, found.diagnosis
+    i, j = graph.vertex_ids[graph.edges[row]]
+    probability = diagnosis.probability[row]
+    right = "-" if probability != probability else f"{probability:.2f}"
+    return f"{i}-{j}", str(diagnosis.verdict[row]), right, diagnosis.reason[row], found.advice[row]
+
+
+def _print_rich(rows: list[tuple[str, ...]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    styles = {"wrong": "bold magenta", "suspect": "yellow", "untestable": "dim", "consistent": "blue"}
+    table = Table(title="Edges, the worst first", title_justify="left")
+    for name in HEADER:
+        table.add_column(name, justify="right" if name == "right" else "left", overflow="fold")
+    for cells in rows:
+        table.add_row(*cells, style=styles.get(cells[1], ""))
+    Console(highlight=False).print(table)
+
+
+def _as_json(found: Diagnosed, out: Path | None) -> dict[str, Any]:
+    graph, diagnosis = found.subject.graph, found.diagnosis
+    counts = {name: int((diagnosis.verdict == name).sum()) for name in ("consistent", "suspect", "wrong", "untestable")}
+    edges = [
+        {
+            "i": graph.vertex_ids[graph.edges[row, 0]],
+            "j": graph.vertex_ids[graph.edges[row, 1]],
+            "verdict": str(diagnosis.verdict[row]),
+            "probability": diagnosis.probability[row],
+            "why": diagnosis.reason[row],
+            "what_to_do": found.advice[row],
+            "source": str(graph.source[row]),
+            "residual_m": diagnosis.residual_m[row],
+            "residual_deg": diagnosis.residual_deg[row],
+            "leverage": diagnosis.leverage[row],
+        }
+        for row in map(int, found.rows)
+    ]
+    return {
+        "source": str(found.subject.path),
+        "out": None if out is None else str(out),
+        "vertices": graph.vertex_count,
+        "pieces": int(diagnosis.piece.max(initial=-1)) + 1,
+        "counts": counts,
+        "energy": diagnosis.energy,
+        "commands": list(found.commands),
+        "notes": list(found.notes),
+        "edges": edges,
+    }

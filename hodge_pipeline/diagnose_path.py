@@ -1,0 +1,178 @@
+"""A run or a pose-graph file diagnosed: what is judged, and what is left of it in a folder."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import artifacts, registry
+from hodge_pipeline.diagnosis.advice import advice, ranked
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.edges_csv import write_edges_csv
+from hodge_pipeline.diagnosis.energy_tables import energy_rows
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.page import PageContents, render
+from hodge_pipeline.diagnosis.plots import draw, side_by_side
+from hodge_pipeline.diagnosis.result import WRONG, Diagnosis
+from hodge_pipeline.edge_pictures import edge_pictures
+from hodge_pipeline.edits import joining, read_history
+from hodge_pipeline.errors import HodgeError, WorkspaceError
+from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.recipe import Recipe, load_recipe
+from hodge_pipeline.solve_file import read_graph
+from hodge_pipeline.types import Bools, CloudSet, Frame, Source, Trajectory, ViewGraph
+from hodge_pipeline.workspace import RECIPE_FILE
+
+PICTURED = 6
+COMMANDED = 20
+"""Edges at most that a command to type names: more of them are a case for a robust solver."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A graph to judge. A run also has its frames and clouds; `disabled (E,)` edges are off by hand."""
+
+    path: Path
+    name: str
+    graph: ViewGraph
+    disabled: Bools
+    is_run: bool = False
+    options: DiagnosisOptions = field(default_factory=DiagnosisOptions)
+    frames: Sequence[Frame] = ()
+    clouds: CloudSet | None = None
+    notes: tuple[str, ...] = ()
+
+
+def open_subject(path: Path) -> Subject:
+    """The graph of a run's last round, or of a file that a reader knows. Raises `HodgeError` where there is none."""
+    stage = path / "stages" / "diagnose"
+    if (stage / "graph.npz").is_file():
+        return _run_subject(path, artifacts.load(stage / "graph.npz", ViewGraph))
+    if (path / RECIPE_FILE).is_file():
+        raise WorkspaceError(
+            f"{path}: this run is not finished: run the same command again, it goes on where it stopped"
+        )
+    source = read_graph(path)
+    assert source.graph is not None
+    name = path.stem if path.is_file() else path.name
+    return Subject(path, name, source.graph, _disabled(path, source.graph), notes=source.notes)
+
+
+def _run_subject(path: Path, graph: ViewGraph) -> Subject:
+    recipe = load_recipe(str(path / RECIPE_FILE))
+    frames, notes = _frames(recipe)
+    clouds = path / "stages" / "clouds"
+    return Subject(
+        path,
+        path.resolve().name,
+        graph,
+        _disabled(path, graph),
+        is_run=True,
+        options=recipe.diagnosis,
+        frames=frames if len(frames) == graph.vertex_count else (),
+        clouds=CloudSet.open(clouds) if (clouds / "offsets.npy").is_file() else None,
+        notes=notes,
+    )
+
+
+def _frames(recipe: Recipe) -> tuple[Sequence[Frame], tuple[str, ...]]:
+    """The frames, for their images alone: a run can be diagnosed when its source has gone."""
+    if recipe.source.path is None:
+        return (), ()
+    try:
+        return (recipe.source.reader or guess_reader(recipe.source.path)).open(recipe.source.path).frames, ()
+    except (HodgeError, OSError) as error:
+        return (), (f"without colour images: {error}",)
+
+
+def _disabled(path: Path, graph: ViewGraph) -> Bools:
+    found = np.zeros(graph.edge_count, bool)
+    for pair in read_history(path).disabled if path.is_dir() else ():
+        found |= joining(graph, pair)
+    return found
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """A subject with its diagnosis, the advice (E,) on each edge, and the commands to type next."""
+
+    subject: Subject
+    diagnosis: Diagnosis
+    advice: tuple[str, ...]
+    commands: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def rows(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+        """The edges, the worst first."""
+        return ranked(self.diagnosis)
+
+
+def diagnose_subject(subject: Subject) -> Diagnosed:
+    """The verdicts, and what follows from them."""
+    found = diagnose(subject.graph, subject.options)
+    pieces = int(found.piece.max(initial=-1)) + 1
+    apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
+    notes = (*subject.notes, *found.notes, *((apart,) if pieces > 1 else ()))
+    return Diagnosed(subject, found, advice(found, subject.disabled), _commands(subject, found), notes)
+
+
+def _commands(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
+    rows = [int(row) for row in ranked(found) if found.verdict[row] == WRONG and not subject.disabled[row]]
+    if not rows:
+        return ()
+    if len(rows) > COMMANDED:
+        return (f"{len(rows)} edges are wrong: edges.csv lists them, poses.tum holds the poses without them",)
+    pairs = ["{}-{}".format(*subject.graph.vertex_ids[subject.graph.edges[row]]) for row in rows]
+    if subject.is_run:
+        return f"hodge edit {subject.path} --disable {','.join(pairs)}", f"hodge solve {subject.path}"
+    return (f"hodge solve {subject.path} --out solved.g2o " + " ".join(f"--disable {pair}" for pair in pairs),)
+
+
+def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:
+    """`edges.csv`, `poses.tum`, `diagnosis.html` and `diagnosis.rrd` in a folder, made if it is not there."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WorkspaceError(f"{out}: cannot be written ({error.strerror}): give another --out") from error
+    subject, found = diagnosed.subject, diagnosed.diagnosis
+    write_edges_csv(out / "edges.csv", subject.graph, found)
+    _write_poses(out / "poses.tum", subject, found)
+    artifacts.write_text(out / "diagnosis.html", render(_page(diagnosed)))
+    if recording:
+        from hodge_pipeline.recording.diagnosis_file import write_diagnosis
+
+        identity = hashlib.sha256(np.ascontiguousarray(found.world_from_cam).tobytes()).hexdigest()[:32]
+        placed = side_by_side(found.world_from_cam, found.piece)
+        write_diagnosis(out / "diagnosis.rrd", identity, subject.graph, placed, found)
+
+
+def _write_poses(path: Path, subject: Subject, found: Diagnosis) -> None:
+    """The robust poses, the stamp of each the number of its vertex, or its row where vertices have names."""
+    ids = subject.graph.vertex_ids
+    numbers = ids.astype(float) if ids.dtype.kind in "iu" else np.arange(len(ids), dtype=float)
+    order = np.argsort(numbers, kind="stable")
+    trajectory = Trajectory(numbers[order], found.world_from_cam[order])
+    registry.load("writers", "tum")().write(path, Source(subject.name, subject.path, trajectory=trajectory))
+
+
+def _page(diagnosed: Diagnosed) -> PageContents:
+    subject, found = diagnosed.subject, diagnosed.diagnosis
+    energy, complaints = energy_rows(subject.graph, found)
+    pictures = edge_pictures(subject.graph, found, diagnosed.rows[:PICTURED], subject.frames, subject.clouds)
+    return PageContents(
+        title=subject.name,
+        path=str(subject.path),
+        graph=subject.graph,
+        diagnosis=found,
+        advice=diagnosed.advice,
+        energy=energy,
+        plots=draw(subject.graph, found, energy),
+        edges=pictures,
+        commands=diagnosed.commands,
+        notes=(*diagnosed.notes, *complaints),
+    )

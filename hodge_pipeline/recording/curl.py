@@ -1,0 +1,92 @@
+"""Triangles of the viewing graph coloured by their curl, and the loops that no triangles fill, drawn as loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.cycles import Loops, loop_products
+from hodge_pipeline.complex.holes import unfilled_loops
+from hodge_pipeline.diagnosis.result import Cycles
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording.stream import log_notes
+from hodge_pipeline.types import Floats, Ints, ViewGraph
+
+MOST_TRIANGLES, MOST_LOOPS = 20_000, 200
+OPEN_CHI = 30.0**0.5
+"""Of the curl: a cycle whose χ² exceeds its square does not close; the colours end there."""
+LOOP_RADIUS = -2.2
+ALPHA = 110
+MOST_NAMED = 12
+BRIGHT_MEDIANS = 4.0
+"""Medians of the loops' errors at which their colours end: the worst stand out, whatever the scene's size."""
+
+
+def log_triangles(
+    stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats, cycles: Cycles
+) -> tuple[str, ...]:
+    """What was left out, in words; each tested triangle in the colour of √χ² of its curl, those that fail in full."""
+    rows = np.flatnonzero(cycles.loops.lengths == 3)
+    corners = _tails(graph, cycles.loops, rows).reshape(-1, 3)
+    finite = np.asarray(np.isfinite(world_from_cam[corners][:, :, :3, 3]).all(axis=(1, 2)))
+    rows, corners = rows[finite], corners[finite]
+    worst = np.argsort(-cycles.chi2[rows], kind="stable")[:MOST_TRIANGLES]
+    notes: tuple[str, ...] = ()
+    if len(rows) > MOST_TRIANGLES:
+        notes = (f"recording: {MOST_TRIANGLES} of {len(rows)} triangles drawn, those of largest curl",)
+    rows, corners = rows[worst], corners[worst]
+    colours = shapes.residual_colours(np.sqrt(cycles.chi2[rows]), OPEN_CHI)
+    alpha = np.where(cycles.closes[rows], ALPHA, 255).astype(np.uint8)
+    if len(rows):
+        mesh = rr.Mesh3D(
+            vertex_positions=world_from_cam[corners.ravel(), :3, 3].astype(np.float32),
+            triangle_indices=np.arange(3 * len(rows)).reshape(-1, 3),
+            vertex_colors=np.repeat(np.column_stack([colours, alpha]), 3, axis=0),
+        )
+        stream.log(layout.TRIANGLES, mesh, static=True)
+    log_notes(stream, 0, notes)
+    return notes
+
+
+def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats) -> tuple[str, ...]:
+    """What was left out, in words; each hole's loop as a closed line, its label how far the motions around it close."""
+    notes: tuple[str, ...] = ()
+    try:
+        loops = unfilled_loops(graph.edges, graph.vertex_count)
+    except GraphError as error:
+        notes = (f"recording: no harmonic loops: {error}",)
+        log_notes(stream, 0, notes)
+        return notes
+    chosen = loops.select(np.arange(len(loops))[::-1][:MOST_LOOPS])
+    starts = chosen.offsets[:-1]
+    corners = np.split(_tails(graph, chosen, np.arange(len(chosen))), starts[1:]) if len(chosen) else []
+    lines = [world_from_cam[np.append(each, each[0]), :3, 3].astype(np.float32) for each in corners]
+    kept = np.array([row for row, line in enumerate(lines) if np.isfinite(line).all()], np.int64)
+    left = se3.log(loop_products(chosen, graph.i_from_j))
+    angle, shift_m = np.linalg.norm(left[:, :3], axis=1), np.linalg.norm(left[:, 3:], axis=1)
+    size = np.hypot(shift_m, shapes.RESIDUAL_ARM_M * angle)[kept]
+    strips = rr.LineStrips3D(
+        [lines[row] for row in kept],
+        colors=shapes.residual_colours(size, BRIGHT_MEDIANS * max(float(np.median(size)), 1e-9) if len(size) else 1.0),
+        radii=[LOOP_RADIUS],
+        labels=[_label(graph, corners[row], shift_m[row], angle[row]) for row in kept],
+        show_labels=False,
+    )
+    stream.log(layout.LOOPS, strips, static=True)
+    if len(kept) < len(loops):
+        notes = (f"recording: {len(kept)} of {len(loops)} harmonic loops drawn, the longest",)
+    log_notes(stream, 0, notes)
+    return notes
+
+
+def _label(graph: ViewGraph, corners: Ints, shift_m: float, angle_rad: float) -> str:
+    names = "-".join(map(str, graph.vertex_ids[corners[:MOST_NAMED]])) + ("-…" if len(corners) > MOST_NAMED else "")
+    return f"{names}: {len(corners)} edges, off by {shift_m:.3g} m, {np.degrees(angle_rad):.2g}°"
+
+
+def _tails(graph: ViewGraph, loops: Loops, rows: Ints) -> Ints:
+    """The vertices along these loops, one after the other."""
+    chosen = loops.select(rows)
+    return graph.edges[chosen.edge, np.where(chosen.sign > 0, 0, 1)]

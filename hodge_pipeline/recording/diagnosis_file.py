@@ -1,0 +1,95 @@
+"""`diagnosis.rrd`: a graph's edges by verdict, its triangles by curl, its harmonic loops, without a run around it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from hodge_pipeline.diagnosis.result import Diagnosis
+from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording.blueprint import BACKGROUND
+from hodge_pipeline.recording.curl import log_loops, log_triangles
+from hodge_pipeline.recording.diagnosis import log_diagnosis
+from hodge_pipeline.recording.eye import Eye
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.stream import log_markdown, writing
+from hodge_pipeline.types import Floats, ViewGraph
+
+APPLICATION = "hodge-pipeline diagnosis"
+VERTEX_RADIUS = -2.5
+MOST_NAMED = 2_000
+LEGEND = """
+| colour | what |
+|---|---|
+| blue, amber, magenta, grey | an edge: consistent, suspect, wrong, untestable |
+| blue to yellow | a triangle: the brighter, the larger its curl; one that does not close is opaque |
+| thick line | a loop that no triangles fill: the brighter, the less it closes |
+"""
+
+
+def write_diagnosis(path: Path, identity: str, graph: ViewGraph, world_from_cam: Floats, diagnosis: Diagnosis) -> None:
+    """One recording, which appears under its name when it is complete; frames are drawn at these poses."""
+    with writing(path, APPLICATION, identity, _blueprint(_eye(world_from_cam))) as stream:
+        reason = np.array(diagnosis.reason, dtype=np.str_)
+        _log_vertices(stream, graph, world_from_cam)
+        log_diagnosis(
+            stream, graph, world_from_cam, diagnosis.verdict, diagnosis.probability, reason, RecordingOptions()
+        )
+        log_triangles(stream, graph, world_from_cam, diagnosis.cycles)
+        log_loops(stream, graph, world_from_cam)
+        log_markdown(stream, layout.LEGEND, LEGEND)
+
+
+def _log_vertices(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats) -> None:
+    drawn = np.flatnonzero(shapes.is_drawable(world_from_cam))
+    names = [str(name) for name in graph.vertex_ids[drawn]] if len(drawn) <= MOST_NAMED else None
+    points = rr.Points3D(
+        world_from_cam[drawn, :3, 3].astype(np.float32), radii=[VERTEX_RADIUS], labels=names, show_labels=False
+    )
+    stream.log(layout.VERTICES, points, static=True)
+
+
+def _blueprint(eye: Eye | None) -> rrb.Blueprint:
+    verdicts = _scene("Edges by verdict", [f"+ {layout.VERDICTS}/**", f"+ {layout.VERTICES}"], eye)
+    curl = _scene(
+        "Triangles by curl, harmonic loops", [f"+ {layout.TRIANGLES}", f"+ {layout.LOOPS}", f"+ {layout.VERTICES}"], eye
+    )
+    texts = rrb.Vertical(
+        rrb.TextDocumentView(origin=layout.DIAGNOSIS, name="Which edge is wrong"),
+        rrb.TextDocumentView(origin=layout.LEGEND, name="Colours"),
+        row_shares=[3, 1],
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(verdicts, curl, texts, column_shares=[2, 2, 1.4]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="hidden"),
+        auto_views=False,
+    )
+
+
+def _scene(name: str, contents: list[str], eye: Eye | None) -> rrb.Spatial3DView:
+    controls = rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up) if eye else None
+    return rrb.Spatial3DView(
+        origin=layout.WORLD,
+        name=name,
+        contents=contents,
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=controls,
+    )
+
+
+def _eye(world_from_cam: Floats) -> Eye | None:
+    """From above the plane in which the frames spread most, a little aside."""
+    places = world_from_cam[shapes.is_drawable(world_from_cam), :3, 3]
+    if len(places) < 2:
+        return None
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2
+    axes = np.linalg.eigh((places - middle).T @ (places - middle))[1]
+    size = max(float(np.ptp(places @ axes[:, 2])), 0.1)
+    position = middle + size * (1.0 * axes[:, 0] - 0.45 * axes[:, 1])
+    return Eye(*(tuple(map(float, each)) for each in (position, middle, axes[:, 0])))  # type: ignore[arg-type]
