@@ -10,7 +10,8 @@ from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.cg import truncated_cg
-from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.solvers.elimination import Elimination
+from hodge_pipeline.solvers.linear import factorise_blocks
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import project
 from hodge_pipeline.types import Floats
@@ -36,7 +37,7 @@ def chordal_rotations(problem: Problem, pinned: Floats) -> Floats:
     tail, head = tail[onto_pinned], head[onto_pinned]
     np.add.at(rhs, tail, weighted @ transposed[head])
     np.add.at(rhs, head, np.swapaxes(weighted, 1, 2) @ transposed[tail])
-    transposed[:free] = _solve(matrix, rhs[:free].reshape(free * d, d)).reshape(free, d, d)
+    transposed[:free] = _solve(problem.structure.elimination, matrix, rhs[:free].reshape(free * d, d)).reshape(free, d, d)
     out = np.empty_like(transposed)
     out[free:] = pinned
     out[:free] = project(np.swapaxes(transposed[:free], 1, 2))
@@ -51,14 +52,14 @@ def _blocks(problem: Problem, edges: slice) -> Floats:
     return np.stack([diagonal, diagonal, forward, np.swapaxes(forward, 1, 2)])
 
 
-def _solve(matrix: bsr_matrix, rhs: Floats) -> Floats:
+def _solve(plan: Elimination, matrix: bsr_matrix, rhs: Floats) -> Floats:
     """The solution (n, d): of a large system by a single-precision factor and conjugate gradients, for its memory."""
     if matrix.shape[0] < LARGE:
-        return factorise(matrix.tocsc(), "NATURAL").solve(rhs)
+        return factorise_blocks(plan, matrix).solve(rhs)
     try:
-        factor = factorise(matrix.astype(np.float32).tocsc(), "NATURAL", single=True)
+        factor = factorise_blocks(plan, matrix, single=True)
     except GraphError:
-        return factorise(matrix.tocsc(), "NATURAL").solve(rhs)
+        return factorise_blocks(plan, matrix).solve(rhs)
     found = truncated_cg(
         lambda x: np.asarray(matrix @ x.reshape(rhs.shape)).reshape(-1),
         lambda r: factor.solve(r.reshape(rhs.shape)).reshape(-1),

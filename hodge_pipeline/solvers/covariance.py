@@ -10,7 +10,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.full import FullObjective
-from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.solvers.linear import factorise_blocks
 from hodge_pipeline.solvers.setup import Setup, prepare
 from hodge_pipeline.solvers.weights import PLANAR_AXES
 from hodge_pipeline.types import Floats, Ints, ViewGraph
@@ -53,7 +53,7 @@ def _joint_covariance(graph: ViewGraph, world_from_cam: Floats, vertices: Ints) 
     if not setup.weights.definite:
         raise GraphError("covariances need positive semi-definite information: mend the indefinite matrices")
     problem = setup.problem
-    objective = FullObjective(problem, setup.weights.information[setup.weights.used])
+    objective = FullObjective.of(problem, setup.weights.information[setup.weights.used])
     point = objective.at(*setup.initial("given"))
     _, hessian = objective.normal_equations(point.left)
     size, free = problem.tangent_size + problem.dimension, problem.free_count
@@ -64,7 +64,7 @@ def _joint_covariance(graph: ViewGraph, world_from_cam: Floats, vertices: Ints) 
     rows = (place[moving, None] * size + np.arange(size)).reshape(-1)
     columns = np.zeros((free * size, len(rows)))
     columns[rows, np.arange(len(rows))] = 1.0
-    inverse = factorise(hessian.tocsc(), "NATURAL").solve(columns)[rows].reshape(len(moving), size, len(moving), size)
+    inverse = factorise_blocks(problem.structure.elimination, hessian).solve(columns)[rows].reshape(len(moving), size, len(moving), size)
     body = np.zeros((len(moving), size, size))
     p = problem.tangent_size
     turned = np.swapaxes(point.rotations[place[moving]], 1, 2)

@@ -6,25 +6,22 @@ Poses are moved in the world frame: R_i ← exp(ω_i^) R_i, t_i ← t_i + v_i.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import bsr_matrix
 from scipy.spatial.transform import Rotation
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.cg import CgResult, Operator, truncated_cg
-from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.solvers.cg import Operator, truncated_cg
+from hodge_pipeline.solvers.direct import DirectSolver, steps_worth_a_factor
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import exponential, lever
 from hodge_pipeline.types import Floats
 
-DIRECT_AFTER_CG_STEPS = 100
-"""A Newton step that needs more makes a direct factorisation of all unknowns worth its price."""
-REFACTOR_AFTER_CG_STEPS = 15
-MAX_CG_STEPS = 1000
+FEWEST_CG_STEPS = 30
+"""Where a factorisation of all unknowns costs no more, CG with the scalar Laplacians is not tried."""
 
 
 @dataclass(frozen=True)
@@ -69,21 +66,18 @@ def full_residuals(problem: Problem, information: Floats, rotations: Floats, tra
     return FullResiduals(residual, turn, predicted, reach, cost)
 
 
-@dataclass
-class _Direct:
-    """The latest direct factor, if the graph turned out to need one, and how many CG steps it last took."""
-
-    solve: Callable[[Floats], Floats] | None = None
-    cg_steps: int = 0
-
-
 @dataclass(frozen=True)
 class FullObjective:
     """chi² of a problem with its information (E, p + d, p + d) over (rotation, translation)."""
 
     problem: Problem
     information: Floats
-    direct: _Direct = field(default_factory=_Direct)
+    direct: DirectSolver
+
+    @classmethod
+    def of(cls, problem: Problem, information: Floats) -> FullObjective:
+        """The objective of a problem."""
+        return cls(problem, information, DirectSolver(problem.structure.elimination))
 
     def at(self, rotations: Floats, translations: Floats) -> FullPoint:
         """The point at these poses."""
@@ -94,16 +88,13 @@ class FullObjective:
         """A Gauss-Newton step by PCG: first with the two Laplacians, with a direct factor once they prove too weak."""
         assert isinstance(point, FullPoint)
         gradient, hessian = self.normal_equations(point.left)
-        spent = 0
-        if self.direct.solve is None:
-            precondition = self.laplacian_preconditioner(point.rotations)
-            found = _solve(hessian, precondition, gradient, tolerance, DIRECT_AFTER_CG_STEPS, enough)
+        spent, worth = 0, steps_worth_a_factor(self.problem.structure.elimination, hessian.blocksize[0])
+        if self.direct.factor is None and worth > FEWEST_CG_STEPS:
+            apply, precondition = (lambda x: np.asarray(hessian @ x)), self.laplacian_preconditioner(point.rotations)
+            found = truncated_cg(apply, precondition, gradient, tolerance, worth, enough)
             spent = found.steps
-        if self.direct.solve is not None or spent >= DIRECT_AFTER_CG_STEPS:
-            if self.direct.solve is None or self.direct.cg_steps > REFACTOR_AFTER_CG_STEPS:
-                self.direct.solve = factorise(hessian.tocsc(), "NATURAL").solve
-            found = _solve(hessian, self.direct.solve, gradient, tolerance, MAX_CG_STEPS, enough)
-            self.direct.cg_steps = found.steps
+        if self.direct.factor is not None or spent >= worth or worth <= FEWEST_CG_STEPS:
+            found = self.direct.solve(hessian, gradient, tolerance, enough)
             spent += found.steps
         slope = 2 * float(gradient @ found.x)
         return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), spent)
@@ -174,8 +165,3 @@ def _frame(left: FullResiduals, edges: slice) -> Floats:
     frame[:, :p, :p], frame[:, p:, p:] = turn, np.swapaxes(predicted, 1, 2)
     return frame
 
-
-def _solve(
-    hessian: bsr_matrix, precondition: Operator, gradient: Floats, tolerance: float, max_steps: int, enough: float
-) -> CgResult:
-    return truncated_cg(lambda x: np.asarray(hessian @ x), precondition, gradient, tolerance, max_steps, enough)

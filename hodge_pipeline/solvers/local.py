@@ -9,9 +9,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order
 
 from hodge_pipeline.solvers.full import FullObjective
-from hodge_pipeline.solvers.minimise import full_objective
+from hodge_pipeline.solvers.minimise import full_objective, isotropic_objective
 from hodge_pipeline.solvers.newton import Limits, descend
-from hodge_pipeline.solvers.objective import IsotropicObjective
 from hodge_pipeline.solvers.problem import Problem, make_problem
 from hodge_pipeline.solvers.setup import Setup
 from hodge_pipeline.types import Floats, Ints
@@ -43,9 +42,7 @@ def settled_nearby(setup: Setup, changed: Ints, limits: Limits, full: bool) -> S
     )
     rotations, translations = setup.initial("given")
     places = vertices[local.order]
-    objective: FullObjective | IsotropicObjective = IsotropicObjective(local)
-    if full:
-        objective = FullObjective(local, full_objective(setup).information[edges])
+    objective = FullObjective.of(local, full_objective(setup).information[edges]) if full else isotropic_objective(local)
     end = descend(objective, objective.at(rotations[places], translations[places]), limits, setup.rounding).point
     rotations[places], translations[places] = end.rotations, end.translations
     return _with_start(setup, rotations, translations)

@@ -6,9 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-from hodge_pipeline.solvers.full import FullObjective
-from hodge_pipeline.solvers.newton import Descent, Limits, Point, descend
+from hodge_pipeline.solvers.direct import steps_worth_a_factor
+from hodge_pipeline.solvers.full import FEWEST_CG_STEPS, FullObjective
+from hodge_pipeline.solvers.joint import JointObjective
+from hodge_pipeline.solvers.newton import Descent, Limits, Objective, Point, descend
 from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
+from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.setup import InitialName, Setup
 
 Watch: TypeAlias = Callable[[Point], None]
@@ -27,7 +30,7 @@ def minimise(
     if full and known:
         objective = full_objective(setup)
         return descend(objective, objective.at(*begin), limits, setup.rounding, watch)
-    isotropic = IsotropicObjective(setup.problem)
+    isotropic = isotropic_objective(setup.problem)
     loose = replace(limits, relative_tolerance=max(limits.relative_tolerance, WARM_START_TOLERANCE))
     warm = descend(isotropic, isotropic.at(*begin), loose if full else limits, setup.rounding, watch)
     if not full:
@@ -39,10 +42,17 @@ def minimise(
     return replace(descent, cg_steps=descent.cg_steps + cg_steps)
 
 
+def isotropic_objective(problem: Problem) -> Objective:
+    """F, in the form whose steps are the cheaper ones on this graph."""
+    size = problem.tangent_size + problem.dimension
+    joint = steps_worth_a_factor(problem.structure.elimination, size) <= FEWEST_CG_STEPS
+    return JointObjective.of(problem) if joint else IsotropicObjective(problem)
+
+
 def full_objective(setup: Setup) -> FullObjective:
     """chi² of the set-up's used edges."""
     used, information = setup.weights.used, setup.weights.information
-    return FullObjective(setup.problem, information if used.all() else information[used])
+    return FullObjective.of(setup.problem, information if used.all() else information[used])
 
 
 def cost_at_start(setup: Setup, full: bool) -> float:

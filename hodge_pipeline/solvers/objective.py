@@ -79,7 +79,7 @@ def quadratic_model(problem: Problem, left: Residuals, exact: bool = True) -> Qu
     so never indefinite, where it need not be exact.
     """
     p, d, structure = problem.tangent_size, problem.dimension, problem.structure
-    hessian = structure.symmetric_pattern.assemble(lambda edges: _curvature(problem, left, edges, exact), (p, p))
+    hessian = structure.symmetric_pattern.assemble(lambda edges: curvature(problem, left, edges, exact), (p, p))
 
     def arms(edges: slice) -> Floats:
         levers = problem.tau[edges, None, None] * lever(left.arm[edges])
@@ -89,7 +89,7 @@ def quadratic_model(problem: Problem, left: Residuals, exact: bool = True) -> Qu
     return QuadraticModel(rotation_gradient(problem, left), hessian, coupling, coupling.transpose())
 
 
-def _curvature(problem: Problem, left: Residuals, edges: slice, exact: bool) -> Floats:
+def curvature(problem: Problem, left: Residuals, edges: slice, exact: bool) -> Floats:
     """The blocks ii, jj, ij, ji (4, m, p, p) of some edges."""
     d, p = problem.dimension, problem.tangent_size
     kappa, tau, eye = problem.kappa[edges, None, None], problem.tau[edges, None, None], np.eye(p)

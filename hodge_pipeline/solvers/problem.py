@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 
+from hodge_pipeline.solvers.elimination import Elimination, plan_elimination
 from hodge_pipeline.solvers.linear import Factor, corrected, factorise, fill_reducing_order
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -89,12 +90,14 @@ class Structure:
 
     - `order (n,)`: the graph's vertex at each position; the first `free_count` positions are unknown.
     - `tail`, `head (E,)`: positions of i and j.
+    - `elimination`: of the free vertices, whose positions are its own.
     """
 
     order: Ints
     free_count: int
     tail: Ints
     head: Ints
+    elimination: Elimination
 
     @cached_property
     def at_tail(self) -> csr_matrix:
@@ -236,10 +239,10 @@ def make_problem(
     position = np.empty(len(pinned), np.int64)
     position[free], position[rest] = np.arange(len(free)), len(free) + np.arange(len(rest))
     tail, head = position[edges[:, 0]], position[edges[:, 1]]
-    elimination = fill_reducing_order(laplacian(tail, head, np.ones(len(edges)), len(free)))
-    order = np.concatenate([free[elimination], rest])
+    elimination = plan_elimination(tail, head, len(free), fill_reducing_order)
+    order = np.concatenate([free[elimination.order], rest])
     position[order] = np.arange(len(order))
-    structure = Structure(order, len(free), position[edges[:, 0]], position[edges[:, 1]])
+    structure = Structure(order, len(free), position[edges[:, 0]], position[edges[:, 1]], elimination)
     return Problem(structure, rotations, translations, kappa, tau)
 
 

@@ -1,0 +1,327 @@
+"""Block elimination of a graph's vertices of low degree, many at a time: chains and ladders vanish without a library.
+
+Each round takes an independent set of vertices of few neighbours. What is left, the core, is small on graphs that are
+like trajectories, and goes to a sparse direct solver. Rounds and fill depend on the graph alone: planned once, then
+used for matrices with blocks of any size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
+
+from hodge_pipeline.types import Bools, Floats, Ints
+
+MOST_NEIGHBOURS = 8
+"""A vertex of more stays in the core: there a library's dense blocks are faster."""
+SMALLEST_ROUND = 0.02
+"""Of the vertices left: smaller rounds are not worth their overhead."""
+FEWEST_IN_ROUND = 16
+PASSES = 3
+
+
+@dataclass(frozen=True)
+class Ordering:
+    """Rows (n,) in the order of elimination; `fill` entries of the factor and `work` = Σ of its columns' counts²."""
+
+    order: Ints
+    work: float
+    fill: float
+
+
+@dataclass(frozen=True)
+class Group:
+    """Vertices of one round with k neighbours each, which later rounds or the core hold.
+
+    - `begin`, `end`: their positions; `neighbours (m, k)` the positions of theirs, ascending.
+    - `slots`: of their blocks above the diagonal, vertex by vertex.
+    - `scatter`: sums what their elimination adds, pair by pair of neighbours, into `targets`, which count the diagonal
+      blocks first and then the others.
+    """
+
+    begin: int
+    end: int
+    slots: slice
+    neighbours: Ints
+    targets: Ints
+    scatter: csr_matrix
+
+    @cached_property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Pairs a ≤ b of neighbours in the order of the scatter's columns."""
+        k = self.neighbours.shape[1]
+        return [(a, b) for a in range(k) for b in range(a, k)]
+
+    @cached_property
+    def gather(self) -> csr_matrix:
+        """Sums values (m · k) at the distinct neighbours, `reached`."""
+        unique, inverse = np.unique(self.neighbours, return_inverse=True)
+        count = self.neighbours.size
+        return csr_matrix((np.ones(count), (inverse.reshape(-1), np.arange(count))), shape=(len(unique), count))
+
+    @cached_property
+    def reached(self) -> Ints:
+        """The distinct neighbours."""
+        return np.unique(self.neighbours)
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """The rounds for one graph: `order (n,)` gives the vertex at each position, those from `core` on are left over.
+
+    `slot_rows`, `slot_columns` are the positions of each block above the diagonal, the core's own fill left out;
+    `work` counts the products of blocks in a factorisation, and `fill` the blocks of the factor.
+    """
+
+    order: Ints
+    core: int
+    groups: tuple[Group, ...]
+    slot_rows: Ints
+    slot_columns: Ints
+    work: float
+    fill: float
+
+    @property
+    def size(self) -> int:
+        """How many vertices there are."""
+        return len(self.order)
+
+    @property
+    def core_share(self) -> float:
+        """The share of the vertices that no round takes."""
+        return 1 - self.core / self.size if self.size else 0.0
+
+    @cached_property
+    def keys(self) -> Ints:
+        """Ascending: row · n + column of each slot."""
+        return self.slot_rows * self.size + self.slot_columns
+
+
+def plan_elimination(tail: Ints, head: Ints, count: int, core_order: Callable[[csc_matrix], Ordering]) -> Elimination:
+    """The rounds for a graph of `count` vertices with edges (tail, head); those at or past `count` are pinned.
+
+    `core_order` gives the elimination order of the core's pattern.
+    """
+    inside = (tail < count) & (head < count) & (tail != head)
+    low, high = np.minimum(tail, head)[inside], np.maximum(tail, head)[inside]
+    pairs = np.unique(low * count + high)
+    alive = np.ones(count, bool)
+    priority = np.random.default_rng(0).permutation(count)
+    rounds: list[tuple[Ints, Ints]] = []
+    left = count
+    while left:
+        low, high = np.divmod(pairs, count)
+        chosen = _independent(low, high, alive, left, priority)
+        if chosen is None:
+            break
+        touched = chosen[low] | chosen[high]
+        vertex = np.where(chosen[low], low, high)[touched]
+        other = (low + high)[touched] - vertex
+        fill = []
+        for vertices, neighbours in _by_degree(np.flatnonzero(chosen), vertex, other):
+            rounds.append((vertices, neighbours))
+            k = neighbours.shape[1]
+            for a in range(k):
+                for b in range(a + 1, k):
+                    first, second = neighbours[:, a], neighbours[:, b]
+                    fill.append(np.minimum(first, second) * count + np.maximum(first, second))
+        pairs = np.unique(np.concatenate([pairs[~touched], *fill]))
+        alive &= ~chosen
+        left = int(alive.sum())
+    rest = np.flatnonzero(alive)
+    low, high = np.divmod(pairs, count)
+    return _planned(count, rounds, _ordered_core(rest, low, high, count, core_order), low, high)
+
+
+def _independent(low: Ints, high: Ints, alive: Bools, left: int, priority: Ints) -> Bools | None:
+    """Vertices of few neighbours, no two of them neighbours; None where there are too few."""
+    count = len(alive)
+    degree = np.bincount(low, minlength=count) + np.bincount(high, minlength=count)
+    most = _highest_degree(degree[alive], left)
+    if most is None:
+        return None
+    candidate = alive & (degree <= most)
+    rank = degree * count + priority
+    chosen = np.zeros(count, bool)
+    for _ in range(PASSES):
+        both = candidate[low] & candidate[high]
+        first, second = low[both], high[both]
+        best = candidate.copy()
+        best[np.where(rank[first] > rank[second], first, second)] = False
+        chosen |= best
+        candidate &= ~best
+        candidate[high[best[low]]] = False
+        candidate[low[best[high]]] = False
+    return chosen
+
+
+def _highest_degree(degrees: Ints, left: int) -> int | None:
+    """The least degree up to which there are enough vertices for a round."""
+    enough = max(SMALLEST_ROUND * left, FEWEST_IN_ROUND)
+    upto = np.cumsum(np.bincount(degrees, minlength=MOST_NEIGHBOURS + 1)[: MOST_NEIGHBOURS + 1])
+    found = np.flatnonzero(upto >= enough)
+    return int(found[0]) if len(found) else None
+
+
+def _by_degree(chosen: Ints, vertex: Ints, other: Ints) -> list[tuple[Ints, Ints]]:
+    """Vertices (m,) with their neighbours (m, k), for each k."""
+    order = np.argsort(vertex, kind="stable")
+    vertex, other = vertex[order], other[order]
+    begin = np.searchsorted(vertex, chosen)
+    degree = np.searchsorted(vertex, chosen, side="right") - begin
+    return [
+        (chosen[degree == k], other[begin[degree == k, None] + np.arange(k)]) for k in np.unique(degree)
+    ]
+
+
+def _ordered_core(
+    rest: Ints, low: Ints, high: Ints, count: int, core_order: Callable[[csc_matrix], Ordering]
+) -> Ordering:
+    """The vertices of the core in elimination order."""
+    place = np.zeros(count, np.int64)
+    place[rest] = np.arange(len(rest))
+    rows, columns = place[low], place[high]
+    ones = np.ones(len(rows))
+    pattern = csc_matrix((np.r_[-ones, -ones], (np.r_[rows, columns], np.r_[columns, rows])), (len(rest), len(rest)))
+    degree = np.bincount(np.r_[rows, columns], minlength=len(rest)) + 1.0
+    pattern = pattern + csc_matrix((degree, (np.arange(len(rest)), np.arange(len(rest)))), pattern.shape)
+    found = core_order(pattern)
+    return replace(found, order=rest[found.order])
+
+
+def _planned(count: int, rounds: list[tuple[Ints, Ints]], core: Ordering, low: Ints, high: Ints) -> Elimination:
+    order = np.concatenate([*(vertices for vertices, _ in rounds), core.order]).astype(np.int64)
+    position = np.empty(count, np.int64)
+    position[order] = np.arange(count)
+    neighbours = [np.sort(position[others], axis=1) for _, others in rounds]
+    begins = np.cumsum([0, *(len(vertices) for vertices, _ in rounds)])
+    rows = [np.repeat(np.arange(b, b + len(n)), n.shape[1]) for b, n in zip(begins[:-1], neighbours, strict=True)]
+    first, second = position[low], position[high]
+    keys = np.sort(np.minimum(first, second) * count + np.maximum(first, second))
+    core_rows, core_columns = np.divmod(keys, max(count, 1))
+    slot_rows = np.concatenate([*rows, core_rows]).astype(np.int64)
+    slot_columns = np.concatenate([*(n.reshape(-1) for n in neighbours), core_columns]).astype(np.int64)
+    slot_ends = np.cumsum([0, *(len(r) for r in rows)])
+    all_keys = slot_rows * count + slot_columns
+    groups = []
+    for number, near in enumerate(neighbours):
+        targets, scatter = _scatter(near, all_keys, count)
+        slots = slice(int(slot_ends[number]), int(slot_ends[number + 1]))
+        groups.append(Group(int(begins[number]), int(begins[number + 1]), slots, near, targets, scatter))
+    counts = [(len(near), near.shape[1] + 1) for near in neighbours]
+    work, fill = (sum(m * float(k) ** power for m, k in counts) for power in (2, 1))
+    return Elimination(
+        order, int(begins[-1]), tuple(groups), slot_rows, slot_columns, work + core.work, fill + core.fill
+    )
+
+
+def _scatter(near: Ints, keys: Ints, count: int) -> tuple[Ints, csr_matrix]:
+    k = near.shape[1]
+    targets = [
+        near[:, a] if a == b else count + np.searchsorted(keys, near[:, a] * count + near[:, b])
+        for a in range(k)
+        for b in range(a, k)
+    ]
+    if not targets:
+        return np.zeros(0, np.int64), csr_matrix((0, 0))
+    unique, inverse = np.unique(np.concatenate(targets), return_inverse=True)
+    entries = np.ones(len(inverse)), (inverse.reshape(-1), np.arange(len(inverse)))
+    return unique.astype(np.int64), csr_matrix(entries, shape=(len(unique), len(inverse)))
+
+
+@dataclass(frozen=True)
+class BlockFactor:
+    """A block matrix after its elimination: `pivots (core, s, s)` inverted, `rows (slots, s, s)` divided by them."""
+
+    plan: Elimination
+    pivots: Floats
+    rows: Floats
+    solve_core: Callable[[Floats], Floats]
+
+    def solve(self, rhs: Floats) -> Floats:
+        """The solution of `matrix @ x = rhs`, of the right-hand side's shape (n · s,) or (n · s, c)."""
+        size = self.pivots.shape[-1]
+        x = np.array(rhs, self.rows.dtype).reshape(self.plan.size, size, -1)
+        columns = x.shape[-1]
+        for group in self.plan.groups:
+            own = x[group.begin : group.end]
+            if group.neighbours.shape[1]:
+                blocks = self.rows[group.slots].reshape(*group.neighbours.shape, size, size)
+                passed = np.matmul(blocks.transpose(0, 1, 3, 2), own[:, None])
+                moved = group.gather @ passed.reshape(-1, size * columns)
+                x[group.reached] -= moved.reshape(-1, size, columns)
+        core = self.plan.core
+        if core < self.plan.size:
+            x[core:] = self.solve_core(x[core:].reshape(-1, columns)).reshape(-1, size, columns)
+        for group in reversed(self.plan.groups):
+            own = np.matmul(self.pivots[group.begin : group.end], x[group.begin : group.end])
+            for a in range(group.neighbours.shape[1]):
+                block = self.rows[group.slots][a :: group.neighbours.shape[1]]
+                own -= np.matmul(block, x[group.neighbours[:, a]])
+            x[group.begin : group.end] = own
+        return np.asarray(x.reshape(rhs.shape), float)
+
+
+def eliminate(
+    plan: Elimination, matrix: bsr_matrix, factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]]
+) -> BlockFactor:
+    """The factor of a symmetric positive definite block matrix whose rows are in the plan's order."""
+    size = matrix.blocksize[0]
+    diagonal, rows = _unpacked(plan, matrix)
+    flat = diagonal.reshape(-1, size * size), rows.reshape(-1, size * size)
+    for group in plan.groups:
+        _eliminate_group(group, diagonal, rows, flat)
+    core = _core_matrix(plan, diagonal, rows) if plan.core < plan.size else None
+    solve_core = (lambda rhs: rhs) if core is None else factorise_core(core)
+    end = plan.groups[-1].slots.stop if plan.groups else 0
+    return BlockFactor(plan, diagonal[: plan.core], rows[:end], solve_core)
+
+
+def _unpacked(plan: Elimination, matrix: bsr_matrix) -> tuple[Floats, Floats]:
+    """The diagonal blocks and those above the diagonal, with zeros for the fill."""
+    size, n = matrix.blocksize[0], plan.size
+    at = np.repeat(np.arange(n), np.diff(matrix.indptr))
+    columns = matrix.indices.astype(np.int64)
+    diagonal = np.zeros((n, size, size), matrix.data.dtype)
+    on = at == columns
+    diagonal[at[on]] = matrix.data[on]
+    rows = np.zeros((len(plan.slot_rows), size, size), matrix.data.dtype)
+    above = np.flatnonzero(at < columns)
+    rows[np.searchsorted(plan.keys, at[above] * n + columns[above])] = matrix.data[above]
+    return diagonal, rows
+
+
+def _eliminate_group(group: Group, diagonal: Floats, rows: Floats, flat: tuple[Floats, Floats]) -> None:
+    size, (count, k) = rows.shape[-1], group.neighbours.shape
+    pivots = diagonal[group.begin : group.end]
+    pivots[:] = np.linalg.inv(pivots)
+    if not k:
+        return
+    blocks = rows[group.slots].reshape(count, k, size, size)
+    divided = np.matmul(pivots[:, None], blocks)
+    added = np.empty((len(group.pairs), count, size, size), rows.dtype)
+    for number, (a, b) in enumerate(group.pairs):
+        np.matmul(blocks[:, a].transpose(0, 2, 1), divided[:, b], out=added[number])
+    total = group.scatter @ added.reshape(-1, size * size)
+    on = int(np.searchsorted(group.targets, len(diagonal)))
+    flat[0][group.targets[:on]] -= total[:on]
+    flat[1][group.targets[on:] - len(diagonal)] -= total[on:]
+    blocks[:] = divided
+
+
+def _core_matrix(plan: Elimination, diagonal: Floats, rows: Floats) -> csc_matrix:
+    begin, size = plan.core, rows.shape[-1]
+    first = plan.groups[-1].slots.stop if plan.groups else 0
+    at, columns = plan.slot_rows[first:] - begin, plan.slot_columns[first:] - begin
+    count = plan.size - begin
+    i = np.concatenate([np.arange(count), at, columns])
+    j = np.concatenate([np.arange(count), columns, at])
+    data = np.concatenate([diagonal[begin:], rows[first:], rows[first:].transpose(0, 2, 1)])
+    order = np.lexsort((j, i))
+    indptr = np.searchsorted(i[order], np.arange(count + 1))
+    whole = bsr_matrix((data[order], j[order], indptr), shape=(count * size, count * size))
+    return whole.tocsc()

@@ -1,0 +1,96 @@
+"""The isotropic objective F with rotations and translations moved together, by Gauss-Newton with a direct factor.
+
+On graphs that are like long chains it takes the place of the descent in the rotations alone: there a lever moves a
+translation so far that the scalar Laplacian is no preconditioner, and a factorisation of all unknowns is cheap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import bsr_matrix
+
+from hodge_pipeline.solvers.direct import DirectSolver
+from hodge_pipeline.solvers.newton import Point, Step
+from hodge_pipeline.solvers.objective import Residuals, residuals, rotation_gradient
+from hodge_pipeline.solvers.problem import Problem
+from hodge_pipeline.solvers.rotations import axial, exponential, lever
+from hodge_pipeline.types import Floats
+
+
+def stiffness(kappa: Floats, turn: Floats) -> Floats:
+    """Gauss-Newton's curvature (m, p, p) of κ‖R_j − R_i R_ij‖² = 2κ|r|², r = 2 sin(θ/2) n in the edge's own frame.
+
+    In that frame a turn of the world changes no residual, so that the soft modes of long chains stay soft.
+    """
+    cosine = 0.25 * (np.einsum("eii->e", turn) + (1.0 if turn.shape[-1] == 3 else 2.0))
+    if turn.shape[-1] == 2:
+        return (2 * kappa * cosine)[:, None, None]
+    half = axial(turn) / (4 * np.sqrt(np.maximum(cosine, 1e-12)))[:, None]
+    return np.asarray(2 * kappa[:, None, None] * (np.eye(3) - half[:, :, None] * half[:, None, :]))
+
+
+@dataclass(frozen=True)
+class JointPoint(Point):
+    """A point with its residuals."""
+
+    left: Residuals
+
+
+@dataclass(frozen=True)
+class JointObjective:
+    """F as a function of rotations and translations."""
+
+    problem: Problem
+    direct: DirectSolver
+
+    @classmethod
+    def of(cls, problem: Problem) -> JointObjective:
+        """The objective of a problem."""
+        return cls(problem, DirectSolver(problem.structure.elimination))
+
+    def at(self, rotations: Floats, translations: Floats) -> JointPoint:
+        """The point at these poses."""
+        left = residuals(self.problem, rotations, translations)
+        return JointPoint(rotations, translations, left.cost, left)
+
+    def step(self, point: Point, tolerance: float, enough: float) -> Step:
+        """A Gauss-Newton step."""
+        assert isinstance(point, JointPoint)
+        gradient, hessian = self.normal_equations(point.left)
+        found = self.direct.solve(hessian, gradient, tolerance, enough)
+        slope = 2 * float(gradient @ found.x)
+        return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), found.steps)
+
+    def moved(self, point: Point, direction: Floats) -> JointPoint:
+        """The point whose free poses are moved by a direction (free · (p + d),)."""
+        free, p = self.problem.free_count, self.problem.tangent_size
+        step = direction.reshape(free, p + self.problem.dimension)
+        turned, shifted = point.rotations.copy(), point.translations.copy()
+        turned[:free] = exponential(step[:, :p]) @ point.rotations[:free]
+        shifted[:free] += step[:, p:]
+        return self.at(turned, shifted)
+
+    def normal_equations(self, left: Residuals) -> tuple[Floats, bsr_matrix]:
+        """Half the gradient (free · (p + d),) and half the Gauss-Newton Hessian."""
+        problem, p = self.problem, self.problem.tangent_size
+        structure, free, size = problem.structure, problem.free_count, problem.tangent_size + problem.dimension
+        force = problem.tau[:, None] * left.shift
+        pulled = np.asarray(structure.at_head @ force - structure.at_tail @ force)[:free]
+        gradient = np.concatenate([rotation_gradient(problem, left), pulled], axis=1)
+
+        reach = left.shift + left.arm
+
+        def blocks(edges: slice) -> Floats:
+            turned, tau = stiffness(problem.kappa[edges], left.turn[edges]), problem.tau[edges, None, None]
+            arms, weight = tau * lever(reach[edges]), tau * np.eye(problem.dimension)
+            out = np.zeros((4, len(arms), size, size))
+            out[:2, :, :p, :p], out[2:, :, :p, :p] = turned, -turned
+            out[:2, :, p:, p:], out[2:, :, p:, p:] = weight, -weight
+            out[0, :, :p, :p] += np.swapaxes(arms, 1, 2) @ lever(reach[edges])
+            out[0, :, p:, :p], out[3, :, p:, :p] = -arms, arms
+            out[0, :, :p, p:], out[2, :, :p, p:] = np.swapaxes(-arms, 1, 2), np.swapaxes(arms, 1, 2)
+            return out
+
+        return gradient.reshape(-1), structure.symmetric_pattern.assemble(blocks, (size, size))
