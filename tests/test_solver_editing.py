@@ -36,7 +36,7 @@ def same(one: Solution, other: Solution) -> None:
     for piece in range(one.component.max() + 1):
         rows = np.flatnonzero(one.component == piece)
         a, b = one.world_from_cam[rows], other.world_from_cam[rows]
-        np.testing.assert_allclose(se3.inverse(a[:1]) @ a, se3.inverse(b[:1]) @ b, atol=1e-4)
+        np.testing.assert_allclose(se3.inverse(a[:1]) @ a, se3.inverse(b[:1]) @ b, atol=3e-4)
 
 
 @settings(max_examples=12, deadline=None)

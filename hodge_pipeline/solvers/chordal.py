@@ -37,7 +37,9 @@ def chordal_rotations(problem: Problem, pinned: Floats) -> Floats:
     tail, head = tail[onto_pinned], head[onto_pinned]
     np.add.at(rhs, tail, weighted @ transposed[head])
     np.add.at(rhs, head, np.swapaxes(weighted, 1, 2) @ transposed[tail])
-    transposed[:free] = _solve(problem.structure.elimination, matrix, rhs[:free].reshape(free * d, d)).reshape(free, d, d)
+    transposed[:free] = _solve(problem.structure.elimination, matrix, rhs[:free].reshape(free * d, d)).reshape(
+        free, d, d
+    )
     out = np.empty_like(transposed)
     out[free:] = pinned
     out[:free] = project(np.swapaxes(transposed[:free], 1, 2))

@@ -64,7 +64,11 @@ def _joint_covariance(graph: ViewGraph, world_from_cam: Floats, vertices: Ints) 
     rows = (place[moving, None] * size + np.arange(size)).reshape(-1)
     columns = np.zeros((free * size, len(rows)))
     columns[rows, np.arange(len(rows))] = 1.0
-    inverse = factorise_blocks(problem.structure.elimination, hessian).solve(columns)[rows].reshape(len(moving), size, len(moving), size)
+    inverse = (
+        factorise_blocks(problem.structure.elimination, hessian)
+        .solve(columns)[rows]
+        .reshape(len(moving), size, len(moving), size)
+    )
     body = np.zeros((len(moving), size, size))
     p = problem.tangent_size
     turned = np.swapaxes(point.rotations[place[moving]], 1, 2)

@@ -17,7 +17,7 @@ STALE_STEPS = 8
 FRESH_STEPS = 50
 TOLERANCE = 1e-3
 NEARLY_THERE = 1e-2
-"""Of the tolerance asked for, which says how far the minimum is: before, an old factor's steps leave soft modes wrong."""
+"""Of the tolerance asked for, which says how far the minimum is: farther, an old factor leaves soft modes wrong."""
 SINGLE_FROM = 1_500_000
 """Unknowns above which the factor is kept in single precision, for its memory; CG makes up for it."""
 SECONDS_A_PRODUCT, SECONDS_A_VERTEX = 0.25e-9, 1e-7
@@ -51,6 +51,12 @@ class DirectSolver:
         self.factor = factorise_blocks(self.plan, hessian, single=hessian.shape[0] > SINGLE_FROM)
         found = self._cg(hessian, gradient, TOLERANCE, enough, self.factor, FRESH_STEPS)
         return CgResult(found.x, found.residual, wasted + found.steps)
+
+    def refined(self, exact: bsr_matrix, gradient: Floats, enough: float) -> CgResult | None:
+        """The step of another Hessian, preconditioned by the latest factor; None where it is not definite."""
+        assert self.factor is not None
+        found = self._cg(exact, gradient, TOLERANCE, enough, self.factor, FRESH_STEPS)
+        return None if found.negative_curvature else found
 
     @staticmethod
     def _cg(

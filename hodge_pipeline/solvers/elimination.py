@@ -20,7 +20,7 @@ MOST_NEIGHBOURS = 8
 """A vertex of more stays in the core: there a library's dense blocks are faster."""
 SMALLEST_ROUND = 0.02
 """Of the vertices left: smaller rounds are not worth their overhead."""
-FEWEST_IN_ROUND = 16
+FEWEST_IN_ROUND = 100
 PASSES = 3
 
 
@@ -173,9 +173,7 @@ def _by_degree(chosen: Ints, vertex: Ints, other: Ints) -> list[tuple[Ints, Ints
     vertex, other = vertex[order], other[order]
     begin = np.searchsorted(vertex, chosen)
     degree = np.searchsorted(vertex, chosen, side="right") - begin
-    return [
-        (chosen[degree == k], other[begin[degree == k, None] + np.arange(k)]) for k in np.unique(degree)
-    ]
+    return [(chosen[degree == k], other[begin[degree == k, None] + np.arange(k)]) for k in np.unique(degree)]
 
 
 def _ordered_core(

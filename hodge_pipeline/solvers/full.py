@@ -164,4 +164,3 @@ def _frame(left: FullResiduals, edges: slice) -> Floats:
     frame = np.zeros((len(turn), p + d, p + d))
     frame[:, :p, :p], frame[:, p:, p:] = turn, np.swapaxes(predicted, 1, 2)
     return frame
-

@@ -6,6 +6,7 @@ translation so far that the scalar Laplacian is no preconditioner, and a factori
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +14,13 @@ from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.solvers.direct import DirectSolver
 from hodge_pipeline.solvers.newton import Point, Step
-from hodge_pipeline.solvers.objective import Residuals, residuals, rotation_gradient
+from hodge_pipeline.solvers.objective import Residuals, curvature, residuals, rotation_gradient
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import axial, exponential, lever
 from hodge_pipeline.types import Floats
+
+NEWTON_FROM = 0.1
+"""Of the tolerance asked for, which says how far the minimum is: from there on the exact Hessian pays."""
 
 
 def stiffness(kappa: Floats, turn: Floats) -> Floats:
@@ -26,7 +30,7 @@ def stiffness(kappa: Floats, turn: Floats) -> Floats:
     """
     cosine = 0.25 * (np.einsum("eii->e", turn) + (1.0 if turn.shape[-1] == 3 else 2.0))
     if turn.shape[-1] == 2:
-        return (2 * kappa * cosine)[:, None, None]
+        return np.asarray((2 * kappa * cosine)[:, None, None])
     half = axial(turn) / (4 * np.sqrt(np.maximum(cosine, 1e-12)))[:, None]
     return np.asarray(2 * kappa[:, None, None] * (np.eye(3) - half[:, :, None] * half[:, None, :]))
 
@@ -60,6 +64,9 @@ class JointObjective:
         assert isinstance(point, JointPoint)
         gradient, hessian = self.normal_equations(point.left)
         found = self.direct.solve(hessian, gradient, tolerance, enough)
+        if tolerance < NEWTON_FROM:
+            exact = self.direct.refined(self.hessian(point.left), gradient, enough)
+            found = exact if exact is not None else found
         slope = 2 * float(gradient @ found.x)
         return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), found.steps)
 
@@ -74,23 +81,37 @@ class JointObjective:
 
     def normal_equations(self, left: Residuals) -> tuple[Floats, bsr_matrix]:
         """Half the gradient (free · (p + d),) and half the Gauss-Newton Hessian."""
-        problem, p = self.problem, self.problem.tangent_size
-        structure, free, size = problem.structure, problem.free_count, problem.tangent_size + problem.dimension
+        problem = self.problem
+        structure, reach = problem.structure, left.shift + left.arm
         force = problem.tau[:, None] * left.shift
-        pulled = np.asarray(structure.at_head @ force - structure.at_tail @ force)[:free]
+        pulled = np.asarray(structure.at_head @ force - structure.at_tail @ force)[: problem.free_count]
         gradient = np.concatenate([rotation_gradient(problem, left), pulled], axis=1)
 
-        reach = left.shift + left.arm
+        def turned(edges: slice) -> Floats:
+            own = stiffness(problem.kappa[edges], left.turn[edges])
+            arm = lever(reach[edges])
+            levered = problem.tau[edges, None, None] * (np.swapaxes(arm, 1, 2) @ arm)
+            return np.stack([own + levered, own, -own, -own])
+
+        return gradient.reshape(-1), self._assembled(turned, reach)
+
+    def hessian(self, left: Residuals) -> bsr_matrix:
+        """Half the Hessian, the residuals' own curvature included: near a minimum it makes the steps Newton's."""
+        return self._assembled(lambda edges: curvature(self.problem, left, edges), left.arm)
+
+    def _assembled(self, turned: Callable[[slice], Floats], arm: Floats) -> bsr_matrix:
+        """The matrix of blocks `turned` (4, m, p, p) of the rotations (ii, jj, ij, ji), and these levers."""
+        problem, p = self.problem, self.problem.tangent_size
+        size = p + problem.dimension
 
         def blocks(edges: slice) -> Floats:
-            turned, tau = stiffness(problem.kappa[edges], left.turn[edges]), problem.tau[edges, None, None]
-            arms, weight = tau * lever(reach[edges]), tau * np.eye(problem.dimension)
+            tau = problem.tau[edges, None, None]
+            arms, weight = tau * lever(arm[edges]), tau * np.eye(problem.dimension)
             out = np.zeros((4, len(arms), size, size))
-            out[:2, :, :p, :p], out[2:, :, :p, :p] = turned, -turned
+            out[:, :, :p, :p] = turned(edges)
             out[:2, :, p:, p:], out[2:, :, p:, p:] = weight, -weight
-            out[0, :, :p, :p] += np.swapaxes(arms, 1, 2) @ lever(reach[edges])
             out[0, :, p:, :p], out[3, :, p:, :p] = -arms, arms
             out[0, :, :p, p:], out[2, :, :p, p:] = np.swapaxes(-arms, 1, 2), np.swapaxes(arms, 1, 2)
             return out
 
-        return gradient.reshape(-1), structure.symmetric_pattern.assemble(blocks, (size, size))
+        return problem.structure.symmetric_pattern.assemble(blocks, (size, size))

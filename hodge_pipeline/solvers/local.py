@@ -42,7 +42,9 @@ def settled_nearby(setup: Setup, changed: Ints, limits: Limits, full: bool) -> S
     )
     rotations, translations = setup.initial("given")
     places = vertices[local.order]
-    objective = FullObjective.of(local, full_objective(setup).information[edges]) if full else isotropic_objective(local)
+    objective = (
+        FullObjective.of(local, full_objective(setup).information[edges]) if full else isotropic_objective(local)
+    )
     end = descend(objective, objective.at(rotations[places], translations[places]), limits, setup.rounding).point
     rotations[places], translations[places] = end.rotations, end.translations
     return _with_start(setup, rotations, translations)

@@ -24,10 +24,11 @@ def minimise(
 ) -> Descent:
     """The descent of the isotropic objective and, where `full`, of the full one from its end.
 
-    `known`: the initial poses are near the full minimum already, so that it begins there.
+    `known`: the initial poses are near the full minimum already, so that it begins there; it does so too where its
+    steps cost no more than isotropic ones.
     """
     begin = setup.initial(initial)
-    if full and known:
+    if full and (known or steps_are_direct(setup.problem)):
         objective = full_objective(setup)
         return descend(objective, objective.at(*begin), limits, setup.rounding, watch)
     isotropic = isotropic_objective(setup.problem)
@@ -44,9 +45,13 @@ def minimise(
 
 def isotropic_objective(problem: Problem) -> Objective:
     """F, in the form whose steps are the cheaper ones on this graph."""
+    return JointObjective.of(problem) if steps_are_direct(problem) else IsotropicObjective(problem)
+
+
+def steps_are_direct(problem: Problem) -> bool:
+    """Whether a factorisation of all unknowns is so cheap that CG is not tried."""
     size = problem.tangent_size + problem.dimension
-    joint = steps_worth_a_factor(problem.structure.elimination, size) <= FEWEST_CG_STEPS
-    return JointObjective.of(problem) if joint else IsotropicObjective(problem)
+    return steps_worth_a_factor(problem.structure.elimination, size) <= FEWEST_CG_STEPS
 
 
 def full_objective(setup: Setup) -> FullObjective:

@@ -89,7 +89,7 @@ def quadratic_model(problem: Problem, left: Residuals, exact: bool = True) -> Qu
     return QuadraticModel(rotation_gradient(problem, left), hessian, coupling, coupling.transpose())
 
 
-def curvature(problem: Problem, left: Residuals, edges: slice, exact: bool) -> Floats:
+def curvature(problem: Problem, left: Residuals, edges: slice, exact: bool = True) -> Floats:
     """The blocks ii, jj, ij, ji (4, m, p, p) of some edges."""
     d, p = problem.dimension, problem.tangent_size
     kappa, tau, eye = problem.kappa[edges, None, None], problem.tau[edges, None, None], np.eye(p)
