@@ -88,6 +88,7 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
             proposed = steps.propose_edges(job, number, source, clouds, poses, measured)
             candidates = starting.with_start_edges(proposed, rounds[0])
             registered = steps.register_edges(job, number, candidates, poses, workers)
+            recording.registration(number, registered, poses, clouds)
             rounds.append(steps.solve(job, number, source, candidates, registered, poses, measured))
             recording.round(number, rounds[-1])
         for edited in edited_rounds(job, source, registered, rounds[-1], len(rounds)):

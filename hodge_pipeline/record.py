@@ -9,7 +9,7 @@ from types import TracebackType
 
 import numpy as np
 
-from hodge_pipeline import artifacts, binding, yaml_file
+from hodge_pipeline import artifacts, binding, se3, yaml_file
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.fusion.ply import read_ply
@@ -17,8 +17,9 @@ from hodge_pipeline.job import RECORDING, Job, log
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge_parts
 from hodge_pipeline.recording.recorder import APPLICATION, Recorder
+from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, has_truth, pose_sets, true_poses
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Source
+from hodge_pipeline.types import Candidates, CloudSet, Floats, Ints, Source
 
 FILE = "recording.rrd"
 Notes = tuple[str, ...]
@@ -66,6 +67,18 @@ class Recording:
             first.name, (first.name,), lambda to: to.poses(first.name, first.world_from_cam, self._source.frames)
         )
 
+    def registration(self, number: int, registered: Registered, before: Floats, clouds: CloudSet) -> None:
+        """What registration found in outer round `number`, from the poses before it."""
+        i, j = registered.pairs.T
+        guesses = se3.inverse(before[i]) @ before[j]
+        reasons = self._job.recipe.acceptance.reasons(registered)
+        self._part(
+            f"registration-{number}",
+            (f"register-{number}",),
+            lambda to: to.registration(number, registered, reasons, guesses, clouds),
+            self._job.recipe.acceptance,
+        )
+
     def round(self, number: int, this: Round) -> None:
         """The edges of outer round `number`, the pairs that became none, and the solve."""
         self._rounds.append(this)
@@ -94,15 +107,19 @@ class Recording:
         """The fused models; of several the last is seen."""
         inputs = tuple(f"fuse-{row}" for row in range(len(models)))
         if models:
+            poses = self._rounds[-1].world_from_cam
+            clouds = CloudSet.open(self._job.path("clouds"))
             self._part(
-                "model", inputs, lambda to: tuple(n for path in models.values() for n in to.model(read_ply(path)))
+                "model",
+                inputs,
+                lambda to: tuple(n for path in models.values() for n in to.model(read_ply(path), clouds, poses)),
             )
 
-    def _part(self, name: str, inputs: tuple[str, ...], write: Callable[[Recorder], Notes]) -> None:
+    def _part(self, name: str, inputs: tuple[str, ...], write: Callable[[Recorder], Notes], *options: object) -> None:
         job, stage = self._job, f"record-{name}"
         if job.recipe.recording.level == "off":
             return
-        with job.stage(stage, RECORDING, 1, job.recipe.recording, inputs) as (folder, advance):
+        with job.stage(stage, RECORDING, 1, (job.recipe.recording, *options), inputs) as (folder, advance):
             if not folder.finished:
                 for note in write(self._recorder(folder.path)):
                     job.note(note)
@@ -180,7 +197,19 @@ def _record_evaluation(recorder: Recorder, source: Source, rounds: Sequence[Roun
     if scores is not None:
         for graph in scores.graphs:
             bars[f"score_{graph.kind}"] = graph.mean_score
+            for name, scores_of_pairs in zip(scores.names, graph.scores, strict=True):
+                if graph.kind == scores.graphs[-1].kind and len(graph.pairs):
+                    per_frame[f"score/{name}"] = mean_at_frames(graph.pairs, scores_of_pairs, len(source.frames))
             rows = zip(scores.names, graph.mean_score, graph.mean_distance_m * 1000, strict=True)
             lines = [f"| {name} | {score:.4f} | {distance:.2f} |" for name, score, distance in rows]
             tables[f"Scores, {graph.kind} graph"] = "\n".join(["| poses | score | d, mm |", "|---|---|---|", *lines])
     return recorder.evaluation(source.frames, per_frame=per_frame, bars=bars, tables=tables)
+
+
+def mean_at_frames(pairs: Ints, values: Floats, count: int) -> Floats:
+    """The mean (count,) of the values (P,) of each frame's pairs (P, 2); NaN where it has none that is known."""
+    known = np.isfinite(values)
+    ends = pairs[known].ravel()
+    total = np.bincount(ends, np.repeat(values[known], 2), minlength=count)
+    number = np.bincount(ends, minlength=count)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)

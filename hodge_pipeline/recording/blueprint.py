@@ -11,38 +11,51 @@ from hodge_pipeline.recording.eye import Eye
 
 BACKGROUND = (24, 26, 32)
 COLOUR_NAMES = {"truth": "green", "odometry": "orange", "start": "orange"}
+PAIR_EYE = Eye((0.6, -1.6, -2.2), (0.0, 0.0, 1.8), (0.0, -1.0, 0.0))
+"""In the axes of a camera: behind it, above, to the right."""
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a recording holds: stages and trajectories by name, the best trajectory, the last rounds (0: none)."""
+    """What a recording holds: stages, trajectories and shown pairs by name, the best trajectory, the last rounds (0:
+    none).
+    """
 
     stages: frozenset[str] = frozenset()
     trajectories: tuple[str, ...] = ()
     trajectory: str = "truth"
     last_graph: int = 0
     last_solution: int = 0
+    pairs: tuple[str, ...] = ()
 
 
-def make_blueprint(contents: Contents, room: Eye | None, graph: Eye | None) -> rrb.Blueprint:
-    """The default blueprint: four tabs, the story first, its timeline the one that all data share.
+def make_blueprint(contents: Contents, room: Eye | None, graph: Eye | None, active_tab: int = 0) -> rrb.Blueprint:
+    """The default blueprint: a tab for each part of the run that is there, the story first.
 
     `room` sees the model, `graph` the cameras alone.
     """
-    tabs = rrb.Tabs(
-        _story_tab(contents, room),
-        _frames_tab(contents, room),
-        _solver_tab(contents, graph),
-        _text_tab(contents),
-        active_tab=0,
-    )
     return rrb.Blueprint(
-        tabs,
+        rrb.Tabs(*make_tabs(contents, room, graph), active_tab=active_tab),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=layout.STORY),
         auto_views=False,
     )
+
+
+def make_tabs(contents: Contents, room: Eye | None, graph: Eye | None) -> list[rrb.Container]:
+    """The tabs in the order of the run."""
+    has_pairs = {"registration", "diagnosis"} & contents.stages
+    return [
+        _story_tab(contents, room),
+        _frames_tab(contents, room),
+        *([registration_tab(contents)] if "registration" in contents.stages else []),
+        *([complex_tab(contents, graph)] if has_pairs else []),
+        _solver_tab(contents, graph),
+        *([model_tab(room)] if "model" in contents.stages else []),
+        *([evaluation_tab(contents, graph)] if "evaluation" in contents.stages else []),
+        _text_tab(contents),
+    ]
 
 
 def _scene(name: str, contents: list[str], eye: Eye | None) -> rrb.Spatial3DView:
@@ -79,7 +92,7 @@ def _story_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
     scene = _scene("Room, trajectories and edges", shown + _lines(contents.trajectory), eye)
     side = rrb.Vertical(
         rrb.Spatial2DView(origin=layout.PINHOLE, name="Colour", contents=[f"+ {layout.COLOUR}"]),
-        rrb.TimeSeriesView(origin=layout.FRAME_PLOTS, name="Scores of the frames"),
+        _errors_view(),
         rrb.Tabs(
             rrb.TextDocumentView(origin=layout.LEGEND, name="Colours"),
             rrb.TextDocumentView(origin=layout.graph_text(max(contents.last_graph, 1)), name="Viewing graph"),
@@ -117,14 +130,86 @@ def _solver_tab(contents: Contents, eye: Eye | None) -> rrb.Vertical:
     return rrb.Vertical(graphs, plots, row_shares=[3, 1], name="Edges and solver")
 
 
+def registration_tab(contents: Contents) -> rrb.Vertical:
+    """Chosen pairs before and after, and the numbers of all."""
+    views = [
+        rrb.Spatial3DView(
+            origin=layout.pair(name),
+            name=f"{name.replace('_', ' ').capitalize()}, {when}",
+            contents=[f"+ {layout.pair(name)}/target", f"+ {layout.pair(name)}/{when}"],
+            background=BACKGROUND,
+            line_grid=rrb.LineGrid3D(visible=False),
+            eye_controls=rrb.EyeControls3D(position=PAIR_EYE.position, look_target=PAIR_EYE.target, eye_up=PAIR_EYE.up),
+        )
+        for when in ("before", "after")
+        for name in contents.pairs
+    ]
+    outer = max(contents.last_graph, 1)
+    bars = [
+        rrb.BarChartView(origin=layout.under(layout.BARS, f"{name}_round_{outer}"), name=title)
+        for name, title in (("fitness", "Fitness of all pairs"), ("rmse_mm", "RMSE of all pairs, mm"))
+    ]
+    numbers = rrb.Horizontal(rrb.TextDocumentView(origin=layout.PAIRS_TEXT, name="Pairs"), *bars)
+    return rrb.Vertical(
+        rrb.Grid(*views, grid_columns=max(len(contents.pairs), 1)), numbers, row_shares=[3, 1], name="Registration"
+    )
+
+
+def complex_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
+    """The triangles by curl, and the verdicts on the edges."""
+    outer = max(contents.last_solution, 1)
+    eye = eye and eye.from_afar(1.7)
+    trajectory = f"+ {layout.trajectory(contents.trajectory)}"
+    scenes = [_scene("Triangles by curl", [f"+ {layout.complex_mesh(outer)}", trajectory], eye)]
+    texts = [rrb.TextDocumentView(origin=layout.complex_text(outer), name="Complex")]
+    if "diagnosis" in contents.stages:
+        scenes.append(_scene("Which edge is wrong", [f"+ {layout.VERDICTS}/**", trajectory], eye))
+        texts.append(rrb.TextDocumentView(origin=layout.DIAGNOSIS, name="Verdicts"))
+    return rrb.Horizontal(
+        *scenes, rrb.Vertical(*texts), column_shares=[2] * len(scenes) + [1], name="Complex, diagnosis"
+    )
+
+
+def model_tab(eye: Eye | None) -> rrb.Horizontal:
+    """The model as it grows frame by frame, beside the whole of it."""
+    eye = eye and eye.from_afar(1.25)
+    growing = [f"+ {layout.GROWTH}/**", f"+ {layout.CAMERA}/**", f"- {layout.CLOUD}", f"- {layout.DEPTH}"]
+    return rrb.Horizontal(
+        _scene("As it grows (timeline frame)", growing, eye), _scene("Whole", [f"+ {layout.MODEL}"], eye), name="Model"
+    )
+
+
+def evaluation_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
+    """Truth, odometry and result together, and the errors frame by frame."""
+    scene = _scene(
+        "Trajectories",
+        [f"+ {layout.trajectory(name)}" for name in contents.trajectories] + _lines(contents.trajectory),
+        eye,
+    )
+    plots = rrb.Vertical(
+        _errors_view(),
+        rrb.TimeSeriesView(origin=layout.FRAME_PLOTS, name="Score of a frame's pairs", contents=["+ $origin/score/**"]),
+        rrb.TimeSeriesView(
+            origin=layout.SOLVER_PLOTS, name="Deviation D of a loop", contents=["+ $origin/loop_deviation_mean"]
+        ),
+    )
+    scores = rrb.TextDocumentView(origin=layout.SCORES, name="Scores")
+    return rrb.Horizontal(
+        scene, rrb.Vertical(plots, scores, row_shares=[3, 1]), column_shares=[3, 2], name="Evaluation"
+    )
+
+
+def _errors_view() -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=layout.FRAME_PLOTS, name="Error of the position (ATE), m", contents=["+ $origin/error_m/**"]
+    )
+
+
 def _text_tab(contents: Contents) -> rrb.Horizontal:
     documents = [rrb.TextDocumentView(origin=layout.RECIPE, name="Recipe")]
     documents += [rrb.TextDocumentView(origin=layout.SOURCE, name="Source")]
-    documents += [rrb.TextDocumentView(origin=layout.SCORES, name="Scores")]
     log = rrb.TextLogView(origin=layout.LOG, name="Log")
-    charts = rrb.BarChartView(origin=layout.BARS, name="Bar charts")
-    right = rrb.Vertical(log, charts) if "evaluation" in contents.stages else log
-    return rrb.Horizontal(rrb.Tabs(*documents), right, name="Log and recipe")
+    return rrb.Horizontal(rrb.Tabs(*documents), log, name="Log and recipe")
 
 
 def legend(contents: Contents) -> str:
@@ -132,6 +217,10 @@ def legend(contents: Contents) -> str:
     lines = ["| colour | what |", "|---|---|"]
     lines += [f"| white | the result, {contents.trajectory.replace('_', ' ')} |"] if contents.last_solution else []
     lines += [f"| {colour} | {name} |" for name, colour in COLOUR_NAMES.items() if name in contents.trajectories]
+    if "diagnosis" in contents.stages:
+        lines += [
+            "| blue, grey, amber, magenta | in the diagnosis: an edge that is consistent, untestable, suspect, wrong |"
+        ]
     if contents.last_graph or contents.last_solution:
         lines += ["| blue to yellow | an edge: the brighter, the larger its residual |"]
         lines += ["| magenta | an edge that the solver ignored |", "| grey | a candidate pair that became no edge |"]

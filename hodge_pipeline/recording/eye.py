@@ -25,6 +25,11 @@ class Eye:
     target: tuple[float, float, float]
     up: tuple[float, float, float]
 
+    def from_afar(self, times: float) -> Eye:
+        """The eye moved back along its view, to so many times its distance: for a view that is narrow."""
+        position, target = np.array(self.position), np.array(self.target)
+        return Eye(_triple(target + times * (position - target)), self.target, self.up)
+
 
 def look_at(model_chunks: Iterable[Chunk], pose_chunks: Iterable[Chunk]) -> Eye | None:
     """An eye that has the model in view, or the cameras where there is no model; None where there are no poses."""

@@ -76,9 +76,17 @@ def log_clouds(
             positions=np.asarray(clouds.points[picked]), colors=np.asarray(clouds.colours[picked])
         ).partition([len(part) for part in parts]),
     )
+    _log_counts(stream, frames, sizes)
     notes = (f"recording: {len(picked)} of {total} cloud points",) if len(picked) < total else ()
     log_notes(stream, 0, notes)
     return notes
+
+
+def _log_counts(stream: rr.RecordingStream, frames: Sequence[Frame], sizes: Ints) -> None:
+    """Points of each frame's cloud: 0 where a frame was skipped."""
+    rows = np.arange(len(sizes))
+    scalars = rr.Scalars.columns(scalars=sizes.astype(float))
+    stream.send_columns(layout.under(layout.FRAME_PLOTS, "points"), frame_columns(frames, len(sizes), rows), scalars)
 
 
 def _colour(frame: Frame) -> EncodedImage | None:

@@ -10,7 +10,7 @@ import rerun as rr
 from hodge_pipeline import se3
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.options import RecordingOptions
-from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_column
+from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_columns
 from hodge_pipeline.types import Candidates, Floats, Frame, Ints, Solution, ViewGraph
 
 LINE_BYTES = 40
@@ -72,7 +72,10 @@ def log_edges(
         kept = options.count(options.edge_lines, len(rejected.pairs), LINE_BYTES, max_bytes / 4)
         pairs = rejected.pairs[shapes.evenly(len(rejected.pairs), kept)]
         grey = np.full((len(pairs), 3), shapes.REJECTED_COLOUR, np.uint8)
-        _log_lines(stream, layout.rejected(outer), world_from_cam, pairs, grey, None)
+        why = rejected.source[shapes.evenly(len(rejected.pairs), kept)]
+        named = zip(graph.vertex_ids[pairs[:, 0]], graph.vertex_ids[pairs[:, 1]], why, strict=True)
+        labels = [f"{i} – {j}: rejected, {reason}" for i, j, reason in named]
+        _log_lines(stream, layout.rejected(outer), world_from_cam, pairs, grey, labels)
     log_markdown(stream, layout.graph_text(outer), graph_summary(outer, graph, residual_m, rejected))
     return _noted(stream, outer, _thinning("edges", len(rows), graph.edge_count, outer))
 
@@ -131,7 +134,7 @@ def iteration_columns(outer: int, count: int, first_iteration: int, rows: Ints) 
     """The times of inner iterations `rows` of `count`: the running number of the run, and the round's story slot."""
     return [
         rr.TimeColumn(layout.ITERATION, sequence=first_iteration + rows),
-        story_column(outer, rows / max(count, 1)),
+        *story_columns(outer, rows / max(count, 1)),
     ]
 
 

@@ -8,6 +8,8 @@ STORY = "story"
 """The timeline that all data with a time share: seconds of a film in which each stage has its own slot."""
 FRAME = "frame"
 ITERATION = "iteration"
+STAGE = "stage"
+"""Counts the slots of the story: 0 is the capture with its odometry, k outer round k, then the fused model."""
 TIME = "time"
 
 SLOT_S = 10.0
@@ -26,6 +28,9 @@ VERDICTS = "/world/verdicts"
 TRIANGLES = "/world/curl/triangles"
 LOOPS = "/world/curl/loops"
 VERTICES = "/world/vertices"
+COMPLEX = "/world/complex"
+GROWTH = "/world/growth"
+PAIRS = "/pairs"
 FILM = "/world/film"
 FILM_EDGES = "/world/film/edges"
 FILM_TRAJECTORY = "/world/film/trajectory"
@@ -37,6 +42,7 @@ LOG = "/text/log"
 SOURCE = "/text/source"
 SCORES = "/text/scores"
 DIAGNOSIS = "/text/diagnosis"
+PAIRS_TEXT = "/text/pairs"
 LEGEND = "/text/legend"
 
 PART_SUFFIX = ".rrd"
@@ -80,6 +86,36 @@ def rejected(outer: int) -> str:
     return f"{edges(outer)}/rejected"
 
 
+def registration(outer: int) -> str:
+    """The numbers of every pair that was registered in an outer round, in columns."""
+    return f"/registration/{round_name(outer)}"
+
+
+def pair(name: str) -> str:
+    """The clouds of a chosen pair, in a space of their own: the axes of frame i."""
+    return f"{PAIRS}/{slug(name)}"
+
+
+def complex_mesh(outer: int) -> str:
+    """The triangles of an outer round's viewing graph."""
+    return f"{COMPLEX}/{round_name(outer)}"
+
+
+def complex_columns(outer: int) -> str:
+    """The triangles and their curl, in columns."""
+    return f"/complex/{round_name(outer)}"
+
+
+def complex_text(outer: int) -> str:
+    """The complex in numbers, and the energy of the 1-form on it."""
+    return f"/text/complex/{round_name(outer)}"
+
+
+def growth(step: int) -> str:
+    """The points that step 0, 1, … adds to the model."""
+    return f"{GROWTH}/step_{step:02d}"
+
+
 def verdict(name: str) -> str:
     """The edges that the diagnosis calls so."""
     return f"{VERDICTS}/{slug(name)}"
@@ -97,7 +133,7 @@ def graph_text(outer: int) -> str:
 
 def under(parent: str, name: str) -> str:
     """The entity of a named series, bar chart or table."""
-    return f"{parent}/{slug(name)}"
+    return "/".join([parent, *(slug(part) for part in name.split("/"))])
 
 
 def part_name(number: int, stage: str, detail: str = "") -> str:

@@ -20,7 +20,7 @@ from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import binary, layout
 from hodge_pipeline.recording.blueprint import legend, make_blueprint
 from hodge_pipeline.recording.eye import look_at
-from hodge_pipeline.recording.merge import contents_of, send
+from hodge_pipeline.recording.merge import contents_of, send, with_pairs
 from hodge_pipeline.recording.stream import log_markdown, open_stream
 
 HOST = "127.0.0.1"
@@ -39,8 +39,8 @@ class Live:
 
     def show(self, parts: Sequence[Path]) -> None:
         """Send the parts that were not sent yet; the views follow what there is."""
-        contents = contents_of(parts)
         readers = [(part, RrdReader(part)) for part in parts]
+        contents = with_pairs(contents_of(parts), readers)
         poses = layout.poses(contents.trajectory)
         for part, reader in readers:
             if part not in self._sent:

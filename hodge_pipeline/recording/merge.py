@@ -6,7 +6,7 @@ import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from subprocess import SubprocessError
 
@@ -37,8 +37,10 @@ def merge(folder: Path, out: Path, application_id: str, recording_id: str) -> Me
     return merge_parts(find_parts(folder), out, application_id, recording_id)
 
 
-def merge_parts(parts: Iterable[Path], out: Path, application_id: str, recording_id: str) -> Merged:
-    """One file of these parts, in the order of the run that their names say.
+def merge_parts(
+    parts: Iterable[Path], out: Path, application_id: str, recording_id: str, *, active_tab: int = 0
+) -> Merged:
+    """One file of these parts, in the order of the run that their names say; it opens on a tab, the story.
 
     A damaged part is mended as far as it can be read; the others are not touched by it.
     """
@@ -47,10 +49,11 @@ def merge_parts(parts: Iterable[Path], out: Path, application_id: str, recording
     notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="hodge-recording-") as scratch:
         readers = [(part, reader) for part in parts if (reader := _open(part, Path(scratch), notes)) is not None]
+        contents = with_pairs(contents, readers)
         poses = layout.poses(contents.trajectory)
         room = look_at(_chunks(readers, layout.MODEL), _chunks(readers, poses))
         graph = look_at((), _chunks(readers, poses))
-        with writing(out, application_id, recording_id, make_blueprint(contents, room, graph)) as stream:
+        with writing(out, application_id, recording_id, make_blueprint(contents, room, graph, active_tab)) as stream:
             for _, reader in readers:
                 send(stream, reader, poses)
             log_notes(stream, 0, notes, level="WARN")
@@ -86,6 +89,13 @@ def contents_of(parts: Iterable[Path]) -> Contents:
         last_graph=max(rounds, default=0),
         last_solution=max(solved, default=0),
     )
+
+
+def with_pairs(contents: Contents, readers: Iterable[tuple[Path, RrdReader]]) -> Contents:
+    """The contents with the names of the pairs whose clouds are shown."""
+    paths = {chunk.entity_path for chunk in _chunks(readers, f"{layout.PAIRS}/**")}
+    names = dict.fromkeys(path.split("/")[2] for path in sorted(paths))
+    return replace(contents, pairs=tuple(names))
 
 
 def _open(part: Path, scratch: Path, notes: list[str]) -> RrdReader | None:

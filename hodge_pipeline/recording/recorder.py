@@ -13,9 +13,13 @@ from hodge_pipeline.recording import frames as frame_log
 from hodge_pipeline.recording import graph as graph_log
 from hodge_pipeline.recording import layout, results
 from hodge_pipeline.recording.diagnosis import log_diagnosis
+from hodge_pipeline.recording.growth import log_growth
 from hodge_pipeline.recording.merge import Merged, merge
 from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.registration import log_registration
 from hodge_pipeline.recording.stream import writing
+from hodge_pipeline.recording.triangles import log_complex
+from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Model, Solution, ViewGraph
 
 Notes = tuple[str, ...]
@@ -54,6 +58,17 @@ class Recorder:
         """A trajectory (N, 4, 4) by its name, such as truth or odometry; NaN where a pose is unknown."""
         return self._part(
             2, "poses", name, lambda s: graph_log.log_poses(s, name, world_from_cam, frames, self.options)
+        )
+
+    def registration(
+        self, outer: int, registered: Registered, rejected: NDArray[np.str_], guesses: Floats, clouds: CloudSet
+    ) -> Notes:
+        """What registration found for every pair (P,) of an outer round, and why it was rejected, if it was."""
+        return self._part(
+            layout.outer_number(outer, 2),
+            "registration",
+            str(outer),
+            lambda s: log_registration(s, outer, registered, rejected, guesses, clouds, self.options),
         )
 
     def edges(
@@ -99,6 +114,7 @@ class Recorder:
             notes = graph_log.log_solution(
                 stream, outer, graph, start, solution, first_iteration, self.options, self._round_bytes
             )
+            notes += log_complex(stream, outer, graph, start, solution, self.options, self._round_bytes / 4)
             name = layout.round_name(outer)
             return notes + graph_log.log_poses(stream, name, solution.world_from_cam, frames, self.options)
 
@@ -120,9 +136,15 @@ class Recorder:
             lambda s: log_diagnosis(s, graph, world_from_cam, verdict, probability, reason, self.options),
         )
 
-    def model(self, model: Model) -> Notes:
-        """The fused scene."""
-        return self._part(900, "model", "", lambda s: results.log_model(s, model, self.options))
+    def model(self, model: Model, clouds: CloudSet | None = None, world_from_cam: Floats | None = None) -> Notes:
+        """The fused scene; with the clouds of the frames and their poses also how it grows."""
+
+        def log(stream: rr.RecordingStream) -> Notes:
+            if clouds is not None and world_from_cam is not None:
+                log_growth(stream, model, clouds, world_from_cam, self.rounds + 1, self.options)
+            return results.log_model(stream, model, self.options)
+
+        return self._part(900, "model", "", log)
 
     def evaluation(
         self,

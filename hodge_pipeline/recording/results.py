@@ -9,7 +9,7 @@ import rerun as rr
 
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.options import RecordingOptions
-from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_column
+from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_columns
 from hodge_pipeline.types import Floats, Frame, Model
 
 VERTEX_BYTES = 28
@@ -71,7 +71,7 @@ def log_text(stream: rr.RecordingStream, recipe: str, log_lines: Sequence[str], 
         share = slots * np.arange(len(log_lines)) / len(log_lines)
         stream.send_columns(
             layout.LOG,
-            indexes=[story_column(0, share)],
+            indexes=story_columns(0, share),
             columns=rr.TextLog.columns(text=list(log_lines), level=[level_of(line) for line in log_lines]),
         )
 

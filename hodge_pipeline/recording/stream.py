@@ -49,14 +49,18 @@ def writing(
     os.replace(partial, path)
 
 
-def story_column(slot: int, share: Floats) -> rr.TimeColumn:
-    """Times on the story timeline at these shares, in [0, 1), of a stage's slot."""
-    return rr.TimeColumn(layout.STORY, duration=layout.SLOT_S * (slot + np.asarray(share, float)))
+def story_columns(slot: int, share: Floats) -> list[rr.TimeColumn]:
+    """Times on the story timeline at these shares, in [0, 1), of a stage's slot, and the stage that the slot is."""
+    slots = slot + np.asarray(share, float)
+    return [
+        rr.TimeColumn(layout.STORY, duration=layout.SLOT_S * slots),
+        rr.TimeColumn(layout.STAGE, sequence=np.floor(slots).astype(np.int64)),
+    ]
 
 
 def frame_columns(frames: Sequence[Frame], count: int, rows: Ints) -> list[rr.TimeColumn]:
     """The times of frames `rows` of `count`: frame row, story, and sensor time where the stamps are real."""
-    columns = [rr.TimeColumn(layout.FRAME, sequence=rows), story_column(0, rows / max(count, 1))]
+    columns = [rr.TimeColumn(layout.FRAME, sequence=rows), *story_columns(0, rows / max(count, 1))]
     if has_real_stamps(frames):
         stamps = np.array([frames[row].stamp_s for row in rows])
         since_1970 = min(frame.stamp_s for frame in frames) > UNIX_STAMP_S
@@ -77,6 +81,7 @@ def log_notes(stream: rr.RecordingStream, slot: int, notes: Iterable[str], level
     """Lines of the run's log, at the start of a stage's slot."""
     for note in notes:
         stream.set_time(layout.STORY, duration=layout.SLOT_S * slot)
+        stream.set_time(layout.STAGE, sequence=slot)
         stream.log(layout.LOG, rr.TextLog(note, level=level))
     stream.reset_time()
 

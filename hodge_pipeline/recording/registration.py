@@ -1,0 +1,129 @@
+"""What registration found: its numbers for every pair, and chosen pairs before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from hodge_pipeline import se3
+from hodge_pipeline.recording import layout
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.shapes import evenly
+from hodge_pipeline.recording.stream import log_markdown
+from hodge_pipeline.registration.pairs import Registered
+from hodge_pipeline.types import CloudSet, Floats, Floats32
+
+POINTS_SHOWN = 6_000
+TARGET_COLOUR, BEFORE_COLOUR, AFTER_COLOUR = (86, 180, 233), (230, 130, 0), (240, 228, 66)
+"""Blue, orange and yellow of Okabe and Ito's set."""
+BINS = 30
+POINT_RADIUS = -1.0
+
+
+def log_registration(
+    stream: rr.RecordingStream,
+    outer: int,
+    registered: Registered,
+    rejected: NDArray[np.str_],
+    guesses: Floats,
+    clouds: CloudSet,
+    options: RecordingOptions,
+) -> tuple[str, ...]:
+    """Nothing to remark; histograms and columns of all pairs (P,), the clouds of the chosen ones in i's axes.
+
+    `rejected (P,)` says why a pair became no edge, an empty word where it is one; `guesses (P, 4, 4)` is `i_from_j`
+    as registration began.
+    """
+    log_columns(stream, outer, registered, rejected)
+    for name, values in (("fitness", registered.fitness), ("rmse_mm", registered.rmse_m * 1000)):
+        _log_histogram(stream, layout.under(layout.BARS, f"{name}_round_{outer}"), values)
+    if options.has_images:
+        chosen = chosen_pairs(registered, rejected, guesses)
+        for name, row in chosen.items():
+            _log_pair(stream, name, registered, row, guesses, clouds)
+        log_markdown(stream, layout.PAIRS_TEXT, _text(registered, rejected, guesses, chosen))
+    return ()
+
+
+def log_columns(stream: rr.RecordingStream, outer: int, registered: Registered, rejected: NDArray[np.str_]) -> None:
+    """Every pair's numbers, one row each, as components that a program reads back."""
+    if not len(registered.pairs):
+        return
+    stream.log(
+        layout.registration(outer),
+        rr.AnyValues(
+            i=registered.pairs[:, 0],
+            j=registered.pairs[:, 1],
+            fitness=registered.fitness.astype(np.float32),
+            rmse_m=registered.rmse_m.astype(np.float32),
+            iterations=registered.iterations,
+            correspondences=registered.correspondences,
+            rejected=rejected.tolist(),
+        ),
+        static=True,
+    )
+
+
+def chosen_pairs(registered: Registered, rejected: NDArray[np.str_], guesses: Floats) -> Mapping[str, int]:
+    """Rows by name: the edge that registration moved most, the edge of least fitness, the fittest pair rejected."""
+    edges, others = np.flatnonzero(rejected == ""), np.flatnonzero(rejected != "")
+    found: dict[str, int] = {}
+    if len(edges):
+        found["moved_most"] = int(edges[np.argmax(moved_m(registered, guesses)[edges])])
+        found["least_fitness"] = int(edges[np.argmin(registered.fitness[edges])])
+    if len(others):
+        found["rejected"] = int(others[np.argmax(np.nan_to_num(registered.fitness[others], nan=-1.0))])
+    return found
+
+
+def moved_m(registered: Registered, guesses: Floats) -> Floats:
+    """How far registration moved each pair (P,) from its guess, a rotation as its arc at 1 m; 0 where unknown."""
+    motion = se3.log(se3.inverse(guesses) @ registered.i_from_j)
+    return np.asarray(np.nan_to_num(np.linalg.norm(motion, axis=1)))
+
+
+def _log_pair(
+    stream: rr.RecordingStream, name: str, registered: Registered, row: int, guesses: Floats, clouds: CloudSet
+) -> None:
+    i, j = registered.pairs[row]
+    source = np.asarray(_thinned(clouds, int(j)), float)
+    for part, points, colour in (
+        ("target", _thinned(clouds, int(i)), TARGET_COLOUR),
+        ("before", np.asarray(se3.transform(guesses[row], source), np.float32), BEFORE_COLOUR),
+        ("after", np.asarray(se3.transform(registered.i_from_j[row], source), np.float32), AFTER_COLOUR),
+    ):
+        shown = rr.Points3D(points, colors=[colour], radii=[POINT_RADIUS])
+        stream.log(f"{layout.pair(name)}/{part}", shown, static=True)
+    stream.log(layout.pair(name), rr.ViewCoordinates.RDF, static=True)
+
+
+def _thinned(clouds: CloudSet, row: int) -> Floats32:
+    points = clouds[row].points_in_cam
+    return np.asarray(points[evenly(len(points), POINTS_SHOWN)])
+
+
+def _log_histogram(stream: rr.RecordingStream, path: str, values: Floats) -> None:
+    known = values[np.isfinite(values)]
+    if len(known):
+        counts, ends = np.histogram(known, bins=BINS)
+        middles, widths = (ends[1:] + ends[:-1]) / 2, np.diff(ends).astype(np.float32)
+        stream.log(path, rr.BarChart(counts, abscissa=middles, widths=widths), static=True)
+
+
+def _text(registered: Registered, rejected: NDArray[np.str_], guesses: Floats, chosen: Mapping[str, int]) -> str:
+    moved = moved_m(registered, guesses)
+    reasons, counts = np.unique(rejected, return_counts=True)
+    lines = ["# Registration", "", "| outcome | pairs |", "|---|---|"]
+    lines += [f"| {reason or 'edge'} | {count} |" for reason, count in zip(reasons, counts, strict=True)]
+    lines += ["", "Blue: frame i. Orange: frame j as guessed. Yellow: frame j as registered.", ""]
+    lines += ["| shown | i – j | fitness | RMSE | iterations | moved |", "|---|---|---|---|---|---|"]
+    for name, row in chosen.items():
+        i, j = registered.pairs[row]
+        lines.append(
+            f"| {name.replace('_', ' ')} | {i} – {j} | {registered.fitness[row]:.2f} "
+            f"| {1000 * registered.rmse_m[row]:.1f} mm | {registered.iterations[row]} | {100 * moved[row]:.1f} cm |"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,130 @@
+"""The complex that the viewing graph spans: its triangles, coloured by what the motions round each leave over."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+import rerun as rr
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.cech import clique_counts, flag_complex
+from hodge_pipeline.diagnosis.energy import energy_shares
+from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.stream import log_markdown, log_notes
+from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
+
+MOST_TRIANGLES = 300_000
+TRIANGLE_BYTES = 60
+OPACITY = 110
+Share: TypeAlias = tuple[str, str, float, float]
+
+
+def log_complex(
+    stream: rr.RecordingStream,
+    outer: int,
+    graph: ViewGraph,
+    start: Floats,
+    solution: Solution,
+    options: RecordingOptions,
+    max_bytes: float,
+) -> tuple[str, ...]:
+    """What was thinned, in words; the triangles by curl, and the energy of the 1-form before and after the solve."""
+    counts = clique_counts(graph.edges, graph.vertex_count)
+    if counts[2] > MOST_TRIANGLES:
+        notes = (f"recording: the {counts[2]} triangles of round {outer} are too many to draw",)
+        log_notes(stream, outer, notes)
+        return notes
+    triangles = flag_complex(graph.edges, graph.vertex_count).simplices[2]
+    curl_m = triangle_curl_m(graph, triangles)
+    if len(triangles):
+        _log_columns(stream, outer, triangles, curl_m)
+    kept = options.count(options.edge_lines, len(triangles), TRIANGLE_BYTES, max_bytes)
+    corners = solution.world_from_cam[triangles, :3, 3]
+    drawable = np.flatnonzero(np.isfinite(corners).all(axis=(1, 2)))
+    rows = drawable[np.argsort(curl_m[drawable], kind="stable")][shapes.evenly(len(drawable), kept)]
+    colours = shapes.residual_colours(curl_m[rows], options.residual_scale_m)
+    if len(rows):
+        _log_mesh(stream, layout.complex_mesh(outer), corners[rows], colours)
+    log_markdown(stream, layout.complex_text(outer), _text(outer, counts, curl_m, _energy(graph, start, solution)))
+    drawn = f"recording: {len(rows)} of {len(triangles)} triangles of round {outer} drawn"
+    thinned = (drawn,) if len(rows) < len(triangles) else ()
+    log_notes(stream, outer, thinned)
+    return thinned
+
+
+def _log_columns(stream: rr.RecordingStream, outer: int, triangles: Ints, curl_m: Floats) -> None:
+    """Every triangle, drawn or not, as components that a program reads back."""
+    stream.log(
+        layout.complex_columns(outer),
+        rr.AnyValues(a=triangles[:, 0], b=triangles[:, 1], c=triangles[:, 2], curl_m=curl_m.astype(np.float32)),
+        static=True,
+    )
+
+
+def triangle_curl_m(graph: ViewGraph, triangles: Ints) -> Floats:
+    """What the measured motions round each triangle (T, 3) leave over, in metres; a rotation is its arc at 1 m.
+
+    Of parallel edges the first counts.
+    """
+    ab, bc, ca = (_motions(graph, triangles[:, k], triangles[:, (k + 1) % 3]) for k in range(3))
+    around = ab @ bc @ ca
+    angle_rad = np.linalg.norm(se3.so3_log(around[:, :3, :3]), axis=1)
+    return np.asarray(np.hypot(np.linalg.norm(around[:, :3, 3], axis=1), shapes.RESIDUAL_ARM_M * angle_rad))
+
+
+def _motions(graph: ViewGraph, a: Ints, b: Ints) -> Floats:
+    """The measured `a_from_b` (T, 4, 4) of pairs that have an edge in either direction."""
+    low, high = graph.edges.min(axis=1), graph.edges.max(axis=1)
+    keys, first = np.unique(low * graph.vertex_count + high, return_index=True)
+    rows = first[np.searchsorted(keys, np.minimum(a, b) * graph.vertex_count + np.maximum(a, b))]
+    motions = graph.i_from_j[rows]
+    turned = graph.edges[rows, 0] != a
+    motions[turned] = se3.inverse(motions[turned])
+    return motions
+
+
+def _log_mesh(
+    stream: rr.RecordingStream, path: str, corners: Floats, colours: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
+) -> None:
+    opaque = np.concatenate([colours, np.full((len(colours), 1), OPACITY, np.uint8)], axis=1)
+    stream.log(
+        path,
+        rr.Mesh3D(
+            vertex_positions=corners.reshape(-1, 3).astype(np.float32),
+            triangle_indices=np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3),
+            vertex_colors=np.repeat(opaque, 3, axis=0),
+        ),
+        static=True,
+    )
+
+
+def _energy(graph: ViewGraph, start: Floats, solution: Solution) -> list[Share]:
+    """The share of each part in rotation and in translation, before and after the solve; without edges ignored."""
+    rows: list[Share] = []
+    for when, poses in (("before", start), ("after", solution.world_from_cam)):
+        if not np.isfinite(poses).all():
+            continue
+        shares, _ = energy_shares(graph, poses, solution.component, solution.weights > 0)
+        for part, (rotation, translation) in shares.get("after", {}).items():
+            rows.append((when, part, rotation, translation))
+    return rows
+
+
+def _text(outer: int, counts: tuple[int, ...], curl_m: Floats, energy: list[Share]) -> str:
+    lines = [f"# Complex, round {outer}", "", "| | |", "|---|---|", f"| frames | {counts[0]} |"]
+    lines += [f"| edges, parallel ones once | {counts[1]} |", f"| triangles | {counts[2]} |"]
+    if len(curl_m):
+        middle, high, top = np.percentile(curl_m, [50, 95, 100]) * 1000
+        lines.append(f"| curl, median / 95th / largest | {middle:.1f} / {high:.1f} / {top:.1f} mm |")
+    if energy:
+        lines += [
+            "",
+            "## Energy of the residual 1-form",
+            "",
+            "Exact is what a solve can remove; curl and harmonic stay.",
+        ]
+        lines += ["", "| solve | part | rotation | translation |", "|---|---|---|---|"]
+        lines += [f"| {when} | {part} | {100 * r:.2f} % | {100 * t:.2f} % |" for when, part, r, t in energy]
+    return "\n".join(lines)

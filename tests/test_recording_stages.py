@@ -1,0 +1,138 @@
+"""Registration, complex, diagnosis and growth in a recording: read back, and by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rerun.chunk import RrdReader
+
+from hodge_pipeline import se3
+from hodge_pipeline.recording import layout
+from hodge_pipeline.recording.blueprint import Contents
+from hodge_pipeline.recording.growth import first_frame
+from hodge_pipeline.recording.merge import find_parts, with_pairs
+from hodge_pipeline.recording.registration import chosen_pairs, moved_m
+from hodge_pipeline.recording.triangles import triangle_curl_m
+from hodge_pipeline.registration.pairs import Registered
+from hodge_pipeline.types import CloudSet, Model, PointCloud, ViewGraph
+from test_recording import circle, make_solution, record, rgb, ring_graph, rows
+
+
+def registered(count: int = 4) -> tuple[Registered, np.ndarray]:
+    """Pairs (0, k), guessed at the identity, moved by 0.1 k m; the last has least fitness."""
+    motions = np.tile(np.eye(4), (count, 1, 1))
+    motions[:, 0, 3] = 0.1 * np.arange(count)
+    columns: dict[str, Any] = {
+        "pairs": np.stack([np.zeros(count, int), np.arange(1, count + 1)], axis=1),
+        "i_from_j": motions,
+        "information": np.tile(np.eye(6), (count, 1, 1)),
+        "fitness": np.linspace(0.9, 0.2, count),
+        "rmse_m": np.linspace(0.01, 0.03, count),
+        "correspondences": np.arange(count) + 100,
+        "iterations": np.arange(count) + 5,
+        "converged": np.ones(count, bool),
+    }
+    return Registered(**columns), np.tile(np.eye(4), (count, 1, 1))
+
+
+def clouds(count: int = 5) -> CloudSet:
+    rng = np.random.default_rng(0)
+    return CloudSet.from_clouds([PointCloud(rng.normal(size=(20, 3)).astype(np.float32)) for _ in range(count)])
+
+
+def test_registration_reads_back_with_the_clouds_of_chosen_pairs(tmp_path: Path) -> None:
+    found, guesses = registered()
+    why = np.array(["", "", "", "too little overlap"])
+    assert chosen_pairs(found, why, guesses) == {"moved_most": 2, "least_fitness": 2, "rejected": 3}
+    np.testing.assert_allclose(moved_m(found, guesses), [0, 0.1, 0.2, 0.3])
+    seen = clouds()
+    record(tmp_path).registration(1, found, why, guesses, seen)
+    part = tmp_path / "012-registration-1.rrd"
+    columns = layout.registration(1)
+    np.testing.assert_array_equal(np.float32(rows(part, columns, "fitness")[0]), np.float32(found.fitness))
+    np.testing.assert_array_equal(np.float32(rows(part, columns, "rmse_m")[0]), np.float32(found.rmse_m))
+    assert rows(part, columns, "iterations")[0] == found.iterations.tolist()
+    assert rows(part, columns, "rejected")[0] == why.tolist()
+    pair = layout.pair("rejected")
+    (after,) = rows(part, f"{pair}/after", "Points3D:positions")
+    moved = np.asarray(seen[4].points_in_cam, float) + [0.3, 0, 0]
+    np.testing.assert_array_equal(np.float32(after), np.float32(moved))
+    (before,) = rows(part, f"{pair}/before", "Points3D:positions")
+    np.testing.assert_array_equal(np.float32(before), seen[4].points_in_cam)
+    readers = [(path, RrdReader(path)) for path in find_parts(tmp_path)]
+    assert with_pairs(Contents(), readers).pairs == ("least_fitness", "moved_most", "rejected")
+
+
+def test_no_pairs_at_all(tmp_path: Path) -> None:
+    none = Registered.of(np.zeros((0, 2), np.int64), [])
+    record(tmp_path).registration(1, none, np.zeros(0, "U1"), np.zeros((0, 4, 4)), clouds())
+    assert not rows(tmp_path / "012-registration-1.rrd", layout.registration(1), "fitness")
+
+
+def test_curl_of_a_triangle_by_hand() -> None:
+    """Three exact motions, one of them measured backwards; then 0.2 m are added to one.
+
+    0 -- 1
+     \\  |
+       2
+    """
+    poses = circle(12)[:3]
+    edges = np.array([[0, 1], [2, 1], [0, 2]])
+    exact = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]]
+    triangle = np.array([[0, 1, 2]])
+    graph = ViewGraph.from_edges(np.arange(3), edges, exact)
+    np.testing.assert_allclose(triangle_curl_m(graph, triangle), [0], atol=1e-7)
+    exact[2] = exact[2] @ se3.from_parts(np.eye(3), np.array([0.2, 0, 0]))
+    np.testing.assert_allclose(triangle_curl_m(graph, triangle), [0.2], atol=1e-9)
+
+
+def test_triangles_read_back(tmp_path: Path) -> None:
+    poses = circle(6)
+    edges = np.array([[0, 1], [1, 2], [0, 2], [2, 3], [3, 4], [4, 5]])
+    measured = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]]
+    graph = ViewGraph.from_edges(np.arange(6), edges, measured)
+    start, solution = make_solution(poses, graph)
+    record(tmp_path).solution(1, graph, start, solution)
+    part = tmp_path / "011-solution-1.rrd"
+    assert [rows(part, layout.complex_columns(1), name)[0] for name in "abc"] == [[0], [1], [2]]
+    (corners,) = rows(part, layout.complex_mesh(1), "Mesh3D:vertex_positions")
+    np.testing.assert_array_equal(np.float32(corners), np.float32(solution.world_from_cam[:3, :3, 3]))
+    (text,) = rows(part, layout.complex_text(1), "TextDocument:text")
+    assert "| triangles | 1 |" in text[0] and "| after | exact |" in text[0]
+
+
+def test_verdicts_have_entities_of_their_own(tmp_path: Path) -> None:
+    poses = circle()
+    graph = ring_graph(poses)
+    verdict = np.array(["consistent"] * (graph.edge_count - 2) + ["wrong", "untestable"])
+    probability = np.where(verdict == "untestable", np.nan, 0.5)
+    record(tmp_path).diagnosis(graph, poses, verdict, probability, np.full(graph.edge_count, "so it is"))
+    part = tmp_path / "890-diagnosis.rrd"
+    (lines,) = rows(part, layout.verdict("wrong"), "LineStrips3D:strips")
+    np.testing.assert_array_equal(np.float32(lines), np.float32(poses[graph.edges[-2:-1], :3, 3]))
+    (labels,) = rows(part, layout.verdict("wrong"), "LineStrips3D:labels")
+    assert labels == ["10 – 1: given, wrong, 50 %: so it is"]
+    assert len(rows(part, layout.verdict("consistent"), "LineStrips3D:strips")[0]) == graph.edge_count - 2
+    (text,) = rows(part, layout.DIAGNOSIS, "TextDocument:text")
+    assert "| untestable | 1 |" in text[0]
+
+
+def test_a_point_grows_with_the_frame_that_saw_it_first(tmp_path: Path) -> None:
+    """Two frames 1 m apart that see one point each, ahead; a third that no cloud saw goes to the last."""
+    ahead = PointCloud(np.float32([[0, 0, 1]]))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 1.0
+    points = np.float32([[1, 0, 1], [0, 0, 1], [0.02, 0, 1.01], [9, 9, 9]])
+    seen = CloudSet.from_clouds([ahead, ahead])
+    assert first_frame(points, seen, poses).tolist() == [1, 0, 0, 1]
+    poses[0] = np.nan
+    assert first_frame(points, seen, poses).tolist() == [1, 1, 1, 1]
+    poses[0] = np.eye(4)
+    colours = np.uint8([[1, 2, 3], [4, 5, 6], [7, 8, 9], [0, 0, 0]])
+    record(tmp_path).model(Model("m", points, colours=colours), seen, poses)
+    part = tmp_path / "900-model.rrd"
+    (first,) = rows(part, layout.growth(0), "Points3D:positions")[:1]
+    np.testing.assert_array_equal(np.float32(first), points[[1, 2]])
+    np.testing.assert_array_equal(rgb(rows(part, layout.growth(0), "Points3D:colors")[0]), colours[[1, 2]])
