@@ -132,19 +132,6 @@ def test_one_cloud_of_all_fragments(tmp_path: Path) -> None:
         PlyWriter().write(tmp_path / "x.ply", replace(source, frames=()))
 
 
-@pytest.mark.parametrize(("name", "package"), [("a.las", "laspy"), ("a.e57", "pye57")])
-def test_other_formats_name_the_package_they_need(tmp_path: Path, name: str, package: str) -> None:
-    pytest.importorskip("importlib")
-    try:
-        __import__(package)
-    except ImportError:
-        (tmp_path / name).write_bytes(b"LASF")
-        with pytest.raises(SourceError, match=f"pip install {package}"):
-            CloudFolderReader().open(tmp_path)
-    else:
-        pytest.skip(f"{package} is installed")
-
-
 @pytest.mark.parametrize(
     ("name", "contents", "message"),
     [

@@ -51,12 +51,21 @@ def test_information_is_turned_to_radians_and_missing_pairs_are_counted(tmp_path
     path, beside = tmp_path / "a.log", tmp_path / "a.info"
     path.write_text(f"0 1 3\n{IDENTITY}1 2 3\n{IDENTITY}")
     beside.write_text("0 1 3\n" + information([9, 9, 9, 400, 400, 400], 8.0))
-    source = PairLogReader(information=beside).open(path)
-    assert source.graph is not None and source.notes == ("1 of 2 pairs are not in a.info: they get its median matrix",)
+    source = PairLogReader().open(path)
+    assert source.graph is not None and source.notes == (
+        "1 of 2 pairs are not in a.info: they get its median matrix",
+        "information of a.info",
+    )
     expected = np.diag([100.0, 100, 100, 9, 9, 9])
     expected[2, 3] = expected[3, 2] = 4.0
     np.testing.assert_array_equal(source.graph.information, [expected, expected])
     assert source.files == (path, beside)
+    alike = PairLogReader(information="none").open(path)
+    assert alike.graph is not None and alike.files == (path,)
+    np.testing.assert_array_equal(alike.graph.information, np.tile(np.eye(6), (2, 1, 1)))
+    elsewhere = beside.rename(tmp_path / "b.info")
+    assert PairLogReader().open(path).files == (path,)
+    assert PairLogReader(information=elsewhere).open(path).files == (path, elsewhere)
 
 
 @pytest.mark.parametrize(

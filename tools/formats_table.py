@@ -18,7 +18,7 @@ OTHER = {
     ".jpg": "images on their own",
     ".JPG": "images on their own",
     ".png": "images on their own",
-    ".info": "information of pairs: a `.log` is read without it",
+    ".info": "information of pairs: read with the `.log` of the same name",
     ".npy": "Open3D's control grid",
     ".mat": "MATLAB; the model beside it is read",
     ".xz": "packed: unpack it, then give the folder",

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass as plain_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,12 @@ from hodge_adapters.colmap_files import natural
 from hodge_adapters.log_text import read_log_file
 from hodge_adapters.pcd_points import read_pcd
 from hodge_adapters.ply_points import read_ply, write_ply
-from hodge_adapters.point_columns import points_of_columns
+from hodge_adapters.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
 from hodge_adapters.text_rows import listed
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Frame, PointCloud, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import Floats, Frame, PointCloud, Source, Trajectory, ViewGraph
 
 _NUMBER = re.compile(r"(\d{1,15})\D*$")
 
@@ -60,9 +60,10 @@ class CloudFolderReader:
         notes: list[str] = []
         for file in files:
             _require(file)
-        numbers = _numbers(files, notes)
+        fragments = _fragments(files, notes)
+        numbers = _numbers([f"{f.path.stem}" if f.row is None else f"{f.path.stem} {f.row}" for f in fragments], notes)
         order = np.argsort(numbers, kind="stable")
-        files, numbers = [files[row] for row in order], [numbers[row] for row in order]
+        fragments, numbers = [fragments[row] for row in order], [numbers[row] for row in order]
         log = self._log(path if path.is_dir() else path.parent) if path.is_dir() or self.log != "auto" else None
         parsed = read_log_file(log) if log else None
         poses = parsed.poses if parsed else {}
@@ -73,13 +74,13 @@ class CloudFolderReader:
             Frame(
                 frame_id=number,
                 stamp_s=float(number),
-                read_points=partial(read_fragment, file, units_per_metre=self.units_per_metre),
-                world_from_cam=poses.get(number),
+                read_points=partial(read_fragment, fragment, units_per_metre=self.units_per_metre),
+                world_from_cam=poses.get(number, fragment.in_metres(self.units_per_metre)),
             )
-            for number, file in zip(numbers, files, strict=True)
+            for number, fragment in zip(numbers, fragments, strict=True)
         )
-        known = [number for number in numbers if number in poses]
-        trajectory = Trajectory(np.array(known, float), np.array([poses[n] for n in known])) if known else None
+        posed = [(frame.stamp_s, frame.world_from_cam) for frame in frames if frame.world_from_cam is not None]
+        trajectory = Trajectory(np.array([s for s, _ in posed]), np.array([p for _, p in posed])) if posed else None
         graph = _graph(numbers, parsed.pairs, parsed.i_from_j, notes) if parsed and len(parsed.pairs) else None
         found = tuple(filter(None, [log]))
         return Source(
@@ -132,35 +133,53 @@ class PlyWriter:
         write_ply(path, PointCloud(np.concatenate(points).astype(np.float32), None, colours))
 
 
-def read_fragment(path: Path, *, units_per_metre: float) -> PointCloud:
-    """The points of one file in metres, by its ending."""
-    cloud = READERS[path.suffix.lower()](path)
+@plain_dataclass(frozen=True)
+class Fragment:
+    """A file of points, or one scan (`row`) of a file with several; `corner` is where LAS coordinates count from."""
+
+    path: Path
+    row: int | None = None
+    corner: tuple[float, float, float] | None = None
+    world_from_scan: tuple[float, ...] | None = None
+
+    def in_metres(self, units_per_metre: float) -> Floats | None:
+        """`world_from_scan` (4, 4) in metres, None where the file gives none."""
+        if self.world_from_scan is None:
+            return None
+        pose = np.array(self.world_from_scan).reshape(4, 4)
+        pose[:3, 3] /= units_per_metre
+        return pose
+
+
+def read_fragment(fragment: Fragment, *, units_per_metre: float) -> PointCloud:
+    """The points of a fragment in metres, by the ending of its file."""
+    if fragment.row is not None:
+        cloud = read_e57(fragment.path, fragment.row)
+    elif fragment.corner is not None:
+        cloud = read_las(fragment.path, fragment.corner)
+    else:
+        cloud = READERS[fragment.path.suffix.lower()](fragment.path)
     if units_per_metre == 1.0:
         return cloud
     return PointCloud(cloud.points_in_cam / np.float32(units_per_metre), cloud.normals_in_cam, cloud.colours)
 
 
-def read_las(path: Path) -> PointCloud:
-    """The points of a LAS or LAZ file, from its lower corner: float32 has no room for map coordinates."""
-    laspy = _import("laspy", path)
-    try:
-        las = laspy.read(path)
-        corner = np.array(las.header.mins)
-        columns: dict[str, Any] = {name: np.asarray(las[name]) - corner[at] for at, name in enumerate("xyz")}
-    except Exception as error:  # a library's own errors, of many kinds
-        raise SourceError(f"{path}: laspy cannot read it ({error}): convert it to PLY") from error
-    return points_of_columns(path, columns)
-
-
-def read_e57(path: Path) -> PointCloud:
-    """The points of the first scan of an E57 file, in the scanner's axes."""
-    pye57 = _import("pye57", path)
-    try:
-        scan = pye57.E57(str(path)).read_scan_raw(0)
-        columns = {name: np.asarray(scan[f"cartesian{name.upper()}"]) for name in "xyz"}
-    except Exception as error:  # a library's own errors, of many kinds
-        raise SourceError(f"{path}: pye57 cannot read it ({error}): convert it to PLY") from error
-    return points_of_columns(path, columns)
+def _fragments(files: list[Path], notes: list[str]) -> list[Fragment]:
+    """The fragments of the files: each scan of an E57 file is one; LAS files share the corner that they count from."""
+    las = [file for file in files if LIBRARIES.get(file.suffix.lower()) == "laspy"]
+    corner = las_corner(las) if las else None
+    if corner is not None:
+        words = " ".join(f"{value:.3f}" for value in corner)
+        notes.append(f"coordinates of {len(las)} LAS files are counted from their common lower corner {words}")
+    found: list[Fragment] = []
+    for file in files:
+        if file.suffix.lower() == ".e57":
+            for scan in e57_scans(file):
+                pose = None if scan.world_from_scan is None else tuple(scan.world_from_scan.ravel().tolist())
+                found.append(Fragment(file, scan.row, world_from_scan=pose))
+        else:
+            found.append(Fragment(file, corner=corner if file in las else None))
+    return found
 
 
 READERS: Mapping[str, Callable[[Path], PointCloud]] = {
@@ -170,7 +189,6 @@ READERS: Mapping[str, Callable[[Path], PointCloud]] = {
     ".laz": read_las,
     ".e57": read_e57,
 }
-LIBRARIES = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
 
 
 def _require(path: Path) -> None:
@@ -179,27 +197,18 @@ def _require(path: Path) -> None:
     if ending not in READERS:
         raise SourceError(f"{path}: not one of {', '.join(READERS)}: convert it to PLY")
     if ending in LIBRARIES:
-        _import(LIBRARIES[ending], path)
+        library(LIBRARIES[ending], path)
 
 
-def _import(library: str, path: Path) -> Any:
-    try:
-        return importlib.import_module(library)
-    except ImportError as error:
-        raise SourceError(
-            f"{path}: needs the package {library}: pip install {library}, or convert it to PLY"
-        ) from error
-
-
-def _numbers(files: list[Path], notes: list[str]) -> list[int]:
+def _numbers(stems: list[str], notes: list[str]) -> list[int]:
     """The last number in each name, or the rows where one has none or two have the same."""
-    found = [_NUMBER.search(file.stem) for file in files]
+    found = [_NUMBER.search(stem) for stem in stems]
     numbers = [int(match[1]) for match in found if match]
-    if len(numbers) == len(files) == len(set(numbers)):
+    if len(numbers) == len(stems) == len(set(numbers)):
         return numbers
-    if len(files) > 1:
+    if len(stems) > 1:
         notes.append("names without a number of their own: fragments are numbered in the order of their names")
-    return list(range(len(files)))
+    return list(range(len(stems)))
 
 
 def _graph(numbers: list[int], pairs: Any, i_from_j: Any, notes: list[str]) -> ViewGraph:

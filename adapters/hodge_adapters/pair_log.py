@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -28,10 +29,10 @@ SPARSE = 10
 class PairLogReader:
     """Opens a `.log` of pairwise estimates as a measured graph."""
 
-    information: Path | None = Field(
-        None,
-        description="a file such as gt.info with the 6x6 information of the pairs, over (t, q_vec); none: all edges "
-        "count alike, which is what such files are usually given as",
+    information: Path | Literal["beside", "none"] = Field(
+        "beside",
+        description="a file such as gt.info with the 6x6 information of the pairs, over (t, q_vec); beside: the .info "
+        "of the same name where there is one; none: all edges count alike",
     )
 
     def sniff(self, path: Path) -> Sniff:
@@ -59,12 +60,19 @@ class PairLogReader:
         graph = ViewGraph.from_edges(ids, edges, found.i_from_j, source="pair")
         next_to = found.pairs[:, 1] - found.pairs[:, 0] == 1
         graph = replace(graph, source=np.where(next_to, "sequential", "pair"))
-        files: tuple[Path, ...] = (path,)
-        if self.information is not None:
-            matrices = read_information(self.information)
-            graph = replace(graph, information=_matched(self.information, found.pairs, matrices, notes))
-            files = (path, self.information)
+        beside = self._information_file(path)
+        if beside is not None:
+            matrices = read_information(beside)
+            graph = replace(graph, information=_matched(beside, found.pairs, matrices, notes))
+            notes.append(f"information of {beside.name}")
+        files = (path,) if beside is None else (path, beside)
         return Source(path.stem, path, graph=graph, notes=tuple(notes), files=files)
+
+    def _information_file(self, path: Path) -> Path | None:
+        if isinstance(self.information, Path):
+            return self.information
+        beside = path.with_suffix(".info")
+        return beside if self.information == "beside" and beside.is_file() else None
 
 
 def read_information(path: Path) -> tuple[Ints, Floats]:

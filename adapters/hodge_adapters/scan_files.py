@@ -1,0 +1,108 @@
+"""Scans as surveyors keep them: LAS and LAZ with `laspy`, E57 with `pye57`. Both packages are asked for when needed."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hodge_adapters.point_columns import points_of_columns
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats, PointCloud
+
+LIBRARIES = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
+MAX_POINTS = 1 << 28
+"""A file that says more would fill 3 GB with one cloud."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One scan of an E57 file: its row there, and `world_from_scan` (4, 4) where the file gives it."""
+
+    row: int
+    world_from_scan: Floats | None
+
+
+def las_corner(paths: Sequence[Path]) -> tuple[float, float, float]:
+    """The lower corner (x, y, z) of all these files, from their headers."""
+    corners = []
+    for path in paths:
+        with _named(path, "laspy"), library("laspy", path).open(path) as file:
+            if not 0 <= file.header.point_count <= MAX_POINTS:
+                raise ValueError(f"says {file.header.point_count} points")
+            corners.append(np.asarray(file.header.mins, float))
+    low = np.min(corners, axis=0)
+    if not np.isfinite(low).all():
+        raise SourceError(f"{paths[0]}: the header's corner is not finite: mend it, or convert the file to PLY")
+    return float(low[0]), float(low[1]), float(low[2])
+
+
+def read_las(path: Path, corner: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PointCloud:
+    """The points of a LAS or LAZ file counted from a corner: float32 has no room for map coordinates."""
+    with _named(path, "laspy"):
+        las = library("laspy", path).read(path)
+        columns: dict[str, Any] = {name: np.asarray(las[name]) - corner[at] for at, name in enumerate("xyz")}
+        if "red" in las.point_format.dimension_names:
+            colours = np.stack([np.asarray(las[name]) for name in ("red", "green", "blue")])
+            # The standard wants 16 bits a channel; files with 8 bits in them are common.
+            scale = 257 if colours.size and colours.max() > 255 else 1
+            columns.update(zip(("red", "green", "blue"), colours // scale, strict=True))
+    return points_of_columns(path, columns)
+
+
+def e57_scans(path: Path) -> list[Scan]:
+    """The scans of an E57 file, by their headers."""
+    scans = []
+    with _named(path, "pye57"):
+        file = library("pye57", path).E57(str(path))
+        for row in range(file.scan_count):
+            header = file.get_header(row)
+            if not 0 <= header.point_count <= MAX_POINTS:
+                raise ValueError(f"scan {row} says {header.point_count} points")
+            pose = se3.from_parts(header.rotation_matrix, header.translation) if header.has_pose() else None
+            if pose is not None and not se3.is_motion(pose):
+                raise ValueError(f"the pose of scan {row} is no rigid motion")
+            scans.append(Scan(row, pose))
+    if not scans:
+        raise SourceError(f"{path}: holds no scan: give a file with points")
+    return scans
+
+
+def read_e57(path: Path, row: int = 0) -> PointCloud:
+    """The points of one scan of an E57 file, in the scanner's axes."""
+    with _named(path, "pye57"):
+        scan = library("pye57", path).E57(str(path)).read_scan_raw(row)
+        good = np.asarray(scan.get("cartesianInvalidState", np.zeros(len(scan["cartesianX"])))) == 0
+        columns = {name: np.asarray(scan[f"cartesian{name.upper()}"])[good] for name in "xyz"}
+        if "colorRed" in scan:
+            for name in ("Red", "Green", "Blue"):
+                columns[name.lower()] = np.asarray(scan[f"color{name}"])[good]
+    return points_of_columns(path, columns)
+
+
+def library(name: str, path: Path) -> Any:
+    """The package of this name; `SourceError` says how to get it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise SourceError(f"{path}: needs the package {name}: pip install {name}, or convert it to PLY") from error
+
+
+class _named:
+    """Turns whatever a package raises into one line that names the file: its errors are of many kinds."""
+
+    def __init__(self, path: Path, package: str) -> None:
+        self.path, self.package = path, package
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, Exception) and not isinstance(error, SourceError):
+            words = " ".join(str(error).split())[:200] or type(error).__name__
+            raise SourceError(f"{self.path}: {self.package} cannot read it ({words}): convert it to PLY") from error
