@@ -9,14 +9,15 @@ import numpy as np
 from hodge_pipeline import artifacts
 from hodge_pipeline.edits import DISABLED, ENABLED, History, joining, read_history
 from hodge_pipeline.job import Job
+from hodge_pipeline.measured import joined
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round
-from hodge_pipeline.types import Bools, Source, ViewGraph
+from hodge_pipeline.types import Bools, ViewGraph
 
 NEXT = "hodge edit --list shows them, hodge edit --undo takes the last back"
 
 
-def edited_rounds(job: Job, source: Source, registered: Registered, last: Round, number: int) -> tuple[Round, ...]:
+def edited_rounds(job: Job, registered: Registered, measured: ViewGraph, last: Round, number: int) -> tuple[Round, ...]:
     """Round `number`, that of the edits in the run folder; nothing where there are none.
 
     It begins at the poses of the round before and is solved by the recipe's solver. Its stage's key holds what the
@@ -25,9 +26,10 @@ def edited_rounds(job: Job, source: Source, registered: Registered, last: Round,
     history = read_history(job.workspace.folder)
     if not history.switches or last.candidates is None:
         return ()
-    everything = registered.as_graph(last.graph.vertex_ids, last.candidates.source)
+    everything = joined([registered.as_graph(last.graph.vertex_ids, last.candidates.source), measured])
     _tell(job, everything, history)
     reasons = job.recipe.acceptance.reasons(registered)
+    reasons = np.concatenate([reasons, np.full(measured.edge_count, "", reasons.dtype)])
     chosen = (reasons == "") | _any_joining(everything, history.enabled)
     graph = everything.select(chosen)
     disabled = _any_joining(graph, history.disabled)
@@ -43,7 +45,7 @@ def edited_rounds(job: Job, source: Source, registered: Registered, last: Round,
                 job.note(f"edited: {note}")
             advance(1)
     solution = artifacts.load_solution(job.path(f"solve-{number}") / "solution.npz")
-    rejected = last.candidates.pairs[~chosen], reasons[~chosen]
+    rejected = everything.edges[~chosen], reasons[~chosen]
     return (Round(graph, solution.world_from_cam, last.candidates, solution, *rejected, disabled=disabled),)
 
 

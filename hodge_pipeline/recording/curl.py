@@ -12,12 +12,13 @@ from hodge_pipeline.diagnosis.result import Cycles
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.stream import log_notes
-from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bytes, Floats, Ints, ViewGraph
 
 MOST_TRIANGLES, MOST_LOOPS = 20_000, 200
 OPEN_CHI = 30.0**0.5
 """Of the curl: a cycle whose χ² exceeds its square does not close; the colours end there."""
 LOOP_RADIUS = -2.2
+LOOP_COLOURS = np.array([[255, 255, 255], [230, 60, 160]], float)
 ALPHA = 110
 MOST_NAMED = 12
 BRIGHT_MEDIANS = 4.0
@@ -69,7 +70,7 @@ def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floa
     size = np.hypot(shift_m, shapes.RESIDUAL_ARM_M * angle)[kept]
     strips = rr.LineStrips3D(
         [lines[row] for row in kept],
-        colors=shapes.residual_colours(size, BRIGHT_MEDIANS * max(float(np.median(size)), 1e-9) if len(size) else 1.0),
+        colors=_loop_colours(size),
         radii=[LOOP_RADIUS],
         labels=[_label(graph, corners[row], shift_m[row], angle[row]) for row in kept],
         show_labels=False,
@@ -79,6 +80,13 @@ def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floa
         notes = (f"recording: {len(kept)} of {len(loops)} harmonic loops drawn, the longest",)
     log_notes(stream, 0, notes)
     return notes
+
+
+def _loop_colours(size: Floats) -> Bytes:
+    """White to magenta, unlike any triangle."""
+    share = np.clip(size / (BRIGHT_MEDIANS * max(float(np.median(size)), 1e-9)), 0, 1) if len(size) else size
+    mixed = LOOP_COLOURS[0] + share[:, None] * (LOOP_COLOURS[1] - LOOP_COLOURS[0])
+    return np.asarray(mixed.round(), np.uint8)
 
 
 def _label(graph: ViewGraph, corners: Ints, shift_m: float, angle_rad: float) -> str:

@@ -20,13 +20,14 @@ from hodge_pipeline.types import Floats, ViewGraph
 
 APPLICATION = "hodge-pipeline diagnosis"
 VERTEX_RADIUS = -2.5
+GREY = (200, 200, 200)
 MOST_NAMED = 2_000
 LEGEND = """
 | colour | what |
 |---|---|
 | blue, amber, magenta, grey | an edge: consistent, suspect, wrong, untestable |
 | blue to yellow | a triangle: the brighter, the larger its curl; one that does not close is opaque |
-| thick line | a loop that no triangles fill: the brighter, the less it closes |
+| white to magenta, thick | a loop that no triangles fill: the redder, the less it closes |
 """
 
 
@@ -47,7 +48,11 @@ def _log_vertices(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: 
     drawn = np.flatnonzero(shapes.is_drawable(world_from_cam))
     names = [str(name) for name in graph.vertex_ids[drawn]] if len(drawn) <= MOST_NAMED else None
     points = rr.Points3D(
-        world_from_cam[drawn, :3, 3].astype(np.float32), radii=[VERTEX_RADIUS], labels=names, show_labels=False
+        world_from_cam[drawn, :3, 3].astype(np.float32),
+        radii=[VERTEX_RADIUS],
+        labels=names,
+        show_labels=False,
+        colors=[GREY],
     )
     stream.log(layout.VERTICES, points, static=True)
 
@@ -91,5 +96,5 @@ def _eye(world_from_cam: Floats) -> Eye | None:
     middle = (places.min(axis=0) + places.max(axis=0)) / 2
     axes = np.linalg.eigh((places - middle).T @ (places - middle))[1]
     size = max(float(np.ptp(places @ axes[:, 2])), 0.1)
-    position = middle + size * (1.0 * axes[:, 0] - 0.45 * axes[:, 1])
+    position = middle + size * (1.7 * axes[:, 0] - 0.6 * axes[:, 1])
     return Eye(*(tuple(map(float, each)) for each in (position, middle, axes[:, 0])))  # type: ignore[arg-type]
