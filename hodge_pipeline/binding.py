@@ -81,13 +81,21 @@ def unbind(value: Any) -> Any:
     """Options as plain data that `bind` reads back: every default written out, a stage as `{stage: name, …}`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {field.name: unbind(getattr(value, field.name)) for field in dataclasses.fields(value)}
-        is_stage = any(isinstance(value, kind.protocol) for kind in registry.KINDS.values())
-        return {"stage": registry.name_of(value), **fields} if is_stage else fields
+        return {"stage": registry.name_of(value), **fields} if _is_stage(value) else fields
     if isinstance(value, Mapping):
         return {str(key): unbind(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [unbind(item) for item in value]
     return str(value) if isinstance(value, Path) else value
+
+
+def _is_stage(value: Any) -> bool:
+    """Whether it has the methods of a kind of stage; an option that is only called like one does not count."""
+    protocols = [kind.protocol for kind in registry.KINDS.values() if isinstance(value, kind.protocol)]
+    return any(
+        all(callable(getattr(value, name)) for name in vars(protocol) if not name.startswith("_"))
+        for protocol in protocols
+    )
 
 
 def _is_section(annotation: Any) -> bool:
