@@ -14,36 +14,17 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.clouds import CloudFolderReader
-from hodge_adapters.colmap import ColmapReader
-from hodge_adapters.euroc import EurocReader, EurocWriter
-from hodge_adapters.g2o import G2oReader, G2oWriter
-from hodge_adapters.icl_nuim import IclNuimReader
-from hodge_adapters.log_text import LogReader, LogWriter
-from hodge_adapters.mcap import McapReader
-from hodge_adapters.nerfstudio import NerfstudioReader, NerfstudioWriter
-from hodge_adapters.open3d_json import Open3dPoseGraphWriter, Open3dReader, Open3dTrajectoryWriter
-from hodge_adapters.pair_log import PairLogReader
-from hodge_adapters.ply_points import write_ply
-from hodge_adapters.poses_text import KittiWriter, TumWriter
-from hodge_adapters.seven_scenes import SevenScenesReader
-from hodge_adapters.toro import ToroReader
-from hodge_adapters.trajectory_files import KittiPosesReader, TumPosesReader
-from hodge_adapters.tum import TumReader
+from fuzz_targets import TARGETS
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.stages import FrameReader
 from hodge_pipeline.testing import check_trajectory, check_view_graph
-from hodge_pipeline.types import Camera, Frame, PointCloud, Source, Trajectory, ViewGraph
-from mcap_data import some_images, write_depth_log
-from readers_data import seven_scenes_sequence, some_poses, tum_folder, tum_line, write_colour, write_depth
+from hodge_pipeline.types import PointCloud, Source
 
 MAX_SECONDS = 5.0
 MAX_EXTRA_BYTES = 2 << 30
@@ -70,160 +51,6 @@ WORDS = (
     b"x\0y",
 )
 _NUMBER = re.compile(rb"[-+0-9][-+0-9.eE]*")
-
-
-@dataclass(frozen=True)
-class Target:
-    """A reader, what makes good data for it and gives the path to open, and how many images of that are refused."""
-
-    reader: FrameReader
-    make: Callable[[Path], Path]
-    refused: int = 0
-
-
-def poses_source(count: int = 4) -> Source:
-    poses = some_poses(count)
-    camera = Camera(8, 6, 10.0, 10.0, 4.0, 3.0)
-    frames = tuple(Frame(f"{row}.png", float(row), camera, world_from_cam=pose) for row, pose in enumerate(poses))
-    edges = np.array([(row, row + 1) for row in range(count - 1)])
-    graph = ViewGraph.from_edges(np.arange(count), edges, se3.inverse(poses[:-1]) @ poses[1:])
-    return Source("made", Path("made"), frames, Trajectory(np.arange(count) + 100.5, poses), graph)
-
-
-def written(writer: object, name: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        writer.write(folder / name, poses_source())
-        return folder / name
-
-    return make
-
-
-def icl(folder: Path) -> Path:
-    for number in range(1):
-        write_depth(folder / f"depth/{number}.png", np.full((480, 640), 5000, np.uint16))
-        write_colour(folder / f"rgb/{number}.png", size=(480, 640))
-    (folder / "associations.txt").write_text("".join(f"{n} depth/{n}.png {n} rgb/{n}.png\n" for n in range(1)))
-    (folder / "a.gt.freiburg").write_text("".join(tum_line(n, pose) for n, pose in enumerate(some_poses(3))))
-    return folder
-
-
-def pov(folder: Path) -> Path:
-    text = "cam_pos = [1, 2, 3]';\ncam_dir = [0, 0, 1]';\ncam_up = [0, 1, 0]';\ncam_right = [1.33, 0, 0]';\n"
-    for number in range(2):
-        stem = folder / f"scene_00_{number:04d}"
-        stem.with_suffix(".txt").write_text(text)
-        stem.with_suffix(".depth").write_text("100.5\n" * 60)
-    return folder
-
-
-def redwood(folder: Path) -> Path:
-    for number in range(1):
-        write_depth(folder / f"depth/{number:05d}.png", np.full((480, 640), 1000, np.uint16))
-        write_colour(folder / f"image/{number:05d}.jpg", size=(480, 640))
-    LogWriter().write(
-        folder / "trajectory.log", Source("a", folder, trajectory=Trajectory(np.arange(3.0), some_poses(3)))
-    )
-    return folder
-
-
-def pairs(folder: Path) -> Path:
-    some = some_poses(3)
-    graph = ViewGraph.from_edges(np.arange(3), np.array([[0, 1], [1, 2], [2, 0]]), np.stack(list(some)))
-    LogWriter().write(folder / "a.log", Source("pairs", folder, graph=graph))
-    return folder / "a.log"
-
-
-def toro(folder: Path) -> Path:
-    lines = [
-        "VERTEX2 0 0 0 0",
-        "VERTEX2 1 1 0 0.1",
-        "EDGE2 0 1 1 0 0.1 500 0 500 5000 0 0",
-        "EDGE2 1 0 -1 0 -0.1 500 0 500 5000 0 0",
-    ]
-    (folder / "a.graph").write_text("\n".join(lines) + "\n")
-    return folder / "a.graph"
-
-
-def colmap(form: str, points: int = 0) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        import pycolmap
-
-        options = pycolmap.SyntheticDatasetOptions()
-        options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 3
-        options.num_points3D = points or 5
-        pycolmap.set_random_seed(0)
-        base = pycolmap.Database.open(folder / "database.db") if points else None
-        model = pycolmap.synthesize_dataset(options, base) if base else pycolmap.synthesize_dataset(options)
-        if base:
-            base.close()
-        (folder / "sparse").mkdir()
-        (model.write_text if form == "txt" else model.write_binary)(folder / "sparse")
-        for image in model.images.values():
-            write_depth(folder / "depth" / image.name, np.full((768 // 64, 1024 // 64), 1000, np.uint16))
-        return folder
-
-    return make
-
-
-def ply(ascii: bool) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        cloud = PointCloud(np.random.default_rng(0).normal(0, 1, (8, 3)).astype(np.float32))
-        write_ply(folder / "cloud_0.ply", cloud)
-        if ascii:
-            header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-            (folder / "cloud_0.ply").write_text(header + "end_header\n1 2 3\n4 5 6\n7 8 9\n")
-        pose = Trajectory(np.zeros(1), some_poses(1))
-        LogWriter().write(folder / "all.log", Source("a", folder, trajectory=pose))
-        return folder
-
-    return make
-
-
-def pcd(kind: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        points = np.arange(24, dtype="<f4").reshape(8, 3)
-        body = (
-            "\n".join(" ".join(map(str, row)) for row in points).encode() + b"\n"
-            if kind == "ascii"
-            else points.tobytes()
-        )
-        if kind == "binary_compressed":
-            raw = points.T.tobytes()
-            packed = b"".join(bytes([len(raw[at : at + 32]) - 1]) + raw[at : at + 32] for at in range(0, len(raw), 32))
-            body = np.array([len(packed), len(raw)], "<u4").tobytes() + packed
-        header = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 8\nHEIGHT 1\nPOINTS 8\n"
-        (folder / "a.pcd").write_bytes(f"{header}DATA {kind}\n".encode() + body)
-        return folder
-
-    return make
-
-
-TARGETS: dict[str, Target] = {
-    "seven_scenes": Target(SevenScenesReader(), lambda folder: seven_scenes_sequence(folder / "seq-01", 2)),
-    "tum": Target(TumReader(), tum_folder),
-    "icl_lists": Target(IclNuimReader(), icl),
-    "icl_pov": Target(IclNuimReader(), pov, refused=2),
-    "icl_redwood": Target(IclNuimReader(), redwood),
-    "mcap": Target(McapReader(), lambda folder: write_depth_log(folder / "a.mcap", some_images(2))),
-    "colmap_bin": Target(ColmapReader(edges="none"), colmap("bin")),
-    "colmap_txt": Target(ColmapReader(edges="none"), colmap("txt")),
-    "colmap_database": Target(ColmapReader(edges="database", min_shared=8), colmap("bin", 12)),
-    "ply_binary": Target(CloudFolderReader(), ply(False)),
-    "ply_ascii": Target(CloudFolderReader(), ply(True)),
-    "pcd_ascii": Target(CloudFolderReader(), pcd("ascii")),
-    "pcd_binary": Target(CloudFolderReader(), pcd("binary")),
-    "pcd_compressed": Target(CloudFolderReader(), pcd("binary_compressed")),
-    "nerfstudio": Target(NerfstudioReader(), written(NerfstudioWriter(), "transforms.json")),
-    "open3d_graph": Target(Open3dReader(), written(Open3dPoseGraphWriter(), "graph.json")),
-    "open3d_cameras": Target(Open3dReader(), written(Open3dTrajectoryWriter(), "cameras.json")),
-    "euroc": Target(EurocReader(), written(EurocWriter(), "data.csv")),
-    "log": Target(LogReader(), written(LogWriter(), "a.log")),
-    "pair_log": Target(PairLogReader(), pairs),
-    "tum_poses": Target(TumPosesReader(), written(TumWriter(), "a.tum")),
-    "kitti_poses": Target(KittiPosesReader(), written(KittiWriter(), "a.txt")),
-    "g2o": Target(G2oReader(), written(G2oWriter(), "a.g2o")),
-    "toro": Target(ToroReader(), toro),
-}
 
 
 def damage(contents: bytes, rng: random.Random) -> bytes:

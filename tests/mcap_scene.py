@@ -20,12 +20,17 @@ from mcap_data import (
     SECOND,
     Log,
     calibration,
+    compressed_depth,
     foxglove_header,
+    odometry,
     point_cloud,
     pose_message,
+    raw_image,
     ros_header,
+    transforms,
 )
 from mcap_encoding import CDR
+from readers_data import HEIGHT, WIDTH, depth_values, some_poses
 
 BEGIN_S = 1000.0
 POSES, CLOUDS = "/cam/pose", "/points"
@@ -79,3 +84,24 @@ def camera_message(camera: Camera) -> dict[str, Any]:
 def pose_in_frame(frame: Frame) -> dict[str, Any]:
     assert frame.world_from_cam is not None
     return {**foxglove_header(stamp_s(frame), "map"), "pose": pose_message(frame.world_from_cam)}
+
+
+def everything(encoding: str = CDR, count: int = 3) -> Log:
+    """Depth raw, as PNG and as RVL, colour, clouds, calibration, odometry and transforms."""
+    log, pose = Log(), some_poses(1)[0]
+    for row in range(count):
+        head, log_ns = foxglove_header(100 + row, "cam"), (100 + row) * SECOND
+        depth = depth_values(row)
+        log.add("/info", "foxglove.CameraCalibration", {**head, **calibration(WIDTH, HEIGHT, 9, 9, 4, 3)}, encoding)
+        log.add("/raw", "foxglove.RawImage", {**head, **raw_image(depth, "16UC1")}, encoding, log_ns)
+        for coding in ("png", "rvl"):
+            image = {**head, **compressed_depth(depth, coding)}
+            log.add(f"/{coding}", "foxglove.CompressedImage", image, encoding, log_ns)
+        colour = raw_image(np.zeros((HEIGHT, WIDTH, 3), np.uint8), "rgb8")
+        log.add("/colour", "foxglove.RawImage", {**head, **colour}, encoding, log_ns)
+        log.add("/odom", "nav_msgs/msg/Odometry", odometry(100 + row, pose), CDR, log_ns)
+        log.add("/tf", "tf2_msgs/msg/TFMessage", transforms((100 + row, "base_link", "cam", pose)), CDR, log_ns)
+        points = {axis: np.arange(4, dtype="<f4") for axis in "xyz"}
+        cloud = {"header": ros_header(100 + row, "cam"), **point_cloud(points, {"x": 0, "y": 4, "z": 8}, 12)}
+        log.add("/points", "sensor_msgs/msg/PointCloud2", cloud, CDR, log_ns)
+    return log

@@ -22,45 +22,19 @@ from hodge_adapters.mcap import McapReader
 from hodge_adapters.mcap_records import MAGIC
 from hodge_pipeline.errors import SourceError
 from mcap_data import (
-    SECOND,
     Log,
     calibration,
-    compressed_depth,
-    foxglove_header,
-    odometry,
-    point_cloud,
     raw_image,
     read_all,
     resident_peak,
     ros_header,
-    transforms,
 )
 from mcap_encoding import CDR, JSON, PROTOBUF
-from readers_data import HEIGHT, WIDTH, depth_values, some_poses
+from mcap_scene import everything
+from readers_data import HEIGHT, WIDTH, depth_values
 
 CASES = int(os.environ.get("HODGE_MCAP_CASES", "240"))
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-
-
-def everything(encoding: str = CDR, count: int = 3) -> Log:
-    """Depth raw, as PNG and as RVL, colour, clouds, calibration, odometry and transforms."""
-    log, pose = Log(), some_poses(1)[0]
-    for row in range(count):
-        head, log_ns = foxglove_header(100 + row, "cam"), (100 + row) * SECOND
-        depth = depth_values(row)
-        log.add("/info", "foxglove.CameraCalibration", {**head, **calibration(WIDTH, HEIGHT, 9, 9, 4, 3)}, encoding)
-        log.add("/raw", "foxglove.RawImage", {**head, **raw_image(depth, "16UC1")}, encoding, log_ns)
-        for coding in ("png", "rvl"):
-            image = {**head, **compressed_depth(depth, coding)}
-            log.add(f"/{coding}", "foxglove.CompressedImage", image, encoding, log_ns)
-        colour = raw_image(np.zeros((HEIGHT, WIDTH, 3), np.uint8), "rgb8")
-        log.add("/colour", "foxglove.RawImage", {**head, **colour}, encoding, log_ns)
-        log.add("/odom", "nav_msgs/msg/Odometry", odometry(100 + row, pose), CDR, log_ns)
-        log.add("/tf", "tf2_msgs/msg/TFMessage", transforms((100 + row, "base_link", "cam", pose)), CDR, log_ns)
-        points = {axis: np.arange(4, dtype="<f4") for axis in "xyz"}
-        cloud = {"header": ros_header(100 + row, "cam"), **point_cloud(points, {"x": 0, "y": 4, "z": 8}, 12)}
-        log.add("/points", "sensor_msgs/msg/PointCloud2", cloud, CDR, log_ns)
-    return log
 
 
 def try_all(path: Path) -> None:
