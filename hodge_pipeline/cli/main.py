@@ -218,6 +218,18 @@ def record(
     recording.record(run_folder, level, max_megabytes, quiet=quiet)
 
 
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(help="A run folder.")],
+    second: Annotated[Path, typer.Argument(help="Another run folder, of the same frames or not.")],
+    out: Annotated[Optional[Path], typer.Option(help="Folder for compare.html and .rrd; default: the second.")] = None,  # noqa: UP045
+) -> None:
+    """Compare two runs: numbers, options that differ, poses and models."""
+    from hodge_pipeline.cli import recording
+
+    recording.compare(first, second, out)
+
+
 def main() -> None:
     """Run the command; what a user can mend is one line and exit code 1 (3: a result that failed its checks)."""
     try:

@@ -1,4 +1,4 @@
-"""The commands about recordings: `hodge view`, `hodge record`."""
+"""The commands about recordings: `hodge view`, `hodge record`, `hodge compare`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from hodge_pipeline import registry
-from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.cli.console import Terminal, print_table
 from hodge_pipeline.errors import RecipeError, WorkspaceError
 from hodge_pipeline.recording.options import Level
 
@@ -56,3 +56,19 @@ def view(run_folder: Path, *, web: bool) -> None:
             viewer.kill()
         if failed:
             raise WorkspaceError(f"{recording}: the viewer ended with an error: try --web")
+
+
+def compare(first: Path, second: Path, out: Path | None) -> None:
+    """Print two runs side by side, and write their comparison as a page and as a recording."""
+    from hodge_pipeline.compare_report import write_comparison
+    from hodge_pipeline.comparison import compare as compare_runs
+    from hodge_pipeline.comparison import tables
+
+    comparison = compare_runs(first, second)
+    folder = second if out is None else out
+    written = write_comparison(folder, comparison)
+    for table in tables(comparison):
+        if table.rows:
+            print_table(table.title, table.header, table.rows)
+    for path in written:
+        print(f"{'written':<8} {path}")

@@ -56,30 +56,35 @@ details { margin-top: 1.5rem; } summary { cursor: pointer; font-size: 1.2rem; fo
 """
 
 
-def render(report: Report, plots: Iterable[Plot]) -> str:
+def render(report: Report, drawn: Iterable[Plot]) -> str:
     """The page, as HTML5 text."""
     first_page = [_head(report), _verdict(report), _tiles(report), _notes(report)]
     tables = [*score_tables(report), *([worst_edges_table(report)] if report.worst_edges else [])]
     details = [source_table(report), *graph_tables(report), *([stages_table(report)] if report.stages else [])]
     body = [
         *first_page,
-        _photographs(
+        photographs(
             "The scene from four sides",
             f"The frames' clouds laid together by their poses: {report.before} on the left, {report.after} on "
             "the right. Walls that are double on the left and single on the right are what the run is for.",
             report.pictures.sides,
         ),
-        *(_table(table, report.after) for table in tables),
-        _photographs("Frames of the worst edges", "", report.pictures.worst_pairs),
-        _plots(plots),
-        *(_table(table, report.after) for table in details),
+        *(table(each, report.after) for each in tables),
+        photographs("Frames of the worst edges", "", report.pictures.worst_pairs),
+        plots(drawn),
+        *(table(each, report.after) for each in details),
         _versions(report),
         _recipe(report),
     ]
+    return document(report.title, body)
+
+
+def document(title: str, body: Iterable[str]) -> str:
+    """A whole page of these parts, in the style of all pages."""
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(report.title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
         + "\n".join(part for part in body if part)
         + "\n</body>\n</html>\n"
     )
@@ -149,12 +154,13 @@ def _notes(report: Report) -> str:
     return f'<section><h2>What to look at</h2><ul class="notes">{items}</ul></section>'
 
 
-def _table(table: Table, highlighted: str) -> str:
-    head = "".join(f"<th{_word(column, table)}>{escape(name)}</th>" for column, name in enumerate(table.header))
-    rows = "".join(_row(row, table, highlighted) for row in table.rows)
-    caption = f'<p class="caption">{escape(table.caption)}</p>' if table.caption else ""
+def table(shown: Table, highlighted: str) -> str:
+    """A table with its title and caption; the row that begins with `highlighted` stands out."""
+    head = "".join(f"<th{_word(column, shown)}>{escape(name)}</th>" for column, name in enumerate(shown.header))
+    rows = "".join(_row(row, shown, highlighted) for row in shown.rows)
+    caption = f'<p class="caption">{escape(shown.caption)}</p>' if shown.caption else ""
     return (
-        f'<section><h2>{escape(table.title)}</h2>{caption}<div class="scroll"><table><thead><tr>{head}</tr></thead>'
+        f'<section><h2>{escape(shown.title)}</h2>{caption}<div class="scroll"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{rows}</tbody></table></div></section>"
     )
 
@@ -168,20 +174,22 @@ def _word(column: int, table: Table) -> str:
     return ' class="word"' if column < table.names else ""
 
 
-def _plots(plots: Iterable[Plot]) -> str:
+def plots(drawn: Iterable[Plot]) -> str:
+    """The plots side by side where there is room."""
     figures = "".join(
         f'<figure><h3>{escape(plot.title)}</h3><img alt="{escape(plot.title)}. {escape(plot.caption)}" '
         f'src="data:image/png;base64,{b64encode(plot.png).decode()}"><figcaption>{escape(plot.caption)}</figcaption></figure>'
-        for plot in plots
+        for plot in drawn
     )
     return f'<section class="pictures"><h2>Pictures</h2><div class="plots">{figures}</div></section>' if figures else ""
 
 
-def _photographs(title: str, caption: str, photographs: Iterable[Photograph]) -> str:
+def photographs(title: str, caption: str, shown: Iterable[Photograph]) -> str:
+    """Photographs side by side where there is room, nothing where there are none."""
     figures = "".join(
         f'<figure><h3>{escape(each.title)}</h3><img alt="{escape(each.title)}. {escape(each.caption)}" '
         f'src="data:image/jpeg;base64,{b64encode(each.jpeg).decode()}"><figcaption>{escape(each.caption)}</figcaption></figure>'
-        for each in photographs
+        for each in shown
     )
     text = f'<p class="caption">{escape(caption)}</p>' if caption else ""
     return (

@@ -19,7 +19,9 @@ POINT_RADIUS = -1.2
 """Negative: points on the screen."""
 
 
-def log_model(stream: rr.RecordingStream, model: Model, options: RecordingOptions) -> tuple[str, ...]:
+def log_model(
+    stream: rr.RecordingStream, model: Model, options: RecordingOptions, path: str = layout.MODEL
+) -> tuple[str, ...]:
     """What was thinned, in words; the fused scene as a mesh or as points, there at every time."""
     available = len(model.points_in_world)
     bytes_each = VERTEX_BYTES + (0 if model.triangles is None else 2 * TRIANGLE_BYTES)
@@ -27,7 +29,7 @@ def log_model(stream: rr.RecordingStream, model: Model, options: RecordingOption
     thin = shapes.thin_model(model, max(kept, 1))
     if thin.triangles is None or not len(thin.triangles):
         cloud = rr.Points3D(thin.points_in_world, colors=thin.colours, radii=[POINT_RADIUS])
-        stream.log(layout.MODEL, cloud, static=True)
+        stream.log(path, cloud, static=True)
     else:
         # Only the side that was seen is drawn, so that a room can be looked into from outside.
         mesh = rr.Mesh3D(
@@ -37,7 +39,7 @@ def log_model(stream: rr.RecordingStream, model: Model, options: RecordingOption
             vertex_colors=thin.colours,
             face_rendering=rr.components.MeshFaceRendering.Front,
         )
-        stream.log(layout.MODEL, mesh, static=True)
+        stream.log(path, mesh, static=True)
     thinned = len(thin.points_in_world) < available
     notes = (f"recording: {len(thin.points_in_world)} of {available} points of model {model.name}",) if thinned else ()
     log_notes(stream, 0, (*model.notes, *notes))

@@ -1,0 +1,86 @@
+"""Two runs in one recording: their trajectories and models, B laid onto A."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from hodge_pipeline import se3
+from hodge_pipeline.recording import layout
+from hodge_pipeline.recording.blueprint import BACKGROUND
+from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.recording.recorder import APPLICATION
+from hodge_pipeline.recording.results import log_model
+from hodge_pipeline.recording.shapes import evenly, frustum_lines
+from hodge_pipeline.recording.stream import log_markdown, writing
+from hodge_pipeline.types import Floats, Model
+
+COLOURS = {"a": (230, 130, 0), "b": (86, 180, 233)}
+"""Orange and sky blue of Okabe and Ito's set."""
+APART = "/plots/apart_m"
+FRUSTA = 40
+
+
+def record_comparison(
+    path: Path,
+    names: tuple[str, str],
+    poses: tuple[Floats, Floats],
+    models: tuple[Model | None, Model | None],
+    apart_m: Floats,
+    text: str,
+) -> None:
+    """Write the recording; the poses (S, 4, 4) of the shared frames and the models are in one world already."""
+    with writing(path, APPLICATION, f"compare-{names[0]}-{names[1]}", _blueprint(names)) as stream:
+        for side, world_from_cam, model in zip("ab", poses, models, strict=True):
+            _log_run(stream, side, world_from_cam, model)
+        if len(apart_m):
+            times = [rr.TimeColumn(layout.FRAME, sequence=np.arange(len(apart_m)))]
+            stream.send_columns(APART, times, rr.Scalars.columns(scalars=apart_m))
+        log_markdown(stream, layout.SCORES, text)
+
+
+def _log_run(stream: rr.RecordingStream, side: str, world_from_cam: Floats, model: Model | None) -> None:
+    root, colour = f"{layout.WORLD}/{side}", COLOURS[side]
+    if len(world_from_cam):
+        line = rr.LineStrips3D([world_from_cam[:, :3, 3].astype(np.float32)], colors=[colour], radii=[-1.6])
+        stream.log(f"{root}/trajectory", line, static=True)
+        picked = world_from_cam[evenly(len(world_from_cam), FRUSTA)]
+        stream.log(f"{root}/frusta", rr.LineStrips3D(frustum_lines(picked), colors=[colour], radii=[-0.5]), static=True)
+        stream.send_columns(
+            f"{root}/poses",
+            [rr.TimeColumn(layout.FRAME, sequence=np.arange(len(world_from_cam)))],
+            rr.Transform3D.columns(translation=world_from_cam[:, :3, 3], quaternion=se3.to_quat_xyzw(world_from_cam)),
+        )
+    if model is not None:
+        log_model(stream, model, RecordingOptions(), f"{root}/model")
+
+
+def _blueprint(names: tuple[str, str]) -> rrb.Blueprint:
+    def scene(name: str, *contents: str) -> rrb.Spatial3DView:
+        shown = [f"+ {layout.WORLD}/{entity}" for entity in contents]
+        return rrb.Spatial3DView(origin=layout.WORLD, name=name, contents=shown, background=BACKGROUND)
+
+    lines = ("a/trajectory", "a/frusta", "b/trajectory", "b/frusta")
+    plot = rrb.TimeSeriesView(origin=APART, name="Apart, m")
+    text = rrb.TextDocumentView(origin=layout.SCORES, name="Numbers")
+    tabs = rrb.Tabs(
+        rrb.Horizontal(
+            scene(f"Orange: {names[0]}. Blue: {names[1]}", *lines),
+            rrb.Vertical(plot, text),
+            column_shares=[2, 1],
+            name="Both",
+        ),
+        rrb.Horizontal(
+            scene(names[0], "a/model", "a/trajectory"), scene(names[1], "b/model", "b/trajectory"), name="Side by side"
+        ),
+    )
+    return rrb.Blueprint(
+        tabs,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=layout.FRAME),
+        auto_views=False,
+    )

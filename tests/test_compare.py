@@ -1,0 +1,97 @@
+"""Two runs side by side: by hand, of the same poses moved as one body, of runs that share nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from hodge_pipeline import registry, se3
+from hodge_pipeline.cli.main import app
+from hodge_pipeline.compare_report import write_comparison
+from hodge_pipeline.comparison import compare, tables
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.evaluation.report import Report, SourceSummary, write_report
+from hodge_pipeline.fusion.ply import write_ply
+from hodge_pipeline.recording import layout
+from hodge_pipeline.types import Floats, Model, Source, Trajectory
+from test_recording import circle, rows
+from test_report import read_page
+
+MOVED = se3.exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -0.5]))
+
+
+def make_run(folder: Path, poses: Floats, recipe: str = "seed: 0\n", first_stamp: float = 100.0) -> Path:
+    folder.mkdir()
+    stamps = first_stamp + np.arange(len(poses))
+    source = Source("s", folder, trajectory=Trajectory(stamps, poses))
+    registry.load("writers", "tum")().write(folder / "poses.tum", source)
+    (folder / "recipe.yaml").write_text(recipe)
+    write_report(folder, Report(folder.name, SourceSummary("s", "x", len(poses))))
+    points = se3.transform(poses, np.array([[0, 0, 1.0], [0.1, 0, 1.0]])).reshape(-1, 3).astype(np.float32)
+    write_ply(folder / "cloud.ply", Model("cloud", points, colours=np.full((len(points), 3), 99, np.uint8)))
+    return folder
+
+
+def test_a_run_moved_as_one_body_is_the_same_run(tmp_path: Path) -> None:
+    a = make_run(tmp_path / "a", circle())
+    b = make_run(tmp_path / "b", MOVED @ circle())
+    found = compare(a, b)
+    np.testing.assert_allclose(found.apart_m, np.zeros(12), atol=1e-6)
+    np.testing.assert_allclose(found.a_from_b, se3.inverse(MOVED), atol=1e-6)
+    measured, options = tables(found)
+    assert measured.rows[0] == ("frames", "12", "12", "")
+    assert {row[0]: row[2] for row in measured.rows}["poses apart, largest"] == "0"
+    assert options.rows == ()
+
+
+def test_options_that_differ_and_frames_that_are_shared(tmp_path: Path) -> None:
+    a = make_run(tmp_path / "a", circle(), "seed: 0\nedges: {stage: overlap, min_iou: 0.3}\n")
+    b = make_run(tmp_path / "b", circle()[4:], "seed: 0\nedges: {stage: overlap, min_iou: 0.5}\n", 104.0)
+    found = compare(a, b)
+    assert len(found.apart_m) == 8
+    assert tables(found)[1].rows == (("edges.min_iou", "0.3", "0.5"),)
+
+
+def test_page_and_recording(tmp_path: Path) -> None:
+    a, b = make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", MOVED @ circle())
+    found = compare(a, b)
+    page, recording = write_comparison(tmp_path / "out", found)
+    text, addresses = read_page(page)
+    assert "a and b" in text and "laid onto A by the 12 frames" in text
+    assert len(addresses) == 5 and all(address.startswith("data:image/") for address in addresses)
+    for side in "ab":
+        poses = np.squeeze(rows(recording, f"{layout.WORLD}/{side}/poses", "Transform3D:translation"))
+        np.testing.assert_allclose(np.float32(poses), np.float32(circle()[:, :3, 3]), atol=2e-6)
+        (points,) = rows(recording, f"{layout.WORLD}/{side}/model", "Points3D:positions")
+        assert len(points) == 24
+    assert len(RrdReader(recording).blueprints()) == 1
+
+
+def test_runs_that_share_no_frame(tmp_path: Path) -> None:
+    a, b = make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", circle(), first_stamp=900.0)
+    found = compare(a, b)
+    assert not len(found.apart_m)
+    page, _ = write_comparison(tmp_path / "out", found)
+    assert "share too few frames" in page.read_text("utf-8")
+
+
+def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "a", circle())
+    with pytest.raises(WorkspaceError, match="holds no report.json"):
+        compare(run, tmp_path)
+    (run / "report.json").write_text("{")
+    with pytest.raises(WorkspaceError, match="cannot be read"):
+        compare(run, run)
+    shutil.rmtree(run)
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a, b = make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", circle())
+    app(["compare", str(a), str(b), "--out", str(tmp_path / "out")], standalone_mode=False)
+    assert "compare.html" in capsys.readouterr().out.replace("\n", "")
+    assert json.loads((a / "report.json").read_text())["title"] == "a"
