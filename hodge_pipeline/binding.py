@@ -61,7 +61,11 @@ def _value(annotation: Any, value: Any, where: Where, keys: Keys, seed: int | No
     if get_origin(annotation) is tuple and isinstance(value, list):
         item = get_args(annotation)[0]
         return tuple(_value(item, each, where, (*keys, row), seed) for row, each in enumerate(value))
-    return bind(annotation, value, where, keys, seed=seed) if _is_section(annotation) else value
+    if not _is_section(annotation):
+        return value
+    if isinstance(value, Mapping) and value.get("stage") == registry.name_of_class(annotation):
+        value = {key: item for key, item in value.items() if key != "stage"}  # an option that takes this stage alone
+    return bind(annotation, value, where, keys, seed=seed)
 
 
 def bind_stage(kind: str, value: Any, where: Where, keys: Keys, seed: int | None = None) -> Any:

@@ -95,7 +95,11 @@ def load(kind: str, name: str) -> Any:
 
 def name_of(stage: object) -> str:
     """The registered name of a stage instance, else its `module:Class`."""
-    cls = type(stage)
+    return name_of_class(type(stage))
+
+
+def name_of_class(cls: type) -> str:
+    """The registered name of a stage, else its `module:Class`."""
     path = f"{cls.__module__}:{cls.__qualname__}"
     for kind in KINDS.values():
         for name, entry in _entries(kind.group).items():
