@@ -9,6 +9,9 @@ from hodge_adapters.colmap_bodies import Bodies
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PositionPriors
 
+ESCAPE_ROUNDS = 3
+ESCAPED_PX = 1e4
+"""No observation is off by so much: its point lies behind the camera."""
 MAX_ITERATIONS = 100
 FUNCTION_TOLERANCE = 1e-7
 
@@ -16,18 +19,41 @@ FUNCTION_TOLERANCE = 1e-7
 def adjust(reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors | None) -> None:
     """Adjust it in place. Without priors the gauge is that of two images; with them the model keeps to theirs.
 
-    Raises `SourceError` where the adjustment fails.
+    A point that escapes through a camera, where COLMAP's cost has no slope, is held where it was. Raises `SourceError`
+    where the adjustment fails.
     """
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
         config.add_image(image_id)
     if priors is None:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        _solve(pycolmap.create_default_bundle_adjuster(_options(), config, reconstruction))
-    else:
-        known = _pose_priors(reconstruction, bodies, priors)
-        _solve(pycolmap.create_pose_prior_bundle_adjuster(_options(), _prior_options(), config, known, reconstruction))
+    before = {key: point.xyz.copy() for key, point in reconstruction.points3D.items()}
+    for _ in range(ESCAPE_ROUNDS):
+        _solve(_adjuster(reconstruction, config, bodies, priors))
+        reconstruction.update_point_3d_errors()
+        escaped = [key for key, point in reconstruction.points3D.items() if not point.error < ESCAPED_PX]
+        if not escaped:
+            return
+        for key in escaped:
+            reconstruction.points3D[key].xyz = before[key]
+            if not config.has_constant_point(key):
+                config.add_constant_point(key)
     reconstruction.update_point_3d_errors()
+
+
+def _adjuster(
+    reconstruction: pycolmap.Reconstruction,
+    config: pycolmap.BundleAdjustmentConfig,
+    bodies: Bodies,
+    priors: PositionPriors | None,
+) -> pycolmap.BundleAdjuster:
+    options = _options()
+    if priors is None:
+        return pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    # what tracks and priors make of each other must not hang on a few bad tracks
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    known = _pose_priors(reconstruction, bodies, priors)
+    return pycolmap.create_pose_prior_bundle_adjuster(options, _prior_options(), config, known, reconstruction)
 
 
 def _options() -> pycolmap.BundleAdjustmentOptions:

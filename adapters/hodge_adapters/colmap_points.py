@@ -16,26 +16,34 @@ LEAST_PARALLAX = 1e-4
 def points_of_rays(model: Model, world_from_cam: Floats) -> Floats:
     """Positions (P, 3) of the points with the images at the poses (N, 4, 4).
 
-    Each is the point nearest to its rays. Where rays are parallel, or meet behind a camera, the point is carried
-    along with its images instead.
+    Each is the point nearest to its rays, or where its images carry it along, whichever is nearer to the observations;
+    carried along where rays are parallel or meet behind a camera.
     """
     points = model.points
-    if not len(points.ids):
+    count = len(points.ids)
+    if not count:
         return np.zeros((0, 3))
     image, centre, ray, owner = _rays(model, world_from_cam)
     old = np.array([one.world_from_cam for one in model.images])
     moves = world_from_cam @ se3.inverse(old)
-    carried = _mean(se3.transform(moves[image], points.xyz[owner][:, None])[:, 0], owner, len(points.ids))
+    carried = _mean(se3.transform(moves[image], points.xyz[owner][:, None])[:, 0], owner, count)
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
-    normal = _sum(across.reshape(-1, 9), owner, len(points.ids)).reshape(-1, 3, 3)
-    right = _sum(np.einsum("nij,nj->ni", across, centre), owner, len(points.ids))
-    count = np.bincount(owner, minlength=len(points.ids))
-    fixed = np.linalg.eigvalsh(normal)[:, 0] > LEAST_PARALLAX * np.maximum(count, 1)
+    normal = _sum(across.reshape(-1, 9), owner, count).reshape(-1, 3, 3)
+    right = _sum(np.einsum("nij,nj->ni", across, centre), owner, count)
+    fixed = np.linalg.eigvalsh(normal)[:, 0] > LEAST_PARALLAX * np.maximum(np.bincount(owner, minlength=count), 1)
     normal[~fixed] = np.eye(3)
     met = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-    ahead = np.ones(len(points.ids))
-    np.minimum.at(ahead, owner, np.einsum("ni,ni->n", ray, met[owner] - centre))
-    return np.where((fixed & (ahead > 0))[:, None], met, carried)
+    better = _off(met, centre, ray, owner) < _off(carried, centre, ray, owner)
+    return np.where((fixed & better)[:, None], met, carried)
+
+
+def _off(xyz: Floats, centre: Floats, ray: Floats, owner: Ints) -> Floats:
+    """The mean square of the sines between the rays and the directions to the points (P,); 1 for one that is behind."""
+    to_point = xyz[owner] - centre
+    length = np.maximum(np.linalg.norm(to_point, axis=1), 1e-300)
+    cosine = np.einsum("ni,ni->n", ray, to_point) / length
+    sine = np.linalg.norm(np.cross(ray, to_point), axis=1) / length
+    return _mean(np.where(cosine > 0, sine**2, 1.0)[:, None], owner, len(xyz))[:, 0]
 
 
 def _rays(model: Model, world_from_cam: Floats) -> tuple[Ints, Floats, Floats, Ints]:

@@ -18,6 +18,7 @@ MERGE_ERROR_PX = 4.0
 """Two points are one where their common position is this near to all observations of both; COLMAP's own limit."""
 NEAR_SHARE = 0.03
 """Of a point's distance from the cameras: how far apart two models may place it and still agree."""
+LEAST_PARALLAX = 1e-4
 LEAST_TIES = 12
 LEAST_TIE_SHARE = 0.15
 
@@ -40,16 +41,22 @@ def point_ids_by_name(reconstruction: pycolmap.Reconstruction) -> dict[str, Ints
     return out
 
 
-def merge_matched_points(reconstruction: pycolmap.Reconstruction, database: Path) -> int:
-    """How many pairs of points that a match calls one were merged, where one position serves all their images."""
+def merge_matched_points(reconstruction: pycolmap.Reconstruction, database: Path, min_shared: int) -> int:
+    """How many pairs of points that a match calls one were merged, where one position serves all their images.
+
+    Only between images that the database matches well and the model holds apart: the ends of a chain that should meet,
+    two models just joined. What COLMAP did not merge elsewhere it had reason to leave.
+    """
     of_name = point_ids_by_name(reconstruction)
     merged: dict[int, int] = {}
     count = 0
-    for a, b in _matched_points(of_name, of_name, database):
+    for a, b in _matched_points(of_name, of_name, database, min_shared):
         first, second = _current(merged, a), _current(merged, b)
-        if first == second or not _is_one(reconstruction, first, second):
+        xyz = None if first == second else _common_position(reconstruction, first, second)
+        if xyz is None:
             continue
         new = reconstruction.merge_points3D(first, second)
+        reconstruction.points3D[new].xyz = xyz
         merged[first] = merged[second] = new
         merged.pop(new, None)
         count += 1
@@ -87,11 +94,20 @@ def similarity(
     return found["tgt_from_src"], int(found["num_inliers"])
 
 
-def _matched_points(of_first: dict[str, Ints], of_second: dict[str, Ints], database: Path) -> Iterator[tuple[int, int]]:
-    """Distinct pairs of different points that matched keypoints of the two sets of images belong to."""
+def _matched_points(
+    of_first: dict[str, Ints], of_second: dict[str, Ints], database: Path, min_shared: int = 0
+) -> Iterator[tuple[int, int]]:
+    """Distinct pairs of different points that matched keypoints of the two sets of images belong to.
+
+    With `min_shared`: only of pairs of images with so many matches that share less than half so many points.
+    """
     names = list(dict.fromkeys([*of_first, *of_second]))
     seen = set()
     for i, j, matches in database_matches(database, {name: row for row, name in enumerate(names)}):
+        if min_shared and (
+            len(matches) < min_shared or 2 * _shared(of_first[names[i]], of_first[names[j]]) >= min_shared
+        ):
+            continue
         for one, other, columns in ((names[i], names[j], matches), (names[j], names[i], matches[:, ::-1])):
             a, b = of_first.get(one), of_second.get(other)
             if a is None or b is None or not len(columns):
@@ -107,25 +123,47 @@ def _matched_points(of_first: dict[str, Ints], of_second: dict[str, Ints], datab
                     yield pair
 
 
+def _shared(a: Ints, b: Ints) -> int:
+    """How many points both images see."""
+    return len(np.intersect1d(a[a != NO_POINT], b[b != NO_POINT]))
+
+
 def _current(merged: dict[int, int], point_id: int) -> int:
     while point_id in merged:
         point_id = merged[point_id]
     return point_id
 
 
-def _is_one(reconstruction: pycolmap.Reconstruction, first: int, second: int) -> bool:
-    a, b = reconstruction.points3D[first], reconstruction.points3D[second]
-    elements = [*a.track.elements, *b.track.elements]
+def _common_position(reconstruction: pycolmap.Reconstruction, first: int, second: int) -> Floats | None:
+    """Where the rays of both points' tracks meet, None where that is not near every observation."""
+    points = (reconstruction.points3D[first], reconstruction.points3D[second])
+    elements = [element for point in points for element in point.track.elements]
     if len({element.image_id for element in elements}) < len(elements):
-        return False  # an image would see it twice
-    share = a.track.length() / len(elements)
-    xyz = share * a.xyz + (1 - share) * b.xyz
-    for element in elements:
-        image = reconstruction.images[element.image_id]
-        pixel = image.project_point(xyz)
-        if pixel is None or np.linalg.norm(pixel - image.points2D[element.point2D_idx].xy) > MERGE_ERROR_PX:
-            return False
-    return True
+        return None  # an image would see it twice
+    images = [reconstruction.images[element.image_id] for element in elements]
+    pixels = [image.points2D[e.point2D_idx].xy for image, e in zip(images, elements, strict=True)]
+    xyz = _meeting(images, pixels)
+    if xyz is None:
+        share = points[0].track.length() / len(elements)
+        xyz = share * points[0].xyz + (1 - share) * points[1].xyz
+    seen = [image.project_point(xyz) for image in images]
+    near = (p is not None and np.linalg.norm(p - q) <= MERGE_ERROR_PX for p, q in zip(seen, pixels, strict=True))
+    return xyz if all(near) else None
+
+
+def _meeting(images: list[pycolmap.Image], pixels: list[Floats]) -> Floats | None:
+    """The point nearest to the rays of these pixels; None where the rays are parallel."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for image, pixel in zip(images, pixels, strict=True):
+        plane = image.camera.cam_from_img(pixel)
+        if plane is None:
+            return None
+        ray = np.asarray(image.cam_from_world().rotation.matrix()).T @ np.array([*plane, 1.0])
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        normal += across
+        right += across @ image.projection_center()
+    fixed = np.linalg.eigvalsh(normal)[0] > LEAST_PARALLAX * len(images)
+    return np.asarray(np.linalg.solve(normal, right)) if fixed else None
 
 
 def _distance(reconstruction: pycolmap.Reconstruction) -> float:

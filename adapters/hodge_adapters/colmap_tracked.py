@@ -155,7 +155,7 @@ class ColmapModel:
             copy.points3D[point_id].xyz = xyz
         notes = self.notes
         if self.edges.database is not None:
-            merged = merge_matched_points(copy, self.edges.database)
+            merged = merge_matched_points(copy, self.edges.database, self.edges.min_shared)
             notes = (*notes, f"{merged} pairs of points that a match calls one were merged") if merged else notes
         copy.update_point_3d_errors()
         return replace(self, reconstruction=copy, files=(), notes=notes)

@@ -147,8 +147,9 @@ def _judged(
     if final.is_observable:
         model, final = model.scaled(final.metres_per_unit), replace(final, metres_per_unit=1.0)
     measures = tuple(_measures(inputs, found, model, options))
-    change = _change(inputs, scales, model, found.errors)
-    decision = decide(measures, change, force=force)
+    change = _change(found.start, scales[0], model, found.errors) if len(inputs) == 1 else None
+    rescaled = scales[0].is_observable and not scales[0].is_one
+    decision = replace(decide(measures, None if rescaled else change, force=force), change=change)
     notes = (*model.notes, *found.notes, *(str(scale) for scale in scales))
     return RefinedModel(inputs, found.start, model, scales, final, found.solved, decision, notes)
 
@@ -171,10 +172,19 @@ def _measures(
     after_chi2 = found.solved.chi2(model.world_from_body)
     out.append(Measure("edge chi2", before_chi2, after_chi2, "lower", CHI2_TOLERANCE * max(before_chi2, 1.0)))
     if found.distances_m.size:
-        scores = np.nanmean(np.exp(-found.distances_m / SIGMA_M), axis=1)
-        name = f"cloud-to-cloud score of {found.distances_m.shape[1]} held-out pairs"
-        out.append(Measure(name, float(scores[0]), float(scores[1]), "higher", SCORE_TOLERANCE))
+        out.append(_score(found.distances_m))
     return out
+
+
+def _score(distances_m: Floats) -> Measure:
+    """The score of the pairs held out (2, H), before and after; its noise is that of the mean of their differences."""
+    scores = np.exp(-distances_m / SIGMA_M)
+    scores = scores[:, np.isfinite(scores).all(axis=0)]
+    count = scores.shape[1]
+    noise = 2 * float((scores[1] - scores[0]).std()) / np.sqrt(max(count, 1))
+    before, after = scores.mean(axis=1) if count else (np.nan, np.nan)
+    name = f"cloud-to-cloud score of {count} held-out pairs"
+    return Measure(name, float(before), float(after), "higher", max(noise, SCORE_TOLERANCE))
 
 
 def _laid_onto(before: Floats, after: Floats) -> Floats:
@@ -184,17 +194,11 @@ def _laid_onto(before: Floats, after: Floats) -> Floats:
     return np.asarray(se3.from_parts(turn, shift) @ before)
 
 
-def _change(
-    inputs: tuple[TrackedModel, ...], scales: tuple[Scale, ...], model: TrackedModel, errors: Floats
-) -> Change | None:
-    """How far the poses of a single input moved; a join is always a change."""
-    if len(inputs) != 1:
-        return None
-    before, after = inputs[0].world_from_body, model.world_from_body
-    laid = _laid_onto(before, after)
-    moved = se3.log(se3.inverse(laid) @ after)
+def _change(start: TrackedModel, scale: Scale, model: TrackedModel, errors: Floats) -> Change:
+    """How far the poses moved from those of the input in metres, laid onto each other."""
+    before, after = start.world_from_body, model.world_from_body
+    moved = se3.log(se3.inverse(_laid_onto(before, after)) @ after)
     rotation, position = np.sqrt(np.nanmean(errors**2, axis=0))
-    scale = scales[0]
     if scale.is_observable:  # the size of the whole is as sure as the scale
         size = np.sqrt(np.mean(np.sum((after[:, :3, 3] - after[:, :3, 3].mean(axis=0)) ** 2, axis=1)))
         position = float(np.hypot(position, scale.sigma * size))
