@@ -32,7 +32,7 @@ def points_of_rays(model: Model, world_from_cam: Floats) -> Floats:
     right = _sum(np.einsum("nij,nj->ni", across, centre), owner, count)
     fixed = np.linalg.eigvalsh(normal)[:, 0] > LEAST_PARALLAX * np.maximum(np.bincount(owner, minlength=count), 1)
     normal[~fixed] = np.eye(3)
-    met = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    met = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], np.float64)
     better = _off(met, centre, ray, owner) < _off(carried, centre, ray, owner)
     return np.where((fixed & better)[:, None], met, carried)
 

@@ -155,7 +155,8 @@ def _meeting(images: list[pycolmap.Image], pixels: list[Floats]) -> Floats | Non
     """The point nearest to the rays of these pixels; None where the rays are parallel."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for image, pixel in zip(images, pixels, strict=True):
-        plane = image.camera.cam_from_img(pixel)
+        camera = image.camera
+        plane = None if camera is None else camera.cam_from_img(pixel)
         if plane is None:
             return None
         ray = np.asarray(image.cam_from_world().rotation.matrix()).T @ np.array([*plane, 1.0])
