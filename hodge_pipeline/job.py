@@ -15,6 +15,7 @@ from typing import Any
 from hodge_pipeline import artifacts, binding
 from hodge_pipeline.monitor import Cost, Monitor
 from hodge_pipeline.recipe import Recipe
+from hodge_pipeline.refine.given_poses import Given
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Source
 from hodge_pipeline.watch import Watcher
@@ -48,7 +49,7 @@ class Job:
 
     A job that does not compute reads finished stages only: one that is not raises `Unfinished`. Without `scoring` the
     score tables, the slowest part of the end, are left out. `live` is the address of a viewer that is shown the
-    recording as it grows.
+    recording as it grows. `given` are the poses that it starts from, where they are not its own odometry.
     """
 
     recipe: Recipe
@@ -60,6 +61,7 @@ class Job:
     keys: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     scoring: bool = True
+    given: Given | None = None
 
     def path(self, stage: str) -> Path:
         """Where a stage's artifacts lie."""

@@ -25,6 +25,7 @@ from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.summary import graph_summary, trajectory_rows, worst_edges
 from hodge_pipeline.evaluation.trajectory import absolute_error
+from hodge_pipeline.guarding import Refined, summary
 from hodge_pipeline.job import Job, versions
 from hodge_pipeline.report_pictures import four_sides, worst_pairs
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
@@ -107,7 +108,9 @@ def _verdict_cells(verdicts: Verdicts | None, row: int) -> tuple[str, str, str]:
     return str(verdicts.verdict[row]), known, str(verdicts.reason[row])
 
 
-def make_report(job: Job, source: Source, rounds: Sequence[Round], scores: ScoreTable | None) -> Report:
+def make_report(
+    job: Job, source: Source, rounds: Sequence[Round], scores: ScoreTable | None, refined: Refined | None = None
+) -> Report:
     """Everything that the run measured."""
     truth, last = true_poses(source), rounds[-1]
     sets = pose_sets(rounds)
@@ -138,9 +141,10 @@ def make_report(job: Job, source: Source, rounds: Sequence[Round], scores: Score
         recipe=yaml_file.dump(binding.unbind(job.recipe)),
         pictures=dataclasses.replace(
             _pictures(source, rounds, sets),
-            sides=four_sides(CloudSet.open(job.path("clouds")), sets["odometry"], sets["result"], component),
+            sides=four_sides(CloudSet.open(job.path("clouds")), sets[rounds[0].name], sets["result"], component),
             worst_pairs=worst_pairs(source, worst),
         ),
+        refinement=None if refined is None else summary(refined.decision),
     )
 
 
@@ -175,14 +179,26 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
 
 
 def write(
-    job: Job, source: Source, rounds: Sequence[Round], models: dict[str, Path], scores: ScoreTable | None
+    job: Job,
+    source: Source,
+    rounds: Sequence[Round],
+    models: dict[str, Path],
+    scores: ScoreTable | None,
+    refined: Refined | None = None,
 ) -> Report:
-    """Write everything but the recording into the run folder; gives the report."""
+    """Write everything but the recording into the run folder; gives the report.
+
+    Of a refinement the poses of all frames; where nothing could be refined the report alone.
+    """
     folder = job.workspace.folder
-    write_poses(folder, source, rounds[-1].world_from_cam)
-    write_graph(folder, source, rounds[-1])
-    for name, path in models.items():
-        artifacts.link_or_copy(path, folder / f"{name}.ply")
-    report = make_report(job, source, rounds, scores)
+    if refined is None:
+        write_poses(folder, source, rounds[-1].world_from_cam)
+    elif job.given is not None and refined.decision.outcome != "nothing":
+        write_poses(folder, job.given.whole, refined.world_from_cam)
+    if refined is None or refined.decision.outcome != "nothing":
+        write_graph(folder, source, rounds[-1])
+        for name, path in models.items():
+            artifacts.link_or_copy(path, folder / f"{name}.ply")
+    report = make_report(job, source, rounds, scores, refined)
     write_report(folder, report)
     return report

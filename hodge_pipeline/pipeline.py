@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from hodge_pipeline import binding, outputs, starting, steps
+from hodge_pipeline import binding, guarding, outputs, starting, steps
 from hodge_pipeline.edited_round import edited_rounds
 from hodge_pipeline.edits import listed_edges
 from hodge_pipeline.evaluation.contents import Report
 from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.guarding import Refined
 from hodge_pipeline.job import Job, logging_to
 from hodge_pipeline.recipe import Recipe, load_recipe, with_source
 from hodge_pipeline.record import Recording
@@ -21,12 +22,16 @@ from hodge_pipeline.workspace import RECIPE_FILE, Workspace
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its folder, what was read, its last round (graph, solution, poses in frame order), the report."""
+    """A finished run: its folder, what was read, its last round (graph, solution, poses in frame order), the report.
+
+    Where it started from given poses the source holds the key frames, and `refined` the decision and all poses.
+    """
 
     folder: Path
     source: Source
     result: Round
     report: Report
+    refined: Refined | None = None
 
 
 def run(
@@ -71,8 +76,9 @@ def _run(job: Job) -> Run:
     source = steps.read(job)
     with Recording(job, source) as recording:
         rounds, models, scores = compute(job, source, recording)
-    report = outputs.write(job, source, rounds, models, scores)
-    return Run(job.workspace.folder, source, rounds[-1], report)
+    refined = None if job.given is None else guarding.finish(job, job.given, rounds)
+    report = outputs.write(job, source, rounds, models, scores, refined)
+    return Run(job.workspace.folder, source, rounds[-1], report, refined)
 
 
 def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round], dict[str, Path], ScoreTable | None]:

@@ -14,6 +14,9 @@ from hodge_pipeline import binding, recipe_file
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.measured import MeasuredOptions
 from hodge_pipeline.recording.options import RecordingOptions
+from hodge_pipeline.refine.given_poses import GivenOptions
+from hodge_pipeline.refine.held_out import GuardOptions
+from hodge_pipeline.refine.key_frames import KeyFrameOptions
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.pairs import Acceptance
@@ -64,6 +67,9 @@ class Recipe:
         description="join what odometry leaves apart, by `global_start`: after lost tracking, or several sequences",
     )
     global_start: GlobalStart = GlobalStart()
+    given: GivenOptions = GivenOptions()
+    key_frames: KeyFrameOptions = KeyFrameOptions()
+    guard: GuardOptions = GuardOptions()
     acceptance: Acceptance = Acceptance()
     measured: MeasuredOptions = MeasuredOptions()
     outer_iterations: int = Field(

@@ -39,6 +39,7 @@ KINDS = {
         Kind("fusion", stages.Fuser, "fuse all frames into one model"),
         Kind("models", stages.ModelReader, "open a model of posed images and tracked points, to be refined"),
         Kind("writers", stages.Writer, "write what another program reads"),
+        Kind("rewriters", stages.PoseRewriter, "write refined poses back into the form they came in"),
     )
 }
 

@@ -31,7 +31,8 @@ class Verdicts:
 
 @dataclass(frozen=True)
 class Round:
-    """One outer iteration: its edges, and the poses (N, 4, 4) that they led to. Round 0 is the odometry.
+    """One outer iteration: its edges, and the poses (N, 4, 4) that they led to. Round 0 holds the first poses, which
+    `name` tells: odometry, or start where they were given.
 
     `rejected_pairs (R, 2)` were registered and not accepted, for `rejected_reasons (R,)`. Only the last round has
     `verdicts`; `disabled (E,)` are edges that a person switched off. `name` is what round 0 is

@@ -26,6 +26,7 @@ from hodge_pipeline.types import (
     Registration,
     Solution,
     Source,
+    Trajectory,
     ViewGraph,
 )
 
@@ -255,4 +256,21 @@ class ModelReader(Protocol):
 
     def join(self, models: Sequence[TrackedModel]) -> Sequence[TrackedModel]:
         """The models again, those that measurements tie together as one: in the gauge and unit of its largest."""
+        ...
+
+
+@runtime_checkable
+class PoseRewriter(Protocol):
+    """Writes poses back into the form of the file they came from; it has the name of the reader of that form."""
+
+    def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
+        """`refined.<suffix>` in the folder: the original with the trajectory's poses in place of its own.
+
+        The trajectory has the stamps that the reader gave; stamps, order, comments and further columns stay as they
+        are. Gives the path.
+        """
+        ...
+
+    def copy(self, folder: Path, original: Path) -> Path:
+        """`refined.<suffix>` in the folder, the original byte for byte. Gives the path."""
         ...

@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 
-from hodge_pipeline import artifacts, steps
+from hodge_pipeline import artifacts, given, steps
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.edges.pairs import labelled, merge
 from hodge_pipeline.job import Job
@@ -19,7 +19,9 @@ START = "start"
 
 
 def first_poses(job: Job, source: Source, workers: Workers) -> Round:
-    """Round 0: what the recipe's `start` and `relocalise` ask for."""
+    """Round 0: given poses, or what the recipe's `start` and `relocalise` ask for."""
+    if job.given is not None:
+        return given.first_poses(job, job.given, source)
     if job.recipe.start == "global":
         return _global_start(job, source, None, ("clouds", "source"), workers)
     first = steps.odometry(job, source, workers)
@@ -29,12 +31,12 @@ def first_poses(job: Job, source: Source, workers: Workers) -> Round:
 
 
 def _global_start(
-    job: Job, source: Source, given: ViewGraph | None, inputs: tuple[str, ...], workers: Workers
+    job: Job, source: Source, known: ViewGraph | None, inputs: tuple[str, ...], workers: Workers
 ) -> Round:
     options, total = job.recipe.global_start, 2 * len(source.frames)
     with job.stage(START, "start without a guess", total, options, inputs) as (folder, advance):
         if not folder.finished:
-            scene = Scene(source.frames, job.path("clouds"), steps.vertex_ids(source), given)
+            scene = Scene(source.frames, job.path("clouds"), steps.vertex_ids(source), known)
             scratch = folder.path / "scratch"
             found = find_start(scene, options, scratch, workers, advance)
             shutil.rmtree(scratch, ignore_errors=True)

@@ -10,14 +10,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline import artifacts, se3
+from hodge_pipeline import artifacts, given, se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.edges.pairs import select
 from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphScores, ScoreTable, score_table
 from hodge_pipeline.fusion.ply import write_ply
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.job import Job, source_key
 from hodge_pipeline.measured import digest, joined, measured_edges, without_measured
+from hodge_pipeline.refine.held_out import is_held_out
 from hodge_pipeline.registration import clouds as cloud_stage
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
@@ -26,9 +28,11 @@ from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequenc
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Source, ViewGraph
 
+HELD_OUT = "held_out.npz"
+
 
 def read(job: Job) -> Source:
-    """The source, opened; its images stay on disk."""
+    """The source, opened; its images stay on disk. Where the run starts from given poses, its key frames alone."""
     path = job.recipe.source.path
     if path is None:
         raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
@@ -41,7 +45,10 @@ def read(job: Job) -> Source:
     if len(source.frames) == 1:
         job.note(f"{path}: has a single frame: there is nothing to register, the model is that frame alone")
     job.keys["source"] = source_key(source, reader)
-    return source
+    if job.recipe.given.poses == "none":
+        return source
+    job.given = given.given_poses(job, source)
+    return given.key_source(job.given, job.recipe.given.poses == "frames")
 
 
 def measured(job: Job, source: Source) -> ViewGraph:
@@ -68,14 +75,22 @@ def prepare_clouds(job: Job, source: Source, workers: Workers) -> CloudSet:
 def propose_edges(
     job: Job, number: int, source: Source, clouds: CloudSet, world_from_cam: Floats, measured: ViewGraph
 ) -> Candidates:
-    """The pairs to register in round `number`, from the poses so far; measured ones are not registered again."""
+    """The pairs to register in round `number`, from the poses so far; measured ones are not registered again.
+
+    Where the run starts from given poses a share of them is kept out, for its guard.
+    """
     name = f"edges-{number}"
     before = _first_stage(job) if number == 1 else f"solve-{number - 1}"
     inputs = ("clouds", "measured", before)
-    with job.stage(name, f"edges, round {number}", 1, job.recipe.edges, inputs) as (folder, advance):
+    options = (job.recipe.edges, None if job.given is None else job.recipe.guard.held_out)
+    with job.stage(name, f"edges, round {number}", 1, options, inputs) as (folder, advance):
         if not folder.finished:
-            candidates = job.recipe.edges.propose(source.frames, clouds, world_from_cam)
-            artifacts.save(folder.path / "candidates.npz", without_measured(candidates, measured))
+            candidates = without_measured(job.recipe.edges.propose(source.frames, clouds, world_from_cam), measured)
+            if job.given is not None:
+                out = is_held_out(candidates, job.recipe.guard.held_out, job.recipe.seed)
+                artifacts.save(folder.path / HELD_OUT, select(candidates, np.flatnonzero(out)))
+                candidates = select(candidates, np.flatnonzero(~out))
+            artifacts.save(folder.path / "candidates.npz", candidates)
             advance(1)
     return artifacts.load(job.path(name) / "candidates.npz", Candidates)
 

@@ -28,7 +28,7 @@ class EurocReader:
     def sniff(self, path: Path) -> Sniff:
         """By the first lines: whole nanoseconds, then numbers with commas between."""
         try:
-            with open(_file_of(Path(path)), "rb") as file:
+            with open(file_of(Path(path)), "rb") as file:
                 lines = file.read(4096).decode("utf-8-sig", "replace").splitlines()[:2]
         except OSError:
             return Sniff(0.0, "not a file that can be read")
@@ -43,7 +43,7 @@ class EurocReader:
 
         Lines that are no pose are left out and noted. Raises `SourceError` where none is left.
         """
-        path = _file_of(Path(path))
+        path = file_of(Path(path))
         good: dict[int, list[float]] = {}
         bad: list[int] = []
         repeated = 0
@@ -86,7 +86,7 @@ class EurocWriter:
         write_text_atomically(Path(path), HEADER + "".join(lines))
 
 
-def _file_of(path: Path) -> Path:
+def file_of(path: Path) -> Path:
     """The file itself, or its usual place in EuRoC's folders."""
     places = ("data.csv", "state_groundtruth_estimate0/data.csv", "mav0/state_groundtruth_estimate0/data.csv")
     return next((path / place for place in places if (path / place).is_file()), path) if path.is_dir() else path

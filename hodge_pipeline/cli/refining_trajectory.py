@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.cli import running
+from hodge_pipeline.errors import SourceError
+
+RECIPE = "slam-refine"
 
 
 def refine(
@@ -20,5 +24,8 @@ def refine(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Run the recipe and print what came out."""
-    raise RecipeError("refine trajectory: not finished yet")
+    """Run the recipe and print what came out; `CheckError`, exit code 3, where the poses given are kept as better."""
+    if not poses.exists():
+        raise SourceError(f"{poses}: no such file or folder: give the poses to refine")
+    ours = [f"given.path={json.dumps(str(poses))}", f"given.match={match}", f"guard.force={str(force).lower()}"]
+    running.run(RECIPE, frames, out, [*ours, *overrides], overwrite=overwrite, quiet=quiet, as_json=as_json)

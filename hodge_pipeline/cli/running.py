@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from hodge_pipeline.cli.console import Terminal, print_table
-from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.recipe import load_recipe
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ def run(
     with resumable(out), Terminal(quiet or as_json) as terminal, _viewer(live, terminal) as address:
         result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal, live=address)
     print_result(result, quiet=quiet, as_json=as_json)
+    if result.refined is not None and result.refined.decision.exit_code:
+        raise CheckError(result.refined.decision.reason)
 
 
 def print_result(result: Run, *, quiet: bool, as_json: bool) -> None:

@@ -22,6 +22,7 @@ NO_MEASURE = "there were neither overlapping clouds nor true poses to compare th
 
 REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
+    "nothing": "not measured",
 }  # fmt: skip
 VERBS = {1: "fell", 0: "hardly changed,", -1: "rose"}
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced"]
+Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "nothing"]
 
 
 @dataclass(frozen=True)
@@ -37,22 +37,24 @@ class Measure:
 
 @dataclass(frozen=True)
 class Change:
-    """How far the poses moved against how well the measurements fix them: root mean squares over the poses."""
+    """How far the poses moved, and how well the measurements fix them: root mean squares over the poses."""
 
     translation_m: float
     rotation_deg: float
-    translation_sigma_m: float
-    rotation_sigma_deg: float
+    translation_uncertainty_m: float
+    rotation_uncertainty_deg: float
 
     @property
     def is_significant(self) -> bool:
-        """Whether the poses moved by more than their own stated uncertainty (one sigma), in either part."""
-        return not (self.translation_m <= self.translation_sigma_m and self.rotation_deg <= self.rotation_sigma_deg)
+        """Whether the poses moved by more than their own stated uncertainty, in either part."""
+        return not (
+            self.translation_m <= self.translation_uncertainty_m and self.rotation_deg <= self.rotation_uncertainty_deg
+        )
 
     def __str__(self) -> str:
         return (
             f"poses moved by {self.translation_m * 1000:.3g} mm and {self.rotation_deg:.2g}° (RMS), "
-            f"known to {self.translation_sigma_m * 1000:.3g} mm and {self.rotation_sigma_deg:.2g}°"
+            f"known to {self.translation_uncertainty_m * 1000:.3g} mm and {self.rotation_uncertainty_deg:.2g}°"
         )
 
 
@@ -63,7 +65,8 @@ class Decision:
     - `refined`: the result is written;
     - `optimal`: it differs from the input by less than its own uncertainty: the input is given back;
     - `worse`: a measure got worse: the input is given back, and the exit code is 3;
-    - `forced`: as `worse`, but the result is written all the same.
+    - `forced`: as `worse`, but the result is written all the same;
+    - `nothing`: no measurement related the poses: nothing is written but the report, and the exit code is 3.
     """
 
     outcome: Outcome
@@ -74,12 +77,12 @@ class Decision:
     @property
     def keeps_input(self) -> bool:
         """Whether the input is given back, byte for byte."""
-        return self.outcome in ("optimal", "worse")
+        return self.outcome in ("optimal", "worse", "nothing")
 
     @property
     def exit_code(self) -> int:
         """3 where the result failed its own checks, else 0."""
-        return 3 if self.outcome == "worse" else 0
+        return 3 if self.outcome in ("worse", "nothing") else 0
 
 
 def decide(measures: Sequence[Measure], change: Change | None = None, *, force: bool = False) -> Decision:

@@ -205,6 +205,6 @@ def _change(start: TrackedModel, scale: Scale, model: TrackedModel, errors: Floa
     return Change(
         translation_m=float(np.sqrt(np.mean(np.sum(moved[:, 3:] ** 2, axis=1)))),
         rotation_deg=float(np.degrees(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=1))))),
-        translation_sigma_m=float(position * np.sqrt(3)),
-        rotation_sigma_deg=float(np.degrees(rotation * np.sqrt(3))),
+        translation_uncertainty_m=float(position * np.sqrt(3)),
+        rotation_uncertainty_deg=float(np.degrees(rotation * np.sqrt(3))),
     )

@@ -1,0 +1,168 @@
+"""The poses that a refinement starts from: whose they are, and which belongs to which frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass as plain_dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats, Frame, Ints, Source, Trajectory
+
+Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
+SAME_STAMP_S = 1e-6
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class GivenOptions:
+    """Poses that the run starts from instead of finding its own."""
+
+    poses: Literal["none", "frames", "file"] = Field(
+        default="none",
+        description="none: as `start` says; frames: the source's own poses; file: those of `path`",
+    )
+    path: Path | None = Field(default=None, description="a trajectory of any format that a reader opens")
+    match: Match = Field(
+        default="auto",
+        description="how a frame finds its pose in the file: stamp, between two poses; number, that of the frame; row, "
+        "the n-th pose is that of the n-th frame; auto: the first of these that fits",
+    )
+    max_gap_s: float = Field(
+        default=0.1,
+        ge=0,
+        description="seconds to the poses around a frame's stamp; frames with a wider gap, between the sparse poses of "
+        "key frames, are carried over it by odometry",
+    )
+
+
+@plain_dataclass(frozen=True)
+class Matched:
+    """Poses on the frames: `frame_times (N,)` and `pose_times (P,)` on one clock, `world_from_cam (N, 4, 4)` at the
+    frames, NaN where there is none, and how they were matched.
+    """
+
+    frame_times: Floats
+    pose_times: Floats
+    world_from_cam: Floats
+    how: str
+
+
+@plain_dataclass(frozen=True)
+class Given:
+    """What a run starts from: the whole source, a pose (N, 4, 4) for each of its frames, and the rows of key frames.
+
+    `path` and `trajectory` are the file of poses and what it holds; `pose_times (P,)` are the moments of its poses on
+    the clock of `frame_times (N,)`.
+    """
+
+    whole: Source
+    world_from_cam: Floats
+    key_rows: Ints
+    frame_times: Floats
+    pose_times: Floats
+    path: Path | None = None
+    trajectory: Trajectory | None = None
+
+
+def own_poses(frames: Sequence[Frame]) -> Matched:
+    """The frames' own poses."""
+    poses = np.full((len(frames), 4, 4), np.nan)
+    for row, frame in enumerate(frames):
+        if frame.world_from_cam is not None:
+            poses[row] = frame.world_from_cam
+    times = np.arange(len(frames), dtype=float)
+    return Matched(times, times[np.isfinite(poses).all(axis=(1, 2))], poses, "the frames' own")
+
+
+def match_poses(trajectory: Trajectory, frames: Sequence[Frame], options: GivenOptions, where: str) -> Matched:
+    """The trajectory's poses on the frames.
+
+    Raises `SourceError` where they have nothing in common, or `options.match` asks for what is not there.
+    """
+    usable = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2)) & np.isfinite(trajectory.stamps_s)
+    trajectory = Trajectory(trajectory.stamps_s[usable], trajectory.world_from_cam[usable])
+    if not len(trajectory):
+        raise SourceError(f"{where}: no pose in it: give a trajectory")
+    if options.match != "auto":
+        matched = _matched(options.match, trajectory, frames, options.max_gap_s)
+        if matched is None or not np.isfinite(matched.world_from_cam).any():
+            raise SourceError(f"{where}: no frame finds a pose by {options.match}: {_ranges(trajectory, frames)}")
+        return matched
+    rows_for_stamps = len(trajectory) == len(frames) and np.array_equal(
+        trajectory.stamps_s, np.arange(len(frames), dtype=float)
+    )
+    for how in ("row", "stamp", "number") if rows_for_stamps else ("stamp", "number"):
+        matched = _matched(how, trajectory, frames, options.max_gap_s)
+        if matched is not None and np.isfinite(matched.world_from_cam).any():
+            return matched
+    raise SourceError(
+        f"{where}: none of its poses is of these frames: {_ranges(trajectory, frames)}: give the poses of this "
+        "sequence, or --match row where the n-th pose is that of the n-th frame"
+    )
+
+
+def _matched(how: str, trajectory: Trajectory, frames: Sequence[Frame], max_gap_s: float) -> Matched | None:
+    """The poses matched in one way, None where it does not apply."""
+    if how == "stamp":
+        return _by_stamp(trajectory, frames, max_gap_s)
+    return _by_number(trajectory, frames) if how == "number" else _by_row(trajectory, frames)
+
+
+def _by_stamp(trajectory: Trajectory, frames: Sequence[Frame], max_gap_s: float) -> Matched:
+    stamps = np.array([frame.stamp_s for frame in frames], float)
+    return Matched(stamps, trajectory.stamps_s, poses_at(trajectory, stamps, max_gap_s), "stamp")
+
+
+def _by_number(trajectory: Trajectory, frames: Sequence[Frame]) -> Matched | None:
+    numbers = np.array([frame.frame_id for frame in frames])
+    whole = np.equal(np.mod(trajectory.stamps_s, 1), 0).all()
+    if numbers.dtype.kind not in "iu" or not whole or (np.diff(numbers) <= 0).any():
+        return None
+    numbers = numbers.astype(float)
+    return Matched(numbers, trajectory.stamps_s, poses_at(trajectory, numbers, 0.0), "number")
+
+
+def _by_row(trajectory: Trajectory, frames: Sequence[Frame]) -> Matched | None:
+    if len(trajectory) != len(frames):
+        return None
+    rows = np.arange(len(frames), dtype=float)
+    return Matched(rows, rows, trajectory.world_from_cam, "row")
+
+
+def poses_at(trajectory: Trajectory, stamps_s: Floats, max_gap_s: float) -> Floats:
+    """Poses (N, 4, 4) at the stamps, on the geodesic between the two around; NaN where one is farther than the gap.
+
+    A pose at the stamp itself, to a microsecond, needs no neighbours.
+    """
+    poses = np.full((len(stamps_s), 4, 4), np.nan)
+    times = trajectory.stamps_s
+    after = np.clip(np.searchsorted(times, stamps_s), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(times[before] - stamps_s) < np.abs(times[after] - stamps_s), before, after)
+    exact = np.abs(times[nearest] - stamps_s) <= SAME_STAMP_S
+    poses[exact] = trajectory.world_from_cam[nearest[exact]]
+    to_before, to_after = stamps_s - times[before], times[after] - stamps_s
+    between = (
+        ~exact & (before < after) & (to_before >= 0) & (to_after >= 0) & (np.maximum(to_before, to_after) <= max_gap_s)
+    )
+    span = np.where(after > before, times[after] - times[before], 1.0)
+    poses[between] = se3.interpolate(
+        trajectory.world_from_cam[before[between]],
+        trajectory.world_from_cam[after[between]],
+        (to_before / span)[between],
+    )
+    return poses
+
+
+def _ranges(trajectory: Trajectory, frames: Sequence[Frame]) -> str:
+    stamps = [frame.stamp_s for frame in frames]
+    return (
+        f"{len(trajectory)} poses at {trajectory.stamps_s[0]:.6g} to {trajectory.stamps_s[-1]:.6g}, "
+        f"{len(frames)} frames at {min(stamps):.6g} to {max(stamps):.6g}"
+    )

@@ -1,0 +1,34 @@
+"""Edges kept out of the solve, by which its result is judged."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.types import Bools, Candidates
+
+MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class GuardOptions:
+    """How a refinement is judged before it replaces the poses it started from."""
+
+    held_out: float = Field(
+        default=0.1,
+        gt=0,
+        lt=1,
+        description="share of the overlapping pairs that are never registered: on them both sets of poses are scored",
+    )
+    force: bool = Field(default=False, description="write the result even where it is worse by its own measures")
+
+
+def is_held_out(candidates: Candidates, share: float, seed: int) -> Bools:
+    """Where (P,) a pair is kept out: a share of those that no sequence needs, the same ones in every round."""
+    mixed = candidates.pairs.astype(np.uint64) * MIXERS[:2]
+    key = (mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(7))) + np.uint64(seed) * MIXERS[2]
+    key = (key ^ (key >> np.uint64(29))) * MIXERS[2]
+    drawn = (key >> np.uint64(11)).astype(float) / float(1 << 53)
+    needed = np.array(["sequential" in str(source).split("+") for source in candidates.source], bool)
+    return np.asarray((drawn < share) & ~needed.reshape(drawn.shape))

@@ -1,0 +1,67 @@
+"""How well the edges fix the poses, and how far the poses moved: the two that a change is judged by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.refine.guard import Change
+from hodge_pipeline.solvers.covariance import marginal_covariances
+from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
+
+MOST_SAMPLED = 60
+"""Poses at which the covariance is taken: enough for a root mean square."""
+SIGMAS = 2.0
+LEAST_WEIGHT = 1e-3
+
+
+def edge_chi2(graph: ViewGraph, world_from_cam: Floats) -> Floats:
+    """χ² (E,) of each edge under the poses (V, 4, 4), 6 on average where information and poses are right."""
+    i, j = graph.edges.T
+    error = se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(world_from_cam[i]) @ world_from_cam[j])
+    return np.asarray(np.einsum("ea,eab,eb->e", error, graph.information, error))
+
+
+def mean_chi2(graph: ViewGraph, weights: Floats, world_from_cam: Floats) -> float:
+    """The mean χ² of the edges, each by the weight (E,) that the solver gave it; NaN where none has any."""
+    total = float(weights.sum())
+    return float(weights @ edge_chi2(graph, world_from_cam)) / total if total > 0 else float("nan")
+
+
+def change(graph: ViewGraph, solution: Solution, before: Floats) -> Change:
+    """The change from the poses before (V, 4, 4) to the solution, with the uncertainty that the edges leave.
+
+    The uncertainty is two standard deviations of a pose against the first of its component, from the inverse of the
+    normal equations, scaled by what the residuals say of the edges' own information. NaN where it cannot be had.
+    """
+    used = np.flatnonzero(solution.weights > LEAST_WEIGHT)
+    moved = se3.inverse(before) @ solution.world_from_cam
+    translation_m = _rms(np.linalg.norm(moved[:, :3, 3], axis=1))
+    rotation_deg = float(np.rad2deg(_rms(np.linalg.norm(se3.so3_log(moved[:, :3, :3]), axis=1))))
+    rows = np.unique(np.linspace(0, graph.vertex_count - 1, MOST_SAMPLED).round().astype(np.int64))
+    rotation, translation = _sigmas(graph, solution, used, rows)
+    return Change(translation_m, rotation_deg, SIGMAS * translation, SIGMAS * float(np.rad2deg(rotation)))
+
+
+def _sigmas(graph: ViewGraph, solution: Solution, used: Ints, rows: Ints) -> tuple[float, float]:
+    """Root mean squares over the rows of the standard deviations of rotation (radians) and translation (metres)."""
+    chosen = graph.select(used)
+    weights = solution.weights[used]
+    chosen = replace(chosen, information=chosen.information * weights[:, None, None])
+    freedom = 6 * (len(used) - graph.vertex_count + 1 + int(solution.component.max(initial=0)))
+    if freedom <= 0:
+        return float("nan"), float("nan")
+    inflation = max(1.0, float(edge_chi2(chosen, solution.world_from_cam).sum()) / freedom)
+    try:
+        covariances = marginal_covariances(chosen, solution.world_from_cam, rows) * inflation
+    except (GraphError, np.linalg.LinAlgError, RuntimeError):  # a singular graph has no covariance
+        return float("nan"), float("nan")
+    spread = np.einsum("kii->ki", covariances)
+    return _rms(np.sqrt(spread[:, :3].sum(axis=1))), _rms(np.sqrt(spread[:, 3:].sum(axis=1)))
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
