@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,10 @@ from hodge_pipeline.types import Candidates, Floats, Ints, Source, Trajectory
 
 CHI2_TOLERANCE = 0.02
 """Of the start's: the solver minimises a robust cost, not this one."""
+SIGMAS = 3.0
+"""Standard errors of the mean change of the score that its own noise may reach."""
+LEAST_TOLERANCE = 0.002
+"""Of the score: what a fraction of a millimetre does."""
 
 HEADLINES = {
     "refined": "Better than the poses given",
@@ -77,16 +81,20 @@ def _decision(job: Job, rounds: Sequence[Round], before: Floats) -> Decision:
     measures = [*_held_out(job, len(rounds) - 1, before, last.world_from_cam)]
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
     measures.append(Measure("edge chi2, mean", chi2[0], chi2[1], tolerance=CHI2_TOLERANCE * chi2[0]))
-    return decide(measures, change(last.graph, last.solution, before), force=job.recipe.guard.force)
+    moved = change(last.graph, last.solution, before)
+    # Where edges hardly fix the poses any change is below its uncertainty; what the measures see counts first then.
+    judged = None if any(measure.is_worse for measure in measures) else moved
+    return replace(decide(measures, judged, force=job.recipe.guard.force), change=moved)
 
 
 def _held_out(job: Job, rounds: int, before: Floats, after: Floats) -> list[Measure]:
     """The score of the pairs kept out of every round; its tolerance is its own standard error."""
-    pairs = held_out_pairs(job, rounds)
+    pairs = held_out_pairs(job)
     if not len(pairs):
         job.note("no overlapping pair was left to judge the result by: only the edges' own chi2 does")
         return []
-    inputs = ("clouds", f"solve-{rounds}", *(f"edges-{number}" for number in range(1, rounds + 1)))
+    edges = (f"edges-{number}" for number in range(1, job.recipe.outer_iterations + 1))
+    inputs = ("clouds", f"solve-{rounds}", *edges)
     with job.stage("guard", "guard", 1, job.recipe.guard, inputs) as (folder, advance):
         if not folder.finished:
             with job.recipe.executor.open() as workers:
@@ -96,21 +104,25 @@ def _held_out(job: Job, rounds: int, before: Floats, after: Floats) -> list[Meas
     distances = artifacts.load_arrays(job.path("guard") / "distances.npz")["distances_m"]
     scores = np.exp(-distances / SIGMA_M)
     error = float((scores[1] - scores[0]).std() / np.sqrt(len(pairs)))
+    tolerance = max(SIGMAS * error, LEAST_TOLERANCE)
     mean_m, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_m[0]:.3g} mm apart before, {mean_m[1]:.3g} mm after"
     job.note(f"{len(pairs)} overlapping pairs were kept out of the solve: clouds there {apart}")
-    return [Measure("score of held-out edges", float(mean[0]), float(mean[1]), "higher", error)]
+    return [Measure("score of held-out edges", float(mean[0]), float(mean[1]), "higher", tolerance)]
 
 
 def _distances(job: Job, pairs: Ints, before: Floats, after: Floats, workers: Workers) -> Floats:
     return edge_distances(job.path("clouds"), pairs, np.stack([before, after]), workers)
 
 
-def held_out_pairs(job: Job, rounds: int) -> Ints:
-    """The pairs (P, 2) that any round proposed and the guard kept out."""
+def held_out_pairs(job: Job) -> Ints:
+    """The pairs (P, 2) that any round proposed and kept out, and that are not among the last round's edges."""
+    rounds = job.recipe.outer_iterations
     files = [job.path(f"edges-{number}") / HELD_OUT for number in range(1, rounds + 1)]
     kept = [artifacts.load(file, Candidates).pairs for file in files if file.is_file()]
-    return np.unique(np.concatenate([np.zeros((0, 2), np.int64), *kept]), axis=0)
+    pairs = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *kept]), axis=0)
+    solved = artifacts.load(job.path(f"edges-{rounds}") / "candidates.npz", Candidates).pairs
+    return np.array(sorted(set(map(tuple, pairs.tolist())) - set(map(tuple, solved.tolist()))), np.int64).reshape(-1, 2)
 
 
 def _spread(given: Given, times: Floats, poses: Floats, key_after: Floats) -> Floats:

@@ -17,6 +17,8 @@ from hodge_pipeline.types import Floats, Frame, Ints, Source, Trajectory
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
 SAME_STAMP_S = 1e-6
+LIKELY_SHARE = 0.5
+"""Of the frames: fewer numbers in common may be a coincidence, since small numbers occur in every sequence."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -99,11 +101,12 @@ def match_poses(trajectory: Trajectory, frames: Sequence[Frame], options: GivenO
     )
     for how in ("row", "stamp", "number") if rows_for_stamps else ("stamp", "number"):
         matched = _matched(how, trajectory, frames, options.max_gap_s)
-        if matched is not None and np.isfinite(matched.world_from_cam).any():
+        found = 0 if matched is None else int(np.isfinite(matched.world_from_cam).all(axis=(1, 2)).sum())
+        if matched is not None and found and (how != "number" or found >= LIKELY_SHARE * len(frames)):
             return matched
     raise SourceError(
         f"{where}: none of its poses is of these frames: {_ranges(trajectory, frames)}: give the poses of this "
-        "sequence, or --match row where the n-th pose is that of the n-th frame"
+        "sequence, or say how they belong together: --match row, --match number"
     )
 
 

@@ -10,6 +10,9 @@ from hodge_pipeline.types import Bools, Candidates
 
 MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
+FEWEST = 15
+LARGEST_SHARE = 0.3
+
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class GuardOptions:
@@ -25,10 +28,15 @@ class GuardOptions:
 
 
 def is_held_out(candidates: Candidates, share: float, seed: int) -> Bools:
-    """Where (P,) a pair is kept out: a share of those that no sequence needs, the same ones in every round."""
+    """Where (P,) a pair is kept out: a share of those that no sequence needs, the same ones in every round.
+
+    Of few pairs a larger share is kept out, up to `LARGEST_SHARE`: one or two pairs would judge nothing.
+    """
     mixed = candidates.pairs.astype(np.uint64) * MIXERS[:2]
     key = (mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(7))) + np.uint64(seed) * MIXERS[2]
     key = (key ^ (key >> np.uint64(29))) * MIXERS[2]
     drawn = (key >> np.uint64(11)).astype(float) / float(1 << 53)
     needed = np.array(["sequential" in str(source).split("+") for source in candidates.source], bool)
-    return np.asarray((drawn < share) & ~needed.reshape(drawn.shape))
+    optional = ~needed.reshape(drawn.shape)
+    wanted = min(LARGEST_SHARE, FEWEST / max(1, int(optional.sum())))
+    return np.asarray((drawn < max(share, wanted)) & optional)

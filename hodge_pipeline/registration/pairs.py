@@ -144,11 +144,12 @@ def _register_block(folder: Path, registrar: Registrar, block: tuple[Ints, Float
 
 def prepared_clouds(folder: Path, registrar: Registrar) -> PreparedClouds:
     """The clouds of a folder as the registrar wants them, kept by this process from block to block."""
-    return _kept_clouds(folder, cast(Hashable, registrar))
+    written = (folder / "points.npy").stat()
+    return _kept_clouds(folder, (written.st_ino, written.st_mtime_ns), cast(Hashable, registrar))
 
 
 @lru_cache(maxsize=1)
-def _kept_clouds(folder: Path, registrar: Hashable) -> PreparedClouds:
+def _kept_clouds(folder: Path, written: tuple[int, int], registrar: Hashable) -> PreparedClouds:
     return PreparedClouds(folder, cast(Registrar, registrar))
 
 

@@ -1,0 +1,176 @@
+"""`hodge refine trajectory` on a small rendered sequence: formats, guard, sparse poses, bad input."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from hodge_adapters.poses_text import read_tum, write_tum
+from hodge_adapters.tum import TumReader
+from hodge_pipeline import se3
+from hodge_pipeline.cli.main import app, main
+from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.types import Floats, Trajectory
+
+SMALL = (
+    "clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1", "key_frames.every=2",
+    "edges.builders=[{stage: sequential}, {stage: overlap, min_iou: 0.15}]",
+)  # fmt: skip
+ROOM = DemoOptions(frames=16, width=160, height=120, noise=0.3)
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A TUM folder of 16 small frames, going 27 degrees round the room and back."""
+    return make_sequence(tmp_path_factory.mktemp("room") / "sequence", ROOM)
+
+
+@pytest.fixture(scope="module")
+def truth(sequence: Path) -> Trajectory:
+    frames = TumReader().open(sequence).frames
+    return Trajectory(np.array([f.stamp_s for f in frames]), np.array([f.world_from_cam for f in frames]))
+
+
+@pytest.fixture(scope="module")
+def drifted(truth: Trajectory) -> Trajectory:
+    """The truth with a drift of 6 cm and 3 degrees from frame 4 to frame 10."""
+    share = np.clip((np.arange(len(truth)) - 4) / 6, 0, 1)[:, None]
+    drift = se3.exp(share * np.array([0.0, 0.05, 0.0, 0.06, 0.0, 0.0]))
+    return Trajectory(truth.stamps_s, truth.world_from_cam @ drift)
+
+
+def refine(poses: Path, frames: Path, out: Path, *more: str) -> Result:
+    sets = [argument for override in SMALL for argument in ("--set", override)]
+    arguments = ["refine", "trajectory", str(poses), "--frames", str(frames), "--out", str(out), *sets, *more]
+    return CliRunner().invoke(app, arguments)
+
+
+def outcome(out: Path) -> str:
+    return str(json.loads((out / "report.json").read_text())["refinement"]["outcome"])
+
+
+def error_m(poses: Floats, truth: Trajectory) -> float:
+    """The largest error of the motion from the first frame."""
+    found, true = (se3.inverse(p[0]) @ p for p in (poses, truth.world_from_cam))
+    return float(np.abs((se3.inverse(true) @ found)[:, :3, 3]).max())
+
+
+@pytest.fixture(scope="module")
+def refined(sequence: Path, drifted: Trajectory, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("refine")
+    write_tum(folder / "slam.txt", drifted)
+    found = refine(folder / "slam.txt", sequence, folder / "run")
+    assert found.exit_code == 0, found.output
+    return folder / "run"
+
+
+def test_drift_is_taken_out_and_the_stamps_stay(refined: Path, drifted: Trajectory, truth: Trajectory) -> None:
+    assert outcome(refined) == "refined"
+    found = read_tum(refined / "refined.txt")
+    np.testing.assert_array_equal(found.stamps_s, drifted.stamps_s)
+    assert error_m(drifted.world_from_cam, truth) > 0.05
+    assert error_m(found.world_from_cam, truth) < 0.02
+    np.testing.assert_allclose(read_tum(refined / "poses.tum").world_from_cam, found.world_from_cam, atol=1e-9)
+
+
+def test_the_report_shows_what_the_guard_measured(refined: Path) -> None:
+    report = json.loads((refined / "report.json").read_text())
+    names = {row["name"] for row in report["refinement"]["measures"]}
+    assert names == {"score of held-out edges", "edge chi2, mean"} and report["verdict"]["outcome"] == "improved"
+    assert "Better than the poses given" in (refined / "report.html").read_text()
+
+
+def test_optimal_poses_come_back_byte_for_byte(refined: Path, sequence: Path, tmp_path: Path) -> None:
+    text = "# my own comment\n" + (refined / "refined.txt").read_text()
+    (tmp_path / "slam.txt").write_text(text)
+    found = refine(tmp_path / "slam.txt", sequence, tmp_path / "run")
+    assert found.exit_code == 0 and outcome(tmp_path / "run") == "optimal"
+    assert (tmp_path / "run" / "refined.txt").read_text() == text
+
+
+def test_a_worse_result_is_not_written_but_with_force(
+    sequence: Path,
+    truth: Trajectory,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Registration that is told to see nothing nearer than a metre makes true poses worse."""
+    write_tum(tmp_path / "slam.tum", truth)
+    blind = ("--set", "registration.distances_m=[1.0]", "--set", "registration.source_points=[20]",
+             "--set", "acceptance.max_rmse_m=9",
+             "--set", "registration.points_per_sample=0.01")  # fmt: skip
+    arguments = [str(tmp_path / "slam.tum"), "--frames", str(sequence), "--out", str(tmp_path / "run"), *blind]
+    sets = [argument for override in SMALL for argument in ("--set", override)]
+    monkeypatch.setattr("sys.argv", ["hodge", "refine", "trajectory", *arguments, *sets])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 3 and outcome(tmp_path / "run") == "worse"
+    assert (tmp_path / "run" / "refined.tum").read_bytes() == (tmp_path / "slam.tum").read_bytes()
+    np.testing.assert_allclose(read_tum(tmp_path / "run" / "poses.tum").world_from_cam, truth.world_from_cam, atol=1e-9)
+    forced = refine(tmp_path / "slam.tum", sequence, tmp_path / "forced", *blind, "--force")
+    assert forced.exit_code == 0 and outcome(tmp_path / "forced") == "forced"
+    assert (tmp_path / "forced" / "refined.tum").read_bytes() != (tmp_path / "slam.tum").read_bytes()
+
+
+def test_sparse_poses_are_carried_over_all_frames(
+    sequence: Path,
+    truth: Trajectory,
+    tmp_path: Path,
+) -> None:
+    every = Trajectory(truth.stamps_s[::6], truth.world_from_cam[::6])
+    write_tum(tmp_path / "KeyFrameTrajectory.txt", every)
+    found = refine(tmp_path / "KeyFrameTrajectory.txt", sequence, tmp_path / "run")
+    assert found.exit_code == 0, found.output
+    assert len(read_tum(tmp_path / "run" / "refined.txt")) == len(every)
+    poses = read_tum(tmp_path / "run" / "poses.tum")
+    np.testing.assert_array_equal(poses.stamps_s, truth.stamps_s)
+    assert error_m(poses.world_from_cam, truth) < 0.03
+
+
+def test_all_edges_rejected_leaves_the_report_alone(
+    sequence: Path,
+    drifted: Trajectory,
+    tmp_path: Path,
+) -> None:
+    write_tum(tmp_path / "slam.txt", drifted)
+    found = refine(tmp_path / "slam.txt", sequence, tmp_path / "run", "--set", "acceptance.max_rmse_m=1e-6")
+    assert found.exit_code != 0 and getattr(found.exception, "exit_code", None) == 3
+    assert "points too far apart" in str(found.exception)
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert "report.html" in names and not any(n.startswith(("refined", "poses", "graph", "edges")) for n in names)
+
+
+@pytest.mark.parametrize(
+    ("lines", "complaint"),
+    [
+        ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n", "none of its poses is of these frames"),
+        ("nan nan nan nan nan nan nan nan\n", "is no pose"),
+    ],
+)
+def test_poses_of_something_else_are_refused(
+    sequence: Path,
+    tmp_path: Path,
+    lines: str,
+    complaint: str,
+) -> None:
+    (tmp_path / "other.txt").write_text(lines)
+    found = refine(tmp_path / "other.txt", sequence, tmp_path / "run")
+    assert complaint in str(found.exception) and getattr(found.exception, "exit_code", None) == 1
+    assert "\n" not in str(found.exception)
+    assert not list((tmp_path / "run").glob("refined*"))
+
+
+def test_a_single_pose_and_nan_poses_do_not_stop_it(
+    sequence: Path,
+    truth: Trajectory,
+    tmp_path: Path,
+) -> None:
+    write_tum(tmp_path / "one.txt", Trajectory(truth.stamps_s[:1], truth.world_from_cam[:1]))
+    text = (tmp_path / "one.txt").read_text() + f"{float(truth.stamps_s[5])!r} nan nan nan nan nan nan nan\n"
+    (tmp_path / "one.txt").write_text(text)
+    found = refine(tmp_path / "one.txt", sequence, tmp_path / "run")
+    assert found.exit_code == 0, found.output
+    assert "1 lines that are no pose left out" in (tmp_path / "run" / "log.txt").read_text()
+    assert (tmp_path / "run" / "refined.txt").read_text().endswith("nan nan nan nan nan nan nan\n")
