@@ -63,8 +63,8 @@ def written(writer: object, name: str) -> Callable[[Path], Path]:
 
 def icl(folder: Path) -> Path:
     for number in range(1):
-        write_depth(folder / f"depth/{number}.png", np.full((480, 640), 5000, np.uint16))
-        write_colour(folder / f"rgb/{number}.png", size=(480, 640))
+        write_depth(folder / f"depth/{number}.png", np.full((6, 8), 5000, np.uint16))
+        write_colour(folder / f"rgb/{number}.png", size=(6, 8))
     (folder / "associations.txt").write_text("".join(f"{n} depth/{n}.png {n} rgb/{n}.png\n" for n in range(1)))
     (folder / "a.gt.freiburg").write_text("".join(tum_line(n, pose) for n, pose in enumerate(some_poses(3))))
     return folder
@@ -75,14 +75,15 @@ def pov(folder: Path) -> Path:
     for number in range(2):
         stem = folder / f"scene_00_{number:04d}"
         stem.with_suffix(".txt").write_text(text)
-        stem.with_suffix(".depth").write_text("100.5\n" * 60)
+        stem.with_suffix(".depth").write_text("1.5 " * 48)
+        write_colour(stem.with_suffix(".png"))
     return folder
 
 
 def redwood(folder: Path) -> Path:
     for number in range(1):
-        write_depth(folder / f"depth/{number:05d}.png", np.full((480, 640), 1000, np.uint16))
-        write_colour(folder / f"image/{number:05d}.jpg", size=(480, 640))
+        write_depth(folder / f"depth/{number:05d}.png", np.full((6, 8), 1000, np.uint16))
+        write_colour(folder / f"image/{number:05d}.jpg", size=(6, 8))
     LogWriter().write(
         folder / "trajectory.log", Source("a", folder, trajectory=Trajectory(np.arange(3.0), some_poses(3)))
     )
@@ -237,9 +238,9 @@ def pcd(kind: str) -> Callable[[Path], Path]:
 TARGETS: dict[str, Target] = {
     "seven_scenes": Target(SevenScenesReader(), lambda folder: seven_scenes_sequence(folder / "seq-01", 2)),
     "tum": Target(TumReader(), tum_folder),
-    "icl_lists": Target(IclNuimReader(), icl),
-    "icl_pov": Target(IclNuimReader(), pov, refused=2),
-    "icl_redwood": Target(IclNuimReader(), redwood),
+    "icl_lists": Target(IclNuimReader(intrinsics=(10.0, -10.0, 4.0, 3.0)), icl),
+    "icl_pov": Target(IclNuimReader(intrinsics=(10.0, -10.0, 4.0, 3.0)), pov),
+    "icl_redwood": Target(IclNuimReader(intrinsics=(10.0, 10.0, 4.0, 3.0)), redwood),
     "seven_scenes_split": Target(SevenScenesReader(split="train", colour_camera="kinect"), scene),
     "mcap_ros": Target(McapReader(), mcap_of(CDR)),
     "mcap_protobuf": Target(McapReader(depth_topic="/rvl"), mcap_of(PROTOBUF)),

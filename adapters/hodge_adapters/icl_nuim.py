@@ -118,10 +118,11 @@ class IclNuimReader:
         files = (*listing.files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour))
         return Source(path.resolve().name, path, frames, trajectory, notes=tuple(notes), files=files)
 
-    def _open_pov(self, path: Path, depth: dict[int, Path]) -> Source:
+    def _open_pov(self, path: Path, pov: dict[int, Path]) -> Source:
         notes: list[str] = []
-        camera = self._camera(ICL).camera((640, 480))
-        frames, files = pov_frames(depth, camera, self.units_per_metre or 1.0, notes)
+        colours = [file for file in (depth.with_suffix(".png") for depth in pov.values()) if file.is_file()]
+        camera = self._camera(ICL).camera(images.common_size(colours) if colours else (640, 480))
+        frames, files = pov_frames(pov, camera, self.units_per_metre or 1.0, notes)
         trajectory = _trajectory(frames)
         return Source(path.resolve().name, path, tuple(frames[:: self.every]), trajectory, None, tuple(notes), files)
 
