@@ -20,6 +20,7 @@ FLOOR = 0.03
 FINAL_PENALTY = 0.5
 PRIOR_SHARE = 0.3
 EXTREME = 0.01
+UNVOUCHED = 0.9
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,16 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
     best = fit(evidence, graph, align(evidence, voted, options.cluster_gain, FINAL_PENALTY, rng), 2)
     agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
     mean = (share + agreeing) / 2 if runs > 1 else agreeing
-    return Consensus(best, _with_prior(mean, evidence.prior), runs)
+    probability = _with_prior(mean, evidence.prior)
+    return Consensus(best, _unvouched(probability, best, evidence), runs)
+
+
+def _unvouched(probability: Floats, fit: Fit, evidence: Evidence) -> Floats:
+    """An edge that alone holds two parts together, against edges that would hold them otherwise, is no more likely
+    than its order makes it: no cycle of edges that agree vouches for it.
+    """
+    bridge = fit.used & np.isinf(fit.resistance) & ~evidence.alone
+    return np.where(bridge, np.minimum(probability, UNVOUCHED * evidence.prior), probability)
 
 
 def edge_weight(evidence: Evidence) -> Floats:

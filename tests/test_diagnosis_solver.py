@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import numpy as np
+
+from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
+from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.result import UNTESTABLE
+from hodge_pipeline.diagnosis.solver import DiagnosedSolver
+from hodge_pipeline.diagnosis.suggestions import suggest_pairs
+from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.stages import ConsistencySolver
+from hodge_pipeline.types import ViewGraph
+
+QUICK = DiagnosisOptions(runs=4, every_pair_tried=False)
+
+
+def test_the_solver_leaves_wrong_edges_out_and_keeps_the_gauge() -> None:
+    poses = poses_on_a_ring(20)
+    clean = measured(poses, near_pairs(20, 4))
+    graph, right = spoiled(clean, np.random.default_rng(0).choice(80, 20, replace=False))
+    solver = DiagnosedSolver(diagnosis=QUICK)
+    assert isinstance(solver, ConsistencySolver)
+    solution = solver.solve(graph, poses)
+    assert not (solution.weights[~right] > 0).any() and (solution.weights[right] > 0).mean() > 0.9
+    np.testing.assert_allclose(solution.world_from_cam[0], poses[0], atol=1e-9)
+    assert np.abs(solution.world_from_cam[:, :3, 3] - poses[:, :3, 3]).max() < 0.1
+    assert "left out by the diagnosis" in solution.notes[0] and "checked again" in solution.notes[1]
+
+
+def test_recipes_that_use_it_bind() -> None:
+    for name in ("seven_scenes_robust", "tum_robust"):
+        assert isinstance(load_recipe(name).solver, DiagnosedSolver)
+    changed = load_recipe("seven_scenes_robust", ["solver.diagnosis.runs=3"]).solver
+    assert isinstance(changed, DiagnosedSolver) and changed.diagnosis.runs == 3
+
+
+def chain(count: int) -> ViewGraph:
+    k = np.arange(count)
+    return measured(poses_on_a_ring(count), np.stack([k[:-1], k[1:]], axis=1))
+
+
+def test_the_missing_side_of_two_untestable_edges_is_suggested_first() -> None:
+    """0 - 1 - 2 and a triangle 2 - 3 - 4: the pair (0, 2) would test both bridges."""
+    graph = measured(poses_on_a_ring(5), np.array([[0, 1], [1, 2], [2, 3], [3, 4], [2, 4]]))
+    found = diagnose(graph, QUICK)
+    assert (found.verdict == UNTESTABLE).tolist() == [True, True, False, False, False]
+    suggestions = suggest_pairs(graph, found)
+    assert suggestions.pairs[0].tolist() == [0, 2] and suggestions.tests[0] == 2
+    assert suggestions.resistance[0] == 2 and "tests 2 untestable edges" in suggestions.reason[0]
+    joined = {tuple(sorted(edge)) for edge in graph.edges.tolist()}
+    assert not joined & {tuple(pair) for pair in suggestions.pairs.tolist()}
+
+
+def test_an_edge_that_is_added_takes_its_suggestion_away_and_the_ends_of_a_loop_come_first() -> None:
+    graph = chain(12)
+    found = diagnose(graph, QUICK)
+    suggestions = suggest_pairs(graph, found, most=50)
+    assert np.bincount(suggestions.pairs.ravel()).max() <= 2, "no view is named more than twice"
+    assert (np.diff(suggestions.score) <= 0).all()
+    far = suggestions.resistance.argmax()
+    i, j = suggestions.pairs[far]
+    closed = ViewGraph.from_edges(
+        graph.vertex_ids,
+        np.concatenate([graph.edges, [[i, j]]]),
+        np.concatenate([graph.i_from_j, (se3.inverse(poses_on_a_ring(12)[i]) @ poses_on_a_ring(12)[j])[None]]),
+    )
+    again = suggest_pairs(closed, diagnose(closed, QUICK), most=50)
+    assert [i, j] not in again.pairs.tolist()
+    assert again.resistance.max() < suggestions.resistance.max()
+
+
+def test_pieces_are_suggested_to_be_joined_and_nothing_needs_nothing() -> None:
+    graph = measured(poses_on_a_ring(6), np.array([[0, 1], [1, 2], [0, 2], [3, 4], [4, 5], [3, 5]]))
+    suggestions = suggest_pairs(graph, diagnose(graph, QUICK))
+    assert suggestions.pairs.tolist() == [[2, 3]] and np.isinf(suggestions.resistance[0])
+    assert "joins two pieces" in suggestions.reason[0]
+    whole = measured(poses_on_a_ring(3), np.array([[0, 1], [1, 2], [0, 2]]))
+    assert len(suggest_pairs(whole, diagnose(whole, QUICK)).pairs) == 0
