@@ -8,17 +8,55 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import bsr_matrix
 
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.cg import truncated_cg
+from hodge_pipeline.solvers.direct import SECONDS_A_PRODUCT
 from hodge_pipeline.solvers.elimination import Elimination
 from hodge_pipeline.solvers.linear import factorise_blocks
-from hodge_pipeline.solvers.problem import Problem
+from hodge_pipeline.solvers.multilevel import RotationGraph, multilevel_rotations
+from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
 from hodge_pipeline.solvers.rotations import project
 from hodge_pipeline.types import Floats
 
 LARGE = 60_000
 """Unknowns above which the factor is kept in single precision."""
+ALWAYS_CHORDAL_S, MULTILEVEL_SECONDS_AN_EDGE = 0.3, 5e-6
+"""Where a factorisation takes longer, by the count of its products, the multilevel scheme takes its place."""
 CG_TOLERANCE, MAX_CG_STEPS = 1e-5, 50
+
+
+def initial_rotations(problem: Problem, pinned: Floats) -> Floats:
+    """Rotations (n, d, d) to start from: the chordal ones, or those of the multilevel scheme where that is cheaper.
+
+    `pinned (n − free, d, d)` are the rotations of the pinned vertices.
+    """
+    plan, edges = problem.structure.elimination, len(problem.kappa)
+    factor_s = SECONDS_A_PRODUCT * problem.dimension**3 * plan.work
+    if factor_s < max(ALWAYS_CHORDAL_S, MULTILEVEL_SECONDS_AN_EDGE * edges):
+        return chordal_rotations(problem, pinned)
+    whole = RotationGraph(problem.count, problem.tail, problem.head, problem.rotations, problem.kappa)
+    found = multilevel_rotations(whole, _chordal_alone)
+    component = connected_components(np.stack([problem.tail, problem.head], axis=1), problem.count)
+    held = np.arange(problem.free_count, problem.count)
+    turn = np.broadcast_to(np.eye(problem.dimension), (component.max() + 1, *pinned.shape[1:])).copy()
+    turn[component[held]] = pinned @ np.swapaxes(found[held], 1, 2)
+    found = turn[component] @ found
+    found[held] = pinned
+    return found
+
+
+def _chordal_alone(graph: RotationGraph) -> Floats:
+    """The chordal rotations of a graph, in a gauge of their own."""
+    edges = np.stack([graph.tail, graph.head], axis=1)
+    held = pinned_vertices(connected_components(edges, graph.count), np.zeros(0, np.int64))
+    flat = np.zeros((len(edges), graph.turns.shape[-1]))
+    problem = make_problem(edges, graph.turns, flat, graph.weights, graph.weights, held)
+    d = problem.dimension
+    eyes = np.broadcast_to(np.eye(d), (problem.count - problem.free_count, d, d))
+    out = np.empty((graph.count, d, d))
+    out[problem.order] = chordal_rotations(problem, eyes)
+    return out
 
 
 def chordal_rotations(problem: Problem, pinned: Floats) -> Floats:

@@ -146,16 +146,27 @@ def _independent(low: Ints, high: Ints, alive: Bools, left: int, priority: Ints)
         return None
     candidate = alive & (degree <= most)
     rank = degree * count + priority
-    chosen = np.zeros(count, bool)
-    for _ in range(PASSES):
-        both = candidate[low] & candidate[high]
-        first, second = low[both], high[both]
+    return independent_set(low, high, candidate, rank, PASSES)
+
+
+def independent_set(tail: Ints, head: Ints, candidate: Bools, rank: Ints, passes: int | None = None) -> Bools:
+    """Candidates (n,) no two of which an edge joins, those of lowest rank first (Luby 1986).
+
+    As many as there can be, unless the passes are limited. Ranks are distinct.
+    """
+    candidate, chosen = candidate.copy(), np.zeros(len(candidate), bool)
+    apart = tail != head
+    tail, head = tail[apart], head[apart]
+    while candidate.any() and passes != 0:
+        both = candidate[tail] & candidate[head]
+        tail, head = tail[both], head[both]
         best = candidate.copy()
-        best[np.where(rank[first] > rank[second], first, second)] = False
+        best[np.where(rank[tail] > rank[head], tail, head)] = False
         chosen |= best
         candidate &= ~best
-        candidate[high[best[low]]] = False
-        candidate[low[best[high]]] = False
+        candidate[head[best[tail]]] = False
+        candidate[tail[best[head]]] = False
+        passes = None if passes is None else passes - 1
     return chosen
 
 

@@ -20,7 +20,7 @@ from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import exponential, lever
 from hodge_pipeline.types import Floats
 
-FEWEST_CG_STEPS = 30
+FEWEST_CG_STEPS = 60
 """Where a factorisation of all unknowns costs no more, CG with the scalar Laplacians is not tried."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.chordal import chordal_rotations
+from hodge_pipeline.solvers.chordal import initial_rotations
 from hodge_pipeline.solvers.newton import Point
 from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
 from hodge_pipeline.solvers.rotations import project
@@ -59,7 +59,7 @@ class Setup:
         if name == "given":
             return project(start[:, :d, :d]), translations
         pinned = project(start[self.problem.free_count :, :d, :d])
-        return chordal_rotations(self.problem, pinned), translations
+        return initial_rotations(self.problem, pinned), translations
 
     @property
     def rounding(self) -> float:
