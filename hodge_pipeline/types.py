@@ -115,6 +115,17 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
+class Priors:
+    """Poses known from elsewhere: vertex rows (P,), `world_from_vertex (P, 4, 4)`, and `information (P, 6, 6)` of ξ =
+    (rotation, translation) in `world_from_vertex · exp(ξ)`; several of one vertex count each.
+    """
+
+    vertices: Ints
+    world_from_vertex: Floats
+    information: Floats
+
+
+@dataclass(frozen=True)
 class ViewGraph:
     """The viewing graph, in columns. A million edges are arrays, not a million objects.
 
@@ -128,6 +139,7 @@ class ViewGraph:
     - `correspondences (E,)`: how many; 0 where unknown.
     - `dimension`: 2 for a graph in the plane z = 0, lifted, with no information out of it; it stays one when written.
     - `fixed`: rows of the vertices that the source holds at the poses it gives them.
+    - `priors`: what the source says of single poses, None where it says nothing.
     """
 
     vertex_ids: NDArray[np.generic]
@@ -140,6 +152,7 @@ class ViewGraph:
     correspondences: Ints
     dimension: int = 3
     fixed: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    priors: Priors | None = None
 
     @property
     def vertex_count(self) -> int:

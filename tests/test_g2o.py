@@ -16,6 +16,7 @@ from hodge_adapters.g2o import (
 from hodge_adapters.toro import ToroReader, load_toro
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.types import ViewGraph
 
 IDENTITY_21 = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4 0 0 4 0 4"
@@ -158,3 +159,71 @@ def test_real_files(data_dir, name, vertices, edges, dimension):
     assert (source.graph.vertex_count, source.graph.edge_count) == (vertices, edges)
     assert load_g2o(path).graph.dimension == dimension
     assert se3.is_motion(source.graph.i_from_j, 1e-9).all()
+
+
+VERTICES = ("VERTEX_SE3:QUAT 7 0 0 0 0 0 0 1", "VERTEX_SE3:QUAT 3 0 0 0 0 0 0 1")
+
+
+def test_priors_are_read_at_the_body_and_written_back(tmp_path):
+    turned = "0 0 0.7071067811865476 0.7071067811865476"
+    path = write(
+        tmp_path / "a.g2o",
+        *VERTICES,
+        EDGE,
+        f"PARAMS_SE3OFFSET 5 0 0 2 {turned}",
+        f"EDGE_SE3_PRIOR 3 5 1 2 3 {turned} {IDENTITY_21}",
+        f"EDGE_PRIOR_SE3 7 4 5 6 0 0 0 1 {IDENTITY_21}",
+    )
+    priors = load_g2o(path).graph.priors
+    assert priors.vertices.tolist() == [0, 1]
+    np.testing.assert_allclose(priors.world_from_vertex[1], se3.from_parts(np.eye(3), [1, 2, 1]), atol=1e-15)
+    # the sensor sits 2 m above the body: a turn of the body about x moves it by 2 m, which its position weighs once
+    np.testing.assert_allclose(np.diag(priors.information[1]), [5, 5, 1, 1, 1, 1], atol=1e-12)
+    graph = load_g2o(path).graph
+    write_g2o(tmp_path / "b.g2o", graph)
+    back = load_g2o(tmp_path / "b.g2o").graph.priors
+    np.testing.assert_allclose(back.world_from_vertex, priors.world_from_vertex, atol=1e-14)
+    np.testing.assert_allclose(back.information, priors.information, atol=1e-12)
+
+
+def test_planar_priors_of_poses_and_of_positions(tmp_path):
+    path = write(
+        tmp_path / "a.g2o",
+        "VERTEX_SE2 0 0 0 0",
+        "VERTEX_SE2 1 0 0 0",
+        "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1",
+        "EDGE_PRIOR_SE2 0 5 6 0.5 2 0 0 3 0 4",
+        "EDGE_PRIOR_SE2_XY 1 7 8 2 1 3",
+    )
+    priors = load_g2o(path).graph.priors
+    assert priors.vertices.tolist() == [0, 1]
+    np.testing.assert_allclose(np.diag(priors.information[0]), [0, 0, 4, 2, 3, 0])
+    np.testing.assert_allclose(priors.world_from_vertex[1], se3.from_parts(np.eye(3), [7, 8, 0]))
+    np.testing.assert_allclose(priors.information[1][3:5, 3:5], [[2, 1], [1, 3]])
+    assert not priors.information[1][2].any()
+    solution = solve(load_g2o(path).graph)
+    np.testing.assert_allclose(solution.world_from_cam[0, :2, 3], [5, 6], atol=2)
+
+
+@pytest.mark.parametrize(
+    "line, message",
+    [
+        (f"EDGE_SE3_PRIOR 3 9 1 2 3 0 0 0 1 {IDENTITY_21}", "a.g2o:4: names a PARAMS_SE3OFFSET that the file lacks"),
+        (f"EDGE_PRIOR_SE3 99 1 2 3 0 0 0 1 {IDENTITY_21}", "a prior names vertex 99"),
+        ("EDGE_PRIOR_SE3 3 1 2 3", "a.g2o:4: EDGE_PRIOR_SE3"),
+    ],
+)
+def test_a_prior_that_makes_no_sense_is_one_line(tmp_path, line, message):
+    with pytest.raises(SourceError, match=message):
+        load_g2o(write(tmp_path / "a.g2o", *VERTICES, EDGE, line))
+
+
+def test_priors_pull_the_poses_to_where_they_are_known(tmp_path):
+    path = write(
+        tmp_path / "a.g2o",
+        *VERTICES,
+        f"EDGE_SE3:QUAT 7 3 1 0 0 0 0 0 1 {IDENTITY_21}",
+        f"EDGE_PRIOR_SE3 7 10 0 0 0 0 0 1 {IDENTITY_21}",
+    )
+    solution = solve(load_g2o(path).graph)
+    np.testing.assert_allclose(solution.world_from_cam[:, :3, 3], [[10, 0, 0], [11, 0, 0]], atol=1e-6)

@@ -14,11 +14,10 @@ from hodge_pipeline.solvers.certificate import certificate_matrix, certify
 from hodge_pipeline.solvers.full import full_residuals
 from hodge_pipeline.solvers.hodge import HodgeSolver, solve
 from hodge_pipeline.solvers.objective import best_translations, quadratic_model, residuals, rotation_gradient
-from hodge_pipeline.solvers.priors import Priors
 from hodge_pipeline.solvers.rotations import exponential, project
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.types import ViewGraph
+from hodge_pipeline.types import Priors, ViewGraph
 
 CERTIFIED_OPTIMA = {
     "smallGrid3D": 1025.39806,

@@ -5,13 +5,14 @@ A g2o information matrix is over (translation, q_vec): half an angle. Ours is ov
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as stage
 
+from hodge_adapters import g2o_priors
 from hodge_adapters.pose_graph_text import Records, count_tags, read_records, write_lines
 from hodge_adapters.posed import length_notes
 from hodge_pipeline import se3
@@ -83,19 +84,49 @@ class Half:
     edge_keys: Ints
     motions: Floats
     information: Floats
+    prior_keys: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    prior_poses: Floats = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    prior_information: Floats = field(default_factory=lambda: np.zeros((0, 6, 6)))
 
 
 def _spatial(records: dict[str, Records]) -> Half:
     vertices, edges = records["VERTEX_SE3:QUAT"], records["EDGE_SE3:QUAT"]
     information = information_of_file(upper_triangle(edges.values[:, 7:], 6))
-    return Half(vertices.keys[:, 0], spatial_poses(vertices), edges.keys, spatial_poses(edges), information)
+    poses, motions = spatial_poses(vertices), spatial_poses(edges)
+    plain, levered = records[g2o_priors.SPATIAL], records[g2o_priors.SPATIAL_OFFSET]
+    parameters = records[g2o_priors.OFFSET]
+    offsets = g2o_priors.offsets_of(levered, parameters, spatial_poses(parameters))
+    known = [information_of_file(upper_triangle(prior.values[:, 7:], 6)) for prior in (plain, levered)]
+    moved, moved_information = g2o_priors.moved_to_body(spatial_poses(levered), known[1], offsets)
+    return Half(
+        vertices.keys[:, 0],
+        poses,
+        edges.keys,
+        motions,
+        information,
+        np.concatenate([plain.keys[:, 0], levered.keys[:, 0]]),
+        np.concatenate([spatial_poses(plain), moved]),
+        np.concatenate([known[0], moved_information]),
+    )
 
 
 def _planar(records: dict[str, Records]) -> Half:
     vertices, edges = records["VERTEX_SE2"], records["EDGE_SE2"]
     information = lift_information(upper_triangle(edges.values[:, 3:], 3))
     poses, motions = lift_poses(vertices.values), lift_poses(edges.values[:, :3])
-    return Half(vertices.keys[:, 0], poses, edges.keys, motions, information)
+    whole, position = records[g2o_priors.PLANAR], records[g2o_priors.PLANAR_POSITION]
+    anywhere = np.pad(position.values[:, :2], ((0, 0), (0, 1)))
+    on_position = np.pad(upper_triangle(position.values[:, 2:], 2), ((0, 0), (0, 1), (0, 1)))
+    return Half(
+        vertices.keys[:, 0],
+        poses,
+        edges.keys,
+        motions,
+        information,
+        np.concatenate([whole.keys[:, 0], position.keys[:, 0]]),
+        lift_poses(np.concatenate([whole.values[:, :3], anywhere])),
+        lift_information(np.concatenate([upper_triangle(whole.values[:, 3:], 3), on_position])),
+    )
 
 
 def rows_of_keys(path: Path, vertex_keys: Ints, edge_keys: Ints) -> tuple[Ints, Ints]:
@@ -124,6 +155,10 @@ def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: in
         notes.append(f"{len(fixed)} vertices are marked FIX")
     motions, information = half.motions, half.information
     graph = ViewGraph.from_edges(ids, edges, motions, information, kind, dimension=dimension, fixed=fixed)
+    priors = g2o_priors.as_priors(half.prior_keys, half.prior_poses, half.prior_information, ids, str(path))
+    if priors is not None:
+        notes.append(f"{len(priors.vertices)} priors of single vertices are read")
+        graph = replace(graph, priors=priors)
     trajectory = Trajectory(np.arange(named, dtype=float), half.poses) if named == len(ids) else None
     return Source(path.stem, path, trajectory=trajectory, graph=graph, notes=tuple(notes), files=(path,))
 
@@ -138,8 +173,15 @@ def skipped(other: dict[str, int]) -> list[str]:
     return notes
 
 
-KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1}
-COLUMNS = {"VERTEX_SE3:QUAT": (7,), "EDGE_SE3:QUAT": (28,), "VERTEX_SE2": (3,), "EDGE_SE2": (9,), "FIX": None}
+KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1, **g2o_priors.KEYS}
+COLUMNS = {
+    "VERTEX_SE3:QUAT": (7,),
+    "EDGE_SE3:QUAT": (28,),
+    "VERTEX_SE2": (3,),
+    "EDGE_SE2": (9,),
+    "FIX": None,
+    **g2o_priors.COLUMNS,
+}
 
 
 def load_g2o(path: Path | str) -> Source:
@@ -196,6 +238,11 @@ def write_g2o(path: Path | str, graph: ViewGraph, world_from_vertex: Floats | No
     write_lines(lines, "FIX", ids[graph.fixed][:, None], np.zeros((len(graph.fixed), 0)))
     poses, information = _pose_columns(graph.i_from_j, dimension), _information_columns(graph.information, dimension)
     write_lines(lines, edge_tag, ids[graph.edges], np.hstack([poses, information]))
+    if graph.priors is not None:
+        known = graph.priors
+        poses, information = _pose_columns(known.world_from_vertex, dimension), known.information
+        columns = _information_columns(information, dimension)
+        g2o_priors.write_priors(lines, dimension, ids[known.vertices], poses, columns)
     temporary = path.with_name(path.name + ".part")
     temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
     temporary.replace(path)

@@ -41,7 +41,7 @@ def initial_rotations(problem: Problem, pinned: Floats) -> Floats:
     held = np.arange(problem.free_count, problem.count)
     turn = np.broadcast_to(np.eye(problem.dimension), (component.max() + 1, *pinned.shape[1:])).copy()
     turn[component[held]] = pinned @ np.swapaxes(found[held], 1, 2)
-    found = turn[component] @ found
+    found = np.asarray(turn[component] @ found)
     found[held] = pinned
     return found
 

@@ -15,7 +15,8 @@ from hodge_pipeline.types import Floats
 STALE_STEPS = 8
 """CG steps with an old factor that cost about as much as a new one."""
 FRESH_STEPS = 50
-TOLERANCE = 1e-3
+TOLERANCE = 1e-6
+"""Of a step: looser ones leave the soft modes of long chains wrong. A factor in double precision needs one step."""
 NEARLY_THERE = 1e-2
 """Of the tolerance asked for, which says how far the minimum is: farther, an old factor leaves soft modes wrong."""
 SINGLE_FROM = 1_500_000

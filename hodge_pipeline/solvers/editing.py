@@ -62,6 +62,8 @@ class GraphEditor:
     def __init__(
         self, graph: ViewGraph, solution: Solution | None = None, *, objective: ObjectiveName = "full"
     ) -> None:
+        if graph.priors is not None:
+            raise GraphError("priors cannot be edited yet: solve the graph with `solve`, or leave its priors out")
         if solution is not None and (
             solution.world_from_cam.shape != (graph.vertex_count, 4, 4) or len(solution.weights) != graph.edge_count
         ):

@@ -16,9 +16,9 @@ from hodge_pipeline.solvers.certificate import Certificate, certify
 from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import cost_at_start, metrics_of, minimise
 from hodge_pipeline.solvers.newton import Limits, Point
-from hodge_pipeline.solvers.priors import Priors, with_world, without_world
+from hodge_pipeline.solvers.priors import with_world, without_world
 from hodge_pipeline.solvers.setup import NO_ROWS, InitialName, Setup, prepare
-from hodge_pipeline.types import Floats, Ints, Solution, SolverIteration, ViewGraph
+from hodge_pipeline.types import Floats, Ints, Priors, Solution, SolverIteration, ViewGraph
 
 ObjectiveName: TypeAlias = Literal["isotropic", "full"]
 MOST_ESCAPES = 3
@@ -49,7 +49,7 @@ def solve(
       the chordal rotations, which need no start.
     - `dimension`: 2 for a graph in the plane; None takes the graph's, and 2 where every edge lies in the plane.
     - `fixed`: rows of vertices that stay at their start; None takes the graph's.
-    - `priors`: what is known of single poses; all that have one share the world's gauge.
+    - `priors`: what is known of single poses; all that have one share the world's gauge. None takes the graph's.
 
     With arrays in hand, in metres and radians, `i_from_j[e]` moving points of frame `edges[e, 1]` into `edges[e, 0]`:
 
@@ -60,7 +60,8 @@ def solve(
     """
     if start is None and (initial == "given" or (fixed is not None and len(fixed))):
         raise GraphError("fixed vertices and a given initial guess need start poses: pass start")
-    if priors is not None:
+    priors = graph.priors if priors is None else priors
+    if priors is not None and len(priors.vertices):
         whole, poses = with_world(graph, priors, start, fixed)
         solution = solve(
             whole,

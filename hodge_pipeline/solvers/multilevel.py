@@ -78,7 +78,7 @@ def _coarsened(graph: RotationGraph, aggregate: Ints, inner: Floats) -> Rotation
     count, d = int(aggregate.max()) + 1, turns.shape[-1]
     keys, edge = np.unique(np.minimum(first, second) * count + np.maximum(first, second), return_inverse=True)
     weights = graph.weights[across]
-    total = np.bincount(edge, weights, len(keys))
+    total: Floats = np.bincount(edge, weights, len(keys)).astype(float)
     weighted = (weights[:, None, None] * turns).reshape(-1, d * d)
     mean = np.stack([np.bincount(edge, column, len(keys)) for column in weighted.T], axis=1) / total[:, None]
     tail, head = np.divmod(keys, count)

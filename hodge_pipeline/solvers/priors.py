@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
-
-
-@dataclass(frozen=True)
-class Priors:
-    """Poses known from elsewhere: vertex rows (P,), `world_from_vertex (P, 4, 4)`, and `information (P, 6, 6)` of ξ =
-    (rotation, translation) in `world_from_vertex · exp(ξ)`; several of one vertex count each.
-    """
-
-    vertices: Ints
-    world_from_vertex: Floats
-    information: Floats
+from hodge_pipeline.types import Floats, Ints, Priors, Solution, ViewGraph
 
 
 def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: Ints | None) -> tuple[ViewGraph, Floats]:
@@ -41,10 +31,11 @@ def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: In
         "prior",
     )
     held = np.zeros(0, np.int64) if start is None else graph.fixed if fixed is None else np.asarray(fixed, np.int64)
+    joined: dict[str, Any] = {name: np.concatenate([getattr(graph, name), getattr(added, name)]) for name in PER_EDGE}
     whole = replace(
         added,
         vertex_ids=np.append(graph.vertex_ids, np.asarray([_unused(graph)], graph.vertex_ids.dtype)),
-        **{name: np.concatenate([getattr(graph, name), getattr(added, name)]) for name in PER_EDGE},
+        **joined,
         dimension=graph.dimension,
         fixed=np.append(held, count),
     )

@@ -76,7 +76,7 @@ def solve_robust(
     final = solve(
         chosen,
         start=setup.poses(last.point),
-        initial="given",
+        initial="given" if graph.priors is None else "chordal",
         objective=objective,
         dimension=2 if setup.dimension == 2 else 3,
         certificate=certificate,
