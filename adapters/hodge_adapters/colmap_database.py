@@ -32,8 +32,7 @@ def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) 
     Raises `SourceError` for a file that is no database of COLMAP, or one that is damaged.
     """
     try:
-        # `immutable` needs no write access, not even for a journal beside the file.
-        with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as database:
+        with _opened(path) as database:
             yield from _pairs(database, path, model, min_shared, notes)
     except (sqlite3.Error, OverflowError) as error:
         raise SourceError(
@@ -41,10 +40,24 @@ def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) 
         ) from error
 
 
+def database_names(path: Path) -> set[str]:
+    """The names of the images in a database. Raises `SourceError` where it is none."""
+    try:
+        with _opened(path) as database:
+            return {str(name) for (name,) in database.execute("SELECT name FROM images")}
+    except (sqlite3.Error, OverflowError) as error:
+        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
+
+
+def _opened(path: Path) -> closing[sqlite3.Connection]:
+    """The database, read-only: `immutable` needs no write access, not even for a journal beside the file."""
+    return closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True))
+
+
 def database_matches(path: Path, row_of_name: Mapping[str, int]) -> Iterator[tuple[int, int, Ints]]:
     """Rows i and j of two images by name, and the keypoints (M, 2) of i and of j that are verified to match."""
     try:
-        with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as database:
+        with _opened(path) as database:
             row_of_id = {
                 int(image_id): row_of_name[name]
                 for image_id, name in database.execute("SELECT image_id, name FROM images")

@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters import images
 from hodge_adapters.colmap import ColmapReader
+from hodge_adapters.colmap_database import database_names
 from hodge_adapters.colmap_depth import sensor_depth
 from hodge_adapters.colmap_files import find_database, find_models, model_ending
 from hodge_adapters.colmap_ties import similarity, tie_points
@@ -22,6 +23,7 @@ from hodge_adapters.colmap_union import united
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Frame
 
+COVISIBILITY = "edges come from the points that images share"
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 
 
@@ -117,16 +119,20 @@ class ColmapModels:
         return DepthOptions(files, self.depth_scale, self.no_depth, self.depth_camera)
 
     def _database(self, folder: Path, frames: dict[str, Frame], notes: list[str]) -> Path | None:
+        """The database, where it has images of the model."""
         if self.database == "none":
             return None
         if self.database == "auto":
             found = find_database(folder)
+        else:
+            found = next((path for path in (Path(self.database), folder / self.database) if path.is_file()), None)
             if found is None:
-                notes.append("no database.db beside or above the model: edges come from points that images share")
-            return found
-        found = next((path for path in (Path(self.database), folder / self.database) if path.is_file()), None)
+                raise SourceError(f"{self.database}: no such database: give --database one that is there, or none")
         if found is None:
-            raise SourceError(f"{self.database}: no such database: give --database one that is there, or none")
+            notes.append(f"no database.db beside or above the model: {COVISIBILITY}")
+        elif not database_names(found) & frames.keys():
+            notes.append(f"{found}: holds none of the model's images: {COVISIBILITY}")
+            return None
         return found
 
     def _with_depth(self, frame: Frame, depth: Path | None) -> Frame:

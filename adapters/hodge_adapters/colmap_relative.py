@@ -18,6 +18,8 @@ INDEPENDENT_POINTS = 50
 """Neighbouring keypoints share the errors of the lens model: more of them than this are no more information."""
 LEAST_SCALE_ERROR = 1e-3
 SCALE_PAIRS = 512
+START_MATCHES = 500
+"""Of many matches, so many evenly serve to begin with; all of them refine it."""
 MAX_SCALE_SPREAD = 0.5
 
 
@@ -80,7 +82,8 @@ def _start(sighting: Sighting, seed: int) -> Floats | None:
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = seed
         options.ransac.max_error = MAX_ERROR_PX
-        rows = np.arange(len(sighting.pixels_i), dtype=np.uint32)
+        count = len(sighting.pixels_i)
+        rows = np.unique(np.linspace(0, count - 1, min(count, START_MATCHES)).round().astype(np.uint32))
         matches = np.column_stack([rows, rows])
         geometry = pycolmap.estimate_calibrated_two_view_geometry(*cameras_and_pixels, matches, options)
     found = pycolmap.estimate_two_view_geometry_pose(*cameras_and_pixels, geometry)

@@ -13,7 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.refine.guard import Change, Decision, Measure, decide
-from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, joined_graphs
+from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, joined_graphs, no_depth_edges
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
 from hodge_pipeline.refine.scale import Scale, metric_scale
@@ -59,7 +59,8 @@ def refine_models(
     with options.executor.open() as workers:
         for joined in options.model.join(metric):
             parts = [row for row, model in enumerate(metric) if set(model.body_names) & set(joined.body_names)]
-            found = _refine(joined, options, workers)
+            is_metric = all(scales[row].is_observable for row in parts)
+            found = _refine(joined, options, workers, is_metric)
             inputs = tuple(models[row] for row in parts)
             out.append(_judged(inputs, tuple(scales[row] for row in parts), found, options, force))
     return tuple(out)
@@ -82,11 +83,12 @@ class _Found:
     notes: tuple[str, ...]
 
 
-def _refine(start: TrackedModel, options: ModelRefinement, workers: Workers) -> _Found:
+def _refine(start: TrackedModel, options: ModelRefinement, workers: Workers, is_metric: bool) -> _Found:
+    """Depth takes part where the model is in metres: else its clouds are in another unit, or not of these images."""
     nothing = np.zeros((2, 0))
     with tempfile.TemporaryDirectory() as folder:
         measured, left_out = start.measured()
-        depth = depth_edges(start, options, Path(folder), workers)
+        depth = depth_edges(start, options, Path(folder), workers) if is_metric else no_depth_edges(start)
         graph = joined_graphs(measured, depth.graph)
         notes = (*left_out, *depth.notes)
         if not graph.edge_count:
@@ -95,7 +97,6 @@ def _refine(start: TrackedModel, options: ModelRefinement, workers: Workers) -> 
         notes = (*notes, *solved.solution.notes)
         if not solved.kept.any():
             return _Found(start, start, solved, np.full((1, 2), np.nan), nothing, (*notes, "every edge was rejected"))
-        is_metric = any(frame.read_depth is not None for frame in start.frames)
         with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
         model, errors = _adjusted(start, solved, options.depth_weight if with_depth else 0.0)
         if not is_metric:

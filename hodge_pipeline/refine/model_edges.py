@@ -36,7 +36,7 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, folder: Path, wor
     """
     images = np.array([row for row, frame in enumerate(model.frames) if frame.read_depth is not None], np.int64)
     if len(images) < 2:
-        return DepthEdges(no_edges(model), np.zeros((0, 2), np.int64), images, ())
+        return no_depth_edges(model)
     frames = [model.frames[row] for row in images]
     poses = np.array([frame.world_from_cam for frame in frames])
     clouds, notes = prepare_clouds(frames, options.clouds, workers)
@@ -74,9 +74,11 @@ def held_out_distances(edges: DepthEdges, folder: Path, pose_sets: Floats, worke
     return edge_distances(folder, edges.held_out, pose_sets[:, edges.images], workers)
 
 
-def no_edges(model: TrackedModel) -> ViewGraph:
-    """A graph of the model's bodies that nothing joins."""
-    return ViewGraph.from_edges(np.array(model.body_names), np.zeros((0, 2), np.int64), np.zeros((0, 4, 4)))
+def no_depth_edges(model: TrackedModel) -> DepthEdges:
+    """What a model without depth has."""
+    none = np.zeros((0, 2), np.int64)
+    graph = ViewGraph.from_edges(np.array(model.body_names), none, np.zeros((0, 4, 4)))
+    return DepthEdges(graph, none, none[:, 0], ())
 
 
 def joined_graphs(first: ViewGraph, second: ViewGraph) -> ViewGraph:
