@@ -11,6 +11,11 @@ Two solve a pose graph that is already in arrays:
     graph = hodge_pipeline.ViewGraph.from_edges(vertex_ids, edges, i_from_j, information)
     world_from_cam = hodge_pipeline.solve(graph).world_from_cam
 
+One refines the poses of a SLAM system, an array or Open3D's own object, and one a pose graph of Open3D's:
+
+    better = hodge_pipeline.refine_trajectory(world_from_cam, frames).poses
+    pose_graph = hodge_pipeline.solve_pose_graph(pose_graph)
+
 One refines a COLMAP model, given as a folder or as pycolmap's own object:
 
     refined = hodge_pipeline.refine_colmap(reconstruction, database="database.db", depth="depth").models[0]
@@ -23,11 +28,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hodge_pipeline.pipeline import Run, run
     from hodge_pipeline.recipe import Recipe, load_recipe
+    from hodge_pipeline.refine.open3d_objects import solve_pose_graph
     from hodge_pipeline.refined_colmap import refine_colmap
+    from hodge_pipeline.refined_trajectory import frames_from_images, refine_trajectory
     from hodge_pipeline.solvers.hodge import solve
     from hodge_pipeline.types import Solution, ViewGraph
 
-__all__ = ["Recipe", "Run", "Solution", "ViewGraph", "load_recipe", "refine_colmap", "run", "solve"]
+__all__ = [
+    "Recipe", "Run", "Solution", "ViewGraph", "frames_from_images", "load_recipe", "refine_colmap", "refine_trajectory",
+    "run", "solve", "solve_pose_graph",
+]  # fmt: skip
 
 _HOMES = {
     "Recipe": "recipe",
@@ -35,6 +45,9 @@ _HOMES = {
     "Run": "pipeline",
     "run": "pipeline",
     "refine_colmap": "refined_colmap",
+    "refine_trajectory": "refined_trajectory",
+    "frames_from_images": "refined_trajectory",
+    "solve_pose_graph": "refine.open3d_objects",
     "solve": "solvers.hodge",
     "Solution": "types",
     "ViewGraph": "types",

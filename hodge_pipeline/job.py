@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -49,7 +50,8 @@ class Job:
 
     A job that does not compute reads finished stages only: one that is not raises `Unfinished`. Without `scoring` the
     score tables, the slowest part of the end, are left out. `live` is the address of a viewer that is shown the
-    recording as it grows. `given` are the poses that it starts from, where they are not its own odometry.
+    recording as it grows. `given` are the poses that it starts from, where they are not its own odometry;
+    `opened` is the source where it needs no reader.
     """
 
     recipe: Recipe
@@ -62,6 +64,7 @@ class Job:
     notes: list[str] = field(default_factory=list)
     scoring: bool = True
     given: Given | None = None
+    opened: Source | None = None
 
     def path(self, stage: str) -> Path:
         """Where a stage's artifacts lie."""
@@ -120,6 +123,11 @@ def source_key(source: Source, reader: Any) -> str:
         status = os.stat(path)
         files.append((str(path), status.st_size, status.st_mtime_ns))
     return key_of("source", binding.unbind(reader), files)
+
+
+def unnamed_key() -> str:
+    """A key that no other run has, for what is in memory and cannot be told from its like."""
+    return uuid.uuid4().hex
 
 
 @contextmanager

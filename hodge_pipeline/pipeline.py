@@ -38,26 +38,28 @@ def run(
     recipe: Recipe | str,
     out: Path | str,
     *,
-    source: Path | str | None = None,
+    source: Path | str | Source | None = None,
     overwrite: bool = False,
     watcher: Watcher | None = None,
     live: str | None = None,
 ) -> Run:
     """Run a recipe (its name, its file or itself) into the folder `out`, going on where an earlier run stopped.
 
+    A `source` may be opened already; a run of frames that are in memory cannot be resumed by another process.
     `live` is the address of a Rerun viewer that shows the run as it happens.
     Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     if isinstance(recipe, str):
         recipe = load_recipe(recipe)
+    opened = source if isinstance(source, Source) else None
     if source is not None:
-        recipe = with_source(recipe, Path(source))
+        recipe = with_source(recipe, Path(source.path if isinstance(source, Source) else source))
     folder = Path(out)
     with (
         Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace,
         logging_to(folder / "log.txt"),
     ):
-        return _run(Job(recipe, workspace, watcher or Nobody(), live=live))
+        return _run(Job(recipe, workspace, watcher or Nobody(), live=live, opened=opened))
 
 
 def solve_again(folder: Path | str, *, watcher: Watcher | None = None) -> Run:
