@@ -61,6 +61,9 @@ class LogFile:
     _is_wanted: dict[int, bool] = field(default_factory=dict)
     _chunk_offsets: list[int] = field(default_factory=list)
     _has_footer: bool = False
+    _count: int = 0
+    _first_ns: int = 0
+    _last_ns: int = 0
 
     def messages(self) -> Iterator[Logged]:
         """The wanted messages. Raises `SourceError` for a file that is no MCAP; all else is complained of."""
@@ -110,11 +113,18 @@ class LogFile:
         """
         damage = record.start - RECORD_HEAD_BYTES
         if not self._has_footer:
-            self.complaints.say(f"{self.path.name}: cut off: whole records up to byte {damage} of {size} were read")
+            until = f"whole records up to byte {damage} of {size} were read, with what is left of the next"
+            self.complaints.say(f"{self.path.name}: cut off: {until}: {self._told()}")
             return None
         following = next((offset for offset in self._chunk_offsets if offset >= record.start), size)
         self.complaints.say(f"{self.path.name}: damaged at byte {damage}: went on at byte {following}")
         return following
+
+    def _told(self) -> str:
+        """How much was read, for what is said of a file that ends too early."""
+        if not self._count:
+            return "no message of use"
+        return f"{self._count} messages of use, logged within {(self._last_ns - self._first_ns) * 1e-9:.3f} s"
 
     def _record(self, read: ReadAt, record: Record) -> Iterator[Logged]:
         if record.opcode == Opcode.CHUNK:
@@ -161,6 +171,9 @@ class LogFile:
                 self.complaints.count(channel.topic, f"a message of more than {MAX_MESSAGE_BYTES} bytes")
                 return
             data = read(place.offset, place.length)
+            self._first_ns = min(self._first_ns, log_time_ns) if self._count else log_time_ns
+            self._last_ns = max(self._last_ns, log_time_ns)
+            self._count += 1
             yield Logged(channel, self.schemas.get(channel.schema_id), log_time_ns, data, place)
 
     def _wants(self, channel_id: int) -> bool:
