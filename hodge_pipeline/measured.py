@@ -81,7 +81,7 @@ def measured_edges(source: Source, options: MeasuredOptions) -> tuple[ViewGraph,
 
 def joined(graphs: Sequence[ViewGraph]) -> ViewGraph:
     """One graph with the edges of all, one graph's after the other's, over the vertices of the first."""
-    shared = ("vertex_ids", "dimension", "fixed")
+    shared = ("vertex_ids", "dimension", "fixed", "priors")
     names = [field.name for field in fields(ViewGraph) if field.name not in shared]
     columns: dict[str, Any] = {name: np.concatenate([getattr(graph, name) for graph in graphs]) for name in names}
     return replace(graphs[0], **columns)
