@@ -126,7 +126,7 @@ def test_cut_at_every_record(tmp_path: Path, compression: CompressionType) -> No
         assert (unfinished in source.notes) != has_all, "all data is there once its end is"
         path.write_bytes(contents[: end + 5])
         cut_off = f"cut.mcap: cut off: whole records up to byte {end} of {end + 5} were read, with"
-        assert (cut_off in McapReader().open(path).notes) != has_all
+        assert any(note.startswith(cut_off) for note in McapReader().open(path).notes) != has_all
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
