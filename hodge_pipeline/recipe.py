@@ -94,6 +94,14 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path |
     return recipe if source is None else with_source(recipe, source)
 
 
+def cloud_options(recipe: Recipe) -> CloudOptions:
+    """The recipe's clouds, with landmarks where a start without a guess matches frames by them."""
+    matched = (recipe.start == "global" or recipe.relocalise) and recipe.global_start.use != "geometry"
+    if not matched or recipe.clouds.landmarks:
+        return recipe.clouds
+    return dataclasses.replace(recipe.clouds, landmarks=recipe.global_start.landmarks)
+
+
 def with_source(recipe: Recipe, path: Path) -> Recipe:
     """The recipe on another source."""
     return dataclasses.replace(recipe, source=dataclasses.replace(recipe.source, path=path))

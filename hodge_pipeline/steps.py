@@ -20,6 +20,7 @@ from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.job import Job, source_key, unnamed_key
 from hodge_pipeline.measured import digest, joined, measured_edges, without_measured
 from hodge_pipeline.refine.held_out import is_held_out
+from hodge_pipeline.recipe import cloud_options
 from hodge_pipeline.registration import clouds as cloud_stage
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
@@ -68,7 +69,7 @@ def measured(job: Job, source: Source) -> ViewGraph:
 
 def prepare_clouds(job: Job, source: Source, workers: Workers) -> CloudSet:
     """The down-sampled cloud of each frame."""
-    options, total = job.recipe.clouds, len(source.frames)
+    options, total = cloud_options(job.recipe), len(source.frames)
     with job.stage("clouds", "clouds", total, options, ("source",)) as (folder, advance):
         if not folder.finished:
             clouds, notes = cloud_stage.prepare_clouds(source.frames, options, workers, advance)

@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+import hodge_pipeline
+from hodge_adapters.ply_points import write_ply
 from hodge_pipeline import se3
 from hodge_pipeline.executors.local import LocalExecutor
+from hodge_pipeline.recipe import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.stages import no_progress
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud
@@ -120,3 +123,22 @@ def test_six_real_fragments_in_no_order(data_dir: Path, tmp_path: Path) -> None:
             error = se3.inverse(wanted) @ se3.inverse(poses[i]) @ poses[j]
             assert np.linalg.norm(error[:3, 3]) < 0.07
             assert np.degrees(np.linalg.norm(se3.so3_log(error[:3, :3]))) < 2.2
+
+
+def test_the_recipe_scans_from_files_to_a_report(tmp_path: Path) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for name, (k, pose) in zip(("b", "a", "c"), enumerate(POSES), strict=True):
+        write_ply(folder / f"{name}.ply", read(seen_from(pose, furnished_corner(k))))
+    plain = [
+        "recording.level=off",
+        "evaluation.tables=false",
+        "executor={stage: local, workers: 0}",
+        "outer_iterations=1",
+    ]
+    run = hodge_pipeline.run(load_recipe("scans", plain, folder), tmp_path / "run")
+    first, second = POSES[1], POSES[0]
+    moved = se3.inverse(run.result.world_from_cam[0]) @ run.result.world_from_cam[1]
+    assert np.abs(se3.log(se3.inverse(se3.inverse(first) @ second) @ moved)).max() < 0.01
+    assert run.report.before == "start"
+    assert (tmp_path / "run" / "report.html").is_file() and (tmp_path / "run" / "cloud.ply").is_file()

@@ -42,7 +42,7 @@ class GlobalStart:
     registrar: GlobalRegistrar = Field(default=FpfhConsensus(), description="how two clouds are matched by geometry")
     images: GlobalRegistrar = Field(default=LandmarkConsensus(), description="how two frames are matched by image")
     refine: Registrar = Field(
-        default=Gicp(distances_m=(0.2, 0.1), source_points=(1000, 2000)),
+        default=Gicp(distances_m=(0.1, 0.05), source_points=(2000, 4000)),
         description="how a match is refined before it is judged",
     )
     all_pairs_up_to: int = Field(
@@ -50,6 +50,15 @@ class GlobalStart:
     )
     similar_per_frame: int = Field(
         default=12, ge=1, description="the most similar frames, by global descriptors, that each frame is matched with"
+    )
+    reach: int = Field(
+        default=5,
+        ge=1,
+        description="frames: after odometry, of so many consecutive ones only the most similar is matched, and none so "
+        "near, since odometry has joined them",
+    )
+    landmarks: int = Field(
+        default=1000, ge=15, description="landmarks of a frame, where `clouds.landmarks` leaves it to the start; 60 ms"
     )
     limits: HypothesisLimits = HypothesisLimits()
     diagnosis: DiagnosisOptions = Field(

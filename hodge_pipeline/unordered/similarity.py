@@ -11,6 +11,7 @@ from hodge_pipeline.registration.global_features import DescribedCloud, describe
 from hodge_pipeline.registration.global_landmarks import DescribedImage
 from hodge_pipeline.registration.global_pairs import load_description
 from hodge_pipeline.types import CloudSet, Floats32, Ints
+from hodge_pipeline.unordered.options import GlobalStart
 
 
 class LocalDescriptors:
@@ -36,11 +37,13 @@ def all_pairs(rows: Ints) -> Ints:
     return np.stack([rows[i], rows[j]], axis=1).astype(np.int64)
 
 
-def similar_pairs(local: LocalDescriptors, rows: Ints, words: int, per_row: int, seed: int) -> Ints:
-    """Pairs (P, 2), i < j, of each row and the `per_row` most similar others, by VLAD (Jégou et al. 2010).
+def similar_pairs(local: LocalDescriptors, rows: Ints, options: GlobalStart, ordered: bool) -> Ints:
+    """Pairs (P, 2), i < j, of each row and the most similar others, by VLAD (Jégou et al. 2010).
 
     The vocabulary is learnt from the rows themselves, so indoor and outdoor, near and far need nothing else.
+    `ordered`: whether rows that follow each other are joined already; see `GlobalStart.reach`.
     """
-    centres = vocabulary(local, rows, words, seed)
+    centres = vocabulary(local, rows, options.words, options.seed)
     vectors = global_descriptors(local, rows, centres)
-    return np.asarray(np.sort(rows[most_similar(vectors, per_row, 0)], axis=1))
+    reach = options.reach if ordered else 0
+    return np.asarray(np.sort(rows[most_similar(vectors, options.similar_per_frame, reach)], axis=1))

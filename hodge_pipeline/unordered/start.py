@@ -57,7 +57,7 @@ def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Worke
     registrar: GlobalRegistrar = options.images if by_image else options.registrar
     describe_clouds(scene.clouds, registrar, rows, scratch / DESCRIBED, workers, advance)
     notes = [] if by_image else [*check_scans(clouds, scene.vertex_ids)]
-    pairs = propose(clouds, rows, scratch / DESCRIBED, options)
+    pairs = propose(clouds, rows, scratch / DESCRIBED, options, scene.given is not None)
     matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
     views = Views.make(scene.frames, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, not by_image, workers)
@@ -79,12 +79,12 @@ def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
     return int((np.diff(clouds.marks) >= options.limits.min_inliers).sum()) * 2 >= int((clouds.sizes > 0).sum())
 
 
-def propose(clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart) -> Ints:
+def propose(clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart, ordered: bool) -> Ints:
     """The pairs (P, 2) to match: all of a few frames, else each with the most similar ones."""
     if len(rows) <= options.all_pairs_up_to:
         return all_pairs(rows)
     local = LocalDescriptors(described, clouds, FEATURE_VOXEL_M)
-    return similar_pairs(local, rows, options.words, options.similar_per_frame, options.seed)
+    return similar_pairs(local, rows, options, ordered)
 
 
 def _tried(count: int, pairs: Ints, hypotheses: Hypotheses) -> str:
