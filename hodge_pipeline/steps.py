@@ -19,8 +19,8 @@ from hodge_pipeline.fusion.ply import write_ply
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.job import Job, source_key, unnamed_key
 from hodge_pipeline.measured import digest, joined, measured_edges, without_measured
-from hodge_pipeline.refine.held_out import is_held_out
 from hodge_pipeline.recipe import cloud_options
+from hodge_pipeline.refine.held_out import is_held_out
 from hodge_pipeline.registration import clouds as cloud_stage
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
