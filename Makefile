@@ -5,13 +5,14 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo paper test fuzz lint format clean
+.PHONY: help setup demo paper test fuzz docs lint format clean
 help:
 	@echo "make setup   system libraries, $(VENV) and everything in it"
 	@echo "make demo    make a room, reconstruct it: runs/demo"
 	@echo "make paper   the paper's tables for every sequence that is there: runs/paper"
 	@echo "make test    the tests"
 	@echo "make fuzz    every reader on 2000 damaged inputs"
+	@echo "make docs    docs/recipes.md from the code"
 	@echo "make lint    ruff, mypy, import directions"
 
 $(STAMP): pyproject.toml constraints.txt tools/system-libraries.sh
@@ -34,6 +35,9 @@ test: $(STAMP)
 
 fuzz: $(STAMP)
 	PYTHONWARNINGS=ignore $(BIN)/python tests/fuzz_readers.py 2000
+
+docs: $(STAMP)
+	$(BIN)/python tools/recipe_reference.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
