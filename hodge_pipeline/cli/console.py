@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 
@@ -10,31 +11,36 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
+    Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
-from hodge_pipeline.stages import Advance
+from hodge_pipeline.stages import Advance, no_progress
 
 
 class Terminal:
-    """A watcher that draws one bar for each stage on stderr, or nothing at all where that is not a terminal."""
+    """A watcher that draws one bar for each stage on stderr; where that is not a terminal, one plain line for each."""
 
     def __init__(self, quiet: bool) -> None:
-        self._console = Console(stderr=True, quiet=quiet, highlight=False)
+        self._console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
         self._tasks: dict[str, TaskID] = {}
         self._totals: dict[str, int] = {}
+        self._draws = self._console.is_terminal and not quiet
         self._progress = Progress(
             TextColumn("{task.description:<24}"),
             BarColumn(),
             MofNCompleteColumn(),
+            RateColumn(),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
             console=self._console,
-            disable=quiet or not self._console.is_terminal,
+            disable=not self._draws,
         )
 
     def __enter__(self) -> Terminal:
@@ -46,7 +52,16 @@ class Terminal:
 
     def stage(self, title: str, total: int) -> AbstractContextManager[Advance]:
         """A bar of `total` units."""
-        return self._bar(title, total)
+        return self._bar(title, total) if self._draws else self._line(title, total)
+
+    @contextmanager
+    def _line(self, title: str, total: int) -> Iterator[Advance]:
+        """Say once that the stage is done: how much it was, and how long it took."""
+        start = time.perf_counter()
+        yield no_progress
+        seconds = time.perf_counter() - start
+        amount = f"{total} in {seconds:.1f} s, {total / seconds:.3g} a second" if total > 1 else f"{seconds:.1f} s"
+        self.say(f"{title}: done, {amount}")
 
     @contextmanager
     def _bar(self, title: str, total: int) -> Iterator[Advance]:
@@ -63,6 +78,15 @@ class Terminal:
     def say(self, message: str) -> None:
         """One line above the bars."""
         self._console.print(message, markup=False)
+
+
+class RateColumn(ProgressColumn):
+    """Units a second, nothing where a stage has one unit alone."""
+
+    def render(self, task: Task) -> Text:
+        """The rate while it runs, of the whole once it is done."""
+        rate = task.finished_speed or task.speed
+        return Text(f"{rate:.3g}/s" if rate and (task.total or 0) > 1 else "", style="progress.data.speed")
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -1,0 +1,50 @@
+"""What a run prints: one plain line for each stage where nobody looks, bars with rates in a terminal, or nothing."""
+
+from __future__ import annotations
+
+import pytest
+from rich.console import Console
+
+from hodge_pipeline.cli import console
+from hodge_pipeline.cli.console import Terminal
+
+
+def work(terminal: Terminal) -> None:
+    with terminal:
+        for title, total in (("recording", 1), ("clouds", 50), ("recording", 1)):
+            with terminal.stage(title, total) as advance:
+                advance(total)
+        terminal.say("a [note]")
+
+
+def test_plain_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    work(Terminal(quiet=False))
+    out, err = capsys.readouterr()
+    lines = err.splitlines()
+    assert out == ""
+    assert lines[0].startswith("recording: done, ") and lines[0].endswith(" s")
+    assert lines[1].startswith("clouds: done, 50 in ") and lines[1].endswith(" a second")
+    assert lines[-1] == "a [note]"
+    assert "\x1b" not in err
+
+
+def test_a_stage_that_fails_prints_no_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError), Terminal(quiet=False) as terminal, terminal.stage("clouds", 3):
+        raise ValueError
+    assert capsys.readouterr().err == ""
+
+
+def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    work(Terminal(quiet=True))
+    assert capsys.readouterr() == ("", "")
+
+
+def test_bars_with_rates_in_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def terminal(**options: object) -> Console:
+        return Console(**{**options, "force_terminal": True, "width": 120})
+
+    monkeypatch.setattr(console, "Console", terminal)
+    work(Terminal(quiet=False))
+    shown = capsys.readouterr().err
+    assert "50/50" in shown and "/s" in shown
+    assert "2/2" in shown  # the two parts of the recording share a bar
