@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import pytest
 from rich.console import Console
+from rich.progress import Task
 
 from hodge_pipeline.cli import console
-from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.cli.console import RateColumn, Terminal
 
 
 def work(terminal: Terminal) -> None:
@@ -46,5 +50,11 @@ def test_bars_with_rates_in_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: 
     monkeypatch.setattr(console, "Console", terminal)
     work(Terminal(quiet=False))
     shown = capsys.readouterr().err
-    assert "50/50" in shown and "/s" in shown
+    assert "50/50" in shown
     assert "2/2" in shown  # the two parts of the recording share a bar
+
+
+@pytest.mark.parametrize(("speed", "total", "shown"), [(12.54, 50, "12.5/s"), (None, 50, ""), (3.0, 1, "")])
+def test_the_rate_of_a_stage_of_many_units(speed: float | None, total: int, shown: str) -> None:
+    task = SimpleNamespace(finished_speed=None, speed=speed, total=total)
+    assert RateColumn().render(cast(Task, task)).plain == shown
