@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import binding, recipe_file
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.measured import MeasuredOptions
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.refine.given_poses import GivenOptions
@@ -90,6 +91,8 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path |
     Raises `RecipeError`: `file:line: key: what was expected`.
     """
     document = recipe_file.load(name_or_path, overrides)
+    if "model" in document.data:
+        raise RecipeError(f"recipe '{name_or_path}' refines a model: hodge refine colmap MODEL --recipe {name_or_path}")
     recipe = binding.bind(Recipe, document.data, lambda keys: origin(document, keys))
     return recipe if source is None else with_source(recipe, source)
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hodge_pipeline.monitor import Monitor
 from hodge_pipeline.refine.model import RefinedModel, refine_models
 from hodge_pipeline.refine.model_options import RECIPE, ModelRefinement, load_model_refinement
 from hodge_pipeline.refined_folder import check_out, write_run_folder
@@ -67,13 +67,9 @@ def run_refinement(
     is_path = isinstance(model, (str, Path))
     if out is not None:
         check_out(out, Path(model) if is_path else None)
-    begin = time.perf_counter(), time.process_time()
-    inputs = options.model.open_models(
-        Path(model) if is_path else model if isinstance(model, (list, tuple)) else [model]
-    )
-    with watcher.stage("refine", 1):
-        results = refine_models(inputs, options, force=force)
-    cost = time.perf_counter() - begin[0], time.process_time() - begin[1]
+    models = Path(model) if is_path else model if isinstance(model, (list, tuple)) else [model]
+    with Monitor().measure() as cost, watcher.stage("refine", 1):
+        results = refine_models(options.model.open_models(models), options, force=force)
     if out is not None:
         write_run_folder(out, results, options, str(model) if is_path else "pycolmap", cost)
     return RefinedColmap(results, out)

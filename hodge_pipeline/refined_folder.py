@@ -13,6 +13,7 @@ import numpy as np
 from hodge_pipeline import artifacts, binding, registry, yaml_file
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.report import write_report
+from hodge_pipeline.monitor import Cost
 from hodge_pipeline.outputs import edge_table
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
@@ -37,7 +38,7 @@ def write_run_folder(
     results: Sequence[RefinedModel],
     options: ModelRefinement,
     source: str,
-    cost: tuple[float, float],
+    cost: Cost,
 ) -> None:
     """Write it all; the models in one step, so that the folder holds those of one run."""
     try:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from hodge_pipeline import binding, yaml_file
 from hodge_pipeline.evaluation.contents import (
-    MeasureRow,
     Path3D,
     Pictures,
-    RefinementSummary,
     Report,
     Residuals,
     SourceSummary,
@@ -17,31 +16,22 @@ from hodge_pipeline.evaluation.contents import (
 )
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.summary import graph_summary, worst_edges
+from hodge_pipeline.guarding import summary
 from hodge_pipeline.job import versions
-from hodge_pipeline.refine.guard import Decision
+from hodge_pipeline.monitor import Cost
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
 
-HEADLINES = {
-    "refined": "Refined",
-    "optimal": "Already optimal: the input was given back",
-    "worse": "Not better: the input was given back",
-    "forced": "Worse, and written all the same (--force)",
-}
 NO_METRES = "There is no depth that tells the scale: lengths are in the model's own unit, called metres here."
 
 
-def summary_of(decision: Decision, scale: str = "") -> RefinementSummary:
-    """A decision as the report shows it."""
-    rows = (MeasureRow(m.name, m.before, m.after, m.better, m.unit, m.is_worse) for m in decision.measures)
-    change = "" if decision.change is None else f"{decision.change}."
-    headline = HEADLINES[decision.outcome]
-    return RefinementSummary(decision.outcome, headline, decision.reason, tuple(rows), change, scale)
+def _scales(result: RefinedModel) -> str:
+    before = "; ".join(str(scale) for scale in dict.fromkeys(result.scales))
+    after = "" if not result.final_scale.is_observable else f". After: {result.final_scale}"
+    return f"Before: {before}{after}."
 
 
-def model_report(
-    results: Sequence[RefinedModel], options: ModelRefinement, source: str, cost: tuple[float, float]
-) -> Report:
+def model_report(results: Sequence[RefinedModel], options: ModelRefinement, source: str, cost: Cost) -> Report:
     """The report of the first result, which has most images; the others in its notes."""
     first = results[0]
     others = [
@@ -64,14 +54,14 @@ def model_report(
         title=f"{source}, refined",
         source=SourceSummary(f"COLMAP model, {quality.points} points", source, quality.images),
         before="start",
-        refinement=summary_of(first.decision, str(first.scales[0])),
+        refinement=replace(summary(first.decision), scale=_scales(first)),
         graph=None
         if solved is None
         else graph_summary(solved.graph, solved.solution.component, solved.solution.weights),
         worst_edges=()
         if solved is None
         else worst_edges(solved.graph, first.model.world_from_body, solved.solution.weights),
-        stages=(StageRow("refine", cost[0], cost[1], float("nan")),),
+        stages=(StageRow("refine", cost.wall_s, cost.cpu_s, cost.peak_mb),),
         notes=(*metric, *others, *first.notes),
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(options)),

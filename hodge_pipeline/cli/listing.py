@@ -76,9 +76,20 @@ def recipes(name: str | None, *, schema: bool) -> None:
 
         print(json.dumps(binding.json_schema(Recipe), indent=1))
     elif name is not None:
-        from hodge_pipeline.recipe import load_recipe
-
-        print(yaml_file.dump(binding.unbind(load_recipe(name))), end="")
+        print(yaml_file.dump(binding.unbind(_any_recipe(name))), end="")
     else:
         for known in recipe_file.recipe_names():
             print(f"{known:<24}{recipe_file.load(known).data.get('description', '')}")
+
+
+def _any_recipe(name: str) -> Any:
+    """The options of a recipe of either kind: of a run, or of the refinement of a model."""
+    from hodge_pipeline import recipe_file
+
+    if "model" in recipe_file.load(name).data:
+        from hodge_pipeline.refine.model_options import load_model_refinement
+
+        return load_model_refinement(name)
+    from hodge_pipeline.recipe import load_recipe
+
+    return load_recipe(name)

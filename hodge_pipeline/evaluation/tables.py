@@ -68,7 +68,8 @@ def _measures(refinement: RefinementSummary) -> Table:
         for row in refinement.measures
     )
     header = ("measure", "before", "after", "unit", "better", "judgement")
-    caption = "Where one is worse by more than its own noise the input is kept. " + refinement.change
+    caption = "Where one is worse by more than its own noise the input is kept. "
+    caption += " ".join(filter(None, (refinement.change, refinement.scale)))
     return Table("Measures", header, rows, caption)
 
 
