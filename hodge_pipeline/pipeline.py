@@ -99,7 +99,7 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
             recording.registration(number, registered, poses, clouds)
             rounds.append(steps.solve(job, number, source, candidates, registered, poses, measured))
             recording.round(number, rounds[-1])
-        for edited in edited_rounds(job, registered, measured, rounds[-1], len(rounds)):
+        for edited in edited_rounds(job, registered, measured, rounds):
             rounds.append(edited)
             recording.round(len(rounds) - 1, edited)
         rounds[-1] = steps.judge_edges(job, rounds[-1], len(rounds) - 1)
