@@ -12,13 +12,15 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.matches import side_by_side
 from hodge_pipeline.diagnosis.page import EdgePictures
 from hodge_pipeline.diagnosis.result import Diagnosis
-from hodge_pipeline.diagnosis.two_clouds import PAPER, picture, views
+from hodge_pipeline.diagnosis.two_clouds import PAPER, View, picture, views
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.plots import Plot
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Frame, Ints, PointCloud, ViewGraph
 
 GAP = 6
 JPEG_QUALITY = 82
+LEAST_UP = 0.1
+"""Of the mean up direction: where cameras look every way there is none."""
 
 
 def edge_pictures(
@@ -39,26 +41,35 @@ def _plots(
     i, j = graph.edges[row].tolist()
     names = graph.vertex_ids[i], graph.vertex_ids[j]
     if clouds is not None and len(clouds[i]) and len(clouds[j]):
-        up_in_i = _up(diagnosis.world_from_cam, diagnosis.piece, i)
-        shown = f"Frame {names[0]} blue, frame {names[1]} orange; left as camera {names[0]} looks, right from above."
-        yield Plot("As the edge says", shown, _clouds(clouds[i], clouds[j], graph.i_from_j[row], up_in_i))
+        known = [("As the edge says", graph.i_from_j[row])]
         if diagnosis.piece[i] == diagnosis.piece[j]:
             robust = se3.inverse(diagnosis.world_from_cam[i]) @ diagnosis.world_from_cam[j]
-            yield Plot("As the robust poses say", shown, _clouds(clouds[i], clouds[j], robust, up_in_i))
+            known.append(("As the robust poses say", robust))
+        seen = _views(clouds[i], clouds[j], [motion for _, motion in known], _up(diagnosis, i))
+        shown = f"Frame {names[0]} blue, frame {names[1]} orange; left as camera {names[0]} looks, right from above."
+        for title, motion in known:
+            yield Plot(title, shown, _clouds(clouds[i], clouds[j], motion, seen))
     if frames:
         yield from _images(frames[i], frames[j])
 
 
-def _up(world_from_cam: Floats, piece: Ints, i: int) -> Floats:
+def _up(diagnosis: Diagnosis, i: int) -> Floats:
     """Where up is, in camera i's axes: the mean of what the cameras of its piece have as up."""
-    up = -world_from_cam[piece == piece[i], :3, 1].mean(axis=0)
+    poses = diagnosis.world_from_cam
+    up = -poses[diagnosis.piece == diagnosis.piece[i], :3, 1].mean(axis=0)
     size = float(np.linalg.norm(up))
-    return np.asarray(world_from_cam[i, :3, :3].T @ (up / size) if size > 0.1 else np.array([0.0, -1.0, 0.0]))
+    return np.asarray(poses[i, :3, :3].T @ (up / size) if size > LEAST_UP else np.array([0.0, -1.0, 0.0]))
 
 
-def _clouds(first: PointCloud, second: PointCloud, i_from_j: Floats, up_in_i: Floats) -> bytes:
-    seen = [picture(first, second, i_from_j, view) for view in views(first, up_in_i)]
-    return _jpeg(np.hstack([seen[0], np.full((len(seen[0]), GAP, 3), PAPER, np.uint8), seen[1]]))
+def _views(first: PointCloud, second: PointCloud, motions: Sequence[Floats], up_in_i: Floats) -> tuple[View, View]:
+    """The same views for every motion, so that the pictures compare."""
+    moved = [se3.transform(motion, np.asarray(second.points_in_cam, float)) for motion in motions]
+    return views(np.concatenate([np.asarray(first.points_in_cam, float), *moved]), up_in_i)
+
+
+def _clouds(first: PointCloud, second: PointCloud, i_from_j: Floats, seen: tuple[View, View]) -> bytes:
+    pictures = [picture(first, second, i_from_j, view) for view in seen]
+    return _jpeg(np.hstack([pictures[0], np.full((len(pictures[0]), GAP, 3), PAPER, np.uint8), pictures[1]]))
 
 
 def _images(first: Frame, second: Frame) -> Iterator[Plot]:

@@ -25,19 +25,18 @@ class View:
     metres_per_pixel: float
 
 
-def views(cloud: PointCloud, up_in_i: Floats) -> tuple[View, View]:
-    """How camera i looks, and from above: both hold the whole of cloud i with some room around it."""
+def views(points_in_i: Floats, up_in_i: Floats) -> tuple[View, View]:
+    """How camera i looks, and from above: both hold all of the points (N, 3)."""
     ahead = np.eye(3)[2]
     across = np.cross(-up_in_i, ahead)
     across /= max(float(np.linalg.norm(across)), 1e-9)
     above = np.stack([across, np.cross(-up_in_i, across), -up_in_i])
-    return tuple(_holding(cloud, axes) for axes in (np.eye(3), above))  # type: ignore[return-value]
+    return _holding(points_in_i, np.eye(3)), _holding(points_in_i, above)
 
 
-def _holding(cloud: PointCloud, axes: Floats) -> View:
-    seen = np.asarray(cloud.points_in_cam, float) @ axes.T
-    low, high = np.percentile(seen, [1, 99], axis=0)
-    size = np.maximum(high - low, 0.05) * 1.25
+def _holding(points_in_i: Floats, axes: Floats) -> View:
+    low, high = np.percentile(points_in_i @ axes.T, [1, 99], axis=0)
+    size = np.maximum(high - low, 0.05) * 1.1
     return View(axes, (low + high) / 2 @ axes, float(max(size[0] / WIDTH, size[1] / HEIGHT)))
 
 

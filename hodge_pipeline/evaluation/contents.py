@@ -87,6 +87,7 @@ class GraphSummary:
     edges_ignored: int = 0
     rejected: Mapping[str, int] = field(default_factory=dict)
     verdicts: Mapping[str, int] = field(default_factory=dict)
+    verdicts_in_use: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

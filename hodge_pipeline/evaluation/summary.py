@@ -81,8 +81,13 @@ def graph_summary(
         components=tuple(ComponentRow(len(row), in_runs(row, graph.vertex_ids)) for row in rows),
         edges_ignored=0 if weights is None else int((weights <= 0).sum()),
         rejected=dict(rejected or {}),
-        verdicts={} if verdict is None else {name: int((verdict == name).sum()) for name in VERDICTS},
+        verdicts=_counts(verdict),
+        verdicts_in_use=_counts(verdict if verdict is None or weights is None else verdict[weights > 0]),
     )
+
+
+def _counts(verdict: NDArray[np.str_] | None) -> dict[str, int]:
+    return {} if verdict is None else {name: int((verdict == name).sum()) for name in VERDICTS}
 
 
 def in_runs(rows: Ints, vertex_ids: Ints | np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> str:

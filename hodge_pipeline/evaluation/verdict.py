@@ -135,9 +135,11 @@ def _graph_suspicions(graph: GraphSummary) -> Iterator[str]:
         yield f"{alone} of {graph.vertices} frames have no edge at all: they keep the pose they started with."
     if graph.edges_ignored:
         yield f"The solver ignored {graph.edges_ignored} of {graph.edges} edges (weight 0)."
-    wrong, suspect = graph.verdicts.get("wrong", 0), graph.verdicts.get("suspect", 0)
+    wrong, suspect = graph.verdicts_in_use.get("wrong", 0), graph.verdicts_in_use.get("suspect", 0)
     if wrong or suspect:
-        yield f"Of {graph.edges} edges {wrong} are judged wrong and {suspect} suspect: hodge diagnose shows them."
+        yield (
+            f"Of the edges that the solver used {wrong} are judged wrong and {suspect} suspect: hodge diagnose shows them."
+        )
     if untestable := graph.verdicts.get("untestable", 0):
         yield f"{untestable} of {graph.edges} edges are untestable: nothing in the graph says whether they are right."
 

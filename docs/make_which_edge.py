@@ -1,0 +1,109 @@
+"""Does what docs/which-edge.md walks through, and draws its pictures: `python docs/make_which_edge.py runs/which-edge`.
+
+With `--loops FILE` it writes the file of loop closures alone, three of them wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+import hodge_pipeline
+from hodge_adapters.g2o import write_g2o
+from hodge_adapters.tum import TumReader
+from hodge_pipeline import se3
+from hodge_pipeline.demo.sequence import demo_source
+from hodge_pipeline.diagnose_path import diagnose_subject, open_subject, write_diagnosed
+from hodge_pipeline.diagnosis.plots import draw
+from hodge_pipeline.edge_pictures import edge_pictures
+from hodge_pipeline.edits import Edit, History, write_history
+from hodge_pipeline.evaluation import splat
+from hodge_pipeline.pipeline import solve_again
+from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.rounds import true_poses
+from hodge_pipeline.types import CloudSet, Floats, ViewGraph
+
+PICTURES = Path(__file__).parent / "pictures"
+RIGHT = ((2, 109), (6, 113), (10, 117))
+"""Frames of the first and of the second time round that see the same corner."""
+MISTAKEN = ((9, 63), (10, 64), (11, 65))
+"""Frames that see the one desk, and frames that see the other, in the corner across."""
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""What moves the one desk onto the other: the room's middle is the origin, z is up."""
+
+
+def write_loops(path: Path, source: Path) -> None:
+    """Loop closures as a place recogniser gives them, with noise; it took one desk for the other three times."""
+    frames = TumReader().open(source)
+    world_from_cam = true_poses(frames)
+    pairs = np.array([*RIGHT, *MISTAKEN])
+    moved = world_from_cam[pairs[:, 1]]
+    moved[len(RIGHT) :] = HALF_TURN @ moved[len(RIGHT) :]
+    noise = se3.exp(np.array([0.004] * 3 + [0.005] * 3) * np.random.default_rng(0).normal(size=(len(pairs), 6)))
+    measured = se3.inverse(world_from_cam[pairs[:, 0]]) @ moved @ noise
+    information = np.tile(np.eye(6) / 0.003**2, (len(pairs), 1, 1))
+    write_g2o(path, ViewGraph.from_edges(np.arange(len(frames.frames)), pairs, measured, information, source="loop"))
+
+
+def from_above(path: Path, folder: Path, world_from_cam: Floats, stand: splat.Stand | None) -> splat.Stand:
+    """A picture of all clouds laid together by these poses, and where it was taken from."""
+    clouds = CloudSet.open(folder / "stages" / "clouds")
+    scene = splat.merged(clouds, world_from_cam, np.arange(len(clouds)))
+    stand = stand or splat.stands(scene, world_from_cam)["front"]
+    path.write_bytes(splat.jpeg(splat.picture(scene, stand)))
+    return stand
+
+
+def stacked(path: Path, jpegs: list[bytes]) -> None:
+    """Pictures of one width, or made so, under each other."""
+    images = [Image.open(io.BytesIO(data)) for data in jpegs]
+    width = min(image.width for image in images)
+    images = [image.resize((width, round(image.height * width / image.width))) for image in images]
+    canvas = Image.new("RGB", (width, sum(image.height + 8 for image in images) - 8), "white")
+    top = 0
+    for image in images:
+        canvas.paste(image, (0, top))
+        top += image.height + 8
+    canvas.save(path, quality=85)
+
+
+def main(folder: Path) -> None:
+    """The run with the wrong loops, its diagnosis, the edit, the run without them; a picture of each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    source, loops, run = demo_source(), folder / "loops.g2o", folder / "run"
+    write_loops(loops, source)
+    options = [f"measured.files=[{{path: {loops}}}]", "edges={stage: sequential, reach: 3}", "outer_iterations=1"]
+    recipe = load_recipe("demo", [*options, "evaluation.tables=false"], source)
+    if (run / "edges.csv").exists():
+        write_history(run, History())
+    doubled = hodge_pipeline.run(recipe, run).result.world_from_cam
+
+    found = diagnose_subject(open_subject(run))
+    write_diagnosed(folder / "why", found)
+    print("\n".join(found.commands))
+    rows = np.array([row for row in found.rows if found.subject.graph.source[row] != "sequential"][:1])
+    (edge,) = edge_pictures(found.subject.graph, found.diagnosis, rows, found.subject.frames, found.subject.clouds)
+    stacked(PICTURES / "which-edge-wrong.jpg", [plot.png for plot in edge.plots])
+    matrix, above, *_ = draw(found.subject.graph, found.diagnosis, ())
+    (PICTURES / "which-edge-matrix.png").write_bytes(matrix.png)
+    (PICTURES / "which-edge-above.png").write_bytes(above.png)
+
+    write_history(run, History((Edit(disable=tuple(f"{i}-{j}" for i, j in MISTAKEN)),)))
+    single = solve_again(run).result.world_from_cam
+    stand = from_above(PICTURES / "which-edge-single.jpg", run, single, None)
+    from_above(PICTURES / "which-edge-doubled.jpg", run, doubled, stand)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("runs/which-edge"))
+    parser.add_argument("--loops", type=Path, help="write the loop closures here and do nothing else")
+    chosen = parser.parse_args()
+    if chosen.loops:
+        write_loops(chosen.loops, demo_source())
+    else:
+        main(chosen.folder)
