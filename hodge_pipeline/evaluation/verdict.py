@@ -138,7 +138,8 @@ def _graph_suspicions(graph: GraphSummary) -> Iterator[str]:
     wrong, suspect = graph.verdicts_in_use.get("wrong", 0), graph.verdicts_in_use.get("suspect", 0)
     if wrong or suspect:
         yield (
-            f"Of the edges that the solver used {wrong} are judged wrong and {suspect} suspect: hodge diagnose shows them."
+            f"Of the edges that the solver used {wrong} are judged wrong and {suspect} suspect: hodge diagnose "
+            "shows them."
         )
     if untestable := graph.verdicts.get("untestable", 0):
         yield f"{untestable} of {graph.edges} edges are untestable: nothing in the graph says whether they are right."
