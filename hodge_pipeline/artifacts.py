@@ -91,8 +91,9 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def save(path: Path, value: Any) -> None:
-    """Write a dataclass whose fields are all arrays or scalars."""
-    save_arrays(path, {field.name: np.asarray(getattr(value, field.name)) for field in fields(value)})
+    """Write a dataclass whose fields are all arrays or scalars; one that is None is left to its default."""
+    columns = {field.name: getattr(value, field.name) for field in fields(value)}
+    save_arrays(path, {name: np.asarray(column) for name, column in columns.items() if column is not None})
 
 
 def load(path: Path, cls: type[T]) -> T:

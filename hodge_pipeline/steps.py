@@ -181,7 +181,7 @@ def judge_edges(job: Job, last: Round, number: int) -> Round:
     with job.stage("diagnose", "diagnosis", 1, job.recipe.diagnosis, (f"solve-{number}",)) as (folder, advance):
         if not folder.finished:
             found = diagnose(last.graph, job.recipe.diagnosis)
-            artifacts.save(folder.path / "graph.npz", last.graph)
+            artifacts.save(folder.path / "graph.npz", replace(last.graph, priors=None))
             verdicts = Verdicts(found.verdict, found.probability, np.array(found.reason, dtype=np.str_))
             artifacts.save(folder.path / "verdicts.npz", verdicts)
             advance(1)

@@ -1,0 +1,242 @@
+"""`hodge diagnose`: the table, what it leaves, and what it says of wrong, untestable and scattered graphs."""
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from typer.testing import CliRunner
+
+import hodge_pipeline
+from hodge_adapters.g2o import write_g2o
+from hodge_adapters.poses_text import read_tum
+from hodge_pipeline import se3
+from hodge_pipeline.cli.main import app
+from hodge_pipeline.complex.betti import betti_numbers
+from hodge_pipeline.complex.cech import flag_complex
+from hodge_pipeline.complex.cycles import loop_products
+from hodge_pipeline.complex.holes import unfilled_loops
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.energy_tables import energy_rows
+from hodge_pipeline.diagnosis.matches import side_by_side
+from hodge_pipeline.diagnosis.plots import side_by_side as pieces_apart
+from hodge_pipeline.diagnosis.two_clouds import FIRST, SECOND, picture, views
+from hodge_pipeline.errors import GraphError, HodgeError
+from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.types import PointCloud, ViewGraph
+from synthetic import tiny_sequence  # noqa: F401 - a fixture
+
+
+def ring(count: int = 12, reach: int = 2, first_id: int = 100) -> tuple[ViewGraph, np.ndarray]:
+    """Views round a circle, each joined to the next ones; their poses."""
+    angle = 2 * np.pi * np.arange(count) / count
+    turn = np.stack([np.zeros(count), np.zeros(count), angle], axis=1)
+    poses = se3.from_parts(se3.so3_exp(turn), np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * 2)
+    edges = np.array([(i, (i + step) % count) for step in range(1, reach + 1) for i in range(count)])
+    noise = se3.exp(0.003 * np.random.default_rng(0).normal(size=(len(edges), 6)))
+    measured = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ noise
+    information = np.tile(np.eye(6) / 0.003**2, (len(edges), 1, 1))
+    return ViewGraph.from_edges(np.arange(count) + first_id, edges, measured, information), poses
+
+
+def spoil(graph: ViewGraph, row: int) -> None:
+    graph.i_from_j[row] = graph.i_from_j[row] @ se3.exp(np.array([0.5, 0.2, -0.4, 0.6, -0.5, 0.3]))
+
+
+def hodge(*arguments: object) -> str:
+    done = CliRunner().invoke(app, ["diagnose", *map(str, arguments)], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wrong_edge(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, ViewGraph]:
+    """A graph file with one wrong edge, diagnosed: its folder, what was printed, and the graph."""
+    folder = tmp_path_factory.mktemp("diagnose")
+    graph, poses = ring(reach=3)
+    spoil(graph, 17)
+    write_g2o(folder / "ring.g2o", graph, poses)
+    return folder, hodge(folder / "ring.g2o", "--out", folder / "why", "--top", 3), graph
+
+
+def test_the_wrong_edge_is_printed_first_with_what_to_do(wrong_edge: tuple[Path, str, ViewGraph]) -> None:
+    folder, text, graph = wrong_edge
+    i, j = graph.vertex_ids[graph.edges[17]]
+    lines = text.splitlines()
+    assert re.match(rf"{i}-{j} +wrong +0\.\d\d  0 of \d+ cycles close; .* fails by .*-> disable it", lines[0])
+    assert lines[3].startswith("… and 33 more edges")
+    assert f"1 of 36 edges is wrong, worst of all {i}–{j}" in text
+    assert f"next     hodge solve {folder / 'ring.g2o'} --out solved.g2o --disable {i}-{j}" in text
+
+
+def test_the_files_say_the_same(wrong_edge: tuple[Path, str, ViewGraph]) -> None:
+    folder, _, graph = wrong_edge
+    with (folder / "why/edges.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0])[:4] == ["i", "j", "verdict", "probability"]
+    assert [[int(row["i"]), int(row["j"])] for row in rows] == graph.vertex_ids[graph.edges].tolist()
+    assert [n for n, row in enumerate(rows) if row["verdict"] != "consistent"] == [17]
+    poses = read_tum(folder / "why/poses.tum")
+    np.testing.assert_array_equal(poses.stamps_s, graph.vertex_ids)
+    between = se3.inverse(poses.world_from_cam[0]) @ poses.world_from_cam[1]
+    np.testing.assert_allclose(between, graph.i_from_j[0], atol=0.02)
+    assert {path.name for path in (folder / "why").iterdir()} == {
+        "edges.csv", "poses.tum", "diagnosis.html", "diagnosis.rrd",
+    }  # fmt: skip
+
+
+def test_the_page_needs_nothing_but_itself(wrong_edge: tuple[Path, str, ViewGraph]) -> None:
+    folder, _, graph = wrong_edge
+    page = (folder / "why/diagnosis.html").read_text()
+    assert not re.search(r"(src|href)=[\"'](?!data:)", page)
+    assert "1 of 36 edges is wrong" in page
+    assert page.count("<img ") == 3
+    i, j = graph.vertex_ids[graph.edges[17]]
+    assert f'<td class="word">{i}–{j}</td><td class="word wrong">wrong</td>' in page
+    for words in ("Energy of the residual motions", "harmonic", "linearisation", "Pieces"):
+        assert words in page
+
+
+def test_the_recording_holds_verdicts_triangles_and_loops(wrong_edge: tuple[Path, str, ViewGraph]) -> None:
+    folder, _, graph = wrong_edge
+    lines: dict[str, int] = {}
+    for chunk in RrdReader(folder / "why/diagnosis.rrd").stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for name in ("LineStrips3D:strips", "Mesh3D:triangle_indices"):
+            if name in batch.schema.names:
+                lines[chunk.entity_path] = len(batch.column(name).flatten())
+    assert lines["/world/verdicts/wrong"] == 1
+    assert lines["/world/verdicts/consistent"] == 35
+    assert lines["/world/curl/triangles"] == flag_complex(graph.edges, graph.vertex_count).counts[2]
+    assert lines["/world/curl/loops"] == 1
+
+
+def test_json_has_every_edge(tmp_path: Path) -> None:
+    graph, poses = ring(6)
+    write_g2o(tmp_path / "a.g2o", graph, poses)
+    answer = json.loads(hodge(tmp_path / "a.g2o", "--json"))
+    assert answer["counts"] == {"consistent": 12, "suspect": 0, "wrong": 0, "untestable": 0}
+    assert len(answer["edges"]) == 12 and answer["pieces"] == 1 and answer["commands"] == []
+    assert hodge(tmp_path / "a.g2o", "--quiet") == ""
+
+
+def test_a_chain_with_one_bad_loop_edge_names_the_loop(tmp_path: Path) -> None:
+    graph, poses = ring(6, reach=1)
+    spoil(graph, 5)
+    write_g2o(tmp_path / "chain.g2o", graph, poses)
+    text = hodge(tmp_path / "chain.g2o", "--out", tmp_path / "why")
+    assert "consistent  " not in text.split("verdict")[0]
+    assert "one of its 6 edges is wrong" in text
+    with (tmp_path / "why/edges.csv").open() as file:
+        assert [row["probability"] for row in csv.DictReader(file) if row["verdict"] == "untestable"] == [""] * 6
+
+
+def test_pieces_are_pieces(tmp_path: Path) -> None:
+    first, poses = ring(6)
+    both = ViewGraph.from_edges(
+        np.arange(12),
+        np.concatenate([first.edges, first.edges + 6]),
+        np.concatenate([first.i_from_j] * 2),
+        np.concatenate([first.information] * 2),
+    )
+    write_g2o(tmp_path / "two.g2o", both, np.concatenate([poses, poses]))
+    text = hodge(tmp_path / "two.g2o", "--out", tmp_path / "why")
+    assert "poses.tum holds 2 pieces, each in a frame of its own" in text
+    assert len(read_tum(tmp_path / "why/poses.tum")) == 12
+
+
+def test_pieces_are_drawn_beside_each_other() -> None:
+    _, poses = ring(6)
+    placed = pieces_apart(np.concatenate([poses, poses, poses]), np.repeat([0, 1, 2], 6))
+    spans = [(placed[k : k + 6, 0, 3].min(), placed[k : k + 6, 0, 3].max()) for k in (0, 6, 12)]
+    assert spans[0][1] < spans[1][0] and spans[1][1] < spans[2][0]
+    np.testing.assert_allclose(placed[6:12, 1:, 3], poses[:, 1:, 3])
+
+
+def test_shares_of_a_piece_add_up_and_pieces_to_the_whole() -> None:
+    graph, _ = ring()
+    spoil(graph, 3)
+    graph = ViewGraph.from_edges(
+        np.arange(18),
+        np.concatenate([graph.edges, ring(6)[0].edges + 12]),
+        np.concatenate([graph.i_from_j, ring(6)[0].i_from_j]),
+    )
+    rows, complaints = energy_rows(graph, diagnose(graph))
+    assert complaints == ()
+    by_name = {(row.group, row.when): row for row in rows}
+    assert {"all edges", "piece 0", "piece 1"} == {row.group for row in rows}
+    for row in rows:
+        for share in row.shares:
+            assert share.sum() == pytest.approx(1)
+    pieces = by_name["piece 0", "before"].rotation + by_name["piece 1", "before"].rotation
+    np.testing.assert_allclose(pieces, by_name["all edges", "before"].rotation)
+    assert by_name["all edges", "after"].rotation.sum() < 0.1 * by_name["all edges", "before"].rotation.sum()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_there_is_a_loop_for_each_hole(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    edges = rng.integers(0, 14, (40, 2))
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    loops = unfilled_loops(edges, 14)
+    assert len(loops) == betti_numbers(flag_complex(edges, 14))[1]
+    poses = se3.exp(rng.normal(size=(14, 6)))
+    closed = loop_products(loops, se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]])
+    np.testing.assert_allclose(closed, np.broadcast_to(np.eye(4), closed.shape), atol=1e-9)
+
+
+def test_a_graph_of_too_many_triangles_is_refused() -> None:
+    edges = np.array([(i, j) for j in range(9) for i in range(j)])
+    assert len(unfilled_loops(edges, 9)) == 0
+    with pytest.raises(GraphError, match="at most 10 triangles"):
+        unfilled_loops(edges, 9, most_triangles=10)
+
+
+def test_two_clouds_are_drawn_where_they_are() -> None:
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)), axis=-1).reshape(-1, 2)
+    left = PointCloud(np.column_stack([grid, np.full(len(grid), 2.0)]).astype(np.float32))
+    i_from_j = se3.from_parts(np.eye(3), np.array([3.0, 0, 0]))
+    both = np.concatenate([left.points_in_cam, left.points_in_cam + [3, 0, 0]])
+    ahead, above = views(both, np.array([0.0, -1.0, 0.0]))
+    image = picture(left, left, i_from_j, ahead).astype(int)
+    blue, orange = (
+        np.abs(image / image.sum(2, keepdims=True) - tint / tint.sum()).sum(2) < 0.05 for tint in (FIRST, SECOND)
+    )
+    assert blue.sum() > 500 and orange.sum() > 500
+    assert np.flatnonzero(blue.any(0)).max() < np.flatnonzero(orange.any(0)).min()
+    assert (picture(left, left, i_from_j, above) < 255).any(2).sum() < blue.sum()
+
+
+def test_an_image_matches_itself_and_nothing_else() -> None:
+    rng = np.random.default_rng(0)
+    image = np.kron(rng.integers(0, 255, (40, 52, 3), np.uint8), np.ones((8, 8, 1), np.uint8)).astype(np.uint8)
+    same, other = side_by_side(image, image), side_by_side(image, np.full_like(image, 90))
+    assert same.agreeing > 50 and same.agreeing == same.matches
+    assert (other.matches, other.agreeing) == (0, 0)
+    np.testing.assert_array_equal(side_by_side(image, image).image, same.image)
+
+
+def test_a_run_is_diagnosed_with_pictures(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    settings = ["clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1", "fusion=[]"]
+    recipe = load_recipe("demo", [*settings, "evaluation.tables=false"], tiny_sequence)
+    run = hodge_pipeline.run(recipe, tmp_path / "run")
+    assert run.result.verdicts is not None
+    answer = json.loads(hodge(tmp_path / "run", "--out", tmp_path / "why", "--json"))
+    assert sum(answer["counts"].values()) == run.result.graph.edge_count
+    assert answer["counts"]["consistent"] == (run.result.verdicts.verdict == "consistent").sum()
+    assert all(source["source"] in run.result.graph.source for source in answer["edges"])
+    page = (tmp_path / "why/diagnosis.html").read_text()
+    assert page.count("As the robust poses say</h3>") == 6
+    assert page.count("SIFT matches;") >= 6
+
+
+def test_mistakes_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    (tmp_path / "half").mkdir()
+    (tmp_path / "half/recipe.yaml").write_text("x: 1\n")
+    for path, message in (("poses.tum", "no graph"), ("half", "not finished"), ("nothing.g2o", "no such file")):
+        with pytest.raises(HodgeError, match=message):
+            hodge(tmp_path / path)
