@@ -42,6 +42,8 @@ def guess_reader(path: Path, known: Sequence[Guess] | None = None) -> FrameReade
     """
     if not path.exists():
         raise SourceError(f"{path}: no such file or folder")
+    if not path.is_file() and not path.is_dir():
+        raise SourceError(f"{path}: neither a file nor a folder: give one that holds data")
     best = guesses(path) if known is None else known
     if not best:
         readers = ", ".join(registry.names("readers"))
@@ -57,7 +59,7 @@ def inspect(path: Path) -> dict[str, Any]:
 
     Images are not read but for the depth of a few frames. What has no value (a range of nothing) is left out.
     """
-    known = guesses(path) if path.exists() else []
+    known = guesses(path) if path.is_file() or path.is_dir() else []
     source = guess_reader(path, known).open(path)
     oddities: list[str] = []
     facts: dict[str, Any] = {

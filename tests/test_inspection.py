@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from dataclasses import replace
 from functools import partial
@@ -146,6 +147,24 @@ def test_a_quaternion_of_another_length_is_noted(tmp_path: Path) -> None:
     assert "1 of 1 edges have a quaternion of another length than 1 (as 2)" in facts["notes"]
     assert facts["oddities"] == ["1 of 1 edges have no information at all: 0-1"]
     assert json.loads(json_text(facts))["graph"]["edges"] == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "complaint"),
+    [
+        ("absent", "no such file or folder"),
+        ("loop", "no such file or folder"),
+        ("pipe", "neither a file nor a folder"),
+        ("notes.md", "no reader knows this format"),
+    ],
+)
+def test_what_cannot_be_opened_is_one_line(tmp_path: Path, name: str, complaint: str) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "notes.md").write_text("words\n")
+    with pytest.raises(SourceError, match=complaint) as error:
+        inspect(tmp_path / name)
+    assert name in str(error.value) and "\n" not in str(error.value)
 
 
 def test_a_real_graph(data_dir: Path) -> None:

@@ -55,7 +55,11 @@ def _visit(data: Path, folder: Path, found: list[tuple[str, str, str]]) -> None:
             _file(data, path, found, loose)
     for ending, count in sorted(loose.items()):
         found.append(
-            (f"{folder.relative_to(data)}/*{ending}", "none", f"{count} files: {OTHER.get(ending, 'no reader')}")
+            (
+                f"{folder.relative_to(data)}/*{ending}",
+                "none",
+                f"{count} file{'s' if count > 1 else ''}: {OTHER.get(ending, 'no reader')}",
+            )
         )
 
 

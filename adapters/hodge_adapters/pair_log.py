@@ -21,6 +21,8 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Ints, Source, ViewGraph
 
+MAX_INFORMATION = 1e100
+"""Sums of larger ones are no numbers any more."""
 SPARSE = 10
 """A count of vertices beyond so many times those that edges name is no count of them: the named ones are taken."""
 
@@ -82,7 +84,7 @@ def read_information(path: Path) -> tuple[Ints, Floats]:
     """
     heads, body, lines = read_blocks(path, 6)
     symmetric = np.isclose(body, np.swapaxes(body, 1, 2), rtol=1e-4, atol=1e-6).all(axis=(1, 2))
-    good = np.isfinite(body).all(axis=(1, 2)) & symmetric
+    good = (np.abs(body) < MAX_INFORMATION).all(axis=(1, 2)) & symmetric
     if not good.all():
         line = lines[int(np.argmin(good))]
         raise SourceError(f"{path}:{line}: not a finite symmetric 6x6 matrix: mend or remove the block")
