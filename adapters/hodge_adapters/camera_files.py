@@ -19,7 +19,10 @@ _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Intrinsics in pixels; `size` (width, height) and `units_per_metre` of depth where the file says so."""
+    """Intrinsics in pixels; `size` (width, height) and `units_per_metre` of depth where the file says so.
+
+    `distortion`: the lens's `k1 k2 p1 p2 k3` where they are known; `distorted`: that there is some.
+    """
 
     fx: float
     fy: float
@@ -28,6 +31,7 @@ class Intrinsics:
     size: tuple[int, int] | None = None
     units_per_metre: float | None = None
     distorted: bool = False
+    distortion: tuple[float, float, float, float, float] | None = None
 
     def camera(self, size: tuple[int, int]) -> Camera:
         """The camera, of the file's own size if it gives one, else of this one."""
@@ -93,10 +97,17 @@ def _from_entries(text: str) -> Intrinsics | None:
         values["cy"],
         units_per_metre=values.get("DepthMapFactor"),
         distorted=any(values.get(name) for name in _DISTORTION),
+        distortion=_distortion(values),
     )
     if {"width", "height"} <= values.keys():
         return replace(found, size=(int(values["width"]), int(values["height"])))
     return found
+
+
+def _distortion(values: dict[str, float]) -> tuple[float, float, float, float, float] | None:
+    """Brown's coefficients, None where there are none; a missing one is zero."""
+    k1, k2, p1, p2, k3 = (values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
+    return (k1, k2, p1, p2, k3) if any((k1, k2, p1, p2, k3)) else None
 
 
 def _from_json(text: str) -> Intrinsics | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hodge_adapters import images
+from hodge_adapters.lens import Lens, encoded_straight_colour, encoded_straight_depth, straight_colour, straight_depth
 from hodge_pipeline.types import Camera, Floats, Frame
 
 
@@ -22,13 +24,14 @@ def image_frame(
     no_depth: tuple[int, ...] = (0,),
     world_from_cam: Floats,
     sequence: str = "",
+    lens: Lens | None = None,
 ) -> Frame:
     """A frame that reads its images when asked, and then refuses those of another size than the camera.
 
-    A pose (4, 4) that is not finite means none.
+    With a lens they are bent straight first. A pose (4, 4) that is not finite means none.
     """
     size = camera.width, camera.height
-    return Frame(
+    frame = Frame(
         frame_id=frame_id,
         stamp_s=float(stamp_s),
         camera=camera,
@@ -38,4 +41,16 @@ def image_frame(
         encoded_colour=partial(images.encoded_colour, colour) if colour else None,
         world_from_cam=world_from_cam if np.isfinite(world_from_cam).all() else None,
         sequence=sequence,
+    )
+    return frame if lens is None else _straight(frame, lens, units_per_metre)
+
+
+def _straight(frame: Frame, lens: Lens, units_per_metre: float) -> Frame:
+    depth, colour = frame.read_depth, frame.read_colour
+    return replace(
+        frame,
+        read_depth=partial(straight_depth, depth, lens) if depth else None,
+        encoded_depth=partial(encoded_straight_depth, depth, lens, units_per_metre) if depth else None,
+        read_colour=partial(straight_colour, colour, lens) if colour else None,
+        encoded_colour=partial(encoded_straight_colour, colour, lens) if colour else None,
     )
