@@ -18,6 +18,7 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.page import PageContents, render
 from hodge_pipeline.diagnosis.plots import draw, side_by_side
 from hodge_pipeline.diagnosis.result import WRONG, Diagnosis
+from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.edge_pictures import edge_pictures
 from hodge_pipeline.edits import joining, read_history
 from hodge_pipeline.errors import HodgeError, WorkspaceError
@@ -28,6 +29,7 @@ from hodge_pipeline.types import Bools, CloudSet, Frame, Source, Trajectory, Vie
 from hodge_pipeline.workspace import RECIPE_FILE
 
 PICTURED = 6
+SUGGESTED = 12
 COMMANDED = 20
 """Edges at most that a command to type names: more of them are a case for a robust solver."""
 
@@ -98,13 +100,14 @@ def _disabled(path: Path, graph: ViewGraph) -> Bools:
 
 @dataclass(frozen=True)
 class Diagnosed:
-    """A subject with its diagnosis, the advice (E,) on each edge, and the commands to type next."""
+    """A subject with its diagnosis, the advice (E,), the commands to type and the pairs to register next."""
 
     subject: Subject
     diagnosis: Diagnosis
     advice: tuple[str, ...]
     commands: tuple[str, ...]
     notes: tuple[str, ...]
+    suggestions: Suggestions
 
     @property
     def rows(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
@@ -118,7 +121,14 @@ def diagnose_subject(subject: Subject) -> Diagnosed:
     pieces = int(found.piece.max(initial=-1)) + 1
     apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
     notes = (*subject.notes, *found.notes, *((apart,) if pieces > 1 else ()))
-    return Diagnosed(subject, found, advice(found, subject.disabled), _commands(subject, found), notes)
+    return Diagnosed(
+        subject,
+        found,
+        advice(found, subject.disabled),
+        _commands(subject, found),
+        notes,
+        suggest_pairs(subject.graph, found, SUGGESTED),
+    )
 
 
 def _commands(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
@@ -173,6 +183,7 @@ def _page(diagnosed: Diagnosed) -> PageContents:
         energy=energy,
         plots=draw(subject.graph, found, energy),
         edges=pictures,
+        suggestions=diagnosed.suggestions,
         commands=diagnosed.commands,
         notes=(*diagnosed.notes, *complaints),
     )

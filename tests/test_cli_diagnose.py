@@ -120,6 +120,9 @@ def test_json_has_every_edge(tmp_path: Path) -> None:
     answer = json.loads(hodge(tmp_path / "a.g2o", "--json"))
     assert answer["counts"] == {"consistent": 12, "suspect": 0, "wrong": 0, "untestable": 0}
     assert len(answer["edges"]) == 12 and answer["pieces"] == 1 and answer["commands"] == []
+    joined = {frozenset((edge["i"], edge["j"])) for edge in answer["edges"]}
+    nexts = [frozenset((pair["i"], pair["j"])) for pair in answer["register_next"]]
+    assert nexts and not joined & set(nexts)
     assert hodge(tmp_path / "a.g2o", "--quiet") == ""
 
 

@@ -11,6 +11,7 @@ from hodge_pipeline.cli.console import Terminal
 if TYPE_CHECKING:
     from hodge_pipeline.diagnose_path import Diagnosed
 
+SUGGESTED = 3
 HEADER = ("edge", "verdict", "right", "why", "what to do")
 
 
@@ -49,10 +50,17 @@ def _print(found: Diagnosed, out: Path | None, top: int) -> None:
     print(f"verdict  {sentence(found.subject.graph, found.diagnosis)}")
     for note in found.notes:
         print(f"note     {note}")
+    for (i, j), reason in list(zip(_suggested(found), found.suggestions.reason, strict=True))[:SUGGESTED]:
+        print(f"register {i}-{j}  {reason}")
     for command in found.commands:
         print(f"next     {command}")
     if out is not None:
         print(f"report   {out / 'diagnosis.html'}")
+
+
+def _suggested(found: Diagnosed) -> list[list[Any]]:
+    """The pairs to register next, by the names of their vertices."""
+    return [list(pair) for pair in found.subject.graph.vertex_ids[found.suggestions.pairs]]
 
 
 def _cells(found: Diagnosed, row: int) -> tuple[str, ...]:
@@ -102,6 +110,12 @@ def _as_json(found: Diagnosed, out: Path | None) -> dict[str, Any]:
         "counts": counts,
         "energy": diagnosis.energy,
         "commands": list(found.commands),
+        "register_next": [
+            {"i": i, "j": j, "why": reason, "score": score}
+            for (i, j), reason, score in zip(
+                _suggested(found), found.suggestions.reason, found.suggestions.score, strict=True
+            )
+        ],
         "notes": list(found.notes),
         "edges": edges,
     }

@@ -13,6 +13,7 @@ from hodge_pipeline.diagnosis.advice import ranked
 from hodge_pipeline.diagnosis.energy import CAVEATS
 from hodge_pipeline.diagnosis.energy_tables import PARTS, SHARE_CAVEAT, EnergyRow
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
+from hodge_pipeline.diagnosis.suggestions import Suggestions
 from hodge_pipeline.diagnosis.wording import cycle_error, name_cycle
 from hodge_pipeline.evaluation.page import STYLE
 from hodge_pipeline.evaluation.plots import Plot
@@ -46,7 +47,7 @@ class PageContents:
     energy: tuple[EnergyRow, ...]
     plots: tuple[Plot, ...]
     edges: tuple[EdgePictures, ...] = ()
-    suggestions: Table | None = None
+    suggestions: Suggestions | None = None
     commands: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -65,7 +66,7 @@ def render(contents: PageContents) -> str:
         *(_edge_pictures(contents, edge) for edge in contents.edges),
         _table(edge_table(contents)),
         _figures("The graph", contents.plots),
-        *([_table(contents.suggestions)] if contents.suggestions else []),
+        _suggestions(contents),
         *([_table(energy_table(contents.energy))] if contents.energy else []),
         _table(pieces_table(contents.graph, contents.diagnosis)),
         _notes(contents.notes),
@@ -159,6 +160,29 @@ def _cycles(contents: PageContents, rows: Ints) -> str:
         if row >= 0
     ]
     return "; ".join(told) or "none"
+
+
+def _suggestions(contents: PageContents) -> str:
+    found = contents.suggestions
+    if found is None or not len(found.pairs):
+        return ""
+    rows = []
+    for (i, j), score, resistance, tests, reason in zip(
+        contents.graph.vertex_ids[found.pairs].tolist(),
+        found.score,
+        found.resistance,
+        found.tests,
+        found.reason,
+        strict=True,
+    ):
+        far = number(resistance, ".2f") if np.isfinite(resistance) else "∞"
+        rows.append((f"{i}–{j}", reason, f"{score:.2f}", far, str(tests)))
+    caption = (
+        "Pairs without an edge, ranked by what one would tell: the uncertainty it would take away, and the untestable "
+        "edges it would put into a triangle. Resistance: variance between the two, in units of one edge's."
+    )
+    header = ("pair", "why", "nats", "resistance", "edges it tests")
+    return _table(Table("Pairs to register next", header, tuple(rows), caption, 2))
 
 
 def energy_table(rows: Sequence[EnergyRow]) -> Table:
