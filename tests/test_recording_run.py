@@ -15,13 +15,18 @@ import pytest
 from rerun.chunk import RrdReader
 
 import hodge_pipeline
+from hodge_pipeline import se3
+from hodge_pipeline.artifacts import load, load_arrays, load_solution
 from hodge_pipeline.errors import HodgeError, SourceError, WorkspaceError
+from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.pipeline import Run
-from hodge_pipeline.recording import binary, layout
+from hodge_pipeline.recording import binary, layout, shapes
+from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.replay import record_again
+from hodge_pipeline.types import CloudSet
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_pipeline import SMALL, Log, small_recipe
-from test_recording import rows
+from test_recording import rgb, rows
 
 NORMAL = ("executor.workers=0", "recording.level=normal", "evaluation.tables=false")
 
@@ -144,7 +149,78 @@ def test_what_is_no_run_cannot_be_recorded(tmp_path: Path) -> None:
         record_again(tmp_path / "nothing", {})
 
 
-def test_the_parts_hold_what_the_run_holds(run: Run) -> None:
+def test_reader_and_odometry_read_back(run: Run) -> None:
+    path, frames = run.folder / "recording.rrd", run.source.frames
+    first = run.folder / "stages/odometry/poses.npz"
+    for entity, column, encoded in (
+        (layout.COLOUR, "EncodedImage:blob", "encoded_colour"),
+        (layout.DEPTH, "EncodedDepthImage:blob", "encoded_depth"),
+    ):
+        blobs = [bytes(row[0]) for row in rows(path, entity, column)]
+        assert blobs == [getattr(frame, encoded)().contents for frame in frames]
+    odometry = load_arrays(first)["world_from_cam"]
+    centres = np.squeeze(rows(path, layout.poses("odometry"), "Transform3D:translation"))
+    np.testing.assert_array_equal(np.float32(centres), np.float32(odometry[:, :3, 3]))
+    points = np.squeeze(rows(path, layout.under(layout.FRAME_PLOTS, "points"), "Scalars:scalars"))
+    np.testing.assert_array_equal(points, CloudSet.open(run.folder / "stages/clouds").sizes)
+
+
+def test_registration_and_edges_read_back(run: Run) -> None:
     path = run.folder / "recording.rrd"
+    registered = load(run.folder / "stages/register-2/registered.npz", Registered)
+    columns = layout.registration(2)
+    np.testing.assert_array_equal(np.float32(rows(path, columns, "fitness")[0]), np.float32(registered.fitness))
+    np.testing.assert_array_equal(np.float32(rows(path, columns, "rmse_m")[0]), np.float32(registered.rmse_m))
+    assert rows(path, columns, "i")[0] == registered.pairs[:, 0].tolist()
+    graph = run.result.graph
+    before = load_solution(run.folder / "stages/solve-1/solution.npz").world_from_cam
+    (lines,) = rows(path, layout.edges(2), "LineStrips3D:strips")
+    np.testing.assert_array_equal(np.float32(lines), np.float32(before[graph.edges, :3, 3]))
+    (colours,) = rows(path, layout.edges(2), "LineStrips3D:colors")
+    expected = shapes.residual_colours(shapes.residuals_m(graph, before), 0.05)
+    np.testing.assert_array_equal(rgb(colours), expected)
+
+
+def test_solver_reads_back_iteration_by_iteration(run: Run) -> None:
+    path, solution = run.folder / "recording.rrd", run.result.solution
+    assert solution is not None
+    first = load_solution(run.folder / "stages/solve-1/solution.npz")
+    states = [step.world_from_cam for step in solution.history]
+    film = dict(
+        zip(
+            rows(path, layout.FILM_TRAJECTORY, layout.ITERATION),
+            [row for row in rows(path, layout.FILM_TRAJECTORY, "Points3D:positions") if row],
+            strict=False,
+        )
+    )
+    start = len(first.history) + 1  # the first round's start and iterations come before
+    for step, state in enumerate(states, start=start + 1):
+        np.testing.assert_array_equal(np.float32(film[step]), np.float32(state[:, :3, 3]))
+    objective = layout.under(layout.SOLVER_PLOTS, "objective")
+    recorded = np.squeeze(rows(path, objective, "Scalars:scalars"))
+    expected = [step.objective for one in (first, solution) for step in one.history]
+    np.testing.assert_array_equal(recorded, expected)
     centres = np.squeeze(rows(path, layout.poses("round_2"), "Transform3D:translation"))
+    turns = np.squeeze(rows(path, layout.poses("round_2"), "Transform3D:quaternion"))
     np.testing.assert_array_equal(np.float32(centres), np.float32(run.result.world_from_cam[:, :3, 3]))
+    np.testing.assert_array_equal(np.float32(turns), np.float32(se3.to_quat_xyzw(run.result.world_from_cam)))
+
+
+def test_verdicts_model_and_errors_read_back(run: Run) -> None:
+    path, verdicts = run.folder / "recording.rrd", run.result.verdicts
+    assert verdicts is not None
+    for name in np.unique(verdicts.verdict):
+        (lines,) = rows(path, layout.verdict(str(name)), "LineStrips3D:strips")
+        assert len(lines) == np.count_nonzero(verdicts.verdict == name)
+    (points,) = rows(path, layout.MODEL, "Points3D:positions")
+    np.testing.assert_array_equal(np.float32(points), read_ply(run.folder / "cloud.ply").points_in_world)
+    grown = sum(
+        len(row)
+        for step in range(24)
+        for row in rows(path, layout.growth(step), "Points3D:positions")
+        if row is not None
+    )
+    assert grown == len(points)
+    errors = np.squeeze(rows(path, layout.under(layout.FRAME_PLOTS, "error_m/result"), "Scalars:scalars"))
+    result = next(row for row in run.report.trajectories if row.name == "result")
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(result.ate_rmse_m, rel=1e-6)

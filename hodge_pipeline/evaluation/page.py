@@ -115,7 +115,7 @@ def _verdict(report: Report) -> str:
 def _tiles(report: Report) -> str:
     tiles = [
         (
-            " → ".join(change.lengths),
+            " → ".join(each.replace(" ", NARROW) for each in change.lengths),
             f"{change.what.removeprefix('the ')}, {percent(change.share)}",
         )
         for change in judge(report).changes

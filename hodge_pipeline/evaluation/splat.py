@@ -20,6 +20,8 @@ JPEG_QUALITY = 82
 PAPER = 255
 AMBIENT = 0.55
 FILL_PASSES = 2
+FRAMING_POINTS = 20_000
+MARGIN = 1.06
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ def _or_zeros(values: Floats32 | Bytes | None, count: int) -> Floats32 | Bytes:
 
 def stands(scene: Scene, world_from_cam: Floats) -> dict[str, Stand]:
     """One place to stand on each of four sides, above the scene; up is where the cameras have it, on average."""
-    low, high = np.percentile(scene.points, [1, 99], axis=0)
+    sample = scene.points[:: max(1, len(scene.points) // FRAMING_POINTS)].astype(float)
     known = world_from_cam[np.isfinite(world_from_cam).all(axis=(1, 2))]
     up = _unit(-known[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
     ahead = known[:, :3, 2].mean(axis=0)
@@ -73,16 +75,18 @@ def stands(scene: Scene, world_from_cam: Floats) -> dict[str, Stand]:
     found = {}
     for name, degrees in SIDES.items():
         turn = se3.exp(np.concatenate([np.deg2rad(degrees) * up, np.zeros(3)]))[:3, :3]
-        level = turn @ ahead
-        look = np.cos(ELEVATION_RAD) * level - np.sin(ELEVATION_RAD) * up
-        right = np.cross(look, up)
-        right /= np.linalg.norm(right)
-        axes = np.stack([right, np.cross(look, right), look])
-        corners = (np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - (low + high) / 2) @ axes.T
-        extent = np.ptp(corners, axis=0)
-        metres = max(extent[0] / WIDTH, extent[1] / HEIGHT, 1e-4) * 1.02
-        found[name] = Stand(axes, (low + high) / 2, float(metres))
+        look = np.cos(ELEVATION_RAD) * (turn @ ahead) - np.sin(ELEVATION_RAD) * up
+        right = _unit(np.cross(look, up), np.array([1.0, 0.0, 0.0]))
+        found[name] = _framed(np.stack([right, np.cross(look, right), look]), sample)
     return found
+
+
+def _framed(axes: Floats, points: Floats) -> Stand:
+    """The stand from which all but a few stray points fill the picture."""
+    low, high = np.percentile(points @ axes.T, [0.5, 99.5], axis=0)
+    extent = high - low
+    metres_per_pixel = max(extent[0] / WIDTH, extent[1] / HEIGHT, 1e-4) * MARGIN
+    return Stand(axes, (low + high) / 2 @ axes, float(metres_per_pixel))
 
 
 def _unit(vector: Floats, fallback: Floats) -> Floats:
