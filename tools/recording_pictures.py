@@ -1,4 +1,4 @@
-"""Draws each tab of a run's recording, without a window: `python tools/recording_pictures.py runs/demo docs/pictures`."""
+"""Draws each tab of a recording, without a window: `python tools/recording_pictures.py runs/demo docs/pictures`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draw(run: Path, out: Path, tabs: tuple[str, ...]) -> None:
         for tab in tabs:
             recording, png = Path(scratch) / f"{tab}.rrd", out / f"recording-{tab}.png"
             merge_parts(parts, recording, APPLICATION, f"picture-{tab}", active_tab=TABS.index(tab))
-            picture(recording, png, wait_s=6.0)
+            picture(recording, png, wait_s=8.0)
             with Image.open(png) as image:
                 height = round(image.height * WIDTH / image.width)
                 image.convert("RGB").resize((WIDTH, height)).quantize(COLOURS).save(png, optimize=True)
