@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hodge_pipeline.diagnosis.arrange import best_arrangement
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.pieces import align
@@ -21,6 +22,8 @@ FINAL_PENALTY = 0.5
 PRIOR_SHARE = 0.3
 EXTREME = 0.01
 UNVOUCHED = 0.9
+FINAL_SHARE = 0.7
+"""Of the final arrangement in the probability; the rest is how often the perturbed runs agree."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +47,13 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
         chi2 = fit(evidence, graph, align(evidence, perturbed, options.cluster_gain, penalty, rng), 1).chi2
         share += np.maximum(0.0, 1 - chi2 / FIRST_GATE) / runs
     voted = weight * (share + FLOOR) / (1 + FLOOR - share) if runs > 1 else weight
-    best = fit(evidence, graph, align(evidence, voted, options.cluster_gain, FINAL_PENALTY, rng), 2)
-    agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
-    mean = (share + agreeing) / 2 if runs > 1 else agreeing
+    leading = align(evidence, voted, options.cluster_gain, FINAL_PENALTY, rng)
+    if evidence.exhaustive:
+        best, agreeing = best_arrangement(evidence, graph, [leading])
+    else:
+        best = fit(evidence, graph, leading, 2)
+        agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
+    mean = FINAL_SHARE * agreeing + (1 - FINAL_SHARE) * share if runs > 1 else agreeing
     probability = _with_prior(mean, evidence.prior)
     return Consensus(best, _unvouched(probability, best, evidence), runs)
 

@@ -23,6 +23,7 @@ from hodge_pipeline.diagnosis.testing_cycles import (
     in_no_cycle,
     judge_cycles,
     unattributable,
+    usual_share,
     witnesses,
 )
 from hodge_pipeline.diagnosis.wording import reasons
@@ -49,6 +50,8 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     angle, moved = cycle_errors(loops, motions)
     noise = edge_noise(graph, loops, angle, moved, prior, reach_m)
     cycles = judge_cycles(loops, angle, moved, noise, reach_m)
+    # where only near pairs were tried, the order cannot tell how many of them are wrong: the cycles can
+    prior = np.minimum(prior, usual_share(cycles))
     evidence = Evidence(
         edges=graph.edges,
         vertex_count=graph.vertex_count,

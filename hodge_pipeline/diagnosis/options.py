@@ -11,7 +11,7 @@ class DiagnosisOptions:
     """How edges are weighed against each other."""
 
     runs: int = Field(
-        default=24,
+        default=8,
         gt=0,
         description="alignments of the scene from perturbed weights; an edge's probability counts its share",
     )

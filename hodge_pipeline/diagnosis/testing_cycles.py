@@ -23,6 +23,17 @@ def judge_cycles(loops: Loops, angle: Floats, moved: Floats, noise: Noise, reach
     return Cycles(loops, angle, moved, chi2, chi2 < GATE)
 
 
+def usual_share(cycles: Cycles) -> float:
+    """The share of right edges that the share of closing cycles tells of; 1 where there is no cycle.
+
+    A cycle closes where all its edges are right: p to the power of its length.
+    """
+    if not len(cycles.loops):
+        return 1.0
+    closing = float(cycles.closes.mean())
+    return max(closing, 1 / (len(cycles.loops) + 1)) ** (1 / float(cycles.loops.lengths.mean()))
+
+
 def closing_support(cycles: Cycles, prior: Floats) -> Floats:
     """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
     row, edge = _rows(cycles.loops), cycles.loops.edge
