@@ -31,7 +31,7 @@ def usual_share(cycles: Cycles) -> float:
     if not len(cycles.loops):
         return 1.0
     closing = float(cycles.closes.mean())
-    return max(closing, 1 / (len(cycles.loops) + 1)) ** (1 / float(cycles.loops.lengths.mean()))
+    return float(max(closing, 1 / (len(cycles.loops) + 1)) ** (1 / float(cycles.loops.lengths.mean())))
 
 
 def closing_support(cycles: Cycles, prior: Floats) -> Floats:
