@@ -13,6 +13,7 @@ from hodge_pipeline.job import Job
 from hodge_pipeline.rounds import Round
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import Candidates, Source, ViewGraph
+from hodge_pipeline.unordered.graphs import COLUMNS
 from hodge_pipeline.unordered.start import Scene, find_start
 
 START = "start"
@@ -40,11 +41,12 @@ def _global_start(
             scratch = folder.path / "scratch"
             found = find_start(scene, options, scratch, workers, advance)
             shutil.rmtree(scratch, ignore_errors=True)
-            artifacts.save(folder.path / "graph.npz", found.graph)
+            columns = {name: getattr(found.graph, name) for name in ("vertex_ids", *COLUMNS)}
+            artifacts.save_arrays(folder.path / "graph.npz", columns)
             artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": found.world_from_cam})
             for note in found.notes:
                 job.note(note)
-    graph = artifacts.load(job.path(START) / "graph.npz", ViewGraph)
+    graph = ViewGraph(**artifacts.load_arrays(job.path(START) / "graph.npz"))
     poses = artifacts.load_arrays(job.path(START) / "poses.npz")["world_from_cam"]
     return Round(graph, poses, name=START)
 
@@ -56,7 +58,7 @@ def with_start_edges(candidates: Candidates, first: Round) -> Candidates:
     """
     if first.name != START:
         return candidates
-    proven = candidates.pairs[candidates.source != "sequential"]
+    proven = candidates.pairs[~np.isin(candidates.source, ("sequential", "nearest"))]
     component = connected_components(proven, first.graph.vertex_count)
     joining = component[first.graph.edges[:, 0]] != component[first.graph.edges[:, 1]]
     if not joining.any():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.stages import FrameReader, Workers
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Source, ViewGraph
+from hodge_pipeline.unordered.tour import propose_along_tour
 
 HELD_OUT = "held_out.npz"
 
@@ -92,7 +94,10 @@ def propose_edges(
     options = (job.recipe.edges, None if job.given is None else job.recipe.guard.held_out)
     with job.stage(name, f"edges, round {number}", 1, options, inputs) as (folder, advance):
         if not folder.finished:
-            candidates = without_measured(job.recipe.edges.propose(source.frames, clouds, world_from_cam), measured)
+            propose = job.recipe.edges.propose
+            if job.recipe.start == "global":
+                propose = partial(propose_along_tour, job.recipe.edges)
+            candidates = without_measured(propose(source.frames, clouds, world_from_cam), measured)
             if job.given is not None:
                 out = is_held_out(candidates, job.recipe.guard.held_out, job.recipe.seed)
                 artifacts.save(folder.path / HELD_OUT, select(candidates, np.flatnonzero(out)))

@@ -10,6 +10,7 @@ import numpy as np
 import hodge_pipeline
 from hodge_adapters.ply_points import write_ply
 from hodge_pipeline import se3
+from hodge_pipeline.edges.sequential import SequentialEdges
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.recipe import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
@@ -19,6 +20,7 @@ from hodge_pipeline.unordered.options import GlobalStart
 from hodge_pipeline.unordered.pieces import laid_apart
 from hodge_pipeline.unordered.scan_checks import check_scans, unregistrable
 from hodge_pipeline.unordered.start import Scene, Start, find_start
+from hodge_pipeline.unordered.tour import propose_along_tour, tour
 from test_global_registration import furnished_corner
 
 OPTIONS = CloudOptions(voxel_m=0.05, min_range_m=0.0, max_range_m=100.0)
@@ -142,3 +144,16 @@ def test_the_recipe_scans_from_files_to_a_report(tmp_path: Path) -> None:
     assert np.abs(se3.log(se3.inverse(se3.inverse(first) @ second) @ moved)).max() < 0.01
     assert run.report.before == "start"
     assert (tmp_path / "run" / "report.html").is_file() and (tmp_path / "run" / "cloud.ply").is_file()
+
+
+def test_a_tour_takes_the_nearest_and_pairs_come_back_to_their_rows() -> None:
+    shuffled = np.random.default_rng(0).permutation(12)
+    poses = se3.exp(np.array([0.0, 0, 0, 0.1, 0, 0]) * shuffled[:, None])
+    order = tour(poses)
+    steps = np.abs(np.diff(shuffled[order]))
+    assert sorted(order.tolist()) == list(range(12)) and (steps == 1).sum() >= 10  # one jump, from an end to the rest
+    frames = [scan(int(k), np.zeros((1, 3))) for k in shuffled]
+    clouds = CloudSet.from_clouds([read(np.ones((20, 3)))] * 12)
+    found = propose_along_tour(SequentialEdges(), frames, clouds, poses)
+    assert (found.pairs[:, 0] < found.pairs[:, 1]).all() and set(found.source.tolist()) == {"nearest"}
+    assert sorted(np.abs(shuffled[found.pairs[:, 0]] - shuffled[found.pairs[:, 1]]).tolist()) == sorted(steps.tolist())
