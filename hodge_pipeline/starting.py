@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,8 @@ def _global_start(
             artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": found.world_from_cam})
             for note in found.notes:
                 job.note(note)
-    graph = ViewGraph(**artifacts.load_arrays(job.path(START) / "graph.npz"))
+    columns: dict[str, Any] = artifacts.load_arrays(job.path(START) / "graph.npz")
+    graph = ViewGraph(**columns)
     poses = artifacts.load_arrays(job.path(START) / "poses.npz")["world_from_cam"]
     return Round(graph, poses, name=START)
 
