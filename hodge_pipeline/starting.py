@@ -47,8 +47,8 @@ def _global_start(
             artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": found.world_from_cam})
             for note in found.notes:
                 job.note(note)
-    columns: dict[str, Any] = artifacts.load_arrays(job.path(START) / "graph.npz")
-    graph = ViewGraph(**columns)
+    stored: dict[str, Any] = artifacts.load_arrays(job.path(START) / "graph.npz")
+    graph = ViewGraph(**stored)
     poses = artifacts.load_arrays(job.path(START) / "poses.npz")["world_from_cam"]
     return Round(graph, poses, name=START)
 
