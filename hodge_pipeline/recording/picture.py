@@ -14,6 +14,7 @@ from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import binary, layout
 
 START_S = 30.0
+ATTEMPTS = 5
 WINDOW = "1600x900"
 
 
@@ -34,9 +35,21 @@ def picture(recording: Path, png: Path, *, story_s: float | None = None, wait_s:
                 if story_s is not None:
                     client.set_time(layout.STORY, duration=story_s, play_state="paused")
                     time.sleep(wait_s / 2)
-                client.save_screenshot(str(png.resolve()))
+                _save(client, png)
             finally:
                 viewer.kill()
+
+
+def _save(client: ViewerClient, png: Path) -> None:
+    """Draw it, as often as a machine without a GPU, and busy, runs out of the viewer's own patience."""
+    for attempt in range(ATTEMPTS):
+        try:
+            client.save_screenshot(str(png.resolve()))
+        except TimeoutError as error:
+            if attempt + 1 == ATTEMPTS:
+                raise WorkspaceError("the headless Rerun viewer is too slow here for a picture: try again") from error
+        else:
+            return
 
 
 def _free_port() -> int:

@@ -16,7 +16,7 @@ from hodge_pipeline.recording.stream import log_markdown, log_notes
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
 MOST_TRIANGLES = 300_000
-TRIANGLE_BYTES = 60
+TRIANGLE_BYTES, COLUMN_BYTES = 60, 28
 OPACITY = 110
 Share: TypeAlias = tuple[str, str, float, float]
 
@@ -38,7 +38,7 @@ def log_complex(
         return notes
     triangles = flag_complex(graph.edges, graph.vertex_count).simplices[2]
     curl_m = triangle_curl_m(graph, triangles)
-    if len(triangles):
+    if 0 < len(triangles) * COLUMN_BYTES <= max_bytes:
         _log_columns(stream, outer, triangles, curl_m)
     kept = options.count(options.edge_lines, len(triangles), TRIANGLE_BYTES, max_bytes)
     corners = solution.world_from_cam[triangles, :3, 3]
