@@ -17,6 +17,7 @@ from hodge_adapters.colmap import ColmapReader
 from hodge_adapters.colmap_database import database_names
 from hodge_adapters.colmap_depth import sensor_depth
 from hodge_adapters.colmap_files import find_database, find_models, model_ending
+from hodge_adapters.colmap_scale import other_camera_note
 from hodge_adapters.colmap_ties import similarity, tie_points
 from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, read_reconstruction
 from hodge_adapters.colmap_union import united
@@ -94,7 +95,7 @@ class ColmapModels:
         depth = self._depth(sensor, frames)
         database = self._database(folder, frames, notes)
         files = (folder / f"{name}{ending}" for name in MODEL_FILES)
-        return ColmapModel(
+        model = ColmapModel(
             name=str(folder),
             reconstruction=reconstruction,
             all_frames={name: self._with_depth(frame, depth.files.get(name)) for name, frame in frames.items()},
@@ -104,6 +105,15 @@ class ColmapModels:
             files=tuple(file for file in files if file.is_file()),
             notes=tuple(notes),
         )
+        return self._with_camera_note(model)
+
+    def _with_camera_note(self, model: ColmapModel) -> ColmapModel:
+        names = [image.name for image in model.records.images]
+        sensors = {row: model.depth.files[name] for row, name in enumerate(names) if name in model.depth.files}
+        if not sensors or self.depth_camera is not None:
+            return model
+        note = other_camera_note(model.records, sensors, self.depth_scale, self.no_depth)
+        return model if note is None else replace(model, notes=(*model.notes, note))
 
     def _sensor(self, folder: Path) -> Path | None:
         if self.depth == "none":

@@ -19,6 +19,8 @@ from hodge_pipeline.types import Floats, Floats32, ViewGraph
 SAMPLED_IMAGES = 12
 MOST_IMAGES = 200
 LEAST_POINTS = 50
+FOCAL_FACTORS = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15, 1.2, 1.25)
+CLEARLY_BETTER = 0.7
 
 
 def metres_per_unit(
@@ -44,6 +46,45 @@ def metres_per_unit(
         f"scale {scale:.6g} m per unit, by sensor depth at {len(found)} points (half within {low:.3f}–{high:.3f})"
     )
     return scale
+
+
+def other_camera_note(
+    model: Model, sensors: Mapping[int, Path], units_per_metre: float, no_depth: tuple[int, ...]
+) -> str | None:
+    """A complaint where depth fits the points much better through a camera of another focal length than the colour's.
+
+    Then depth and colour are of two cameras, and nobody has laid the one onto the other's pixels.
+    """
+    rows = np.array(sorted(sensors), np.int64)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, SAMPLED_IMAGES).round().astype(int))]
+    spreads = {}
+    for factor in FOCAL_FACTORS:
+        ratios = [np.zeros(0)]
+        for row in rows.tolist():
+            record = model.cameras[model.images[row].camera_id]
+            camera = colmap_camera(record)
+            size = images.image_size(sensors[row])
+            if size != (record.width, record.height):
+                camera.rescale(*size)
+            given = (
+                factor * camera.focal_length_x,
+                factor * camera.focal_length_y,
+                camera.principal_point_x - HALF_PIXEL,
+                camera.principal_point_y - HALF_PIXEL,
+            )
+            ratios += depth_ratios(model, {row: sensors[row]}, units_per_metre, no_depth, given)
+        found = np.concatenate(ratios)
+        spreads[factor] = (
+            float(np.median(np.abs(found / np.median(found) - 1))) if len(found) >= LEAST_POINTS else np.inf
+        )
+    best = min(spreads, key=lambda factor: spreads[factor])
+    if not spreads[best] < CLEARLY_BETTER * spreads[1.0]:
+        return None
+    return (
+        f"depth seems to be of another camera than the images: half of its ratios to the points lie within "
+        f"{spreads[best]:.1%} instead of {spreads[1.0]:.1%} with a focal length {best:g} times theirs: "
+        "give --depth-camera"
+    )
 
 
 def scaled_poses(world_from_cam: Floats, scale: float) -> Floats:

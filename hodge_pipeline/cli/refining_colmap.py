@@ -33,8 +33,11 @@ def refine(
         print(f"{'report':<8} {out / 'report.html'}")
     failed = [result.decision.reason for result in done.results if result.decision.exit_code]
     if failed:
-        kept = "the input was given back" if (out / "sparse").is_dir() else "nothing was written but the report"
-        raise CheckError(f"{'; '.join(failed)}: {kept} (--force writes a worse result)")
+        written = any(result.decision.outcome == "worse" for result in done.results)
+        kept = (
+            "the input was given back (--force writes the result)" if written else "nothing was written but the report"
+        )
+        raise CheckError(f"{'; '.join(failed)}: {kept}")
 
 
 def _print(result: RefinedModel) -> None:

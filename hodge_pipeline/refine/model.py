@@ -143,7 +143,7 @@ def _judged(
     model = found.model
     final = metric_scale(model.depth_ratios()) if any(scale.is_observable for scale in scales) else scales[0]
     if found.solved is None or not found.solved.kept.any():
-        decision = Decision("worse", found.notes[-1])
+        decision = Decision("nothing", found.notes[-1])
         return RefinedModel(inputs, found.start, model, scales, final, found.solved, decision, found.notes)
     if final.is_observable:
         model, final = model.scaled(final.metres_per_unit), replace(final, metres_per_unit=1.0)
