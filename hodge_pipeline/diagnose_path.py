@@ -17,7 +17,7 @@ from hodge_pipeline.diagnosis.energy_tables import energy_rows
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.page import PageContents, render
 from hodge_pipeline.diagnosis.plots import draw, side_by_side
-from hodge_pipeline.diagnosis.result import WRONG, Diagnosis
+from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.edge_pictures import edge_pictures
 from hodge_pipeline.edits import joining, read_history
@@ -28,7 +28,7 @@ from hodge_pipeline.solve_file import read_graph
 from hodge_pipeline.types import Bools, CloudSet, Frame, Source, Trajectory, ViewGraph
 from hodge_pipeline.workspace import RECIPE_FILE
 
-PICTURED = 6
+PICTURED, LEAST_PICTURED = 6, 2
 SUGGESTED = 12
 COMMANDED = 20
 """Edges at most that a command to type names: more of them are a case for a robust solver."""
@@ -173,7 +173,8 @@ def _write_poses(path: Path, subject: Subject, found: Diagnosis) -> None:
 def _page(diagnosed: Diagnosed) -> PageContents:
     subject, found = diagnosed.subject, diagnosed.diagnosis
     energy, complaints = energy_rows(subject.graph, found)
-    pictures = edge_pictures(subject.graph, found, diagnosed.rows[:PICTURED], subject.frames, subject.clouds)
+    rows = diagnosed.rows[: max(LEAST_PICTURED, min(PICTURED, int((found.verdict != CONSISTENT).sum())))]
+    pictures = edge_pictures(subject.graph, found, rows, subject.frames, subject.clouds)
     return PageContents(
         title=subject.name,
         path=str(subject.path),

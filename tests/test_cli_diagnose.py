@@ -232,8 +232,9 @@ def test_a_run_is_diagnosed_with_pictures(tiny_sequence: Path, tmp_path: Path) -
     assert answer["counts"]["consistent"] == (run.result.verdicts.verdict == "consistent").sum()
     assert all(source["source"] in run.result.graph.source for source in answer["edges"])
     page = (tmp_path / "why/diagnosis.html").read_text()
-    assert page.count("As the robust poses say</h3>") == 6
-    assert page.count("SIFT matches;") >= 6
+    bad = sum(count for verdict, count in answer["counts"].items() if verdict != "consistent")
+    assert page.count("As the edge says</h3>") == max(2, min(6, bad))
+    assert "SIFT matches;" in page
 
 
 def test_mistakes_are_one_line(tmp_path: Path) -> None:

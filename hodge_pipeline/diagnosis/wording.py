@@ -62,10 +62,10 @@ def _undecided(graph: ViewGraph, cycles: Cycles, row: int) -> str:
 def cycle_error(cycles: Cycles, row: int) -> str:
     """Whether a cycle closes, and by how much it does not, in words."""
     verb = "closes to" if cycles.closes[row] else "fails by"
-    return f"{verb} {cycles.displacement_m[row]:.3g} m, {np.degrees(cycles.angle_rad[row]):.2g}°"
+    return f"{verb} {cycles.displacement_m[row]:.3g} m, {np.degrees(cycles.angle_rad[row]):.3g}°"
 
 
 def _distance(metres: float, degrees: float) -> str:
     if not np.isfinite(metres):
         return "its ends lie in different pieces"
-    return f"{metres:.3g} m, {degrees:.2g}° from the poses"
+    return f"{metres:.3g} m, {degrees:.3g}° from the poses"

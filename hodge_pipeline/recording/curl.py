@@ -91,7 +91,7 @@ def _loop_colours(size: Floats) -> Bytes:
 
 def _label(graph: ViewGraph, corners: Ints, shift_m: float, angle_rad: float) -> str:
     names = "-".join(map(str, graph.vertex_ids[corners[:MOST_NAMED]])) + ("-…" if len(corners) > MOST_NAMED else "")
-    return f"{names}: {len(corners)} edges, off by {shift_m:.3g} m, {np.degrees(angle_rad):.2g}°"
+    return f"{names}: {len(corners)} edges, off by {shift_m:.3g} m, {np.degrees(angle_rad):.3g}°"
 
 
 def _tails(graph: ViewGraph, loops: Loops, rows: Ints) -> Ints:
