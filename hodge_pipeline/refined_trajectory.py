@@ -16,12 +16,12 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.contents import Report
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.refine.given_poses import RECIPE, recipe_for
 from hodge_pipeline.refine.guard import Decision
 from hodge_pipeline.refine.open3d_objects import poses_of, with_poses
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source
 from hodge_pipeline.watch import Watcher
 
-RECIPE = "slam-refine"
 Array = TypeVar("Array")
 
 
@@ -72,20 +72,22 @@ def refine_trajectory(
     *,
     out: Path | str | None = None,
     force: bool = False,
-    recipe: str = RECIPE,
+    recipe: str = "",
     overrides: Sequence[str] = (),
     watcher: Watcher | None = None,
 ) -> RefinedTrajectory:
     """Poses made better by the frames they belong to, one pose for each frame.
 
     `poses`: world_from_cam (N, 4, 4), or an `open3d.camera.PinholeCameraTrajectory`. `frames`: a path that a reader
-    opens, or frames (see `frames_from_images`). `out` keeps the run folder with report and recording. Files of poses go
-    to `hodge refine trajectory`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
+    opens, or frames (see `frames_from_images`). `recipe`: slam-refine, or slam-refine-tum for TUM's folders. `out`
+    keeps the run folder with report and recording. Files of poses go to `hodge refine trajectory`. Raises `HodgeError`
+    (see `errors`) for whatever the user can mend.
     """
     open3d = not isinstance(poses, (np.ndarray, list, tuple))
     given = poses_of(poses) if open3d else np.asarray(poses, float)
     source = _source(frames, given)
-    loaded = load_recipe(recipe, ["given.poses=frames", f"guard.force={str(force).lower()}", *overrides])
+    chosen = recipe or (recipe_for(Path(frames)) if isinstance(frames, (str, Path)) else RECIPE)
+    loaded = load_recipe(chosen, ["given.poses=frames", f"guard.force={str(force).lower()}", *overrides])
     with tempfile.TemporaryDirectory(prefix="hodge-refine-") as scratch:
         folder = Path(scratch) / "run" if out is None else Path(out)
         run = pipeline.run(loaded, folder, source=source, watcher=watcher)

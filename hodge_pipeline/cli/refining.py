@@ -37,9 +37,12 @@ def trajectory(
         str, typer.Option(help="How a pose finds its frame: stamp, number, row (n-th pose, n-th frame), or auto.")
     ] = "auto",
     force: Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")] = False,
+    recipe: Annotated[
+        str, typer.Option("--recipe", help="A recipe like slam-refine, which is the default; for TUM slam-refine-tum.")
+    ] = "",
     overrides: Annotated[
         Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
-        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe slam-refine."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe."),
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
@@ -49,7 +52,7 @@ def trajectory(
     from hodge_pipeline.cli import refining_trajectory
 
     refining_trajectory.refine(
-        poses, frames, out, match, overrides or [], force=force, overwrite=overwrite, quiet=quiet, as_json=json
+        poses, frames, out, match, recipe, overrides or [], force=force, overwrite=overwrite, quiet=quiet, as_json=json
     )
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from hodge_pipeline.cli import running
 from hodge_pipeline.errors import SourceError
-
-RECIPE = "slam-refine"
+from hodge_pipeline.refine.given_poses import recipe_for
 
 
 def refine(
@@ -17,6 +16,7 @@ def refine(
     frames: Path,
     out: Path,
     match: str,
+    recipe: str,
     overrides: Sequence[str],
     *,
     force: bool,
@@ -28,4 +28,5 @@ def refine(
     if not poses.exists():
         raise SourceError(f"{poses}: no such file or folder: give the poses to refine")
     ours = [f"given.path={json.dumps(str(poses))}", f"given.match={match}", f"guard.force={str(force).lower()}"]
-    running.run(RECIPE, frames, out, [*ours, *overrides], overwrite=overwrite, quiet=quiet, as_json=as_json)
+    chosen = recipe or recipe_for(frames)
+    running.run(chosen, frames, out, [*ours, *overrides], overwrite=overwrite, quiet=quiet, as_json=as_json)

@@ -13,12 +13,23 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.inspection import guesses
 from hodge_pipeline.types import Floats, Frame, Ints, Source, Trajectory
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
 SAME_STAMP_S = 1e-6
 LIKELY_SHARE = 0.5
 """Of the frames: fewer numbers in common may be a coincidence, since small numbers occur in every sequence."""
+
+RECIPE = "slam-refine"
+CALIBRATED = {"tum": "slam-refine-tum"}
+"""Recipes for the readers of formats whose depth and colour are calibrated to each other, where landmarks measure."""
+
+
+def recipe_for(frames: Path) -> str:
+    """The recipe that refines poses of these frames, by their format."""
+    found = guesses(frames) if frames.exists() else []
+    return CALIBRATED.get(found[0].name, RECIPE) if found else RECIPE
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
