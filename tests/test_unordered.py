@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import hodge_pipeline
 from hodge_adapters.ply_points import write_ply
@@ -16,7 +17,8 @@ from hodge_pipeline.recipe import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.stages import no_progress
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud
-from hodge_pipeline.unordered.options import GlobalStart
+from hodge_pipeline.unordered.hypotheses import allowed_violation
+from hodge_pipeline.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.unordered.pieces import laid_apart
 from hodge_pipeline.unordered.scan_checks import check_scans, unregistrable
 from hodge_pipeline.unordered.start import Scene, Start, find_start
@@ -131,7 +133,7 @@ def test_the_recipe_scans_from_files_to_a_report(tmp_path: Path) -> None:
     folder = tmp_path / "scans"
     folder.mkdir()
     for name, (k, pose) in zip(("b", "a", "c"), enumerate(POSES), strict=True):
-        write_ply(folder / f"{name}.ply", read(seen_from(pose, furnished_corner(k))))
+        write_ply(folder / f"{name}.ply", read(seen_from(pose, furnished_corner(k, 10_000))))
     plain = [
         "recording.level=off",
         "evaluation.tables=false",
@@ -157,3 +159,11 @@ def test_a_tour_takes_the_nearest_and_pairs_come_back_to_their_rows() -> None:
     found = propose_along_tour(SequentialEdges(), frames, clouds, poses)
     assert (found.pairs[:, 0] < found.pairs[:, 1]).all() and set(found.source.tolist()) == {"nearest"}
     assert sorted(np.abs(shuffled[found.pairs[:, 0]] - shuffled[found.pairs[:, 1]]).tolist()) == sorted(steps.tolist())
+
+
+def test_what_a_run_allows_its_pairs_to_see_through_follows_its_camera() -> None:
+    limits = HypothesisLimits()
+    assert allowed_violation(np.array([0.0, 0.0, 0.001, 0.1]), limits) == limits.violation_floor
+    assert allowed_violation(np.array([0.01, 0.01, np.nan, 0.3]), limits) == pytest.approx(0.08)
+    assert allowed_violation(np.full(5, 0.2), limits) == limits.max_violation
+    assert allowed_violation(np.full(2, np.nan), limits) == limits.violation_floor

@@ -18,6 +18,7 @@ from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, ViewGraph
 from hodge_pipeline.unordered.options import HypothesisLimits
 
 POINTS_PROJECTED = 1500
+USUAL_VIOLATIONS = 8.0
 ViewOf = Callable[[int], DepthView | None]
 
 
@@ -103,10 +104,17 @@ def weigh(
     reason = np.full(len(chosen), "", "U64")
     if needs_all_directions:
         reason[free != ""] = "what they share leaves a motion open"
-    reason[seen_through > limits.max_violation] = "one camera saw through the other's surface"
+    reason[seen_through > allowed_violation(seen_through, limits)] = "one camera saw through the other's surface"
     reason[~(registered.rmse_m <= limits.max_rmse_m)] = "points too far apart"
     reason[~(overlap >= limits.min_overlap)] = "too little overlap"
     return _with_unworthy(matches, worth, registered, overlap, seen_through, free, reason)
+
+
+def allowed_violation(seen_through: Floats, limits: HypothesisLimits) -> float:
+    """The violation up to which a pair may be right, from those (P,) of a run, most of which are right."""
+    known = seen_through[np.isfinite(seen_through)]
+    usual = float(np.median(known)) if len(known) else 0.0
+    return float(np.clip(USUAL_VIOLATIONS * usual, limits.violation_floor, limits.max_violation))
 
 
 def _frame_of(clouds: CloudSet, row: int) -> tuple[Floats, float]:

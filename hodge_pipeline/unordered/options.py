@@ -27,7 +27,14 @@ class HypothesisLimits:
         default=0.15,
         ge=0,
         le=1,
-        description="share of points in view that the other depth image saw through; right pairs have below 0.05",
+        description="share of points in view that the other depth image saw through, at most, however noisy the camera",
+    )
+    violation_floor: float = Field(
+        default=0.03,
+        ge=0,
+        le=1,
+        description="what every camera may: below it no pair is refused. Between the two, 8 times the median of the "
+        "run's pairs is allowed: places that look alike differ in what surrounds them",
     )
 
 
