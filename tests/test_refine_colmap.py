@@ -156,6 +156,21 @@ def test_without_one_edge_nothing_is_written_but_the_report(tmp_path: Path) -> N
     assert sorted(path.name for path in out.iterdir()) == ["recipe.yaml", "report.html", "report.json"]
 
 
+def test_points_that_one_image_saw_are_kept(tmp_path: Path) -> None:
+    model = noisy(tmp_path)
+    odd = pycolmap.Reconstruction(disturbed(model, tmp_path / "start"))
+    lost = min(odd.points3D)
+    element = odd.points3D[lost].track.elements[0]
+    image_id, column, xyz = element.image_id, element.point2D_idx, odd.points3D[lost].xyz.copy()
+    odd.delete_point3D(lost)
+    track = pycolmap.Track()
+    track.add_element(image_id, column)
+    lone = odd.add_point3D(xyz, track)
+    done = hodge_pipeline.refine_colmap(odd, database="none", overrides=FREE)
+    assert done.results[0].decision.outcome == "refined"
+    assert done.models[0].points3D[lone].track.length() == 1
+
+
 def test_scale_is_the_median_with_the_error_of_the_images_medians() -> None:
     rng = np.random.default_rng(0)
     bias = rng.normal(scale=0.01, size=40)

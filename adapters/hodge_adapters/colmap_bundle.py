@@ -22,6 +22,22 @@ def adjust(reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: Posi
     A point that escapes through a camera, where COLMAP's cost has no slope, is held where it was. Raises `SourceError`
     where the adjustment fails.
     """
+    alone = [key for key, point in reconstruction.points3D.items() if point.track.length() < 2]
+    if alone:  # they tell nothing; real models have such, and COLMAP refuses to adjust a model with them
+        part = pycolmap.Reconstruction(reconstruction)
+        for key in alone:
+            part.delete_point3D(key)
+        _adjust(part, bodies, priors)
+        for frame_id in bodies.frame_ids:
+            reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
+        for key, point in part.points3D.items():
+            reconstruction.points3D[key].xyz = point.xyz
+        reconstruction.update_point_3d_errors()
+    else:
+        _adjust(reconstruction, bodies, priors)
+
+
+def _adjust(reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors | None) -> None:
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
         config.add_image(image_id)
@@ -95,6 +111,9 @@ def _pose_priors(
 
 
 def _solve(adjuster: pycolmap.BundleAdjuster) -> None:
-    summary = adjuster.solve()
+    try:
+        summary = adjuster.solve()
+    except (ValueError, RuntimeError, IndexError) as error:  # what its C++ checks raise
+        raise SourceError(f"bundle adjustment failed ({error}): does COLMAP itself open the model?") from error
     if not summary.is_solution_usable():
         raise SourceError(f"bundle adjustment failed ({summary.brief_report()}): the model's points do not fit it")

@@ -22,6 +22,8 @@ from hodge_pipeline.types import Floats
 
 ADJUSTMENTS = 2
 """Rounds of merging points and bundle adjustment: what the first brings together the second can merge."""
+NO_EDGE = "no edge was found: no two images share enough points, matches or depth (model.min_shared)"
+NO_EDGE_LEFT = "every edge was rejected: no two of them agree"
 CHI2_TOLERANCE = 0.05
 SCORE_TOLERANCE = 0.002
 
@@ -92,11 +94,11 @@ def _refine(start: TrackedModel, options: ModelRefinement, workers: Workers, is_
         graph = joined_graphs(measured, depth.graph)
         notes = (*left_out, *depth.notes)
         if not graph.edge_count:
-            return _Found(start, start, None, np.full((1, 2), np.nan), nothing, (*notes, "no edge was found"))
+            return _Found(start, start, None, np.full((1, 2), np.nan), nothing, (*notes, NO_EDGE))
         solved = solve_bodies(graph, start.world_from_body, options.solver)
         notes = (*notes, *solved.solution.notes)
         if not solved.kept.any():
-            return _Found(start, start, solved, np.full((1, 2), np.nan), nothing, (*notes, "every edge was rejected"))
+            return _Found(start, start, solved, np.full((1, 2), np.nan), nothing, (*notes, NO_EDGE_LEFT))
         with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
         model, errors = _adjusted(start, solved, options.depth_weight if with_depth else 0.0)
         if not is_metric:
@@ -144,7 +146,8 @@ def _judged(
     final = metric_scale(model.depth_ratios()) if any(scale.is_observable for scale in scales) else scales[0]
     if found.solved is None or not found.solved.kept.any():
         decision = Decision("nothing", found.notes[-1])
-        return RefinedModel(inputs, found.start, model, scales, final, found.solved, decision, found.notes)
+        notes = (*model.notes, *found.notes[:-1])
+        return RefinedModel(inputs, found.start, model, scales, final, found.solved, decision, notes)
     if final.is_observable:
         model, final = model.scaled(final.metres_per_unit), replace(final, metres_per_unit=1.0)
     measures = tuple(_measures(inputs, found, model, options))
