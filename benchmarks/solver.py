@@ -1,12 +1,13 @@
-"""How long the maximum-likelihood solver takes, and how good its minimum is: prints one Markdown table.
+"""How long the maximum-likelihood solver takes, and how good its minimum is: prints the tables of solver.md.
 
-    python benchmarks/solver.py                       # the real graphs of HODGE_DATA, GTSAM beside where importable
-    python benchmarks/solver.py --synthetic 10000 100000 1000000
-    python benchmarks/solver.py --files my.g2o
+    OMP_NUM_THREADS=1 python benchmarks/solver.py --write              # benchmarks/solver.md, all but the largest
+    OMP_NUM_THREADS=1 python benchmarks/solver.py --write --million    # and graphs of a million poses
+    python benchmarks/solver.py --files my.g2o --synthetic             # these only
 
-CPU seconds, the median of several calls, reading excluded; every graph runs in a process of its own, whose peak memory
-is given. F is the isotropic objective with the file's information as it stands (as SE-Sync reads it), chi² the full one
-(as g2o reads it). Set OMP_NUM_THREADS=1 to compare with other solvers on one thread.
+Seconds are medians of several calls, reading excluded; every graph runs in a process of its own, whose peak memory is
+given. F is the isotropic objective with the file's information as it stands (as SE-Sync reads it), chi² the full one
+(as g2o reads it). The real graphs are those of HODGE_DATA; GTSAM and g2o run beside where they can be imported
+(`pip install hodge-pipeline[bench]`).
 """
 
 from __future__ import annotations
@@ -15,163 +16,87 @@ import argparse
 import dataclasses
 import multiprocessing
 import os
+import platform
 import resource
-import statistics
-import time
-from collections.abc import Callable
+import tempfile
+from collections.abc import Iterator
+from datetime import date
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import scipy
+from clock import Times, timed
+from peers import g2o_seconds, gnc_weights, gtsam_seconds
+from pose_graphs import SHAPES, synthetic, with_wrong_edges
 
-from hodge_adapters.g2o import information_for_file, load_g2o
-from hodge_pipeline import se3
+from hodge_adapters.g2o import information_for_file, load_g2o, write_g2o
 from hodge_pipeline.solvers.hodge import solve
-from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
+from hodge_pipeline.solvers.robust import solve_robust
+from hodge_pipeline.solvers.setup import relative_gradient
+from hodge_pipeline.types import Solution, ViewGraph
 
 CERTIFIED_OPTIMA = {
     "smallGrid3D": 1025.39806,
     "parking-garage": 1.26252443,
-    "sphere_bignoise_vertex3": 2961756.490,
     "sphere2500": 1687.005814,
     "torus3D": 24227.04556,
     "cubicle": 717.125991,
+    "MIT": 61.154,
+    "CSAIL": 31.704,
+    "intel": 52.348,
+    "manhattan": 6431.39,
+    "kitti_00": 125.70,
+    "kitti_05": 276.51,
 }
-SYNTHETIC = ("cylinder", "trajectory", "lattice", "sphere")
+DEFAULT_SHAPES = ["cylinder", "trajectory", "streets", "lattice"]
+MOST_POSES = {"lattice": 10_000}
+"""By default: its factor fills up."""
+MOST_CERTIFIED = 6000
+GTSAM_TO = {"trajectory": 100_000, "streets": 10_000}
 COLUMNS = (
-    "graph", "V / E", "F", "F / optimum − 1", "CPU s", "certified", "CPU s with it", "chi²", "CPU s", "GTSAM CPU s",
-    "GTSAM / F", "GTSAM / chi²", "peak MB",
+    "graph", "V / E", "F", "F / optimum − 1", "CPU s", "wall s", "gradient", "certified", "CPU s with it", "chi²",
+    "CPU s", "g2o chi²", "g2o CPU s", "GTSAM CPU s", "GTSAM / F", "GTSAM / chi²", "peak MB",
 )  # fmt: skip
+ROBUST_COLUMNS = ("solver", "edges", "wrong", "wrong ones kept", "right ones left out", "CPU s")
+EXPLAINED = """# The maximum-likelihood solver, measured
 
+Made by `OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/solver.py --write{flags}` on {day}: {machine}.
+{load}
 
-def cylinder(count: int) -> tuple[Floats, Ints]:
-    """Rings of 100 poses, each joined to the ring below twice: loops everywhere."""
-    k = np.arange(count)
-    angle = 2 * np.pi * k / 100
-    radius = 100 / (2 * np.pi)
-    position = np.stack([radius * np.cos(angle), radius * np.sin(angle), k / 100], axis=1)
-    poses = se3.from_parts(se3.so3_exp(np.outer(angle, [0, 0, 1])), position)
-    return poses, np.concatenate([np.stack([k[:-s], k[s:]], axis=1) for s in (1, 100, 101)])
-
-
-def trajectory(count: int) -> tuple[Floats, Ints]:
-    """A random walk in a grid of streets, with a loop closure at three in ten returns: like a chain."""
-    rng = np.random.default_rng(0)
-    heading = np.repeat(rng.integers(0, 4, count // 10 + 1), 10)[:count]
-    position = np.cumsum(np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[heading], axis=0)
-    turns = se3.so3_exp(np.outer(heading * np.pi / 2, [0, 0, 1]))
-    poses = se3.from_parts(turns, np.pad(position, ((0, 0), (0, 1))).astype(float))
-    place = position[:, 0] * 10**7 + position[:, 1]
-    order = np.argsort(place, kind="stable")
-    returns = np.stack([order[:-1], order[1:]], axis=1)[np.diff(place[order]) == 0]
-    returns = returns[(returns[:, 1] - returns[:, 0] > 1) & (rng.random(len(returns)) < 0.3)]
-    k = np.arange(count)
-    return poses, np.concatenate([np.stack([k[:-1], k[1:]], axis=1), returns])
-
-
-def sphere(count: int) -> tuple[Floats, Ints]:
-    """Rings of 44 poses on a sphere, each joined to the next and to three of the ring above."""
-    k = np.arange(count)
-    turn, tilt = 2 * np.pi * k / 44, np.pi * (k + 1) / (count + 1)
-    position = 50 * np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=1)
-    rotation = se3.so3_exp(np.outer(turn, [0, 0, 1])) @ se3.so3_exp(np.outer(tilt, [0, 1, 0]))
-    return se3.from_parts(rotation, position), np.concatenate(
-        [np.stack([k[:-s], k[s:]], axis=1) for s in (1, 43, 44, 45)]
-    )
-
-
-def chained(graph: ViewGraph) -> Floats:
-    """Poses by a walk along the edges from each vertex to the next: a start that leads to a local minimum."""
-    steps = graph.i_from_j[np.flatnonzero(graph.edges[:, 1] - graph.edges[:, 0] == 1)]
-    poses = [np.eye(4)]
-    for step in steps:
-        poses.append(poses[-1] @ step)
-    return np.stack(poses)
-
-
-def lattice(count: int) -> tuple[Floats, Ints]:
-    """A cube of poses turned at random, each joined to its six neighbours: the worst fill."""
-    side = round(count ** (1 / 3))
-    k = np.arange(side**3).reshape(side, side, side)
-    position = np.stack(np.unravel_index(np.arange(side**3), k.shape), axis=1).astype(float)
-    poses = se3.from_parts(se3.so3_exp(np.random.default_rng(1).normal(size=(side**3, 3))), position)
-    pairs = [(k.take(range(side - 1), axis), k.take(range(1, side), axis)) for axis in range(3)]
-    return poses, np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in pairs])
-
-
-SHAPES: dict[str, tuple[Callable[[int], tuple[Floats, Ints]], float, float]] = {
-    "cylinder": (cylinder, 0.05, 0.1),
-    "trajectory": (trajectory, 0.01, 0.02),
-    "lattice": (lattice, 0.05, 0.1),
-    "sphere": (sphere, 0.35, 0.5),
-}
-
-
-def synthetic(shape: str, count: int) -> ViewGraph:
-    """A modelled graph with noise of this many radians and metres an axis."""
-    make, sigma_rad, sigma_m = SHAPES[shape]
-    poses, edges = make(count)
-    sigma = np.repeat([sigma_rad, sigma_m], 3)
-    noise = sigma * np.random.default_rng(2).normal(size=(len(edges), 6))
-    measured = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ se3.exp(noise)
-    information = np.tile(np.diag(sigma**-2), (len(edges), 1, 1))
-    return ViewGraph.from_edges(np.arange(len(poses)), edges, measured, information)
-
-
-def timed(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
-    """The median CPU seconds of some calls, and what the last one gave."""
-    seconds = []
-    for _ in range(repeats):
-        start = time.process_time()
-        result = call()
-        seconds.append(time.process_time() - start)
-    return statistics.median(seconds), result
-
-
-def gtsam_seconds(path: Path, dimension: int, graph: ViewGraph, repeats: int) -> str:
-    """CPU seconds of GTSAM's chordal start and Gauss-Newton, on another objective (it reads q_vec as an angle)."""
-    try:
-        import gtsam
-    except ImportError:
-        return "not installed"
-    if dimension == 2:
-        return ""
-    try:
-        factors, _ = gtsam.readG2o(str(path), True)
-        first = int(graph.vertex_ids[0])
-        factors.add(gtsam.PriorFactorPose3(first, gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
-
-        def run() -> Any:
-            start = gtsam.InitializePose3.initialize(factors)
-            return gtsam.GaussNewtonOptimizer(factors, start).optimize()
-
-        seconds, _ = timed(run, repeats)
-    except RuntimeError:
-        return "fails"
-    return f"{seconds:.3f}"
+CPU seconds are medians over the repeats, reading excluded. F is the isotropic objective, chi² the full one: two
+problems with two minima, each with its own seconds. `gradient` is its norm at the end of F over that at the start.
+GTSAM's seconds are for its chordal start and Gauss-Newton on its own objective (3-D graphs only), g2o's for
+Levenberg-Marquardt from the file's poses, both in the same run. The last ratios are how many times as long GTSAM took as
+F without the certificate, and as chi². Peak memory is of the process after solving F. `sphere` has the noise of
+sphere_bignoise; the graphs below it show how the cost grows.
+"""
 
 
 def row(task: tuple[str, str | int, int]) -> list[str]:
     """One line of the table."""
     name, what, repeats = task
-    path, dimension = Path(str(what)), 3
-    if isinstance(what, int):
-        graph = synthetic(name, what)
-        isotropic = graph
-    else:
-        file = load_g2o(path)
-        graph, dimension = file.graph, file.graph.dimension
-        raw = np.roll(information_for_file(graph.information), (3, 3), axis=(1, 2))
-        isotropic = graph if dimension == 2 else dataclasses.replace(graph, information=raw)
-    plain_s, plain = timed(lambda: solve(isotropic, objective="isotropic"), repeats)
-    certified_s, certified = (
-        (float("nan"), plain)
-        if graph.vertex_count > 20_000
-        else timed(lambda: solve(isotropic, objective="isotropic", certificate=True), repeats)
-    )
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    full_s, full = timed(lambda: solve(graph), repeats)
-    other = "" if isinstance(what, int) else gtsam_seconds(path, dimension, graph, repeats)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(str(what))
+        if isinstance(what, int):
+            graph = isotropic = synthetic(name, what)
+            path = Path(folder) / f"{name}.g2o"
+        else:
+            graph = load_g2o(path).graph
+            raw = np.roll(information_for_file(graph.information), (3, 3), axis=(1, 2))
+            isotropic = graph if graph.dimension == 2 else dataclasses.replace(graph, information=raw)
+        plain_s, plain = timed(lambda: solve(isotropic, objective="isotropic"), repeats)
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        gradient = relative_gradient(isotropic, plain.world_from_cam)
+        certified_s, certified = None, plain
+        if graph.vertex_count <= MOST_CERTIFIED:
+            certified_s, certified = timed(lambda: solve(isotropic, objective="isotropic", certificate=True), repeats)
+        full_s, full = timed(lambda: solve(graph), repeats) if graph.vertex_count <= 500_000 else (None, plain)
+        if isinstance(what, int) and what <= GTSAM_TO.get(name, 10_000):
+            write_g2o(path, graph)
+        peers = path.is_file()
+        gtsam = gtsam_seconds(path, graph, min(repeats, 3)) if peers and graph.dimension == 3 else ""
+        readable = not isinstance(what, int) and "chi2" in full.metrics
+        g2o = g2o_seconds(path, graph.dimension) if readable else ""
     optimum = CERTIFIED_OPTIMA.get(path.stem)
     cost = plain.metrics["objective"]
     return [
@@ -179,20 +104,28 @@ def row(task: tuple[str, str | int, int]) -> list[str]:
         f"{graph.vertex_count} / {graph.edge_count}",
         f"{cost:.10g}",
         "" if optimum is None else f"{cost / optimum - 1:+.1e}",
-        f"{plain_s:.3f}",
+        f"{plain_s.cpu_s:.3f}",
+        f"{plain_s.wall_s:.3f}",
+        f"{gradient:.0e}",
         {1.0: "yes", 0.0: "no"}.get(certified.metrics.get("certified", -1.0), ""),
-        "" if np.isnan(certified_s) else f"{certified_s:.3f}",
-        chi2_cell(full),
-        f"{full_s:.3f}",
-        other,
-        *(ratio(other, seconds) for seconds in (plain_s, full_s)),
+        seconds(certified_s),
+        "" if full_s is None else chi2_cell(full),
+        seconds(full_s),
+        f"{g2o[1]:.9g}" if isinstance(g2o, tuple) else g2o,
+        seconds(g2o[0]) if isinstance(g2o, tuple) else "",
+        gtsam if isinstance(gtsam, str) else seconds(gtsam),
+        *(ratio(gtsam, own) for own in (plain_s, full_s)),
         f"{peak_mb:.0f}",
     ]
 
 
-def ratio(other: str, seconds: float) -> str:
+def seconds(times: Times | None) -> str:
+    return "" if times is None else f"{times.cpu_s:.3f}"
+
+
+def ratio(other: Times | str, own: Times | None) -> str:
     """How many times as long the other solver took, where it did."""
-    return f"{float(other) / seconds:.1f}" if other.replace(".", "").isdigit() else ""
+    return "" if isinstance(other, str) or own is None else f"{other.cpu_s / own.cpu_s:.1f}"
 
 
 def chi2_cell(solution: Solution) -> str:
@@ -200,21 +133,81 @@ def chi2_cell(solution: Solution) -> str:
     return f"{solution.metrics['chi2']:.9g}" if "chi2" in solution.metrics else "indefinite"
 
 
+def robust_rows(count: int, share: float) -> Iterator[list[str]]:
+    """A cylinder with wrong edges: this solver, which trusts no edge, and GTSAM's GNC, which is told whom to trust."""
+    graph, wrong = with_wrong_edges(synthetic("cylinder", count), share)
+    own_s, solution = timed(lambda: solve_robust(graph), 1)
+    yield robust_row("hodge, robust", graph, wrong, solution.weights > 0.5, own_s)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cylinder.g2o"
+        write_g2o(path, graph)
+        other = gnc_weights(path, graph)
+    if isinstance(other, str):
+        yield ["GTSAM GNC", other, *[""] * 4]
+    else:
+        yield robust_row("GTSAM GNC, sequence trusted", graph, wrong, other[1] > 0.5, other[0])
+
+
+def robust_row(name: str, graph: ViewGraph, wrong: np.ndarray, kept: np.ndarray, times: Times) -> list[str]:
+    is_wrong = np.zeros(graph.edge_count, bool)
+    is_wrong[wrong] = True
+    counts = graph.edge_count, len(wrong), (kept & is_wrong).sum(), (~kept & ~is_wrong).sum()
+    return [name, *(str(int(number)) for number in counts), seconds(times)]
+
+
+def robust_table(task: tuple[int, float]) -> list[list[str]]:
+    return list(robust_rows(*task))
+
+
+def machine() -> str:
+    """The machine in words."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+        model = models[0] if models else model
+    versions = f"CPython {platform.python_version()}, numpy {np.__version__}, scipy {scipy.__version__}"
+    return f"{model}, {os.cpu_count()} cores, {platform.system()}; {versions}"
+
+
+def table(columns: tuple[str, ...], rows: Iterator[list[str]]) -> Iterator[str]:
+    yield f"|{'|'.join(columns)}|"
+    yield f"|{'---|' * len(columns)}"
+    for cells in rows:
+        yield f"|{'|'.join(cells)}|"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--synthetic", nargs="*", type=int, default=[], metavar="POSES")
-    parser.add_argument("--shapes", nargs="*", choices=SYNTHETIC, default=SYNTHETIC)
-    parser.add_argument("--files", nargs="*", type=Path, default=[])
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--synthetic", nargs="*", type=int, default=[10_000, 100_000], metavar="POSES")
+    parser.add_argument(
+        "--shapes", nargs="*", choices=list(SHAPES), default=["cylinder", "trajectory", "streets", "lattice"]
+    )
+    parser.add_argument("--files", nargs="*", type=Path, default=None)
+    parser.add_argument("--million", action="store_true", help="a cylinder and streets of a million poses")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--write", action="store_true", help="write benchmarks/solver.md")
     options = parser.parse_args()
     data = Path(os.environ.get("HODGE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
-    files = options.files or ([] if options.synthetic else sorted((data / "pose_graphs").glob("*/*.g2o")))
+    files = sorted((data / "pose_graphs" / "sesync").glob("*.g2o")) if options.files is None else options.files
     tasks: list[tuple[str, str | int, int]] = [(path.stem, str(path), options.repeats) for path in files]
-    tasks += [(s, n, options.repeats if n <= 10_000 else 1) for n in options.synthetic for s in options.shapes]
-    print("|" + "|".join(COLUMNS) + "|", "|" + "---|" * len(COLUMNS), sep="\n", flush=True)
+    if options.files is None:
+        tasks.append(("sphere", 2200, options.repeats))
+    tasks += [(shape, n, 1) for n in options.synthetic for shape in options.shapes if n <= MOST_POSES.get(shape, n)]
+    tasks += [(shape, 1_000_000, 1) for shape in ("cylinder", "trajectory", "streets") if options.million]
+    day, load = date.today().isoformat(), os.getloadavg()[0] / (os.cpu_count() or 1)
+    busy = f"Other jobs kept the machine {'busy' if load > 0.5 else 'hardly busy'}: {load:.1f} waiting for each core."
+    lines = [EXPLAINED.format(flags=" --million" * options.million, day=day, machine=machine(), load=busy)]
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
-        for cells in pool.imap(row, tasks):
-            print("|" + "|".join(cells) + "|", flush=True)
+        for line in table(COLUMNS, pool.imap(row, tasks)):
+            print(line, flush=True)
+            lines.append(line)
+        lines += ["", "Edges replaced by random motions, one in five, in a cylinder of 500 poses:", ""]
+        for line in table(ROBUST_COLUMNS, iter(pool.apply(robust_table, ((500, 0.2),)))):
+            print(line, flush=True)
+            lines.append(line)
+    if options.write:
+        Path(__file__).with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

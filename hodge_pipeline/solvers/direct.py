@@ -19,8 +19,6 @@ TOLERANCE = 1e-6
 """Of a step: looser ones leave the soft modes of long chains wrong. A factor in double precision needs one step."""
 NEARLY_THERE = 1e-2
 """Of the tolerance asked for, which says how far the minimum is: farther, an old factor leaves soft modes wrong."""
-SINGLE_FROM = 1_500_000
-"""Unknowns above which the factor is kept in single precision, for its memory; CG makes up for it."""
 SECONDS_A_PRODUCT, SECONDS_A_VERTEX = 0.25e-9, 1e-7
 SECONDS_A_FILL, SECONDS_A_MATVEC = 8e-9, 2e-7
 """Measured: of a factorisation with blocks of size s, times s³; of a CG step with the two scalar Laplacians."""
@@ -49,7 +47,7 @@ class DirectSolver:
                 return found
             wasted = found.steps
         self.factor = None
-        self.factor = factorise_blocks(self.plan, hessian, single=hessian.shape[0] > SINGLE_FROM)
+        self.factor = factorise_blocks(self.plan, hessian)
         found = self._cg(hessian, gradient, TOLERANCE, enough, self.factor, FRESH_STEPS)
         return CgResult(found.x, found.residual, wasted + found.steps)
 

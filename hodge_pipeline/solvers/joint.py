@@ -14,7 +14,7 @@ from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.solvers.direct import DirectSolver
 from hodge_pipeline.solvers.newton import Point, Step
-from hodge_pipeline.solvers.objective import Residuals, curvature, residuals, rotation_gradient
+from hodge_pipeline.solvers.objective import Residuals, curvature, gradient, residuals
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import axial, exponential, lever
 from hodge_pipeline.types import Floats
@@ -62,12 +62,12 @@ class JointObjective:
     def step(self, point: Point, tolerance: float, enough: float) -> Step:
         """A Gauss-Newton step."""
         assert isinstance(point, JointPoint)
-        gradient, hessian = self.normal_equations(point.left)
-        found = self.direct.solve(hessian, gradient, tolerance, enough)
+        slopes, hessian = self.normal_equations(point.left)
+        found = self.direct.solve(hessian, slopes, tolerance, enough)
         if tolerance < NEWTON_FROM:
-            exact = self.direct.refined(self.hessian(point.left), gradient, enough)
+            exact = self.direct.refined(self.hessian(point.left), slopes, enough)
             found = exact if exact is not None else found
-        slope = 2 * float(gradient @ found.x)
+        slope = 2 * float(slopes @ found.x)
         return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), found.steps)
 
     def moved(self, point: Point, direction: Floats) -> JointPoint:
@@ -82,10 +82,7 @@ class JointObjective:
     def normal_equations(self, left: Residuals) -> tuple[Floats, bsr_matrix]:
         """Half the gradient (free · (p + d),) and half the Gauss-Newton Hessian."""
         problem = self.problem
-        structure, reach = problem.structure, left.shift + left.arm
-        force = problem.tau[:, None] * left.shift
-        pulled = np.asarray(structure.at_head @ force - structure.at_tail @ force)[: problem.free_count]
-        gradient = np.concatenate([rotation_gradient(problem, left), pulled], axis=1)
+        reach = left.shift + left.arm
 
         def turned(edges: slice) -> Floats:
             own = stiffness(problem.kappa[edges], left.turn[edges])
@@ -93,7 +90,7 @@ class JointObjective:
             levered = problem.tau[edges, None, None] * (np.swapaxes(arm, 1, 2) @ arm)
             return np.stack([own + levered, own, -own, -own])
 
-        return gradient.reshape(-1), self._assembled(turned, reach)
+        return gradient(problem, left).reshape(-1), self._assembled(turned, reach)
 
     def hessian(self, left: Residuals) -> bsr_matrix:
         """Half the Hessian, the residuals' own curvature included: near a minimum it makes the steps Newton's."""

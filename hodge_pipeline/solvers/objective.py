@@ -74,6 +74,13 @@ def rotation_gradient(problem: Problem, left: Residuals) -> Floats:
     return np.asarray(problem.structure.at_head @ pull - problem.structure.at_tail @ push)[: problem.free_count]
 
 
+def gradient(problem: Problem, left: Residuals) -> Floats:
+    """Half the gradient of F by rotations and translations (free, p + d)."""
+    structure, force = problem.structure, problem.tau[:, None] * left.shift
+    pulled = np.asarray(structure.at_head @ force - structure.at_tail @ force)[: problem.free_count]
+    return np.concatenate([rotation_gradient(problem, left), pulled], axis=1)
+
+
 def quadratic_model(problem: Problem, left: Residuals, exact: bool = True) -> QuadraticModel:
     """The second-order model of F in ω at these residuals; without the residuals' own curvature (Gauss-Newton), and
     so never indefinite, where it need not be exact.

@@ -12,6 +12,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.chordal import initial_rotations
 from hodge_pipeline.solvers.newton import Point
+from hodge_pipeline.solvers.objective import gradient, residuals
 from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
 from hodge_pipeline.solvers.rotations import project
 from hodge_pipeline.solvers.weights import Weights, check_graph, edge_weights, is_planar
@@ -107,3 +108,13 @@ def _gauge(component: Ints, fixed: Ints, start: Floats | None) -> Floats:
     free = ~held[component]
     gauge[free] = start[first[component[free]]]
     return gauge
+
+
+def relative_gradient(graph: ViewGraph, world_from_cam: Floats) -> float:
+    """The norm of F's gradient at these poses (V, 4, 4) over that at the start which `solve` would choose."""
+    setup = prepare(graph, world_from_cam)
+
+    def norm(rotations: Floats, translations: Floats) -> float:
+        return float(np.linalg.norm(gradient(setup.problem, residuals(setup.problem, rotations, translations))))
+
+    return norm(*setup.initial("given")) / max(norm(*setup.initial("chordal")), 1e-300)
