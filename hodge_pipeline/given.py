@@ -78,6 +78,8 @@ def key_source(given: Given, own: bool) -> Source:
 
 def _trajectory(job: Job, path: Path) -> Trajectory:
     opened = guess_reader(path).open(path)
+    if opened.graph is not None and opened.graph.edge_count:
+        raise SourceError(f"{path}: a graph of measured edges, which needs no frames: give it to hodge solve")
     for note in opened.notes:
         job.note(f"{path.name}: {note}")
     if opened.trajectory is not None:

@@ -16,10 +16,11 @@ from hodge_pipeline import registry, se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.recipe import load_recipe
 from hodge_pipeline.refine.correction import spread_correction
 from hodge_pipeline.refine.given_poses import GivenOptions, match_poses
 from hodge_pipeline.refine.key_frames import KeyFrameOptions, choose_key_frames
-from hodge_pipeline.types import Floats, Frame, Trajectory
+from hodge_pipeline.types import Floats, Frame, Source, Trajectory
 
 SMALL = ("clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1")
 
@@ -216,3 +217,15 @@ def test_the_loop_that_open3d_left_open_is_closed(data_dir: Path, tmp_path: Path
             error = found @ se3.inverse(se3.inverse(origin) @ motion @ origin)
             assert np.rad2deg(np.linalg.norm(se3.so3_log(error[:3, :3]))) < 0.05
             assert np.linalg.norm((se3.inverse(found) @ se3.inverse(origin) @ motion @ origin)[:3, 3]) < 0.003
+
+
+def test_a_graph_is_sent_to_solve(tmp_path: Path) -> None:
+    (tmp_path / "graph.g2o").write_text(
+        "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\n"
+        "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 " + "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
+    )
+    depth = np.full((24, 32), 2.0, np.float32)
+    made = hodge_pipeline.frames_from_images([depth, depth], np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]))
+    recipe = load_recipe("slam-refine", [f"given.path={tmp_path / 'graph.g2o'}"])
+    with pytest.raises(SourceError, match="give it to hodge solve"):
+        hodge_pipeline.run(recipe, tmp_path / "run", source=Source("memory", Path("memory"), made))

@@ -177,6 +177,6 @@ def poses_at(trajectory: Trajectory, stamps_s: Floats, max_gap_s: float) -> Floa
 def _ranges(trajectory: Trajectory, frames: Sequence[Frame]) -> str:
     stamps = [frame.stamp_s for frame in frames]
     return (
-        f"{len(trajectory)} poses at {trajectory.stamps_s[0]:.6g} to {trajectory.stamps_s[-1]:.6g}, "
-        f"{len(frames)} frames at {min(stamps):.6g} to {max(stamps):.6g}"
+        f"{len(trajectory)} poses at {trajectory.stamps_s[0]:.10g} to {trajectory.stamps_s[-1]:.10g}, "
+        f"{len(frames)} frames at {min(stamps):.10g} to {max(stamps):.10g}"
     )
