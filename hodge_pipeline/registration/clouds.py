@@ -82,7 +82,10 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     points, colours = _voxel_means(samples.points_in_cam, samples.colours, options.voxel_m)
     landmarks = _landmarks(frame, options)
     cloud = PointCloud(points, _normals(points, options.normal_neighbours), colours, landmarks)
-    note = samples.note if len(points) else f"frame {frame.frame_id}: no valid measurement in range, its cloud is empty"
+    empty = f"frame {frame.frame_id}: no valid measurement in range, its cloud is empty"
+    if samples.note and not len(points):
+        empty += f": {samples.note}"
+    note = samples.note if len(points) else empty
     return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), note)
 
 
@@ -168,7 +171,18 @@ def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
         ranges = np.linalg.norm(points, axis=1)
     kept = (ranges >= options.min_range_m) & (ranges <= options.max_range_m)
     colours = cloud.colours[kept] if cloud.colours is not None and options.colours else None
-    return _Samples(points[kept], colours, len(points))
+    return _Samples(points[kept], colours, len(points), "" if kept.any() else _out_of_range(ranges, options))
+
+
+def _out_of_range(ranges: Floats32, options: CloudOptions) -> str:
+    """What to do about points none of which is in range: scanners store millimetres as often as metres."""
+    finite = ranges[np.isfinite(ranges)]
+    if not len(finite):
+        return ""
+    usual = float(np.median(finite))
+    limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
+    unit = " (millimetres? then source.reader.units_per_metre=1000)" if usual > options.max_range_m else ""
+    return f"its points lie {usual:.3g} m away, in range are {limits}{unit}"
 
 
 def _voxel_means(points: Floats32, colours: Bytes | None, voxel_m: float) -> tuple[Floats32, Bytes]:
