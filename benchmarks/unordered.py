@@ -1,8 +1,8 @@
 """Registration with no guess beside open3d's RANSAC over FPFH at its defaults, same clouds, same run.
 
-`python benchmarks/unordered.py FRAGMENTS GT_LOG`, such as 3DMatch's red kitchen with its `gt.log`. For each registrar: the
-listed pairs that its match puts within 0.3 m and 15°, those that GICP then brings within 6 cm and 2°, the pairs that are
-not listed and would be accepted, and the CPU seconds with the features.
+`python benchmarks/unordered.py FRAGMENTS GT_LOG`, such as 3DMatch's red kitchen with its `gt.log`. For each registrar:
+the listed pairs that its match puts within 0.3 m and 15°, those that GICP then brings within 6 cm and 2°, the pairs
+that are not listed and would be accepted, and the CPU seconds with the features.
 """
 
 from __future__ import annotations
