@@ -194,6 +194,10 @@ def test_seven_scenes_poses_become_a_folder(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.loadtxt(out / "frame-000004.pose.txt"), moved.world_from_cam[1], atol=1e-12)
     same = SevenScenesRewriter().copy(tmp_path, tmp_path / "seq") / "frame-000000.pose.txt"
     assert same.read_bytes() == (tmp_path / "seq" / "frame-000000.pose.txt").read_bytes()
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "seq").rename(tmp_path / "scene" / "seq-01")
+    of_scene = SevenScenesRewriter().rewrite(tmp_path, tmp_path / "scene", moved) / "seq-01" / "frame-000004.pose.txt"
+    np.testing.assert_allclose(np.loadtxt(of_scene), moved.world_from_cam[1], atol=1e-12)
 
 
 def test_every_rewriter_has_the_name_of_a_reader() -> None:

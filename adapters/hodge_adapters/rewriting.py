@@ -13,7 +13,7 @@ import numpy as np
 from hodge_adapters.euroc import NANO
 from hodge_adapters.euroc import file_of as euroc_file
 from hodge_adapters.open3d_json import Open3dReader, Open3dTrajectoryWriter
-from hodge_adapters.seven_scenes_files import FRAME_FILE
+from hodge_adapters.seven_scenes_files import FRAME_FILE, sequence_folders
 from hodge_adapters.text_rows import read_text, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -122,17 +122,17 @@ class SevenScenesRewriter:
             match = FRAME_FILE.match(file.name)
             pose = poses.at(float(match[1])) if match else None
             if pose is None:
-                shutil.copyfile(file, out / file.name)
+                shutil.copyfile(file, _beside(out, original, file))
             else:
                 rows = ("\t".join(f"{value:.17g}" for value in row) for row in pose)
-                write_text_atomically(out / file.name, "".join(f"{row}\n" for row in rows))
+                write_text_atomically(_beside(out, original, file), "".join(f"{row}\n" for row in rows))
         return out
 
     def copy(self, folder: Path, original: Path) -> Path:
         """See `PoseRewriter`."""
         out = _emptied(folder / "refined")
         for file in _pose_files(original):
-            shutil.copyfile(file, out / file.name)
+            shutil.copyfile(file, _beside(out, original, file))
         return out
 
 
@@ -177,8 +177,18 @@ def _copied(folder: Path, original: Path) -> Path:
 
 
 def _pose_files(original: Path) -> list[Path]:
-    names = (FRAME_FILE.match(path.name) for path in sorted(original.iterdir()))
-    return [original / match.string for match in names if match and match[2].lower() == "pose"]
+    """The pose files in the folder, or in its sequences' folders where it is a scene."""
+    folders = [original, *(folder for _, folder in sequence_folders(original))]
+    files = (path for folder in folders for path in sorted(folder.iterdir()))
+    named = ((path, FRAME_FILE.match(path.name)) for path in files)
+    return [path for path, match in named if match and match[2].lower() == "pose"]
+
+
+def _beside(out: Path, original: Path, file: Path) -> Path:
+    """Where the file lies in `out` as it does in the original folder; its folder is made."""
+    path = out / file.relative_to(original)
+    path.parent.mkdir(exist_ok=True)
+    return path
 
 
 def _emptied(folder: Path) -> Path:
