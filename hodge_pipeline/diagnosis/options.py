@@ -16,7 +16,7 @@ class DiagnosisOptions:
         description="alignments of the scene from perturbed weights; an edge's probability counts its share",
     )
     edges_budget: int = Field(
-        default=60_000, gt=0, description="runs × edges at most, so that large graphs take fewer runs (always one)"
+        default=20_000, gt=0, description="runs × edges at most, so that large graphs take fewer runs (always one)"
     )
     perturbation: float = Field(
         default=0.7,

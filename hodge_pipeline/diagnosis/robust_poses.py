@@ -11,7 +11,9 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.pieces import Alignment
 from hodge_pipeline.diagnosis.resistance import effective_resistance
-from hodge_pipeline.solvers.hodge import solve
+from hodge_pipeline.solvers.newton import Limits, descend
+from hodge_pipeline.solvers.objective import IsotropicObjective
+from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 FREEDOM = 4.0
@@ -54,17 +56,16 @@ def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, rounds: int)
 def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> Floats:
     chosen = graph.select(np.flatnonzero(used))
     large = graph.edge_count > LARGE
+    limits = Limits(3 if large else 20, 1e-3 if large else 1e-6)
+    setup = prepare(chosen, poses, dimension=3)
+    rotations, translations = setup.initial("given")
     weight = np.ones(chosen.edge_count)
     for _ in range(2 if large else 4):
-        poses = solve(
-            replace(chosen, information=weight[:, None, None] * chosen.information),
-            start=poses,
-            objective="isotropic",
-            initial="given",
-            dimension=3,
-            max_iterations=3 if large else 20,
-            relative_tolerance=1e-3 if large else 1e-6,
-        ).world_from_cam
+        share = weight[setup.weights.used]
+        problem = replace(setup.problem, kappa=share * setup.problem.kappa, tau=share * setup.problem.tau)
+        objective = IsotropicObjective(problem)
+        point = descend(objective, objective.at(rotations, translations), limits, setup.rounding).point
+        rotations, translations, poses = point.rotations, point.translations, setup.poses(point)
         angle, moved = left_over(chosen, poses)
         squares = (angle / evidence.noise.rotation_rad[used]) ** 2 + (moved / evidence.noise.translation_m[used]) ** 2
         weight = (FREEDOM + DIMENSION) / (FREEDOM + squares)
