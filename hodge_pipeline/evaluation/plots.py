@@ -27,6 +27,8 @@ STYLES: tuple[dict[str, Any], ...] = (
 MARKERS = "osD^vP"
 DOTS_PER_INCH = 150
 HISTOGRAM_BINS = 40
+WIDE = 5
+"""Values that differ by less than this factor are legible on a linear axis."""
 SMALLEST_RESIDUAL = 1e-3
 """Where a logarithmic histogram begins, in centimetres and degrees: nothing below it is of interest."""
 
@@ -137,7 +139,7 @@ def _score_histogram(figure: Figure, report: Report) -> None:
         axes.hist(scores, bins=bins, histtype="step", label=f"{name}{mean}", **_style(report, name))
     axes.set_xlabel(f"score, {len(graph.pairs)} {GRAPH_NAMES[graph.kind]}")
     axes.set_ylabel("pairs")
-    axes.legend(frameon=False, fontsize=9, loc="upper left")
+    axes.legend(frameon=False, fontsize=9, loc="best")
 
 
 def _residuals(figure: Figure, report: Report) -> None:
@@ -224,6 +226,6 @@ def _convergence(figure: Figure, report: Report) -> None:
 
 
 def _log_where_positive(axes: Any, values: list[float]) -> None:
-    if values and min(values) > 0:
+    if values and 0 < WIDE * min(values) < max(values):
         axes.set_yscale("log")
     axes.xaxis.get_major_locator().set_params(integer=True)
