@@ -79,7 +79,7 @@ class Recipe:
         le=20,
         description="rounds of new edges, registration and solve, each from the poses of the last",
     )
-    diagnosis: DiagnosisOptions = DiagnosisOptions(runs=8, every_pair_tried=False)
+    diagnosis: DiagnosisOptions = DiagnosisOptions()
     fusion: tuple[Fuser, ...] = Field(default=(), description="each makes one model from the final poses")
     evaluation: EvaluationOptions = EvaluationOptions()
     recording: RecordingOptions = RecordingOptions()

@@ -16,7 +16,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.edges import area_under_roc
 from hodge_pipeline.types import ViewGraph
 
-QUICK = DiagnosisOptions(runs=4, every_pair_tried=False)
+QUICK = DiagnosisOptions()
 
 
 @given(seed=st.integers(0, 1000))
@@ -62,7 +62,7 @@ def test_many_wrong_edges_are_told_apart_and_left_out_of_the_poses(share: float)
 def test_relabelling_and_turning_edges_round_changes_no_verdict() -> None:
     clean = measured(poses_on_a_ring(16), near_pairs(16, 4))
     graph, _ = spoiled(clean, np.array([5, 20, 33]))
-    options = DiagnosisOptions(runs=1, order_prior=False, every_pair_tried=False)
+    options = DiagnosisOptions(order_prior=False)
     first = diagnose(graph, options)
     rng = np.random.default_rng(0)
     names, order = rng.permutation(16), rng.permutation(graph.edge_count)

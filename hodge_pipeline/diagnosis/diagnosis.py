@@ -11,10 +11,10 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.diagnosis.consensus import find_consensus
 from hodge_pipeline.diagnosis.energy import energy_shares
-from hodge_pipeline.diagnosis.evidence import Evidence, seems_exhaustive
+from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.noise import Noise, edge_noise
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.order import order_prior
+from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
 from hodge_pipeline.diagnosis.robust_poses import left_over
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors, short_cycles
@@ -50,8 +50,9 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     angle, moved = cycle_errors(loops, motions)
     noise = edge_noise(graph, loops, angle, moved, prior, reach_m)
     cycles = judge_cycles(loops, angle, moved, noise, reach_m)
-    # where only near pairs were tried, the order cannot tell how many of them are wrong: the cycles can
-    prior = np.minimum(prior, usual_share(cycles))
+    if not every_pair_tried(graph.edges, graph.vertex_count):
+        # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
+        prior = np.minimum(prior, usual_share(cycles))
     evidence = Evidence(
         edges=graph.edges,
         vertex_count=graph.vertex_count,
@@ -61,7 +62,6 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
         support=closing_support(cycles, prior),
         alone=in_no_cycle(graph.edges, graph.vertex_count, cycles),
         reach_m=reach_m,
-        exhaustive=_every_pair_tried(graph, options),
     )
     consensus = find_consensus(evidence, _with_noise(graph, motions, noise), options)
     undecided = unattributable(graph.edges, graph.vertex_count, cycles)
@@ -70,14 +70,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     verdict = _verdicts(probability, untestable, consensus.fit.used, options)
     kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
     world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
-    return _report(
-        graph, cycles, probability, verdict, kept, undecided, world_from_cam, consensus.fit.resistance, consensus.runs
-    )
-
-
-def _every_pair_tried(graph: ViewGraph, options: DiagnosisOptions) -> bool:
-    told = options.every_pair_tried
-    return seems_exhaustive(graph.edges, graph.vertex_count) if told is None else told
+    return _report(graph, cycles, probability, verdict, kept, undecided, world_from_cam, consensus.fit.resistance)
 
 
 def _with_noise(graph: ViewGraph, motions: Floats, noise: Noise) -> ViewGraph:
@@ -102,7 +95,6 @@ def _report(
     undecided: Ints,
     world_from_cam: Floats,
     resistance: Floats,
-    runs: int,
 ) -> Diagnosis:
     piece = connected_components(graph.edges[kept], graph.vertex_count)
     same = piece[graph.edges[:, 0]] == piece[graph.edges[:, 1]]
@@ -112,7 +104,7 @@ def _report(
     share = 1 - 1 / (1 + resistance)
     energy, caveats = energy_shares(graph, world_from_cam, piece, kept)
     counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
-    tested = f"{len(cycles.loops)} cycles, {int(cycles.closes.sum())} of them close; {runs} alignments"
+    tested = f"{len(cycles.loops)} cycles, {int(cycles.closes.sum())} of them close"
     return Diagnosis(
         verdict=verdict,
         probability=probability,

@@ -18,8 +18,11 @@ FIRST_GATE_RAD = 0.35
 FIRST_GATE_SHARE = 0.6
 LONGEST_CYCLE = 4
 FEWEST_CYCLES = 20
-HEAVY_TAILS = 1.6
+HEAVY_TAILS = 1.9
 """Errors of registration have heavier tails than a Gaussian of the same median."""
+
+LEVER = 1.8
+"""Of the reach: how far around the working point lies what is seen, which an error of rotation moves along."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, pri
         (translation, moved, FIRST_GATE_SHARE * reach_m, DEFAULT_SHARE * reach_m),
     ):
         sizes.append(_scale(loops, relative, error, gate, prior, 1.0 if informed else fallback))
+    if not informed:
+        sizes[1] = max(sizes[1], LEVER * sizes[0] * reach_m)
     return Noise(sizes[0] * rotation, sizes[1] * translation)
 
 

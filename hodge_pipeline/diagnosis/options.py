@@ -10,34 +10,11 @@ from pydantic.dataclasses import dataclass
 class DiagnosisOptions:
     """How edges are weighed against each other."""
 
-    runs: int = Field(
-        default=8,
-        gt=0,
-        description="alignments of the scene from perturbed weights; an edge's probability counts its share",
-    )
-    edges_budget: int = Field(
-        default=20_000, gt=0, description="runs × edges at most, so that large graphs take fewer runs (always one)"
-    )
-    perturbation: float = Field(
-        default=0.7,
-        ge=0,
-        description="spread of the logarithm of the weights from run to run: wide enough to try other answers",
-    )
     cluster_gain: float = Field(
-        default=3.0,
+        default=2.0,
         ge=0,
         description="nats that agreeing edges between two pieces add per e-fold of their number: they are one event, "
         "since places that look alike give many wrong edges that agree",
-    )
-    overlap_penalties: tuple[float, ...] = Field(
-        default=(0.3, 1.0),
-        description="tried in turn: weight of 'these two views lie upon each other and no edge says so', used only "
-        "where every pair seems to have been tried",
-    )
-    every_pair_tried: bool | None = Field(
-        default=None,
-        description="whether every pair of views was tried, so that a missing edge speaks against an overlap; none: "
-        "where a tenth of all pairs has an edge. A run's recipe says false, since it tries a few pairs to a frame",
     )
     order_prior: bool = Field(
         default=True,
@@ -51,4 +28,4 @@ class DiagnosisOptions:
     wrong_below: float = Field(
         default=0.2, gt=0, lt=1, description="probability below which an edge is wrong, not suspect"
     )
-    seed: int = Field(default=0, ge=0, description="of the perturbations")
+    seed: int = Field(default=0, ge=0, description="of the order in which edges that weigh the same are tried")

@@ -1,7 +1,8 @@
 """What the order of the vertices says about an edge before any geometry: nothing, unless the graph shows that it does.
 
-Wrong edges join any two views; right ones join views that overlap, in a sequence mostly neighbours. So where near
-pairs are joined more often than far ones, the excess is the share of right edges among them.
+A wrong edge joins any two views; a right one joins views that overlap, in a sequence mostly neighbours, and takes the
+place of a wrong one. With f the share of all far pairs that are joined, a share r of near pairs holds q right edges and
+(1 - q) f wrong ones, so q = (r - f) / (1 - f), and an edge between them is right with the probability q / r.
 """
 
 from __future__ import annotations
@@ -10,13 +11,15 @@ import numpy as np
 
 from hodge_pipeline.types import Floats, Ints
 
-FLOOR, CEILING = 0.05, 0.95
+FLOOR, CEILING = 0.05, 0.98
 FAR_SHARE = 0.25
 """Pairs further apart than this share of the vertices tell how often any two views are joined."""
+TRIED_FROM = 0.1
+"""Share of the far pairs that are joined."""
 
 
 def order_prior(edges: Ints, vertex_count: int) -> Floats:
-    """The probability (E,) that an edge is right, from its gap |i − j| alone: 1 − far rate / rate at its gap.
+    """The probability (E,) that an edge is right, from its gap |i − j| alone.
 
     All are equal where near pairs are joined no more often than far ones. Vertex rows are the order.
     """
@@ -26,12 +29,22 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
     joined = np.bincount(np.maximum(place, 0), minlength=len(bounds) - 1)[: len(bounds) - 1]
     pairs = np.array([_pairs(low, high, vertex_count) for low, high in zip(bounds[:-1], bounds[1:], strict=True)])
     rate = np.minimum(joined / np.maximum(pairs, 1), 1.0)
-    start = max(int(np.ceil(FAR_SHARE * vertex_count)), 2)
-    far = (gap >= start).sum() / max(_pairs(start, vertex_count, vertex_count), 1)
+    far = _far_rate(gap, vertex_count)
     if rate[0] < 2 * far or not joined.any():
         return np.full(len(edges), 0.5)
-    share = np.clip(1 - far / np.maximum(rate, 1e-12), FLOOR, CEILING)
+    right = np.maximum(rate - far, 0) / (1 - far)
+    share = np.clip(right / np.maximum(rate, 1e-12), FLOOR, CEILING)
     return np.asarray(share[np.maximum(place, 0)])
+
+
+def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
+    """Whether far pairs are joined so often that registration seems to have been tried on all pairs."""
+    return _far_rate(np.abs(edges[:, 1] - edges[:, 0]), vertex_count) >= TRIED_FROM
+
+
+def _far_rate(gap: Ints, vertex_count: int) -> float:
+    start = max(int(np.ceil(FAR_SHARE * vertex_count)), 2)
+    return float((gap >= start).sum() / max(_pairs(start, vertex_count, vertex_count), 1))
 
 
 def _bounds(vertex_count: int) -> list[int]:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.overlap import overlap_costs
 from hodge_pipeline.diagnosis.votes import Votes, agreed_motions, collect_votes
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -29,9 +28,7 @@ class Alignment:
     piece_from: Floats
 
 
-def align(
-    evidence: Evidence, weight: Floats, cluster_gain: float, overlap_penalty: float, rng: np.random.Generator
-) -> Alignment:
+def align(evidence: Evidence, weight: Floats, cluster_gain: float, rng: np.random.Generator) -> Alignment:
     """The alignment that these edge weights (E,) lead to."""
     count = evidence.vertex_count
     piece, piece_from = np.arange(count), np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
@@ -39,8 +36,6 @@ def align(
     weight = weight * (1 + TIE_BREAK * rng.random(len(weight)))
     while (votes := collect_votes(evidence, piece, piece_from, weight)) is not None:
         gain = _gains(evidence, votes, weight, cluster_gain)
-        if evidence.exhaustive and overlap_penalty > 0:
-            gain = gain - overlap_penalty * overlap_costs(evidence, votes, piece, piece_from, gain)
         joined = _joins(votes, gain, count)
         if not len(joined):
             break

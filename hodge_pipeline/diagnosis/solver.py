@@ -20,6 +20,8 @@ from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
 MEDIAN_CHI2 = {2: 2.366, 3: 5.348}
 """Of χ² with 3 and 6 degrees of freedom."""
+TAILS = 1.6
+"""Where rotation or translation alone makes most of χ², its tail is as long as that of half the degrees of freedom."""
 LEAST_WEIGHT = 0.1
 ROUNDS = 3
 
@@ -39,7 +41,7 @@ class DiagnosedSolver:
     """Edges that the diagnosis calls wrong or suspect are left out, the others weigh their probability; GNC solves."""
 
     diagnosis: DiagnosisOptions = Field(
-        default=DiagnosisOptions(runs=8, every_pair_tried=False),
+        default=DiagnosisOptions(),
         description="what judges the edges, as in a recipe's section `diagnosis`",
     )
     objective: ObjectiveName = Field(default="full", description="what the edges that are kept are solved with")
@@ -74,7 +76,7 @@ def _attempt(
     usual = _chi2(graph, found.world_from_cam, found.piece)
     known = usual[rows][np.isfinite(usual[rows])]
     scale = max(float(np.median(known)) / MEDIAN_CHI2[size], 1e-12) if len(known) else 1.0
-    limit = (CHI2_99_PLANAR if size == 2 else CHI2_99_SPATIAL) * scale
+    limit = TAILS * (CHI2_99_PLANAR if size == 2 else CHI2_99_SPATIAL) * scale
     solution = solve_robust(chosen, start=start, threshold=limit, objective=objective)
     chi2 = _chi2(graph, solution.world_from_cam, solution.component)
     return _Attempt(rows, solution, chi2, limit)

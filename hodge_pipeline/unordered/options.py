@@ -69,7 +69,7 @@ class GlobalStart:
     )
     limits: HypothesisLimits = HypothesisLimits()
     diagnosis: DiagnosisOptions = Field(
-        default=DiagnosisOptions(order_prior=False, every_pair_tried=False),
+        default=DiagnosisOptions(order_prior=False),
         description="who judges the edges together; the order of the frames is no evidence here",
     )
     words: int = Field(default=32, ge=1, description="words of the global descriptors' vocabulary")
