@@ -54,13 +54,15 @@ def guess_reader(path: Path, known: Sequence[Guess] | None = None) -> FrameReade
     return reader
 
 
-def inspect(path: Path) -> dict[str, Any]:
+def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     """Facts of a path as plain data: guesses, frames, stamps, cameras, depth, poses, graph, notes, oddities.
+
+    The surest reader opens it where none is given.
 
     Images are not read but for the depth of a few frames. What has no value (a range of nothing) is left out.
     """
     known = guesses(path) if path.is_file() or path.is_dir() else []
-    source = guess_reader(path, known).open(path)
+    source = (reader or guess_reader(path, known)).open(path)
     oddities: list[str] = []
     facts: dict[str, Any] = {
         "path": str(path),

@@ -87,6 +87,19 @@ def test_inspect_says_what_a_folder_is(tiny_sequence: Path) -> None:  # noqa: F8
     assert "160x120" in text
 
 
+def test_inspect_and_convert_take_a_reader_and_its_options(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    facts = json.loads(hodge("inspect", tiny_sequence, "--reader", "tum", "--set", "every=4", "--json").stdout)
+    assert facts["frames"] == 6
+    wrong = hodge("inspect", tiny_sequence, "--set", "evry=4")
+    assert wrong.returncode == 1 and "unknown option (did you mean 'every'?)" in wrong.stderr
+    assert (
+        "no stage 'tmu' of kind 'readers' (did you mean 'tum'?)"
+        in hodge("inspect", tiny_sequence, "--reader", "tmu").stderr
+    )
+    made = hodge("convert", tiny_sequence, tmp_path / "out.tum", "--set", "truth=")
+    assert made.returncode == 1 and "no trajectory" in made.stderr
+
+
 def test_a_full_disk_is_one_line_and_keeps_what_was_finished(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
     command = [sys.executable, "-m", "hodge_pipeline.cli.main", "run", "tum", "--source", str(tiny_sequence)]
     command += ["--out", str(tmp_path / "run"), *LIGHT, "--quiet"]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from hodge_pipeline import registry
+from hodge_pipeline.cli.reader_choice import choose_reader
 from hodge_pipeline.errors import RecipeError, SourceError
-from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.stages import Writer
 from hodge_pipeline.types import Source, Trajectory
 
@@ -27,12 +28,14 @@ BY_SUFFIX = {
 """Writers by the ending of the output; no ending is a folder."""
 
 
-def convert(source: Path, out: Path, *, to: str | None = None) -> None:
-    """Read a path with the surest reader and write it to another, in the format of its name or of `to`.
+def convert(
+    source: Path, out: Path, *, to: str | None = None, reader: str | None = None, settings: Sequence[str] = ()
+) -> None:
+    """Read a path with the surest reader, or the one named, and write it, in the format of its name or of `to`.
 
     Prints what was written and every note of the reader. Raises `RecipeError` where no writer is meant by the name.
     """
-    opened = with_trajectory(guess_reader(source).open(source))
+    opened = with_trajectory(choose_reader(source, reader, settings).open(source))
     name = to or writer_name(out, opened)
     writer: Writer = registry.load("writers", name)()
     writer.write(out, opened)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ from hodge_pipeline import registry
 from hodge_pipeline.errors import HodgeError, RecipeError
 
 
-def inspect(path: Path, *, as_json: bool) -> None:
-    """Print what a path is."""
+def inspect(path: Path, *, reader: str | None, settings: Sequence[str], as_json: bool) -> None:
+    """Print what a path is, opened by the surest reader or the one that is named."""
+    from hodge_pipeline.cli.reader_choice import choose_reader
     from hodge_pipeline.inspection import inspect as facts_of
 
-    facts = facts_of(path)
+    facts = facts_of(path, choose_reader(path, reader, settings) if reader or settings else None)
     if as_json:
         from hodge_pipeline.artifacts import json_text
 

@@ -40,6 +40,11 @@ Overrides = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
     typer.Option("--set", metavar="KEY=VALUE", help="Change an option, such as edges.max_edges_per_frame=6."),
 ]
+Reader = Annotated[Optional[str], typer.Option(help="The reader by name; none: the surest of the path.")]  # noqa: UP045
+ReaderSet = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--set", metavar="OPTION=VALUE", help="An option of the reader, such as tracks=false."),
+]
 Out = Annotated[Path, typer.Option("--out", help="The run folder; the same command goes on where it stopped.")]
 Overwrite = Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
@@ -154,11 +159,11 @@ def edit(
 
 
 @app.command()
-def inspect(source: Path, json: Json = False) -> None:
+def inspect(source: Path, reader: Reader = None, overrides: ReaderSet = None, json: Json = False) -> None:
     """Say what a path is: format, frames, stamps, depth range, intrinsics, oddities."""
     from hodge_pipeline.cli import listing
 
-    listing.inspect(source, as_json=json)
+    listing.inspect(source, reader=reader, settings=overrides or [], as_json=json)
 
 
 @app.command()
@@ -166,11 +171,13 @@ def convert(
     source: Path,
     out: Annotated[Path, typer.Argument(help="Its name means the format: .tum .kitti .csv .g2o .json .ply, a folder.")],
     to: Annotated[Optional[str], typer.Option("--to", help="The writer by name (see `hodge stages writers`).")] = None,  # noqa: UP045
+    reader: Reader = None,
+    overrides: ReaderSet = None,
 ) -> None:
     """Write what a path holds in another format."""
     from hodge_pipeline.cli import converting
 
-    converting.convert(source, out, to=to)
+    converting.convert(source, out, to=to, reader=reader, settings=overrides or [])
 
 
 @app.command()
