@@ -19,6 +19,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import demo_source
 from hodge_pipeline.diagnose_path import diagnose_subject, open_subject, write_diagnosed
 from hodge_pipeline.diagnosis.plots import draw
+from hodge_pipeline.diagnosis.result import WRONG
 from hodge_pipeline.edge_pictures import edge_pictures
 from hodge_pipeline.edits import Edit, History, write_history
 from hodge_pipeline.evaluation import splat
@@ -92,7 +93,9 @@ def main(folder: Path) -> None:
     (PICTURES / "which-edge-matrix.png").write_bytes(matrix.png)
     (PICTURES / "which-edge-above.png").write_bytes(above.png)
 
-    write_history(run, History((Edit(disable=tuple(f"{i}-{j}" for i, j in MISTAKEN)),)))
+    names, graph = found.subject.graph.vertex_ids, found.subject.graph
+    wrong = [names[graph.edges[row]] for row in found.rows if found.diagnosis.verdict[row] == WRONG]
+    write_history(run, History((Edit(disable=tuple(f"{i}-{j}" for i, j in wrong)),)))
     single = solve_again(run).result.world_from_cam
     stand = from_above(PICTURES / "which-edge-single.jpg", run, single, None)
     from_above(PICTURES / "which-edge-doubled.jpg", run, doubled, stand)
