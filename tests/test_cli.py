@@ -96,7 +96,7 @@ def test_inspect_and_convert_take_a_reader_and_its_options(tiny_sequence: Path, 
         "no stage 'tmu' of kind 'readers' (did you mean 'tum'?)"
         in hodge("inspect", tiny_sequence, "--reader", "tmu").stderr
     )
-    made = hodge("convert", tiny_sequence, tmp_path / "out.tum", "--set", "truth=")
+    made = hodge("convert", tiny_sequence, tmp_path / "out.tum", "--set", 'truth=""')
     assert made.returncode == 1 and "no trajectory" in made.stderr
 
 
