@@ -160,12 +160,13 @@ def test_pieces_are_drawn_beside_each_other() -> None:
 
 
 def test_shares_of_a_piece_add_up_and_pieces_to_the_whole() -> None:
-    graph, _ = ring()
+    graph, _ = ring(reach=3)
     spoil(graph, 3)
     graph = ViewGraph.from_edges(
         np.arange(18),
         np.concatenate([graph.edges, ring(6)[0].edges + 12]),
         np.concatenate([graph.i_from_j, ring(6)[0].i_from_j]),
+        np.concatenate([graph.information, ring(6)[0].information]),
     )
     rows, complaints = energy_rows(graph, diagnose(graph))
     assert complaints == ()
