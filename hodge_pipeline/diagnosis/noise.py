@@ -52,8 +52,9 @@ def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
     same = graph.edge_count < 2 or bool((graph.information == graph.information[:1]).all())
     if same and (not graph.edge_count or np.array_equal(graph.information[0], np.eye(6))):
         return np.ones(graph.edge_count), np.ones(graph.edge_count), False
-    weights = edge_weights(graph, 3)
-    return _deviation(2 * weights.kappa), _deviation(weights.tau), True
+    flat = graph.dimension == 2
+    weights = edge_weights(graph, 2 if flat else 3)
+    return _deviation(weights.kappa if flat else 2 * weights.kappa), _deviation(weights.tau), True
 
 
 def _deviation(precision: Floats) -> Floats:
