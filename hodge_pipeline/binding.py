@@ -126,12 +126,19 @@ KIND = "x-stage-kind"
 
 
 class _StageSchema(GenerateJsonSchema):
-    """JSON schema in which a field typed by a stage Protocol is marked with that kind."""
+    """JSON schema in which a field typed by a stage Protocol is marked with that kind, and a stage may say its name."""
 
     def is_instance_schema(self, schema: Any) -> JsonSchemaValue:
         """A mark in place of the kind; `_linked` makes a reference of it once pydantic has checked its own."""
         kind = registry.kind_of(schema["cls"])
         return {KIND: kind.name} if kind else super().is_instance_schema(schema)
+
+    def dataclass_schema(self, schema: Any) -> JsonSchemaValue:
+        """An option that takes one stage alone: `stage: name` may stand among its options, as `bind` reads it."""
+        found, name = super().dataclass_schema(schema), registry.name_of_class(schema["cls"])
+        if ":" not in name:
+            found["properties"] = {"stage": {"const": name}, **found.get("properties", {})}
+        return found
 
 
 def json_schema(cls: type) -> dict[str, Any]:
@@ -152,7 +159,7 @@ def json_schema(cls: type) -> dict[str, Any]:
 def _stage_schema(kind: str, name: str, definitions: dict[str, Any]) -> dict[str, Any]:
     stage = TypeAdapter(registry.load(kind, name)).json_schema(schema_generator=_StageSchema)
     definitions.update(stage.pop("$defs", {}))
-    stage["properties"] = {"stage": {"const": name}, **stage.get("properties", {})}
+    stage["properties"] = {**stage.get("properties", {}), "stage": {"const": name}}
     stage["required"] = ["stage", *stage.get("required", [])]
     return {"anyOf": [{"const": name}, stage]}
 

@@ -8,6 +8,8 @@ from hodge_pipeline import binding, registry
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.recipe import Recipe, load_recipe
 from hodge_pipeline.recipe_file import recipe_names
+from hodge_pipeline.refine.model_options import RECIPE as MODEL_RECIPE
+from hodge_pipeline.refine.model_options import ModelRefinement, load_model_refinement
 from hodge_pipeline.yaml_file import dump, parse
 
 SMALL = """
@@ -18,6 +20,11 @@ executor: local
 """
 
 
+def load_any(name: str) -> Recipe | ModelRefinement:
+    """The recipe of a run, or of the refinement of a model."""
+    return load_model_refinement(name) if name == MODEL_RECIPE else load_recipe(name)
+
+
 def load(tmp_path: Path, text: str) -> Recipe:
     path = tmp_path / "r.yaml"
     path.write_text(text)
@@ -26,9 +33,9 @@ def load(tmp_path: Path, text: str) -> Recipe:
 
 @pytest.mark.parametrize("name", recipe_names())
 def test_every_recipe_of_the_package_loads_and_round_trips(name: str) -> None:
-    recipe = load_recipe(name)
+    recipe = load_any(name)
     text = dump(binding.unbind(recipe))
-    again = binding.bind(Recipe, parse(text, "again").data, lambda keys: "again")
+    again = binding.bind(type(recipe), parse(text, "again").data, lambda keys: "again")
     assert again == recipe
     assert recipe.description
 
@@ -93,9 +100,10 @@ def test_the_schema_offers_every_stage_and_refuses_unknown_keys() -> None:
 
 def test_the_schema_agrees_with_the_recipes() -> None:
     jsonschema = pytest.importorskip("jsonschema")
-    schema = binding.json_schema(Recipe)
+    schemas = {cls: binding.json_schema(cls) for cls in (Recipe, ModelRefinement)}
     for name in recipe_names():
-        jsonschema.validate(binding.unbind(load_recipe(name)), schema)
+        recipe = load_any(name)
+        jsonschema.validate(binding.unbind(recipe), schemas[type(recipe)])
 
 
 @pytest.mark.parametrize("kind", registry.KINDS)

@@ -66,7 +66,7 @@ def test_a_recording_gives_the_poses_of_its_folder(tiny_sequence: Path, tmp_path
     log = write_rgbd(tmp_path / "log.mcap", frames, COMPRESSED, compressed_depth, CDR)
     runs = []
     for name, source, reader in (
-        ("tum", tiny_sequence, "source.reader.every=2"),
+        ("seven_scenes", tiny_sequence, "source.reader={stage: tum, every: 2}"),  # the stages that mcap has
         ("mcap", log, "source.reader.depth_scale=5000"),
     ):
         recipe = load_recipe(name, [*LIGHT, "fusion=[{stage: tsdf, voxel_m: 0.1, min_weight: 1}]", reader], source)

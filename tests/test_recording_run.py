@@ -82,6 +82,7 @@ def stopped(run: Run, out: Path, signal_name: str) -> subprocess.CompletedProces
     """A run from the command line that gets a signal after its first solve."""
     script = textwrap.dedent(f"""
         import os, signal, sys
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background of a script ignores it
         from hodge_pipeline import steps
         from hodge_pipeline.cli.main import main
         solve = steps.solve

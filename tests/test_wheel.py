@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import sysconfig
 import venv
 import zipfile
 from pathlib import Path
@@ -31,8 +30,9 @@ def hodge(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps", str(wheel)]
     subprocess.run(install, check=True, capture_output=True)
     (site,) = home.glob("lib/python*/site-packages")
-    # as a plain path its own .pth files are not read, so the checkout's editable install stays out
-    (site / "libraries.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
+    # as plain paths their own .pth files are not read, so the checkout's editable install stays out
+    libraries = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
+    (site / "libraries.pth").write_text("".join(f"{path}\n" for path in libraries))
     where = subprocess.run(
         [python, "-c", "import hodge_pipeline as p, hodge_adapters as a; print(p.__file__, a.__file__)"],
         check=True, capture_output=True, text=True, cwd=home,

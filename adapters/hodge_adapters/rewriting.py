@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
 
 from hodge_adapters.euroc import NANO
 from hodge_adapters.euroc import file_of as euroc_file
@@ -20,9 +22,10 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Trajectory
 
 _FIELD = re.compile(r"[^\s,]+")
+NO_OPTIONS = ConfigDict(extra="forbid")
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class _Poses:
     """The refined poses by their exact stamps."""
 
@@ -34,6 +37,7 @@ class _Poses:
         return self.trajectory.world_from_cam[row] if found else None
 
 
+@dataclass(frozen=True, config=NO_OPTIONS)
 class TumRewriter:
     """Lines of `stamp tx ty tz qx qy qz qw`."""
 
@@ -53,6 +57,7 @@ class TumRewriter:
         return _copied(folder, original)
 
 
+@dataclass(frozen=True, config=NO_OPTIONS)
 class KittiRewriter:
     """Lines of twelve numbers, which are the poses in their order."""
 
@@ -70,6 +75,7 @@ class KittiRewriter:
         return _copied(folder, original)
 
 
+@dataclass(frozen=True, config=NO_OPTIONS)
 class EurocRewriter:
     """Lines of `nanoseconds,x,y,z,qw,qx,qy,qz,…`: further columns (velocities, biases) stay as they are."""
 
@@ -89,6 +95,7 @@ class EurocRewriter:
         return _copied(folder, euroc_file(original))
 
 
+@dataclass(frozen=True, config=NO_OPTIONS)
 class LogRewriter:
     """Blocks of `i j n` and four rows of a matrix."""
 
@@ -112,6 +119,7 @@ class LogRewriter:
         return _copied(folder, original)
 
 
+@dataclass(frozen=True, config=NO_OPTIONS)
 class SevenScenesRewriter:
     """A folder of `frame-000000.pose.txt`: a folder `refined` with the same files."""
 
@@ -136,17 +144,18 @@ class SevenScenesRewriter:
         return out
 
 
+@dataclass(frozen=True, config=NO_OPTIONS)
 class Open3dRewriter:
     """Open3D's camera trajectory in JSON, with its cameras."""
 
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
         """See `PoseRewriter`."""
         source, poses = Open3dReader().open(original), _Poses(trajectory)
-        frames = tuple(replace(frame, world_from_cam=poses.at(frame.stamp_s)) for frame in source.frames)
+        frames = tuple(dataclasses.replace(frame, world_from_cam=poses.at(frame.stamp_s)) for frame in source.frames)
         if not frames:
             raise SourceError(f"{original}: a pose graph holds no trajectory of frames: give it to hodge solve")
         out = folder / f"refined{original.suffix}"
-        Open3dTrajectoryWriter().write(out, replace(source, frames=frames, trajectory=trajectory))
+        Open3dTrajectoryWriter().write(out, dataclasses.replace(source, frames=frames, trajectory=trajectory))
         return out
 
     def copy(self, folder: Path, original: Path) -> Path:
