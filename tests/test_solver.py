@@ -10,6 +10,7 @@ from hodge_adapters.g2o import information_for_file, load_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers import minimise
 from hodge_pipeline.solvers.certificate import certificate_matrix, certify
 from hodge_pipeline.solvers.full import full_residuals
 from hodge_pipeline.solvers.hodge import HodgeSolver, solve
@@ -243,6 +244,49 @@ def test_repeated_edges_count_each_time():
     double = dataclasses.replace(graph, information=2 * graph.information)
     one, two = solve(twice), solve(double)
     assert one.metrics["objective"] == pytest.approx(two.metrics["objective"], rel=1e-9)
+
+
+@pytest.mark.parametrize("objective", ["isotropic", "full"])
+@pytest.mark.parametrize("length", [2e7, 1e9, 1e12])
+def test_an_edge_longer_than_the_earth_gives_a_result_and_a_warning(objective, length):
+    graph, truth = ladder(0.0)
+    assert not any("longer than the earth" in note for note in solve(graph, objective=objective).notes)
+    motion = graph.i_from_j.copy()
+    motion[3, :3, 3] += [length, 0, 0]
+    solution = solve(dataclasses.replace(graph, i_from_j=motion), objective=objective)
+    i, j = graph.vertex_ids[graph.edges[3]]
+    assert any(
+        note.startswith("1 edges are longer than the earth") and f"({i}, {j})" in note for note in solution.notes
+    )
+    assert np.isfinite(solution.world_from_cam).all()
+    left = motion - se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
+    assert solution.metrics["objective"] < (left[3, :3, 3] @ left[3, :3, 3]) * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("objective", ["isotropic", "full"])
+def test_two_halves_farther_apart_than_the_earth_is_wide(objective):
+    graph, truth = ladder(0.0)
+    far = truth.copy()
+    far[6:, 0, 3] += 2e7
+    apart = dataclasses.replace(graph, i_from_j=se3.inverse(far[graph.edges[:, 0]]) @ far[graph.edges[:, 1]])
+    np.testing.assert_allclose(solve(apart, objective=objective).world_from_cam, far, rtol=1e-9, atol=1e-6)
+
+
+def test_direct_steps_take_over_where_cg_takes_long(monkeypatch):
+    graph, _ = ladder(0.3, rungs=40)
+    best = solve(graph, objective="isotropic")
+    assert minimise.steps_are_direct(prepare(graph).problem)
+    made, joint_of = [], minimise.JointObjective.of
+    monkeypatch.setattr(minimise.JointObjective, "of", lambda problem: made.append(1) or joint_of(problem))
+    monkeypatch.setattr(minimise, "CG_STEPS_BEFORE_DIRECT", 1)
+    taken_over = solve(graph, objective="isotropic", keep_history=True)
+    assert taken_over.metrics["objective"] == pytest.approx(best.metrics["objective"], rel=1e-8)
+    assert taken_over.metrics["iterations"] == len(taken_over.history)
+    assert all(later.objective <= one.objective for one, later in itertools.pairwise(taken_over.history))
+    monkeypatch.setattr(minimise, "CG_FIRST_TO", 0)
+    at_once = solve(graph, objective="isotropic")
+    assert len(made) == 2
+    assert at_once.metrics["objective"] == pytest.approx(best.metrics["objective"], rel=1e-8)
 
 
 def test_many_parallel_edges_join_their_vertices():

@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order
 
 from hodge_pipeline.solvers.full import FullObjective
-from hodge_pipeline.solvers.minimise import full_objective, isotropic_objective
+from hodge_pipeline.solvers.minimise import descend_isotropic, full_objective
 from hodge_pipeline.solvers.newton import Limits, descend
 from hodge_pipeline.solvers.problem import Problem, make_problem
 from hodge_pipeline.solvers.setup import Setup
@@ -42,10 +42,12 @@ def settled_nearby(setup: Setup, changed: Ints, limits: Limits, full: bool) -> S
     )
     rotations, translations = setup.initial("given")
     places = vertices[local.order]
-    objective = (
-        FullObjective.of(local, full_objective(setup).information[edges]) if full else isotropic_objective(local)
-    )
-    end = descend(objective, objective.at(rotations[places], translations[places]), limits, setup.rounding).point
+    begin = rotations[places], translations[places]
+    if full:
+        objective = FullObjective.of(local, full_objective(setup).information[edges])
+        end = descend(objective, objective.at(*begin), limits, setup.rounding).point
+    else:
+        end = descend_isotropic(local, begin, limits, setup.rounding).point
     rotations[places], translations[places] = end.rotations, end.translations
     return _with_start(setup, rotations, translations)
 

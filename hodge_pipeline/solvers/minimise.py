@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
@@ -9,12 +10,16 @@ from typing import TypeAlias
 from hodge_pipeline.solvers.direct import steps_worth_a_factor
 from hodge_pipeline.solvers.full import FEWEST_CG_STEPS, FullObjective
 from hodge_pipeline.solvers.joint import JointObjective
-from hodge_pipeline.solvers.newton import Descent, Limits, Objective, Point, descend
+from hodge_pipeline.solvers.newton import CG_LIMIT_REACHED, Descent, Limits, Point, descend
 from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.setup import InitialName, Setup
 
 Watch: TypeAlias = Callable[[Point], None]
+CG_FIRST_TO = 15_000
+"""Poses: on longer chains CG takes too many steps to be worth a try."""
+CG_STEPS_BEFORE_DIRECT = 200
+"""In all: with these CG has cost about as much as a descent with factorisations."""
 WARM_START_TOLERANCE = 1e-5
 """The isotropic optimum starts the full objective: nearer than this they differ anyway."""
 
@@ -24,34 +29,55 @@ def minimise(
 ) -> Descent:
     """The descent of the isotropic objective and, where `full`, of the full one from its end.
 
-    `known`: the initial poses are near the full minimum already, so that it begins there; it does so too where its
-    steps cost no more than isotropic ones.
+    `known`: the initial poses are near the full minimum already, so that it begins there; it does so too where CG is
+    not tried for the isotropic one.
     """
     begin = setup.initial(initial)
-    if full and (known or steps_are_direct(setup.problem)):
+    if full and (known or direct_at_once(setup.problem)):
         objective = full_objective(setup)
         return descend(objective, objective.at(*begin), limits, setup.rounding, watch)
-    isotropic = isotropic_objective(setup.problem)
     loose = replace(limits, relative_tolerance=max(limits.relative_tolerance, WARM_START_TOLERANCE))
-    warm = descend(isotropic, isotropic.at(*begin), loose if full else limits, setup.rounding, watch)
+    warm = descend_isotropic(setup.problem, begin, loose if full else limits, setup.rounding, watch)
     if not full:
         return warm
     point, steps, cg_steps = (warm.point.rotations, warm.point.translations), len(warm.costs) - 1, warm.cg_steps
-    del isotropic, warm, begin  # a large graph's memory is better spent on what follows
+    del warm, begin  # a large graph's memory is better spent on what follows
     objective = full_objective(setup)
     descent = descend(objective, objective.at(*point), limits.after(steps), setup.rounding, watch)
     return replace(descent, cg_steps=descent.cg_steps + cg_steps)
 
 
-def isotropic_objective(problem: Problem) -> Objective:
-    """F, in the form whose steps are the cheaper ones on this graph."""
-    return JointObjective.of(problem) if steps_are_direct(problem) else IsotropicObjective(problem)
+def descend_isotropic(
+    problem: Problem, begin: tuple[Floats, Floats], limits: Limits, floor: float, watch: Watch | None = None
+) -> Descent:
+    """The descent of F from these rotations and translations, by the steps that are cheaper on this graph.
+
+    Where a factorisation of all unknowns is cheap, it takes over from CG once that has cost as much.
+    """
+    if direct_at_once(problem):
+        joint = JointObjective.of(problem)
+        return descend(joint, joint.at(*begin), limits, floor, watch)
+    direct = steps_are_direct(problem)
+    reduced = IsotropicObjective(problem, CG_STEPS_BEFORE_DIRECT) if direct else IsotropicObjective(problem)
+    most = CG_STEPS_BEFORE_DIRECT if direct else math.inf
+    first = descend(reduced, reduced.at(*begin), limits, floor, watch, most)
+    if first.reason != CG_LIMIT_REACHED:
+        return first
+    joint = JointObjective.of(problem)
+    point = joint.at(first.point.rotations, first.point.translations)
+    then = descend(joint, point, limits.after(len(first.costs) - 1), floor, watch)
+    return replace(then, costs=first.costs + then.costs[1:], cg_steps=first.cg_steps + then.cg_steps)
 
 
 def steps_are_direct(problem: Problem) -> bool:
-    """Whether a factorisation of all unknowns is so cheap that CG is not tried."""
+    """Whether a factorisation of all unknowns costs no more than a few CG steps."""
     size = problem.tangent_size + problem.dimension
     return steps_worth_a_factor(problem.structure.elimination, size) <= FEWEST_CG_STEPS
+
+
+def direct_at_once(problem: Problem) -> bool:
+    """Whether such a factorisation is made without a try of CG."""
+    return problem.free_count > CG_FIRST_TO and steps_are_direct(problem)
 
 
 def full_objective(setup: Setup) -> FullObjective:

@@ -12,6 +12,7 @@ from hodge_pipeline.types import Floats
 
 SUFFICIENT_DECREASE = 1e-4
 MAX_HALVINGS = 40
+CG_LIMIT_REACHED = "limit of CG steps reached"
 CG_SHARE = 0.1
 """Of what further steps may still win: where so little is left in a linear system, it is solved."""
 LOOSEST_TOLERANCE, TIGHTEST_TOLERANCE = 0.3, 1e-3
@@ -77,9 +78,17 @@ class Descent:
 
 
 def descend(
-    objective: Objective, point: Point, limits: Limits, floor: float, watch: Callable[[Point], None] | None = None
+    objective: Objective,
+    point: Point,
+    limits: Limits,
+    floor: float,
+    watch: Callable[[Point], None] | None = None,
+    most_cg_steps: float = math.inf,
 ) -> Descent:
-    """The descent from a point. A cost or decrease below `floor` is rounding: there is nothing left to win."""
+    """The descent from a point. A cost or decrease below `floor` is rounding: there is nothing left to win.
+
+    It ends, not converged, once it has taken more than `most_cg_steps`.
+    """
     costs, cg_steps, tolerance, before = [point.cost], 0, LOOSEST_TOLERANCE, math.inf
     for _ in range(limits.max_iterations):
         if point.cost <= floor:
@@ -99,6 +108,8 @@ def descend(
             return Descent(point, tuple(costs), cg_steps, True, "converged")
         if time.monotonic() > limits.deadline_s:
             return Descent(point, tuple(costs), cg_steps, False, "time limit reached")
+        if cg_steps > most_cg_steps:
+            return Descent(point, tuple(costs), cg_steps, False, CG_LIMIT_REACHED)
         before = decrease
         tolerance = min(LOOSEST_TOLERANCE, max(TIGHTEST_TOLERANCE, math.sqrt(max(decrease, 0.0) / costs[-2])))
     return Descent(point, tuple(costs), cg_steps, False, "iteration limit reached")

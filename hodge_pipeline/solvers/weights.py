@@ -15,6 +15,8 @@ OUT_OF_PLANE = np.array([0, 1, 5])
 PLANAR_TOLERANCE = 1e-12
 INDEFINITE_TOLERANCE = 1e-9
 """Of the largest eigenvalue: a more negative one is not rounding."""
+EARTH_M = 1.2742e7
+"""The earth's diameter: a longer edge is a unit or a measurement gone wrong."""
 FLOOR = 1e-9
 """Of the median weight: what an edge that says nothing on rotation, or on translation, gets in its place."""
 
@@ -72,6 +74,12 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
         notes.append(f"{int(loops.sum())} edges join a vertex to itself: ignored")
     if (silent := int((~used & ~loops).sum())) > 0:
         notes.append(f"{silent} edges have no information: ignored")
+    lengths = np.where(used, np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1), 0.0)
+    if (far := int((lengths > EARTH_M).sum())) > 0:
+        i, j = graph.vertex_ids[graph.edges[np.argmax(lengths)]]
+        notes.append(
+            f"{far} edges are longer than the earth, ({i}, {j}) {lengths.max():.2g} m: check them and the unit"
+        )
     indefinite = _indefinite(information) & used
     if indefinite.any():
         notes.append(f"{int(indefinite.sum())} of {graph.edge_count} information matrices are indefinite")
