@@ -14,6 +14,7 @@ from hodge_pipeline.solvers.newton import CG_LIMIT_REACHED, Descent, Limits, Poi
 from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.setup import InitialName, Setup
+from hodge_pipeline.types import Floats
 
 Watch: TypeAlias = Callable[[Point], None]
 CG_FIRST_TO = 15_000
