@@ -13,7 +13,7 @@ from hodge_pipeline.complex.decomposition import hodge_decomposition
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
-MOST_TRIANGLES = 200_000
+MOST_TRIANGLES, MOST_EDGES = 200_000, 50_000
 CAVEATS = (
     "energy shares are of ω = log(T_i Z_ij T_j⁻¹) at the robust poses, unit weights, world origin at the centroid of "
     "each piece; where residual motions are large ω is only their linearisation, and wrong edges dominate it",
@@ -24,6 +24,8 @@ def energy_shares(
     graph: ViewGraph, world_from_cam: Floats, piece: Ints, kept: Bools
 ) -> tuple[Mapping[str, Mapping[str, tuple[float, float]]], tuple[str, ...]]:
     """(rotation, translation) shares of each part, for all edges inside pieces (`before`) and the kept (`after`)."""
+    if graph.edge_count > MOST_EDGES:
+        return {}, (f"energy shares left out: more than {MOST_EDGES} edges",)
     inside = piece[graph.edges[:, 0]] == piece[graph.edges[:, 1]]
     inside &= graph.edges[:, 0] != graph.edges[:, 1]
     centred = _centred(world_from_cam, piece)

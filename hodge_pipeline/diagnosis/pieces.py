@@ -1,7 +1,7 @@
 """Align a scene from its edges: pieces grow together where most edges agree on how, best first.
 
-Each round every piece picks the neighbour that the agreeing edges speak for most; where two pick each other they are
-joined (Borůvka's scheme for trees). Once joined, all their edges vote together, so that long cycles are tested without
+Each round every piece picks the neighbour that the agreeing edges speak for most and is joined to it, unless that
+neighbour has much better joins of its own to come (Borůvka's scheme for trees, with patience). Once joined, all their edges vote together, so that long cycles are tested without
 ever being listed. No edge is trusted: one that agrees with nothing is simply left out.
 """
 
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.votes import Votes, agreed_motions, collect_votes
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -18,6 +19,8 @@ from hodge_pipeline.types import Bools, Floats, Ints
 TIE_BREAK = 1e-3
 SINGLE_VOTE_FROM = 0.3
 """The weight from which one edge, which no other confirms, may join two pieces."""
+PATIENCE = 0.7
+"""Of the best score that a piece has: weaker joins to it wait, since more edges may then say where they go."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +39,19 @@ def align(evidence: Evidence, weight: Floats, cluster_gain: float, rng: np.rando
     weight = weight * (1 + TIE_BREAK * rng.random(len(weight)))
     while (votes := collect_votes(evidence, piece, piece_from, weight)) is not None:
         gain = _gains(evidence, votes, weight, cluster_gain)
-        joined = _joins(votes, gain, count)
+        joined, moves_low = _joins(votes, gain, count)
         if not len(joined):
             break
         motions = agreed_motions(votes, joined, weight)
+        motions[moves_low] = se3.inverse(motions[moves_low])
         pair = votes.pair[joined]
+        low, high = votes.low[pair], votes.high[pair]
         into = np.full(count, -1, np.int64)
-        into[votes.high[pair]] = np.arange(len(pair))
+        into[np.where(moves_low, low, high)] = np.arange(len(pair))
         moving = np.flatnonzero(into[piece] >= 0)
         step = into[piece[moving]]
         piece_from[moving] = motions[step] @ piece_from[moving]
-        piece[moving] = votes.low[pair][step]
+        piece[moving] = np.where(moves_low, high, low)[step]
     return Alignment(piece, piece_from)
 
 
@@ -64,16 +69,27 @@ def _gains(evidence: Evidence, votes: Votes, weight: Floats, cluster_gain: float
     return np.where((agreeing >= 2) | ((agreeing == 1) & alone), gain, 0.0)
 
 
-def _joins(votes: Votes, gain: Floats, count: int) -> Ints:
-    """The hypotheses whose two pieces choose each other: the best of a pair, and the best pair of both pieces."""
+def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
+    """The hypotheses to join by, and whether it is the lower of the two pieces that moves.
+
+    A piece moves to the one that most speaks for, if that one stays where it is in this round and has no much better
+    join of its own to wait for.
+    """
     order = np.lexsort((-gain, votes.pair))
     best = order[votes.start]
-    score = gain[best]
-    real = np.flatnonzero(score > 0)
-    real = real[np.lexsort((real, -score[real]))]
-    rank = np.arange(len(real))
+    real = np.flatnonzero(gain[best] > 0)
+    real = real[np.lexsort((real, -gain[best][real]))]
+    low, high, score = votes.low[real], votes.high[real], gain[best][real]
     first = np.full(count, len(real))
-    np.minimum.at(first, votes.low[real], rank)
-    np.minimum.at(first, votes.high[real], rank)
-    mutual = (first[votes.low[real]] == rank) & (first[votes.high[real]] == rank)
-    return np.asarray(best[real[mutual]])
+    np.minimum.at(first, low, np.arange(len(real)))
+    np.minimum.at(first, high, np.arange(len(real)))
+    chosen, moves_low = [], []
+    moved, base = np.zeros(count, bool), np.zeros(count, bool)
+    for row in np.unique(first[first < len(real)]).tolist():
+        for mover, other, lower in ((high[row], low[row], False), (low[row], high[row], True)):
+            wanted = first[mover] == row and score[row] >= PATIENCE * score[first[other]]
+            if wanted and not (moved[mover] or base[mover] or moved[other]):
+                moved[mover] = base[other] = True
+                chosen.append(real[row])
+                moves_low.append(lower)
+    return best[np.array(chosen, np.int64)], np.array(moves_low, bool)
