@@ -1,8 +1,9 @@
 """Align a scene from its edges: pieces grow together where most edges agree on how, best first.
 
 Each round every piece picks the neighbour that the agreeing edges speak for most and is joined to it, unless that
-neighbour has much better joins of its own to come (Borůvka's scheme for trees, with patience). Once joined, all their edges vote together, so that long cycles are tested without
-ever being listed. No edge is trusted: one that agrees with nothing is simply left out.
+neighbour has much better joins of its own to come (Borůvka's scheme for trees, with patience). Once joined, all their
+edges vote together, so that long cycles are tested without ever being listed. No edge is trusted: one that agrees with
+nothing is simply left out.
 """
 
 from __future__ import annotations
