@@ -12,6 +12,12 @@ from hodge_pipeline.solvers.elimination import Elimination
 from hodge_pipeline.solvers.linear import Factor, factorise_blocks
 from hodge_pipeline.types import Floats
 
+CG_FIRST_TO = 15_000
+"""Vertices: on longer chains CG takes too many steps to be worth a try."""
+FEWEST_CG_STEPS = 60
+"""Where a factorisation of all unknowns costs no more, it is cheap."""
+CG_STEPS_TRIED = 12
+"""In all, before a cheap factorisation is made: on small graphs they often suffice, and cost next to nothing."""
 STALE_STEPS = 8
 """CG steps with an old factor that cost about as much as a new one."""
 FRESH_STEPS = 50
@@ -33,10 +39,18 @@ def steps_worth_a_factor(plan: Elimination, size: int) -> int:
 
 @dataclass
 class DirectSolver:
-    """Solves with one Hessian after another, and the latest factor."""
+    """Solves with one Hessian after another, the latest factor, and how many CG steps went without one."""
 
     plan: Elimination
     factor: Factor | None = None
+    tried: int = 0
+
+    def steps_to_try(self, size: int) -> int:
+        """How many CG steps to try before a factorisation with blocks of this size."""
+        worth = steps_worth_a_factor(self.plan, size)
+        if self.factor is not None or (worth <= FEWEST_CG_STEPS and self.plan.size > CG_FIRST_TO):
+            return 0
+        return worth if worth > FEWEST_CG_STEPS else max(CG_STEPS_TRIED - self.tried, 0)
 
     def solve(self, hessian: bsr_matrix, gradient: Floats, tolerance: float, enough: float) -> CgResult:
         """The step x with H x ≈ −g: by CG with the factor of an earlier H where that is quick, else with its own."""

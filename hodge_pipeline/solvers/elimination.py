@@ -20,7 +20,7 @@ MOST_NEIGHBOURS = 8
 """A vertex of more stays in the core: there a library's dense blocks are faster."""
 SMALLEST_ROUND = 0.02
 """Of the vertices left: smaller rounds are not worth their overhead."""
-FEWEST_IN_ROUND = 1000
+FEWEST_IN_ROUND = 2000
 PASSES = 3
 
 

@@ -14,14 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.cg import Operator, truncated_cg
-from hodge_pipeline.solvers.direct import DirectSolver, steps_worth_a_factor
+from hodge_pipeline.solvers.direct import DirectSolver
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import exponential, lever
 from hodge_pipeline.types import Floats
-
-FEWEST_CG_STEPS = 60
-"""Where a factorisation of all unknowns costs no more, CG with the scalar Laplacians is not tried."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +85,13 @@ class FullObjective:
         """A Gauss-Newton step by PCG: first with the two Laplacians, with a direct factor once they prove too weak."""
         assert isinstance(point, FullPoint)
         gradient, hessian = self.normal_equations(point.left)
-        spent, worth = 0, steps_worth_a_factor(self.problem.structure.elimination, hessian.blocksize[0])
-        if self.direct.factor is None and worth > FEWEST_CG_STEPS:
+        spent, tried = 0, self.direct.steps_to_try(hessian.blocksize[0])
+        if tried:
             apply, precondition = (lambda x: np.asarray(hessian @ x)), self.laplacian_preconditioner(point.rotations)
-            found = truncated_cg(apply, precondition, gradient, tolerance, worth, enough)
+            found = truncated_cg(apply, precondition, gradient, tolerance, tried, enough)
             spent = found.steps
-        if self.direct.factor is not None or spent >= worth or worth <= FEWEST_CG_STEPS:
+            self.direct.tried += spent
+        if spent >= tried:
             found = self.direct.solve(hessian, gradient, tolerance, enough)
             spent += found.steps
         slope = 2 * float(gradient @ found.x)

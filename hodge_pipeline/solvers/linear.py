@@ -54,6 +54,8 @@ def factorise_blocks(plan: Elimination, matrix: bsr_matrix, single: bool = False
 
     `single`: in float32. Raises `GraphError` where the matrix is singular.
     """
+    if not plan.groups:
+        return factorise(matrix.tocsc(), "NATURAL", single)
     try:
         found = eliminate(
             plan,

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-from hodge_pipeline.solvers.direct import steps_worth_a_factor
-from hodge_pipeline.solvers.full import FEWEST_CG_STEPS, FullObjective
+from hodge_pipeline.solvers import direct
+from hodge_pipeline.solvers.full import FullObjective
 from hodge_pipeline.solvers.joint import JointObjective
 from hodge_pipeline.solvers.newton import CG_LIMIT_REACHED, Descent, Limits, Point, descend
 from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
@@ -17,8 +17,6 @@ from hodge_pipeline.solvers.setup import InitialName, Setup
 from hodge_pipeline.types import Floats
 
 Watch: TypeAlias = Callable[[Point], None]
-CG_FIRST_TO = 15_000
-"""Poses: on longer chains CG takes too many steps to be worth a try."""
 CG_STEPS_BEFORE_DIRECT = 200
 """In all: with these CG has cost about as much as a descent with factorisations."""
 WARM_START_TOLERANCE = 1e-5
@@ -58,9 +56,9 @@ def descend_isotropic(
     if direct_at_once(problem):
         joint = JointObjective.of(problem)
         return descend(joint, joint.at(*begin), limits, floor, watch)
-    direct = steps_are_direct(problem)
-    reduced = IsotropicObjective(problem, CG_STEPS_BEFORE_DIRECT) if direct else IsotropicObjective(problem)
-    most = CG_STEPS_BEFORE_DIRECT if direct else math.inf
+    cheap = steps_are_direct(problem)
+    reduced = IsotropicObjective(problem, CG_STEPS_BEFORE_DIRECT) if cheap else IsotropicObjective(problem)
+    most = CG_STEPS_BEFORE_DIRECT if cheap else math.inf
     first = descend(reduced, reduced.at(*begin), limits, floor, watch, most)
     if first.reason != CG_LIMIT_REACHED:
         return first
@@ -73,12 +71,12 @@ def descend_isotropic(
 def steps_are_direct(problem: Problem) -> bool:
     """Whether a factorisation of all unknowns costs no more than a few CG steps."""
     size = problem.tangent_size + problem.dimension
-    return steps_worth_a_factor(problem.structure.elimination, size) <= FEWEST_CG_STEPS
+    return direct.steps_worth_a_factor(problem.structure.elimination, size) <= direct.FEWEST_CG_STEPS
 
 
 def direct_at_once(problem: Problem) -> bool:
     """Whether such a factorisation is made without a try of CG."""
-    return problem.free_count > CG_FIRST_TO and steps_are_direct(problem)
+    return problem.free_count > direct.CG_FIRST_TO and steps_are_direct(problem)
 
 
 def full_objective(setup: Setup) -> FullObjective:
