@@ -16,7 +16,7 @@ CG_FIRST_TO = 15_000
 """Vertices: on longer chains CG takes too many steps to be worth a try."""
 FEWEST_CG_STEPS = 60
 """Where a factorisation of all unknowns costs no more, it is cheap."""
-CG_STEPS_TRIED = 12
+CG_STEPS_TRIED = 20
 """In all, before a cheap factorisation is made: on small graphs they often suffice, and cost next to nothing."""
 STALE_STEPS = 8
 """CG steps with an old factor that cost about as much as a new one."""
