@@ -58,7 +58,8 @@ def make_tabs(contents: Contents, room: Eye | None, graph: Eye | None) -> list[r
     ]
 
 
-def _scene(name: str, contents: list[str], eye: Eye | None) -> rrb.Spatial3DView:
+def scene_view(name: str, contents: list[str], eye: Eye | None) -> rrb.Spatial3DView:
+    """A view of the world with these entities, seen from `eye` where one is given."""
     controls = rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up) if eye else None
     return rrb.Spatial3DView(
         origin=layout.WORLD,
@@ -89,7 +90,7 @@ def _story_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
         f"- {layout.DEPTH}",
     ]
     shown += [f"+ {layout.trajectory(name)}" for name in contents.trajectories]
-    scene = _scene("Room, trajectories and edges", shown + _lines(contents.trajectory), eye)
+    scene = scene_view("Room, trajectories and edges", shown + _lines(contents.trajectory), eye)
     side = rrb.Vertical(
         rrb.Spatial2DView(origin=layout.PINHOLE, name="Colour", contents=[f"+ {layout.COLOUR}"]),
         _errors_view(),
@@ -107,14 +108,14 @@ def _frames_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
         rrb.Spatial2DView(origin=layout.PINHOLE, name="Depth", contents=[f"+ {layout.DEPTH}"]),
     )
     shown = [f"+ {layout.CAMERA}/**", f"- {layout.DEPTH}", f"+ {layout.trajectory(contents.trajectory)}"]
-    return rrb.Horizontal(_scene("Camera and its cloud", shown, eye), images, column_shares=[2, 1], name="Frames")
+    return rrb.Horizontal(scene_view("Camera and its cloud", shown, eye), images, column_shares=[2, 1], name="Frames")
 
 
 def _solver_tab(contents: Contents, eye: Eye | None) -> rrb.Vertical:
     rejected = [f"+ {layout.rejected(contents.last_graph)}"] if contents.last_graph else []
     graphs = rrb.Horizontal(
-        _scene("Solve: edges by residual", [f"+ {layout.FILM}/**"], eye),
-        _scene("As measured, with rejected pairs", [f"+ {layout.edges(contents.last_graph)}", *rejected], eye),
+        scene_view("Solve: edges by residual", [f"+ {layout.FILM}/**"], eye),
+        scene_view("As measured, with rejected pairs", [f"+ {layout.edges(contents.last_graph)}", *rejected], eye),
     )
     plots = rrb.Horizontal(
         *(
@@ -160,10 +161,10 @@ def complex_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
     outer = max(contents.last_solution, 1)
     eye = eye and eye.from_afar(1.7)
     trajectory = f"+ {layout.trajectory(contents.trajectory)}"
-    scenes = [_scene("Triangles by curl", [f"+ {layout.complex_mesh(outer)}", trajectory], eye)]
+    scenes = [scene_view("Triangles by curl", [f"+ {layout.complex_mesh(outer)}", trajectory], eye)]
     texts = [rrb.TextDocumentView(origin=layout.complex_text(outer), name="Complex")]
     if "diagnosis" in contents.stages:
-        scenes.append(_scene("Which edge is wrong", [f"+ {layout.VERDICTS}/**", trajectory], eye))
+        scenes.append(scene_view("Which edge is wrong", [f"+ {layout.VERDICTS}/**", trajectory], eye))
         texts.append(rrb.TextDocumentView(origin=layout.DIAGNOSIS, name="Verdicts"))
     return rrb.Horizontal(
         *scenes, rrb.Vertical(*texts), column_shares=[2] * len(scenes) + [1], name="Complex, diagnosis"
@@ -175,13 +176,15 @@ def model_tab(eye: Eye | None) -> rrb.Horizontal:
     eye = eye and eye.from_afar(1.25)
     growing = [f"+ {layout.GROWTH}/**", f"+ {layout.CAMERA}/**", f"- {layout.CLOUD}", f"- {layout.DEPTH}"]
     return rrb.Horizontal(
-        _scene("As it grows (timeline frame)", growing, eye), _scene("Whole", [f"+ {layout.MODEL}"], eye), name="Model"
+        scene_view("As it grows (timeline frame)", growing, eye),
+        scene_view("Whole", [f"+ {layout.MODEL}"], eye),
+        name="Model",
     )
 
 
 def evaluation_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
     """Truth, odometry and result together, and the errors frame by frame."""
-    scene = _scene(
+    scene = scene_view(
         "Trajectories",
         [f"+ {layout.trajectory(name)}" for name in contents.trajectories] + _lines(contents.trajectory),
         eye,

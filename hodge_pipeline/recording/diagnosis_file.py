@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.recording import layout, shapes
-from hodge_pipeline.recording.blueprint import BACKGROUND
+from hodge_pipeline.recording.blueprint import scene_view
 from hodge_pipeline.recording.curl import log_loops, log_triangles
 from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.eye import Eye
@@ -58,8 +58,8 @@ def _log_vertices(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: 
 
 
 def _blueprint(eye: Eye | None) -> rrb.Blueprint:
-    verdicts = _scene("Edges by verdict", [f"+ {layout.VERDICTS}/**", f"+ {layout.VERTICES}"], eye)
-    curl = _scene(
+    verdicts = scene_view("Edges by verdict", [f"+ {layout.VERDICTS}/**", f"+ {layout.VERTICES}"], eye)
+    curl = scene_view(
         "Triangles by curl, harmonic loops", [f"+ {layout.TRIANGLES}", f"+ {layout.LOOPS}", f"+ {layout.VERTICES}"], eye
     )
     texts = rrb.Vertical(
@@ -73,18 +73,6 @@ def _blueprint(eye: Eye | None) -> rrb.Blueprint:
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="hidden"),
         auto_views=False,
-    )
-
-
-def _scene(name: str, contents: list[str], eye: Eye | None) -> rrb.Spatial3DView:
-    controls = rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up) if eye else None
-    return rrb.Spatial3DView(
-        origin=layout.WORLD,
-        name=name,
-        contents=contents,
-        background=BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=controls,
     )
 
 

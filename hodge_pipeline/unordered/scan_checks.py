@@ -12,7 +12,6 @@ from hodge_pipeline.types import CloudSet, Floats, PointCloud
 
 FACTOR_OF_UNITS = 50.0
 """Scans of one scene differ less in extent; millimetres and metres differ by 1000."""
-FEWEST_VOXELS_ACROSS = 20
 SURFACE_NEIGHBOURS = 30
 SAMPLED_POINTS = 2000
 VOLUME = 0.12
