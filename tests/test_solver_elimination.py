@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import bsr_matrix
 
@@ -28,6 +28,7 @@ def block_laplacian(plan, tail, head, size, rng):
     return dense
 
 
+@settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([1, 3, 6]), st.sampled_from(["chain", "ladder", "random", "star"]))
 def test_it_solves_what_a_dense_solve_does(seed, size, shape):
     rng = np.random.default_rng(seed)
