@@ -18,25 +18,30 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.page import PageContents, render
 from hodge_pipeline.diagnosis.plots import draw, side_by_side
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
+from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.edge_pictures import edge_pictures
-from hodge_pipeline.edits import joining, read_history
+from hodge_pipeline.edits import REJECTED, joining, listed_edges, read_history, vertex_rows
 from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.recipe import Recipe, load_recipe
 from hodge_pipeline.solve_file import read_graph
-from hodge_pipeline.types import Bools, CloudSet, Frame, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import Bools, CloudSet, Frame, Ints, Source, Trajectory, ViewGraph
+from hodge_pipeline.unordered.pieces import laid_apart
 from hodge_pipeline.workspace import RECIPE_FILE
 
 PICTURED, LEAST_PICTURED = 6, 2
-SUGGESTED = 12
+SUGGESTED, REGISTERED = 12, 6
+"""Pairs that are ranked, and those that a command to type names."""
 COMMANDED = 20
-"""Edges at most that a command to type names: more of them are a case for a robust solver."""
+"""Edges at most that a command to type names."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A graph to judge. A run also has its frames and clouds; `disabled (E,)` edges are off by hand."""
+    """A graph to judge. A run also has its frames and clouds; `disabled (E,)` edges are off by hand, pairs (P, 2) were
+    `tried` in vain.
+    """
 
     path: Path
     name: str
@@ -44,6 +49,8 @@ class Subject:
     disabled: Bools
     is_run: bool = False
     options: DiagnosisOptions = field(default_factory=DiagnosisOptions)
+    suggestions: SuggestionOptions = field(default_factory=SuggestionOptions)
+    tried: Ints | None = None
     frames: Sequence[Frame] = ()
     clouds: CloudSet | None = None
     notes: tuple[str, ...] = ()
@@ -75,10 +82,17 @@ def _run_subject(path: Path, graph: ViewGraph) -> Subject:
         _disabled(path, graph),
         is_run=True,
         options=recipe.diagnosis,
+        suggestions=recipe.suggestions,
+        tried=_rejected(path, graph),
         frames=frames if len(frames) == graph.vertex_count else (),
         clouds=CloudSet.open(clouds) if (clouds / "offsets.npy").is_file() else None,
         notes=notes,
     )
+
+
+def _rejected(path: Path, graph: ViewGraph) -> Ints:
+    """The pairs of a run that were registered and not accepted."""
+    return vertex_rows(graph.vertex_ids, [edge.name for edge in listed_edges(path) if edge.status == REJECTED])
 
 
 def _frames(recipe: Recipe) -> tuple[Sequence[Frame], tuple[str, ...]]:
@@ -121,26 +135,37 @@ def diagnose_subject(subject: Subject) -> Diagnosed:
     pieces = int(found.piece.max(initial=-1)) + 1
     apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
     notes = (*subject.notes, *found.notes, *((apart,) if pieces > 1 else ()))
-    return Diagnosed(
-        subject,
-        found,
-        advice(found, subject.disabled),
-        _commands(subject, found),
-        notes,
-        suggest_pairs(subject.graph, found, SUGGESTED),
+    suggestions = suggest_pairs(
+        subject.graph, found, SUGGESTED, overlapping=_overlapping(subject, found), tried=subject.tried
     )
+    commands = _commands(subject, found, suggestions)
+    return Diagnosed(subject, found, advice(found, subject.disabled), commands, notes, suggestions)
 
 
-def _commands(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
-    rows = [int(row) for row in ranked(found) if found.verdict[row] == WRONG and not subject.disabled[row]]
-    if not rows:
-        return ()
-    if len(rows) > COMMANDED:
-        return (f"{len(rows)} edges are wrong: edges.csv lists them, poses.tum holds the poses without them",)
-    pairs = ["{}-{}".format(*subject.graph.vertex_ids[subject.graph.edges[row]]) for row in rows]
-    if subject.is_run:
-        return f"hodge edit {subject.path} --disable {','.join(pairs)}", f"hodge solve {subject.path}"
-    return (f"hodge solve {subject.path} --out solved.g2o " + " ".join(f"--disable {pair}" for pair in pairs),)
+def _overlapping(subject: Subject, found: Diagnosis) -> Ints | None:
+    """The pairs of a run that see something in common at the robust poses."""
+    if subject.clouds is None or not subject.frames:
+        return None
+    poses = laid_apart(found.piece, found.world_from_cam, subject.clouds)
+    return subject.suggestions.among.propose(subject.frames, subject.clouds, poses).pairs
+
+
+def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> tuple[str, ...]:
+    rows = np.array([row for row in ranked(found) if found.verdict[row] == WRONG and not subject.disabled[row]], int)
+    wrong = _names(subject.graph, subject.graph.edges[rows])
+    if not subject.is_run:
+        if len(wrong) > COMMANDED:
+            return (f"hodge solve {subject.path} --out solved.g2o --robust",)
+        off = " ".join(f"--disable {pair}" for pair in wrong)
+        return (f"hodge solve {subject.path} --out solved.g2o {off}",) if wrong else ()
+    options = f" --disable {','.join(wrong) if len(wrong) <= COMMANDED else WRONG}" if wrong else ""
+    useful = suggestions.pairs[suggestions.score >= subject.suggestions.min_gain][:REGISTERED]
+    options += f" --register {','.join(_names(subject.graph, useful))}" if len(useful) else ""
+    return (f"hodge edit {subject.path}{options}", f"hodge solve {subject.path}") if options else ()
+
+
+def _names(graph: ViewGraph, pairs: Ints) -> list[str]:
+    return ["{}-{}".format(*ends) for ends in graph.vertex_ids[pairs]]
 
 
 def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:

@@ -1,70 +1,117 @@
-"""The round that a person's edits add to a run: the last one's edges, some switched off or on, solved again."""
+"""The round that a person's edits add to a run: the last one's edges, some switched off or on, some registered anew."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hodge_pipeline import artifacts
-from hodge_pipeline.edits import DISABLED, ENABLED, History, joining, read_history
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.edits import DISABLED, ENABLED, REGISTERED, History, joining, read_history, vertex_rows
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.job import Job
 from hodge_pipeline.measured import joined
+from hodge_pipeline.more_edges import MoreRound, Placed, register_more, with_more
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.stages import Workers
+from hodge_pipeline.types import Bools, Candidates, CloudSet, Floats, Source, ViewGraph
+from hodge_pipeline.unordered.pieces import laid_apart
 
 ARM_M = 1.0
 """A residual rotation counts as its arc at this distance."""
+BY_HAND = "by_hand"
 NEXT = "hodge edit --list shows them, hodge edit --undo takes the last back"
 
 
-def edited_rounds(job: Job, registered: Registered, measured: ViewGraph, rounds: Sequence[Round]) -> tuple[Round, ...]:
+@dataclass(frozen=True)
+class _Edges:
+    """Every edge of a round and every pair that is none: `reasons (E,)` why, empty where it is one; `disabled (E,)`."""
+
+    graph: ViewGraph
+    reasons: NDArray[np.str_]
+    chosen: Bools
+    disabled: Bools
+
+    @property
+    def kept(self) -> ViewGraph:
+        """The edges that count."""
+        return self.graph.select(self.chosen & ~self.disabled)
+
+
+def edited_rounds(
+    job: Job, source: Source, measured: ViewGraph, rounds: Sequence[Round], workers: Workers
+) -> Iterator[MoreRound]:
     """One more round, that of the edits in the run folder; nothing where there are none.
 
     It begins at the poses of the earlier round that its edges agree with best, since those after a wrong edge may be
-    far off, and is solved by the recipe's solver. Its stage's key holds what the
-    edits come to, so that a run that is resumed has them too, and one whose edits are undone is as it was.
+    far off, and is solved by the recipe's solver. Its stages' keys hold what the edits come to, so that a run that is
+    resumed has them too, and one whose edits are undone is as it was.
     """
     number, last = len(rounds), rounds[-1]
     history = read_history(job.workspace.folder)
-    if not history.switches or last.candidates is None:
-        return ()
-    everything = joined([registered.as_graph(last.graph.vertex_ids, last.candidates.source), measured])
-    _tell(job, everything, history)
-    reasons = job.recipe.acceptance.reasons(registered)
-    reasons = np.concatenate([reasons, np.full(measured.edge_count, "", reasons.dtype)])
-    chosen = (reasons == "") | _any_joining(everything, history.enabled)
-    graph = everything.select(chosen)
-    disabled = _any_joining(graph, history.disabled)
+    if not history.switches or last.candidates is None or last.registered is None:
+        return
+    edges = _edited(job, last.candidates, last.registered, measured, history)
+    candidates, registered, new = last.candidates, last.registered, last.registered.select(np.zeros(0, np.int64))
+    before, inputs = last.world_from_cam, [f"register-{number - 1}", f"solve-{number - 1}"]
+    if history.registered:
+        placed = _placed(job, edges.kept)
+        before, pairs = placed.world_from_cam, vertex_rows(measured.vertex_ids, history.registered)
+        new = register_more(job, number, "registration, by hand", source, pairs, placed, workers, tuple(inputs))
+        candidates, registered = with_more(candidates, new.pairs, BY_HAND), Registered.joined([registered, new])
+        edges = _edited(job, candidates, registered, measured, history)
+        inputs.append(f"register-{number}")
+    _tell(job, edges, history)
+    graph, off = edges.graph.select(edges.chosen), edges.disabled[edges.chosen]
     options = (job.recipe.solver, history.switches)
-    inputs = (f"register-{number - 1}", f"solve-{number - 1}")
-    with job.stage(f"solve-{number}", "solve, edited", 1, options, inputs) as (folder, advance):
+    with job.stage(f"solve-{number}", "solve, edited", 1, options, tuple(inputs)) as (folder, advance):
         if not folder.finished:
-            kept = graph.select(~disabled)
-            solution = job.recipe.solver.solve(kept, _start(kept, rounds))
+            solution = job.recipe.solver.solve(edges.kept, _start(job, edges.kept, rounds))
             weights = np.zeros(graph.edge_count)
-            weights[~disabled] = solution.weights
+            weights[~off] = solution.weights
             artifacts.save_solution(folder.path / "solution.npz", replace(solution, weights=weights))
             for note in solution.notes:
                 job.note(f"edited: {note}")
             advance(1)
     solution = artifacts.load_solution(job.path(f"solve-{number}") / "solution.npz")
-    rejected = everything.edges[~chosen], reasons[~chosen]
-    return (Round(graph, solution.world_from_cam, last.candidates, solution, *rejected, disabled=disabled),)
+    rejected = edges.graph.edges[~edges.chosen], edges.reasons[~edges.chosen]
+    edited = Round(graph, solution.world_from_cam, candidates, registered, solution, *rejected, disabled=off)
+    yield MoreRound(edited, new, before)
 
 
-def _start(graph: ViewGraph, rounds: Sequence[Round]) -> Floats:
-    """The poses of the round, the latest of equals, that the edges are nearest to on average."""
+def _placed(job: Job, graph: ViewGraph) -> Placed:
+    found = diagnose(graph, job.recipe.diagnosis)
+    clouds = CloudSet.open(job.path("clouds"))
+    return Placed(laid_apart(found.piece, found.world_from_cam, clouds), found.piece)
+
+
+def _start(job: Job, graph: ViewGraph, rounds: Sequence[Round]) -> Floats:
+    """The poses of the round, the latest of equals, that the edges are nearest to on average; the robust ones of the
+    edges themselves where they join what no round had joined.
+    """
 
     def distance(one: Round) -> float:
         translation_m, angle_rad = edge_residuals(graph, one.world_from_cam)
         known = np.hypot(translation_m, ARM_M * angle_rad)
         return float(np.nanmean(known)) if np.isfinite(known).any() else np.inf
 
+    apart = connected_components(rounds[-1].graph.edges, graph.vertex_count)
+    if (apart[graph.edges[:, 0]] != apart[graph.edges[:, 1]]).any():
+        return _placed(job, graph).world_from_cam
     return min(reversed(rounds), key=distance).world_from_cam
+
+
+def _edited(job: Job, candidates: Candidates, registered: Registered, measured: ViewGraph, history: History) -> _Edges:
+    graph = joined([registered.as_graph(measured.vertex_ids, candidates.source), measured])
+    reasons = job.recipe.acceptance.reasons(registered)
+    reasons = np.concatenate([reasons, np.full(measured.edge_count, "", reasons.dtype)])
+    chosen = (reasons == "") | _any_joining(graph, history.enabled)
+    return _Edges(graph, reasons, chosen, _any_joining(graph, history.disabled))
 
 
 def _any_joining(graph: ViewGraph, pairs: tuple[str, ...]) -> Bools:
@@ -74,10 +121,15 @@ def _any_joining(graph: ViewGraph, pairs: tuple[str, ...]) -> Bools:
     return found
 
 
-def _tell(job: Job, graph: ViewGraph, history: History) -> None:
-    for word, pairs in ((DISABLED, history.disabled), (ENABLED, history.enabled)):
-        if pairs:
+def _tell(job: Job, edges: _Edges, history: History) -> None:
+    for word in (DISABLED, ENABLED, REGISTERED):
+        if pairs := [pair for pair, switch in history.switches.items() if switch == word]:
             job.note(f"edited by hand: {word} {', '.join(pairs)} ({NEXT})")
-    lost = [pair for pair in history.switches if not joining(graph, pair).any()]
-    if lost:
+    found = {pair: joining(edges.graph, pair) for pair in history.switches}
+    if lost := [pair for pair, rows in found.items() if not rows.any()]:
         job.note(f"edits without effect, since the last round has no such edge: {', '.join(lost)}")
+    for pair in history.registered:
+        rows = found[pair]
+        if rows.any() and not edges.chosen[rows].any():
+            reason = edges.reasons[rows][-1]
+            job.note(f"{pair} was registered and rejected, {reason}: --enable {pair} lets it in all the same")

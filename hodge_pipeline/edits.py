@@ -1,4 +1,4 @@
-"""Edges that a person switched off or on, and the history of it in the run folder: `edits.json`."""
+"""Edges that a person switched off or on or had registered, and the history of it in the run folder: `edits.json`."""
 
 from __future__ import annotations
 
@@ -9,28 +9,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hodge_pipeline import artifacts
 from hodge_pipeline.errors import GraphError, WorkspaceError
-from hodge_pipeline.types import Bools, ViewGraph
+from hodge_pipeline.types import Bools, Ints, ViewGraph
 
 FILE = "edits.json"
 EDGES = "edges.csv"
 FORMAT_VERSION = 1
-ENABLED, DISABLED = "enabled", "disabled"
+ENABLED, DISABLED, REGISTERED, REJECTED = "enabled", "disabled", "registered", "rejected"
 
 
 @dataclass(frozen=True)
 class Edit:
-    """One command: the pairs `a-b` of vertex ids that it switched off and on; one that was `undone` counts no more."""
+    """One command: the pairs `a-b` of vertex ids that it switched off and on, and those to register; one that was
+    `undone` counts no more.
+    """
 
     disable: tuple[str, ...] = ()
     enable: tuple[str, ...] = ()
+    register: tuple[str, ...] = ()
     undone: bool = False
 
     def __str__(self) -> str:
-        parts = [f"{verb} {', '.join(pairs)}" for verb, pairs in (("disable", self.disable), ("enable", self.enable))]
-        told = "; ".join(part for part, pairs in zip(parts, (self.disable, self.enable), strict=True) if pairs)
+        parts = (("disable", self.disable), ("enable", self.enable), ("register", self.register))
+        told = "; ".join(f"{verb} {', '.join(pairs)}" for verb, pairs in parts if pairs)
         return f"{told} (undone)" if self.undone else told
 
 
@@ -42,10 +46,11 @@ class History:
 
     @property
     def switches(self) -> dict[str, str]:
-        """What the edits come to: `disabled` or `enabled` for each pair that was touched; the latest edit counts."""
+        """What the edits come to: disabled, enabled or registered for each pair; the latest edit of a pair counts."""
         out: dict[str, str] = {}
         for edit in self.edits:
             if not edit.undone:
+                out |= dict.fromkeys(edit.register, REGISTERED)
                 out |= dict.fromkeys(edit.disable, DISABLED) | dict.fromkeys(edit.enable, ENABLED)
         return dict(sorted(out.items()))
 
@@ -58,6 +63,11 @@ class History:
     def enabled(self) -> tuple[str, ...]:
         """The pairs that are on by hand."""
         return tuple(pair for pair, switch in self.switches.items() if switch == ENABLED)
+
+    @property
+    def registered(self) -> tuple[str, ...]:
+        """The pairs to register, those that were switched off or on later too."""
+        return tuple(sorted({pair for edit in self.edits if not edit.undone for pair in edit.register}))
 
     def added(self, edit: Edit) -> History:
         """The history with one more edit."""
@@ -89,12 +99,12 @@ def _edit(item: Any) -> Edit:
     if not isinstance(item, dict):
         raise ValueError("expected a mapping for each edit")
     undone = item.get("undone", False)
-    names = item.get("disable", []), item.get("enable", [])
+    names = [item.get(verb, []) for verb in ("disable", "enable", "register")]
     if not isinstance(undone, bool) or not all(
         isinstance(n, list) and all(isinstance(p, str) for p in n) for n in names
     ):
         raise ValueError("expected lists of pairs, and undone true or false")
-    return Edit(tuple(names[0]), tuple(names[1]), undone)
+    return Edit(tuple(names[0]), tuple(names[1]), tuple(names[2]), undone)
 
 
 def write_history(folder: Path, history: History) -> None:
@@ -151,9 +161,38 @@ def named_edges(edges: Iterable[ListedEdge], pairs: Sequence[str]) -> list[Liste
     return [by_name[pair] for pair in pairs]
 
 
+def pairs_to_register(folder: Path, edges: Sequence[ListedEdge], pairs: Sequence[str]) -> tuple[str, ...]:
+    """The pairs, named as a run's frames are, each once. Raises `GraphError` for a pair that is an edge, or no pair."""
+    stored = folder / "stages" / "diagnose" / "graph.npz"
+    if not stored.is_file():
+        raise WorkspaceError(f"{folder}: is no run of frames: there is nothing to register")
+    ids = artifacts.load_arrays(stored)["vertex_ids"]
+    names = tuple(dict.fromkeys(f"{ids[i]}-{ids[j]}" for i, j in np.sort(vertex_rows(ids, pairs), axis=1)))
+    joined = {frozenset((edge.i, edge.j)): edge for edge in edges if edge.status != REJECTED}
+    for i, j in vertex_rows(ids, names):
+        if edge := joined.get(frozenset((str(ids[i]), str(ids[j])))):
+            raise GraphError(f"{edge.name}: is an edge already ({edge.source}, {edge.status})")
+    return names
+
+
 def joining(graph: ViewGraph, pair: str) -> Bools:
     """Where (E,) an edge joins the vertex ids `a-b`, in either direction; parallel ones all."""
     names = graph.vertex_ids[graph.edges].astype(str)
-    cuts = [(pair[:k], pair[k + 1 :]) for k in range(1, len(pair)) if pair[k] == "-"]
-    hits = [((names == [a, b]) | (names == [b, a])).all(axis=1) for a, b in cuts]
+    hits = [((names == [a, b]) | (names == [b, a])).all(axis=1) for a, b in _cuts(pair)]
     return np.asarray(np.any(hits, axis=0) if hits else np.zeros(graph.edge_count, bool))
+
+
+def vertex_rows(vertex_ids: NDArray[np.generic], pairs: Sequence[str]) -> Ints:
+    """The rows (P, 2) of the vertices that pairs `a-b` name. Raises `GraphError` for a pair that names no two."""
+    names = vertex_ids.astype(str).tolist()
+    rows = {name: row for row, name in enumerate(names)}
+    found = [[(rows[a], rows[b]) for a, b in _cuts(pair) if a in rows and b in rows and a != b] for pair in pairs]
+    for pair, ends in zip(pairs, found, strict=True):
+        if not ends:
+            raise GraphError(f"{pair}: names no two frames: give two ids, as 12-87, of {names[0]} to {names[-1]}")
+    return np.array([ends[0] for ends in found], np.int64).reshape(-1, 2)
+
+
+def _cuts(pair: str) -> list[tuple[str, str]]:
+    """Every way to read a pair, since an id may hold a hyphen."""
+    return [(pair[:k], pair[k + 1 :]) for k in range(1, len(pair)) if pair[k] == "-"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from hodge_pipeline import binding, guarding, outputs, starting, steps
@@ -15,6 +16,7 @@ from hodge_pipeline.job import Job, logging_to
 from hodge_pipeline.recipe import Recipe, load_recipe, with_source
 from hodge_pipeline.record import Recording
 from hodge_pipeline.rounds import Round
+from hodge_pipeline.suggested_rounds import suggested_rounds
 from hodge_pipeline.types import Source
 from hodge_pipeline.watch import Nobody, Watcher
 from hodge_pipeline.workspace import RECIPE_FILE, Workspace
@@ -99,9 +101,12 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
             recording.registration(number, registered, poses, clouds)
             rounds.append(steps.solve(job, number, source, candidates, registered, poses, measured))
             recording.round(number, rounds[-1])
-        for edited in edited_rounds(job, registered, measured, rounds):
-            rounds.append(edited)
-            recording.round(len(rounds) - 1, edited)
+        suggested = suggested_rounds(job, source, clouds, measured, rounds, workers)
+        for more in chain(suggested, edited_rounds(job, source, measured, rounds, workers)):
+            if len(more.registered.pairs):
+                recording.registration(len(rounds), more.registered, more.before, clouds)
+            rounds.append(more.round)
+            recording.round(len(rounds) - 1, more.round)
         rounds[-1] = steps.judge_edges(job, rounds[-1], len(rounds) - 1)
         recording.diagnosis(rounds[-1])
         scores = steps.evaluate(job, source, rounds, workers)

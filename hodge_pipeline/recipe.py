@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import binding, recipe_file
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.measured import MeasuredOptions
 from hodge_pipeline.recording.options import RecordingOptions
@@ -80,6 +81,7 @@ class Recipe:
         description="rounds of new edges, registration and solve, each from the poses of the last",
     )
     diagnosis: DiagnosisOptions = DiagnosisOptions()
+    suggestions: SuggestionOptions = SuggestionOptions()
     fusion: tuple[Fuser, ...] = Field(default=(), description="each makes one model from the final poses")
     evaluation: EvaluationOptions = EvaluationOptions()
     recording: RecordingOptions = RecordingOptions()

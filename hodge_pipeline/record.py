@@ -130,9 +130,8 @@ class Recording:
 
     def _recorder(self, folder: Path) -> Recorder:
         job = self._job
-        return Recorder(
-            folder, job.workspace.identity, options=job.recipe.recording, rounds=job.recipe.outer_iterations
-        )
+        rounds = job.recipe.outer_iterations + job.recipe.suggestions.rounds
+        return Recorder(folder, job.workspace.identity, options=job.recipe.recording, rounds=rounds)
 
     def _finish(self) -> None:
         job = self._job

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.types import Bools, Candidates, Floats, Ints, Solution, Source, ViewGraph
 
 
@@ -34,14 +35,15 @@ class Round:
     """One outer iteration: its edges, and the poses (N, 4, 4) that they led to. Round 0 holds the first poses, which
     `name` tells: odometry, or start where they were given.
 
-    `rejected_pairs (R, 2)` were registered and not accepted, for `rejected_reasons (R,)`. Only the last round has
-    `verdicts`; `disabled (E,)` are edges that a person switched off. `name` is what round 0 is
-    called beside the others.
+    `registered` holds every pair that was, in the order of `candidates`; of them `rejected_pairs (R, 2)` were not
+    accepted, for `rejected_reasons (R,)`. Only the last round has `verdicts`; `disabled (E,)` are edges that a person
+    switched off.
     """
 
     graph: ViewGraph
     world_from_cam: Floats
     candidates: Candidates | None = None
+    registered: Registered | None = None
     solution: Solution | None = None
     rejected_pairs: Ints = field(default_factory=_no_pairs)
     rejected_reasons: NDArray[np.str_] = field(default_factory=_no_reasons)

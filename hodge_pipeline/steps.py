@@ -173,7 +173,7 @@ def solve(
             advance(1)
     solution = artifacts.load_solution(job.path(name) / "solution.npz")
     rejected = candidates.pairs[~accepted], reasons[~accepted]
-    return Round(graph, solution.world_from_cam, candidates, solution, *rejected)
+    return Round(graph, solution.world_from_cam, candidates, registered, solution, *rejected)
 
 
 def vertex_ids(source: Source) -> NDArray[np.generic]:

@@ -79,7 +79,7 @@ def test_an_edge_is_taken_out_the_run_resumes_with_it_and_undo_gives_the_old_pos
     worst = max((r for r in rows_of(folder) if r["status"] == "used"), key=lambda row: float(row["residual_m"]))
     pair = f"{worst['i']}-{worst['j']}"
     told = hodge("edit", folder, "--disable", f"{worst['j']}-{worst['i']}")
-    assert f"disabled  {pair}" in told
+    assert f"disabled   {pair}" in told
     assert f"hodge solve {folder}" in told
 
     report = json.loads(hodge("solve", folder, "--json"))

@@ -50,7 +50,8 @@ def _print(found: Diagnosed, out: Path | None, top: int) -> None:
     print(f"verdict  {sentence(found.subject.graph, found.diagnosis)}")
     for note in found.notes:
         print(f"note     {note}")
-    for (i, j), reason in list(zip(_suggested(found), found.suggestions.reason, strict=True))[:SUGGESTED]:
+    useful = found.suggestions.score >= found.subject.suggestions.min_gain
+    for (i, j), reason in list(zip(_suggested(found), found.suggestions.reason[useful], strict=False))[:SUGGESTED]:
         print(f"register {i}-{j}  {reason}")
     for command in found.commands:
         print(f"next     {command}")

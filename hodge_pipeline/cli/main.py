@@ -141,21 +141,29 @@ def edit(
     run_folder: Annotated[Path, typer.Argument(help="A finished run.")],
     disable: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option(metavar="A-B", help="Switch the edges between two frames off; may be repeated, or A-B,C-D."),
+        typer.Option(
+            metavar="A-B",
+            help="Switch the edges between two frames off; may be repeated, or A-B,C-D; `wrong`: all such.",
+        ),
     ] = None,
     enable: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(metavar="A-B", help="Switch them on: disabled ones again, rejected ones in spite of the reason."),
+    ] = None,
+    register: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(metavar="A-B", help="Register a pair that is no edge, as `hodge diagnose` suggests some."),
     ] = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take the last edit back.")] = False,
     listing: Annotated[bool, typer.Option("--list", help="Print every edit so far.")] = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Switch edges of a run off or on; `hodge solve RUN` then solves and fuses again."""
+    """Switch edges of a run off or on, or have more registered; `hodge solve RUN` then solves and fuses again."""
     from hodge_pipeline.cli import editing
 
-    editing.edit(run_folder, disable or [], enable or [], undo=undo, listing=listing, quiet=quiet, as_json=json)
+    pairs = editing.Pairs(disable or [], enable or [], register or [])
+    editing.edit(run_folder, pairs, undo=undo, listing=listing, quiet=quiet, as_json=json)
 
 
 @app.command()

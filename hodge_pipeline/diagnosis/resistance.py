@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from hodge_pipeline.complex.coboundary import coboundary_0, grounded_laplacian
 from hodge_pipeline.complex.components import connected_components, first_of_component
-from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.solvers.linear import Factor, factorise
 from hodge_pipeline.types import Bools, Floats, Ints
 
 EXACT_TO = 1500
@@ -14,42 +17,63 @@ SKETCHES = 24
 BRIDGE = 1e-3
 
 
-def effective_resistance(edges: Ints, vertex_count: int, used: Bools) -> Floats:
-    """The resistance (E,) between the ends of each edge through the used edges other than itself, each of resistance
-    one: the variance of the relative pose in units of an edge's. ∞ where they do not join the ends.
+@dataclass(frozen=True)
+class Network:
+    """Edges as resistors of one: how loosely it holds any two vertices together.
 
-    Exact up to 1500 vertices, beyond that by random projections (Spielman and Srivastava 2008), within a third or so.
+    `component (V,)`; `grounded (V,)` one vertex of each; `d0` of the edges, `factor` of their Laplacian without those.
     """
-    rows = np.flatnonzero(used & (edges[:, 0] != edges[:, 1]))
-    component = connected_components(edges[rows], vertex_count)
-    grounded = first_of_component(component)
-    d0 = coboundary_0(edges[rows], vertex_count)
-    factor = factorise(grounded_laplacian(d0, np.ones(len(rows)), grounded))
-    through = (
-        _exact(factor.solve, grounded, edges)
-        if vertex_count <= EXACT_TO
-        else _sketched(factor.solve, d0, grounded, edges)
-    )
-    joined = component[edges[:, 0]] == component[edges[:, 1]]
-    own = np.zeros(len(edges), bool)
-    own[rows] = True
+
+    component: Ints
+    grounded: Bools
+    d0: csr_matrix
+    factor: Factor
+
+    @classmethod
+    def of(cls, edges: Ints, vertex_count: int) -> Network:
+        """The network of these edges; self-loops hold nothing."""
+        proper = edges[edges[:, 0] != edges[:, 1]]
+        component = connected_components(proper, vertex_count)
+        grounded = first_of_component(component)
+        d0 = coboundary_0(proper, vertex_count)
+        return cls(component, grounded, d0, factorise(grounded_laplacian(d0, np.ones(len(proper)), grounded)))
+
+    def between(self, pairs: Ints) -> Floats:
+        """The resistance (P,) of each pair: the variance of its relative pose in units of an edge's. ∞ where nothing
+        joins the two.
+
+        Exact up to 1500 vertices, beyond that by random projections (Spielman and Srivastava 2008), within a third or
+        so.
+        """
+        i, j = pairs.T
+        through = self._exact(i, j) if len(self.grounded) <= EXACT_TO else self._sketched(i, j)
+        return np.where(self.component[i] == self.component[j], through, np.inf)
+
+    def potentials(self, i: int, j: int) -> Floats:
+        """What a unit current from j to i makes of each vertex (V,) of their component."""
+        current = np.zeros((len(self.grounded), 1))
+        current[i], current[j] = 1, -1
+        out = np.zeros(len(self.grounded))
+        out[~self.grounded] = self.factor.solve(current[~self.grounded])[:, 0]
+        return out
+
+    def _exact(self, i: Ints, j: Ints) -> Floats:
+        inverse = np.zeros((len(self.grounded), len(self.grounded)))
+        free = np.flatnonzero(~self.grounded)
+        inverse[np.ix_(free, free)] = self.factor.solve(np.eye(len(free)))
+        return np.asarray(inverse[i, i] + inverse[j, j] - 2 * inverse[i, j])
+
+    def _sketched(self, i: Ints, j: Ints) -> Floats:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(self.d0.shape[0], SKETCHES)) / np.sqrt(SKETCHES)
+        sketch = np.zeros((self.d0.shape[1], SKETCHES))
+        sketch[~self.grounded] = self.factor.solve(np.asarray(self.d0.T @ signs)[~self.grounded])
+        return np.asarray(((sketch[i] - sketch[j]) ** 2).sum(axis=1))
+
+
+def effective_resistance(edges: Ints, vertex_count: int, used: Bools) -> Floats:
+    """The resistance (E,) between the ends of each edge through the used edges other than itself; see `Network`."""
+    own = used & (edges[:, 0] != edges[:, 1])
+    through = Network.of(edges[own], vertex_count).between(edges)
     rest = np.maximum(1 - through, 0.0)
     without = np.where(rest > BRIDGE, through / np.where(rest > BRIDGE, rest, 1.0), np.inf)
-    return np.where(joined, np.where(own, without, through), np.inf)
-
-
-def _exact(solve, grounded: Bools, edges: Ints) -> Floats:  # type: ignore[no-untyped-def]
-    count = len(grounded)
-    inverse = np.zeros((count, count))
-    free = np.flatnonzero(~grounded)
-    inverse[np.ix_(free, free)] = solve(np.eye(len(free)))
-    i, j = edges.T
-    return np.asarray(inverse[i, i] + inverse[j, j] - 2 * inverse[i, j])
-
-
-def _sketched(solve, d0, grounded: Bools, edges: Ints) -> Floats:  # type: ignore[no-untyped-def]
-    rng = np.random.default_rng(0)
-    signs = rng.choice([-1.0, 1.0], size=(d0.shape[0], SKETCHES)) / np.sqrt(SKETCHES)
-    sketch = np.zeros((d0.shape[1], SKETCHES))
-    sketch[~grounded] = solve(np.asarray(d0.T @ signs)[~grounded])
-    return np.asarray(((sketch[edges[:, 0]] - sketch[edges[:, 1]]) ** 2).sum(axis=1))
+    return np.where(own, without, through)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from hodge_pipeline.diagnosis.resistance import effective_resistance
+from hodge_pipeline.diagnosis.resistance import Network
 from hodge_pipeline.diagnosis.result import UNTESTABLE, Diagnosis
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -33,31 +34,40 @@ class Suggestions:
     score: Floats
     resistance: Floats
     tests: Ints
-    reason: tuple[str, ...]
+    reason: NDArray[np.str_]
+
+    def select(self, rows: Bools) -> Suggestions:
+        """These only, in this order."""
+        return Suggestions(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
-def suggest_pairs(graph: ViewGraph, diagnosis: Diagnosis, most: int = 20) -> Suggestions:
+def suggest_pairs(
+    graph: ViewGraph,
+    diagnosis: Diagnosis,
+    most: int = 20,
+    *,
+    overlapping: Ints | None = None,
+    tried: Ints | None = None,
+) -> Suggestions:
     """The most telling pairs that no kept edge joins yet, ranked; each view occurs at most twice.
 
-    Candidates are the missing sides of triangles, views that lie near each other, and neighbours in order that lie in
-    different pieces.
+    Candidates are the pairs (N, 2) that see something in common, `overlapping`; where that is not known, the missing
+    sides of triangles and views that lie near each other. And neighbours in order that lie in different pieces. Pairs
+    that were `tried` in vain are left out.
     """
     count, kept = graph.vertex_count, np.flatnonzero(diagnosis.kept)
     joined = _adjacency(graph.edges[kept], count)
-    pairs = np.concatenate([_missing_sides(joined), _near(diagnosis), _across_pieces(diagnosis.piece)], axis=0)
+    inside = np.concatenate([_missing_sides(joined), _near(diagnosis)]) if overlapping is None else overlapping
+    inside = inside[diagnosis.piece[inside[:, 0]] == diagnosis.piece[inside[:, 1]]]
+    pairs = np.concatenate([inside, _across_pieces(diagnosis.piece)])
     low, high = np.sort(pairs, axis=1).T
     keys = np.unique(low * count + high)
-    pairs = np.stack([keys // count, keys % count], axis=1)
+    pairs = np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    pairs = pairs[~_contains(graph.edges[kept], pairs, count)]
-    tests = _tested(graph.edges[diagnosis.verdict == UNTESTABLE], joined, pairs)
-    resistance = _resistance(graph.edges[kept], pairs, count)
-    score = np.log1p(np.where(np.isfinite(resistance), resistance, count)) + TESTED_GAIN * tests
-    order = np.lexsort((np.arange(len(pairs)), -score))
-    chosen = order[_first_of_each(pairs[order], count)][:most]
-    return Suggestions(
-        pairs[chosen], score[chosen], resistance[chosen], tests[chosen], _reasons(resistance[chosen], tests[chosen])
-    )
+    known = graph.edges[kept] if tried is None else np.concatenate([graph.edges[kept], tried])
+    pairs = pairs[~_contains(known, pairs, count)]
+    gains = _Gains.of(graph.edges[kept], graph.edges[diagnosis.verdict == UNTESTABLE], pairs, count)
+    return _best_first(pairs, gains, most)
 
 
 def _adjacency(edges: Ints, count: int) -> csr_matrix:
@@ -98,34 +108,84 @@ def _contains(edges: Ints, pairs: Ints, count: int) -> Bools:
     return np.isin(pairs[:, 0] * count + pairs[:, 1], low * count + high)
 
 
-def _tested(untestable: Ints, joined: csr_matrix, pairs: Ints) -> Ints:
-    """How many untestable edges (K,) would have a triangle with each pair and one joined side."""
-    if not len(untestable) or not len(pairs):
-        return np.zeros(len(pairs), np.int64)
-    alone = _adjacency(untestable, joined.shape[0])
-    i, j = pairs.T
-    # a common neighbour k over one untestable and one joined edge; both untestable counts both
-    through = np.asarray(alone[i].multiply(joined[j]).sum(axis=1)).ravel()
-    through += np.asarray(joined[i].multiply(alone[j]).sum(axis=1)).ravel()
-    return np.asarray(through, np.int64)
+class _Gains:
+    """What an edge of each pair would add to the kept edges and to the pairs taken so far."""
+
+    def __init__(self, joined: csr_matrix, alone: csr_matrix, network: Network, pairs: Ints) -> None:
+        self._joined, self._alone, self._network, self._pairs = joined, alone, network, pairs
+        self._taken: list[Floats] = []
+        self.resistance = network.between(pairs)
+        self.tests = self._tested(np.arange(len(pairs)))
+
+    @classmethod
+    def of(cls, kept: Ints, untestable: Ints, pairs: Ints, count: int) -> _Gains:
+        """Those of these pairs beside the kept edges."""
+        return cls(_adjacency(kept, count), _adjacency(untestable, count), Network.of(kept, count), pairs)
+
+    @property
+    def score(self) -> Floats:
+        """Nats of each pair."""
+        count = self._joined.shape[0]
+        known = np.where(np.isfinite(self.resistance), self.resistance, count)
+        return np.asarray(np.log1p(known) + TESTED_GAIN * self.tests)
+
+    def take(self, row: int) -> None:
+        """Count the pair among the edges: the variances fall by what it holds, and what it tests is tested."""
+        i, j = self._pairs[row].tolist()
+        if self.tests[row]:
+            self._test(i, j)
+        if np.isfinite(self.resistance[row]):
+            # L⁺ loses z zᵀ, z = L⁺ b / √(1 + bᵀ L⁺ b), by each pair taken (Sherman and Morrison 1950)
+            held = self._network.potentials(i, j)
+            for before in self._taken:
+                held -= before * (before[i] - before[j])
+            held /= np.sqrt(1 + self.resistance[row])
+            self._taken.append(held)
+            falls = (held[self._pairs[:, 0]] - held[self._pairs[:, 1]]) ** 2
+            self.resistance = np.maximum(self.resistance - falls, 0.0)
+
+    def _test(self, i: int, j: int) -> None:
+        alone, joined = self._alone.tolil(), self._joined
+        touched = {i, j}
+        for a, b in ((i, j), (j, i)):
+            for k in self._alone[a].multiply(joined[b]).indices.tolist():
+                alone[a, k] = alone[k, a] = 0
+                alone[b, k] = alone[k, b] = 0
+                touched.add(k)
+        self._alone = alone.tocsr()
+        self._alone.eliminate_zeros()
+        again = np.flatnonzero(np.isin(self._pairs, list(touched)).any(axis=1))
+        self.tests[again] = self._tested(again)
+
+    def _tested(self, rows: Ints) -> Ints:
+        """How many untestable edges would have a triangle with each pair (K,) and one joined side."""
+        if not self._alone.nnz or not len(rows):
+            return np.zeros(len(rows), np.int64)
+        i, j = self._pairs[rows].T
+        # a common neighbour k over one untestable and one joined edge; both untestable counts both
+        through = np.asarray(self._alone[i].multiply(self._joined[j]).sum(axis=1)).ravel()
+        through += np.asarray(self._joined[i].multiply(self._alone[j]).sum(axis=1)).ravel()
+        return np.asarray(through, np.int64)
 
 
-def _resistance(edges: Ints, pairs: Ints, count: int) -> Floats:
-    both = np.concatenate([edges, pairs])
-    used = np.arange(len(both)) < len(edges)
-    return effective_resistance(both, count, used)[len(edges) :]
-
-
-def _first_of_each(pairs: Ints, count: int) -> Ints:
-    """The places of the pairs, in order, that come before their views have been named often enough."""
-    named = np.zeros(count, np.int64)
-    out = []
-    for place, (i, j) in enumerate(pairs.tolist()):
-        if max(named[i], named[j]) < EACH_VERTEX:
-            named[i] += 1
-            named[j] += 1
-            out.append(place)
-    return np.array(out, np.int64)
+def _best_first(pairs: Ints, gains: _Gains, most: int) -> Suggestions:
+    """The pair that adds most, then the one that adds most to it, and so on; none whose views were named too often."""
+    named = np.zeros(int(pairs.max(initial=-1)) + 1, np.int64)
+    free = np.ones(len(pairs), bool)
+    rows: list[int] = []
+    told: list[tuple[float, float, int]] = []
+    while free.any() and len(rows) < most:
+        score = np.where(free, gains.score, -np.inf)
+        row = int(np.argmax(score))
+        rows.append(row)
+        told.append((float(score[row]), float(gains.resistance[row]), int(gains.tests[row])))
+        named[pairs[row]] += 1
+        free[row] = False
+        free &= (named[pairs] < EACH_VERTEX).all(axis=1)
+        gains.take(row)
+    score, resistance, tests = np.array(told, float).reshape(-1, 3).T
+    reason = np.array(_reasons(resistance, tests.astype(np.int64)), dtype=np.str_)
+    return Suggestions(pairs[np.array(rows, np.int64)], score, resistance, tests.astype(np.int64), reason)
 
 
 def _reasons(resistance: Floats, tests: Ints) -> tuple[str, ...]:
@@ -134,8 +194,8 @@ def _reasons(resistance: Floats, tests: Ints) -> tuple[str, ...]:
         if not np.isfinite(value):
             text = "joins two pieces"
         else:
-            text = f"its ends are known to {np.sqrt(value):.2g} of an edge's deviation; an edge leaves "
-            text += f"{np.sqrt(value / (1 + value)):.2g}"
+            after = np.sqrt(value / (1 + value))
+            text = f"the deviation between the two falls from {np.sqrt(value):.2g} to {after:.2g} of one edge's"
         if number:
             text = f"tests {number} untestable edge{'s' if number > 1 else ''}; {text}"
         lines.append(text)
