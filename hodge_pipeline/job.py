@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hodge_pipeline import artifacts, binding
 from hodge_pipeline.monitor import Cost, Monitor
@@ -21,6 +21,9 @@ from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Source
 from hodge_pipeline.watch import Watcher
 from hodge_pipeline.workspace import KEY_FILE, StageFolder, Workspace, key_of
+
+if TYPE_CHECKING:
+    from hodge_pipeline.tracked import Tracked
 
 LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless")
 RECORDING = "recording"
@@ -51,7 +54,8 @@ class Job:
     A job that does not compute reads finished stages only: one that is not raises `Unfinished`. Without `scoring` the
     score tables, the slowest part of the end, are left out. `live` is the address of a viewer that is shown the
     recording as it grows. `given` are the poses that it starts from, where they are not its own odometry;
-    `opened` is the source where it needs no reader.
+    `opened` is the source where it needs no reader; `tracked` says how all frames move with the
+    key frames.
     """
 
     recipe: Recipe
@@ -65,6 +69,7 @@ class Job:
     scoring: bool = True
     given: Given | None = None
     opened: Source | None = None
+    tracked: Tracked | None = None
 
     def path(self, stage: str) -> Path:
         """Where a stage's artifacts lie."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from hodge_pipeline.evaluation.contents import (
     Residuals,
     SourceSummary,
     StageRow,
+    TrajectoryRow,
 )
 from hodge_pipeline.evaluation.report import write_report
 from hodge_pipeline.evaluation.residuals import edge_residuals
@@ -29,7 +30,7 @@ from hodge_pipeline.guarding import Refined, summary
 from hodge_pipeline.job import Job, versions
 from hodge_pipeline.report_pictures import four_sides, worst_pairs
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
-from hodge_pipeline.types import CloudSet, Floats, Solution, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import CloudSet, Floats, Ints, Solution, Source, Trajectory, ViewGraph
 
 EDGE_COLUMNS = (
     "i", "j", "source", "status", "fitness", "rmse_m", "correspondences", "weight", "residual_m", "residual_deg",
@@ -112,11 +113,10 @@ def make_report(
     job: Job, source: Source, rounds: Sequence[Round], scores: ScoreTable | None, refined: Refined | None = None
 ) -> Report:
     """Everything that the run measured."""
-    truth, last = true_poses(source), rounds[-1]
+    last = rounds[-1]
     sets = pose_sets(rounds)
     assert last.solution is not None
     component = last.solution.component
-    names = [frame.sequence for frame in source.frames]
     verdict = None if last.verdicts is None else last.verdicts.verdict
     worst = worst_edges(last.graph, last.world_from_cam, last.solution.weights, verdict=verdict)
     return Report(
@@ -131,7 +131,7 @@ def make_report(
             notes=source.notes,
         ),
         scores=scores,
-        trajectories=trajectory_rows(sets, truth, component, names) if has_truth(source) else (),
+        trajectories=_trajectories(job, source, sets, component),
         loops=_loop_rows(last.solution),
         graph=graph_summary(last.graph, component, last.solution.weights, last.rejected_counts, verdict),
         worst_edges=worst,
@@ -146,6 +146,16 @@ def make_report(
         ),
         refinement=None if refined is None else summary(refined.decision),
     )
+
+
+def _trajectories(job: Job, source: Source, sets: Mapping[str, Floats], component: Ints) -> tuple[TrajectoryRow, ...]:
+    """The errors of each set of poses, over all frames, those that are not key frames included."""
+    if job.tracked is not None:
+        source, component = job.tracked.whole, component[job.tracked.anchors]
+        sets = {name: job.tracked.all_poses(poses) for name, poses in sets.items()}
+    if not has_truth(source):
+        return ()
+    return trajectory_rows(sets, true_poses(source), component, [frame.sequence for frame in source.frames])
 
 
 def _loop_rows(solution: Solution) -> tuple[LoopRow, ...]:
@@ -191,7 +201,9 @@ def write(
     Of a refinement the poses of all frames; where nothing could be refined the report alone.
     """
     folder = job.workspace.folder
-    if refined is None:
+    if job.tracked is not None:
+        write_poses(folder, job.tracked.whole, job.tracked.all_poses(rounds[-1].world_from_cam))
+    elif refined is None:
         write_poses(folder, source, rounds[-1].world_from_cam)
     elif job.given is not None and refined.decision.outcome != "nothing":
         write_poses(folder, job.given.whole, refined.world_from_cam)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from hodge_pipeline import binding, guarding, outputs, starting, steps
+from hodge_pipeline import binding, guarding, outputs, starting, steps, tracked
 from hodge_pipeline.edited_round import edited_rounds
 from hodge_pipeline.edits import listed_edges
 from hodge_pipeline.evaluation.contents import Report
@@ -77,7 +77,7 @@ def solve_again(folder: Path | str, *, watcher: Watcher | None = None) -> Run:
 
 
 def _run(job: Job) -> Run:
-    source = steps.read(job)
+    source = tracked.key_frames(job, steps.read(job))
     with Recording(job, source) as recording:
         rounds, models, scores = compute(job, source, recording)
     refined = None if job.given is None else guarding.finish(job, job.given, rounds)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hodge_pipeline import artifacts, binding, registry, steps
+from hodge_pipeline import artifacts, binding, registry, steps, tracked
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.job import Job, Unfinished, log, logging_to
 from hodge_pipeline.pipeline import compute
@@ -47,9 +47,9 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
     with Workspace.open(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
         job = Job(changed, workspace, watcher or Nobody(), computes=False, scoring=not _solved_without_scores(folder))
         log.info("recording made again from the run folder")
-        source = steps.read(job)
         missing = ""
         try:
+            source = tracked.key_frames(job, steps.read(job))
             with Recording(job, source) as recording:
                 compute(job, source, recording)
         except Unfinished as unfinished:

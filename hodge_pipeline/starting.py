@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_pipeline import artifacts, given, steps
+from hodge_pipeline import artifacts, given, steps, tracked
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.edges.pairs import labelled, merge
 from hodge_pipeline.job import Job
@@ -26,7 +26,10 @@ def first_poses(job: Job, source: Source, workers: Workers) -> Round:
         return given.first_poses(job, job.given, source)
     if job.recipe.start == "global":
         return _global_start(job, source, None, ("clouds", "source"), workers)
-    first = steps.odometry(job, source, workers)
+    if job.tracked is not None:
+        first = tracked.first_poses(job, job.tracked, source)
+    else:
+        first = steps.odometry(job, source, workers)
     if not job.recipe.relocalise:
         return first
     return _global_start(job, source, first.graph, ("odometry", "source"), workers)

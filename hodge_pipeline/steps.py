@@ -70,7 +70,9 @@ def measured(job: Job, source: Source) -> ViewGraph:
 
 
 def prepare_clouds(job: Job, source: Source, workers: Workers) -> CloudSet:
-    """The down-sampled cloud of each frame."""
+    """The down-sampled cloud of each frame; where the source was tracked they are there."""
+    if job.tracked is not None:
+        return CloudSet.open(job.path("clouds"))
     options, total = cloud_options(job.recipe), len(source.frames)
     with job.stage("clouds", "clouds", total, options, ("source",)) as (folder, advance):
         if not folder.finished:

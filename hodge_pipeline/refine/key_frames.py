@@ -14,7 +14,16 @@ from hodge_pipeline.types import Floats, Ints
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class KeyFrameOptions:
-    """Which frames are registered where a run starts from given poses; the others move as those around them."""
+    """Which frames are registered where a run starts from given poses, or is long; the others move as those around
+    them.
+    """
+
+    whole_up_to: int = Field(
+        default=300,
+        ge=1,
+        description="frames: without given poses a source of so many is registered whole; a longer one is tracked from "
+        "key frame to key frame, which are chosen by how far the camera moved and by what it still sees",
+    )
 
     distance_m: float = Field(
         default=0.1,
@@ -26,8 +35,8 @@ class KeyFrameOptions:
     every: int = Field(
         default=5,
         ge=0,
-        description="frames: every such frame of a sequence is one, however little it moved, since given poses can "
-        "jump where their maker joined two pieces; 0: none for that reason",
+        description="frames: of given poses every such frame of a sequence is one, however little it moved, since they "
+        "can jump where their maker joined two pieces; 0: none for that reason",
     )
 
 

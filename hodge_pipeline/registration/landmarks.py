@@ -11,21 +11,25 @@ EDGE_STEP = 0.03
 """A landmark whose 3x3 pixels differ by more than this share of its depth lies on an edge: its depth is a guess."""
 
 
-def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: float) -> Landmarks:
+def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: float, *, scale: int = 1) -> Landmarks:
     """At most `count` landmarks, the strongest first; none for a frame without image, depth image or camera.
 
-    A colour image of another size than the depth image is taken to show the same view.
+    A colour image of another size than the depth image is taken to show the same view. They are found in an image
+    `scale` times smaller.
     """
     if frame.read_colour is None or frame.read_depth is None or frame.camera is None:
         return Landmarks.none()
-    image, depth = frame.read_colour(), frame.read_depth()
+    grey, depth = cv2.cvtColor(frame.read_colour(), cv2.COLOR_RGB2GRAY), frame.read_depth()
+    if scale > 1:
+        size = (grey.shape[1] // scale, grey.shape[0] // scale)
+        grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
     detector = cv2.SIFT_create(nfeatures=count)  # type: ignore[attr-defined]
-    found, descriptors = detector.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    found, descriptors = detector.detectAndCompute(grey, None)
     if not found:
         return Landmarks.none()
-    scale = np.array([depth.shape[1] / image.shape[1], depth.shape[0] / image.shape[0]])
+    larger = np.array([depth.shape[1] / grey.shape[1], depth.shape[0] / grey.shape[0]])
     strongest = np.argsort([-point.response for point in found], kind="stable")[:count]
-    pixels = np.array([found[row].pt for row in strongest]) * scale
+    pixels = (np.array([found[row].pt for row in strongest]) + 0.5) * larger - 0.5
     z, sound = _depth_at(depth, np.round(pixels).astype(np.int64), min_range_m, max_range_m)
     points = back_projected(pixels[sound].astype(np.float32), z[sound], frame.camera)
     return Landmarks(points, np.asarray(descriptors)[strongest[sound]].astype(np.uint8))

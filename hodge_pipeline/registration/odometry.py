@@ -81,7 +81,7 @@ def odometry(
         advance(len(result.pairs))
     steps = Registered.joined([results[number] for number in range(len(blocks))])
     lost = ~(steps.fitness >= options.min_fitness)
-    poses = _chained(len(sizes), sequences, steps)
+    poses = chained(len(sizes), sequences, steps)
     notes = tuple(
         f"tracking was lost between rows {i} and {j} (fitness {fitness:.2f}): no edge there, the motion is guessed"
         for (i, j), fitness in zip(steps.pairs[lost], steps.fitness[lost], strict=True)
@@ -128,7 +128,8 @@ def _durations(stamps_s: Floats) -> Floats:
     return np.where((durations > 0).all(), durations, 1.0)
 
 
-def _chained(count: int, sequences: Sequence[Ints], steps: Registered) -> Floats:
+def chained(count: int, sequences: Sequence[Ints], steps: Registered) -> Floats:
+    """Poses (count, 4, 4) that steps between rows of each sequence lead to; a sequence begins beside the one before."""
     motion_to = {int(j): (int(i), motion) for (i, j), motion in zip(steps.pairs, steps.i_from_j, strict=True)}
     poses: Floats = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
     begin_x = 0.0

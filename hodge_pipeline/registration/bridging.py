@@ -1,0 +1,61 @@
+"""What tracking left apart, tried again: key frames before a break are registered to those behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.registration.odometry import OdometryOptions
+from hodge_pipeline.registration.pairs import Registered, register_pairs
+from hodge_pipeline.stages import Workers
+from hodge_pipeline.types import Floats, Ints
+
+REACH = 3
+"""Key frames on either side of a break."""
+
+
+def bridge(
+    clouds: Path,
+    sequences: Sequence[Ints],
+    steps: Registered,
+    poses: Floats,
+    options: OdometryOptions,
+    workers: Workers,
+) -> tuple[Registered, Floats]:
+    """The good steps with the bridges that were found, and the poses (K, 4, 4) moved accordingly, of K key frames.
+
+    A step of less than `options.min_fitness` is a break. The bridge over it is the fittest registration of one of the
+    three key frames before it and one of the three behind.
+    """
+    good = steps.fitness >= options.min_fitness
+    breaks = steps.pairs[~good]
+    if not len(breaks):
+        return steps, poses
+    pairs = np.concatenate([_across(pair, rows) for rows in sequences for pair in breaks if np.isin(pair, rows).all()])
+    pairs = np.unique(pairs, axis=0)
+    guesses = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
+    found = register_pairs(clouds, options.registration, pairs, guesses, workers)
+    bridges, moved = [], poses.copy()
+    for i, j in breaks.tolist():
+        over = np.flatnonzero(
+            (found.pairs[:, 0] <= i) & (found.pairs[:, 1] >= j) & (found.fitness >= options.min_fitness)
+        )
+        if len(over):
+            best = over[np.argmax(found.fitness[over])]
+            a, b = found.pairs[best]
+            change = moved[a] @ found.i_from_j[best] @ se3.inverse(moved[b])
+            rows = next(rows for rows in sequences if i in rows)
+            behind = rows[rows >= j]
+            moved[behind] = change @ moved[behind]
+            bridges.append(best)
+    chosen = found.select(np.unique(np.array(bridges, np.int64)))
+    return Registered.joined([steps.select(good), chosen]), moved
+
+
+def _across(pair: Ints, rows: Ints) -> Ints:
+    place = int(np.searchsorted(rows, pair[0]))
+    before, behind = rows[max(0, place - REACH + 1) : place + 1], rows[place + 1 : place + 1 + REACH]
+    return np.stack(np.meshgrid(before, behind, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -1,0 +1,108 @@
+"""Tracked blocks on disk: a killed run goes on with the next one, and the clouds of all are joined file by file."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline import artifacts
+from hodge_pipeline.registration.pairs import Registered
+from hodge_pipeline.registration.tracking import TrackedBlock
+from hodge_pipeline.types import CloudSet, Floats, Ints
+
+STEP, CLOUD = "step_", "cloud_"
+
+
+@dataclass(frozen=True)
+class BlockRows:
+    """A `TrackedBlock` without its clouds."""
+
+    keys: Ints
+    steps: Registered
+    rows: Ints
+    anchors: Ints
+    key_from_row: Floats
+    fitness: Floats
+    notes: tuple[str, ...]
+
+
+class TrackedBlocks:
+    """The blocks in a folder, by number."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(exist_ok=True)
+        self._folder = folder
+
+    def finished(self) -> set[int]:
+        """The numbers of the blocks that are there."""
+        return {int(path.stem) for path in self._folder.glob("[0-9]*.npz")}
+
+    def write(self, number: int, block: TrackedBlock) -> None:
+        """Keep one block."""
+        clouds = CloudSet.from_clouds(block.clouds)
+        arrays = {name: getattr(block, name) for name in ("keys", "rows", "anchors", "key_from_row", "fitness")}
+        arrays["notes"] = np.array(block.notes, dtype=np.str_)
+        arrays |= {STEP + field.name: getattr(block.steps, field.name) for field in fields(Registered)}
+        arrays |= {CLOUD + name: getattr(clouds, name) for name in CloudSet.FILES}
+        artifacts.save_arrays(self._path(number), arrays)
+
+    def rows(self, number: int) -> BlockRows:
+        """What became of the rows of one block."""
+        with np.load(self._path(number)) as stored:
+            steps = Registered(*(stored[STEP + field.name] for field in fields(Registered)))
+            columns = {name: stored[name] for name in ("keys", "rows", "anchors", "key_from_row", "fitness")}
+            return BlockRows(steps=steps, notes=tuple(stored["notes"].tolist()), **columns)
+
+    def remove(self) -> None:
+        """Forget the blocks: what they held is written."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def join_clouds(self, chosen: Sequence[Ints], folder: Path) -> None:
+        """Write the clouds of the `chosen` key frames of each block as a `CloudSet` into a folder.
+
+        Memory holds the clouds of one block at a time.
+        """
+        sizes, marks = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)]
+        for number, keep in enumerate(chosen):
+            with np.load(self._path(number)) as stored:
+                sizes.append(np.diff(stored[CLOUD + "offsets"])[keep])
+                marks.append(np.diff(stored[CLOUD + "marks"])[keep])
+        ends = {"offsets": np.cumsum(np.concatenate(sizes)), "marks": np.cumsum(np.concatenate(marks))}
+        nothing = CloudSet.from_clouds([])
+        files: dict[str, NDArray[Any]] = {}
+        for name in CloudSet.FILES:
+            if name in ends:
+                np.save(folder / f"{name}.npy", ends[name])
+                continue
+            like: NDArray[Any] = getattr(nothing, name)
+            shape = (int(ends["marks" if name.startswith("mark_") else "offsets"][-1]), *like.shape[1:])
+            files[name] = _empty_file(folder / f"{name}.npy", shape, like.dtype)
+        filled = dict.fromkeys(files, 0)
+        for number, keep in enumerate(chosen):
+            part = self._cut(number, keep)
+            for name, file in files.items():
+                column = getattr(part, name)
+                file[filled[name] : filled[name] + len(column)] = column
+                filled[name] += len(column)
+
+    def _cut(self, number: int, keep: Ints) -> CloudSet:
+        with np.load(self._path(number)) as stored:
+            whole = CloudSet(*(stored[CLOUD + name] for name in CloudSet.FILES))
+        return CloudSet.from_clouds([whole[int(row)] for row in keep])
+
+    def _path(self, number: int) -> Path:
+        return self._folder / f"{number:06d}.npz"
+
+
+def _empty_file(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """An array to be filled that is the file; an empty array cannot be mapped, and is written as it is."""
+    if shape[0]:
+        return np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+    np.save(path, np.zeros(shape, dtype))
+    return np.zeros(shape, dtype)

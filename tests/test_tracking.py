@@ -1,0 +1,157 @@
+"""Long sequences: key frames, the poses of the frames between them, frames that show nothing, resume."""
+
+import json
+import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hodge_pipeline
+from hodge_adapters.poses_text import read_tum
+from hodge_adapters.tum import TumReader
+from hodge_pipeline import se3, tracked
+from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.executors.local import InProcess
+from hodge_pipeline.recipe import Recipe, load_recipe
+from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
+from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, frame_blocks, track_block
+from hodge_pipeline.tracked import Tracked, tracking_options
+from hodge_pipeline.types import CloudSet, Floats32, Source
+
+FRAMES = 64
+SMALL = (
+    "clouds.voxel_m=0.06", "fusion=[]", "executor.workers=0", "recording.level=off", "evaluation.tables=false",
+    "outer_iterations=1", "edges.max_edges_per_frame=4", "key_frames.whole_up_to=20",
+)  # fmt: skip
+
+
+def small_recipe(source: Path, *overrides: str) -> Recipe:
+    return load_recipe("demo", [*SMALL, *overrides], source)
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    options = DemoOptions(frames=FRAMES, width=160, height=120, stride=1, turns=0.12)
+    return make_sequence(tmp_path_factory.mktemp("long") / "sequence", options)
+
+
+@pytest.fixture(scope="module")
+def run(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> hodge_pipeline.Run:
+    return hodge_pipeline.run(small_recipe(sequence), tmp_path_factory.mktemp("runs") / "run")
+
+
+def track(source: Source, folder: Path) -> tuple[Tracked, tuple[str, ...]]:
+    folder.mkdir()
+    options = tracking_options(small_recipe(source.path))
+    return tracked._track(source, options, folder, InProcess(), lambda done: None)
+
+
+def empty_depth(shape: tuple[int, int]) -> Floats32:
+    return np.zeros(shape, np.float32)
+
+
+def with_dark(source: Source, rows: range) -> Source:
+    frames = list(source.frames)
+    for row in rows:
+        frames[row] = replace(frames[row], read_depth=partial(empty_depth, (120, 160)))
+    return replace(source, frames=tuple(frames))
+
+
+def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeline.Run) -> None:
+    assert 2 < len(run.result.world_from_cam) < FRAMES / 2
+    poses = read_tum(run.folder / "poses.tum")
+    assert len(poses) == FRAMES
+    assert any("of 64 frames are key frames" in note for note in run.report.notes)
+    rows = {row.name: row for row in run.report.trajectories}
+    assert rows["result"].frames == FRAMES
+    assert rows["result"].ate_rmse_m < 0.02
+
+
+def test_a_source_that_is_short_enough_is_registered_whole(sequence: Path) -> None:
+    recipe = small_recipe(sequence, "key_frames.whole_up_to=64")
+    source = TumReader().open(sequence)
+    job = hodge_pipeline.job.Job(recipe, None, hodge_pipeline.watch.Nobody())  # type: ignore[arg-type]
+    assert tracked.key_frames(job, source) is source
+
+
+def test_frames_follow_their_key_frames(sequence: Path, tmp_path: Path) -> None:
+    found, _ = track(TumReader().open(sequence), tmp_path / "t")
+    before = found.all_poses(found.world_from_key)
+    np.testing.assert_allclose(before[found.key_rows], found.world_from_key, atol=1e-12)
+    change = se3.exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -0.5]))
+    np.testing.assert_allclose(found.all_poses(change @ found.world_from_key), change @ before, atol=1e-9)
+    assert found.found.all()
+    assert (found.anchors[found.key_rows] == np.arange(len(found.key_rows))).all()
+
+
+def test_blocks_share_their_border_and_nothing_else() -> None:
+    rows = np.arange(10, 10 + 2 * FRAMES_IN_BLOCK + 5)
+    blocks = frame_blocks(rows, tuple(range(200)), np.arange(200.0))  # type: ignore[arg-type]
+    own = [block.rows[int(block.warm_up) :] for block in blocks]
+    assert [int(part[0]) for part in own[1:]] == [int(part[-1]) for part in own[:-1]]
+    np.testing.assert_array_equal(np.concatenate([own[0], *(part[1:] for part in own[1:])]), rows)
+    assert [block.rows.tolist() for block in frame_blocks(np.array([3]), tuple(range(9)), np.arange(9.0))] == [[3]]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dark", [range(20, 26), range(46, 51), range(60, 64)])
+def test_frames_without_depth_are_bridged_and_said(sequence: Path, tmp_path: Path, dark: range) -> None:
+    source = TumReader().open(sequence)
+    whole, _ = track(source, tmp_path / "whole")
+    found, notes = track(with_dark(source, dark), tmp_path / "dark")
+    assert np.flatnonzero(~found.found).tolist() == list(dark)
+    assert any(f"tracking was lost at {len(dark)} frames" in note for note in notes)
+    assert not any("for good" in note for note in notes)
+    poses, expected = (one.all_poses(one.world_from_key) for one in (found, whole))
+    seen = found.found
+    first = int(np.flatnonzero(seen)[0])
+    apart = se3.inverse(se3.inverse(poses[first]) @ poses) @ (se3.inverse(expected[first]) @ expected)
+    assert np.linalg.norm(apart[seen, :3, 3], axis=1).max() < 0.06
+    assert np.isfinite(poses).all()
+    inside = [row for row in dark if dark[0] > 0 and dark[-1] < FRAMES - 1]
+    assert all(np.linalg.norm(apart[row, :3, 3]) < 0.09 for row in inside)
+
+
+def test_a_killed_tracking_keeps_its_blocks(
+    sequence: Path, tmp_path: Path, run: hodge_pipeline.Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep, written = TrackedBlocks.write, list[int]()
+
+    def write(self: TrackedBlocks, number: int, block: object) -> None:
+        keep(self, number, block)  # type: ignore[arg-type]
+        written.append(number)
+        if len(written) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(TrackedBlocks, "write", write)
+    with pytest.raises(KeyboardInterrupt):
+        hodge_pipeline.run(small_recipe(sequence), tmp_path / "run")
+    again = hodge_pipeline.run(small_recipe(sequence), tmp_path / "run")
+    assert written == [0, 1]
+    np.testing.assert_array_equal(again.result.world_from_cam, run.result.world_from_cam)
+    assert not (again.folder / "stages" / "clouds" / "blocks").exists()
+
+
+def test_clouds_are_joined_without_the_border_twice(sequence: Path, tmp_path: Path) -> None:
+    source = TumReader().open(sequence)
+    found, _ = track(source, tmp_path / "t")
+    clouds = CloudSet.open(tmp_path / "t")
+    assert len(clouds) == len(found.key_rows) == len(set(found.key_rows.tolist()))
+    options = tracking_options(small_recipe(sequence))
+    (first, *_) = frame_blocks(np.arange(FRAMES), tuple(source.frames), tracked.stamps_of(source))
+    block = track_block(options, first)
+    np.testing.assert_array_equal(clouds[1].points_in_cam, block.clouds[1].points_in_cam)
+
+
+def test_the_same_command_again_computes_nothing(
+    run: hodge_pipeline.Run, sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "again"
+    shutil.copytree(run.folder, folder)
+    monkeypatch.setattr(tracked, "_track", None)
+    again = hodge_pipeline.run(small_recipe(sequence), folder)
+    np.testing.assert_array_equal(again.result.world_from_cam, run.result.world_from_cam)
+    stages = [stage["name"] for stage in json.loads((folder / "report.json").read_text())["stages"]]
+    assert "tracking" in stages
