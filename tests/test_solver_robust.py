@@ -57,6 +57,28 @@ def test_wrong_edges_are_found_and_left_out(share, planar):
     assert any(f"{kept.sum()} of {graph.edge_count} edges kept" in note for note in solution.notes)
 
 
+def rings(count: int, around: int) -> tuple[ViewGraph, np.ndarray]:
+    """A cylinder of rings of so many poses, each joined to the ring below twice, and the true poses."""
+    k = np.arange(count)
+    angle = 2 * np.pi * k / around
+    place = np.stack([np.cos(angle), np.sin(angle), 2 * np.pi * k / around**2], axis=1) * around / (2 * np.pi)
+    truth = se3.from_parts(se3.so3_exp(np.outer(angle, [0, 0, 1])), place)
+    edges = np.concatenate([np.stack([k[:-s], k[s:]], axis=1) for s in (1, around, around + 1)])
+    sigma = np.repeat([0.05, 0.1], 3)
+    errors = np.random.default_rng(0).normal(size=(len(edges), 6)) * sigma
+    measured = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ se3.exp(errors)
+    return ViewGraph.from_edges(k, edges, measured, np.tile(np.diag(sigma**-2), (len(edges), 1, 1))), truth
+
+
+def test_right_edges_of_a_drifting_graph_are_not_lost():
+    """Noise bends the rings so far that edges which close them look wrong until the others hold the shape."""
+    graph, truth = rings(200, 40)
+    graph, wrong = spoiled(graph, 0.2, 13)
+    kept = solve_robust(graph, start=truth).weights > 0.5
+    assert kept[wrong].mean() < 0.01
+    assert kept[~wrong].mean() > 0.97
+
+
 def test_a_wrong_sequential_edge_is_not_trusted():
     graph, truth = band(12, 4, 3)
     motion = graph.i_from_j.copy()
