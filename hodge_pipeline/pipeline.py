@@ -16,6 +16,7 @@ from hodge_pipeline.job import Job, logging_to
 from hodge_pipeline.recipe import Recipe, load_recipe, with_source
 from hodge_pipeline.record import Recording
 from hodge_pipeline.rounds import Round
+from hodge_pipeline.scale import apply_scale
 from hodge_pipeline.suggested_rounds import suggested_rounds
 from hodge_pipeline.types import Source
 from hodge_pipeline.watch import Nobody, Watcher
@@ -87,6 +88,7 @@ def _run(job: Job) -> Run:
 
 def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round], dict[str, Path], ScoreTable | None]:
     """The rounds, the models' files by name, the scores: every stage in order, each recorded once it is done."""
+    apply_scale(job, source)
     measured = steps.measured(job, source)
     with job.recipe.executor.open() as workers:
         clouds = steps.prepare_clouds(job, source, workers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -58,6 +58,12 @@ class Recipe:
     description: str = Field(default="", description="one sentence for `hodge recipes`")
     seed: int = Field(default=0, ge=0, description="of everything random; the same seed gives the same poses")
     source: SourceOptions = SourceOptions()
+    scale: Annotated[float, Field(gt=0)] | Literal["auto"] = Field(
+        default=1.0,
+        description="factor on every length (`…_m`) of clouds, odometry, start, edges, registration, acceptance, "
+        "solver and fusion, which are written for rooms; auto: such that most scans have 1500 to 40,000 voxels of "
+        "`clouds.voxel_m`, so 1 for rooms",
+    )
     clouds: CloudOptions = CloudOptions()
     start: Literal["odometry", "global"] = Field(
         default="odometry",

@@ -15,7 +15,8 @@ from hodge_pipeline import artifacts, given, se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.edges.pairs import select
 from hodge_pipeline.errors import RecipeError, SourceError
-from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphScores, ScoreTable, score_table
+from hodge_pipeline.evaluation.scaled_scores import scaled_score_table
+from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphScores, ScoreTable
 from hodge_pipeline.fusion.ply import write_ply
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.job import Job, source_key, unnamed_key
@@ -242,14 +243,17 @@ def evaluate(job: Job, source: Source, rounds: Sequence[Round], workers: Workers
     reference = "truth" if has_truth(source) else "result"
     sets = {"truth": truth, **sets} if has_truth(source) else sets
     inputs = ("clouds", _first_stage(job), *(f"solve-{number}" for number in range(1, len(rounds))))
+    scale = float(job.recipe.scale)
     with job.stage("evaluate", "evaluation", 1, job.recipe.evaluation, inputs) as (folder, advance):
         if not folder.finished:
-            table = score_table(job.path("clouds"), sets, reference, workers)
+            table = scaled_score_table(job.path("clouds"), sets, reference, workers, scale, folder.path / "scaled")
             artifacts.save_arrays(
                 folder.path / "scores.npz",
                 {f"{g.kind}_{part}": getattr(g, part) for g in table.graphs for part in ("pairs", "distances_m")},
             )
             advance(1)
     arrays = artifacts.load_arrays(job.path("evaluate") / "scores.npz")
-    graphs = tuple(GraphScores(kind, arrays[f"{kind}_pairs"], arrays[f"{kind}_distances_m"]) for kind in GRAPH_KINDS)
+    graphs = tuple(
+        GraphScores(kind, arrays[f"{kind}_pairs"], arrays[f"{kind}_distances_m"], scale) for kind in GRAPH_KINDS
+    )
     return ScoreTable(tuple(sets), reference, graphs)

@@ -84,7 +84,7 @@ def as_json(report: Report) -> dict[str, Any]:
 def _scores(table: ScoreTable) -> dict[str, Any]:
     return {
         "reference": table.reference,
-        "sigma_m": SIGMA_M,
+        "sigma_m": table.scale * SIGMA_M,
         "graphs": {
             graph.kind: {
                 "edges": len(graph.pairs),

@@ -109,16 +109,20 @@ def _relative(poses: Floats, pairs: Ints) -> Floats:
 
 @dataclass(frozen=True)
 class GraphScores:
-    """The scores of every set of poses on one graph: `pairs (P, 2)`, `distances_m (S, P)`, NaN where not defined."""
+    """The scores of every set of poses on one graph: `pairs (P, 2)`, `distances_m (S, P)`, NaN where not defined.
+
+    `scale`: what σ and the reach of 0.1 m were taken times, for scenes that are no rooms.
+    """
 
     kind: GraphKind
     pairs: Ints
     distances_m: Floats
+    scale: float = 1.0
 
     @property
     def scores(self) -> Floats:
         """`exp(−d/σ)` (S, P)."""
-        return np.asarray(np.exp(-self.distances_m / SIGMA_M))
+        return np.asarray(np.exp(-self.distances_m / (self.scale * SIGMA_M)))
 
     @property
     def counts(self) -> Ints:
@@ -128,7 +132,7 @@ class GraphScores:
     @property
     def unmatched(self) -> Ints:
         """How many edges (S,) have no point within 0.1 m of the other cloud."""
-        return np.asarray((self.distances_m >= NO_NEIGHBOUR_M).sum(axis=1), np.int64)
+        return np.asarray((self.distances_m >= self.scale * NO_NEIGHBOUR_M).sum(axis=1), np.int64)
 
     @property
     def mean_distance_m(self) -> Floats:
@@ -155,6 +159,11 @@ class ScoreTable:
     names: tuple[str, ...]
     reference: str
     graphs: tuple[GraphScores, ...]
+
+    @property
+    def scale(self) -> float:
+        """What the lengths of the scores were taken times."""
+        return max((graph.scale for graph in self.graphs), default=1.0)
 
 
 def score_table(

@@ -84,7 +84,7 @@ def _scores(report: Report) -> Table:
     ]
     caption = (
         f"How well overlapping clouds lie on each other, on the pairs of the {table.reference} poses ({counts}). "
-        f"d: mean point-to-plane distance; score: mean of exp(−d / {SIGMA_M * 1000:g} mm), 1 is perfect. "
+        f"d: mean point-to-plane distance; score: mean of exp(−d / {table.scale * SIGMA_M * 1000:g} mm), 1 is perfect. "
         "Compare rows with each other: a score has no meaning alone."
     )
     return Table("Scores", ("poses", *(cell for column in columns for cell in column)), tuple(rows), caption)

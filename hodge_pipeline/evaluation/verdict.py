@@ -149,13 +149,17 @@ def _edge_suspicions(report: Report) -> Iterator[str]:
     large = [
         edge
         for edge in report.worst_edges
-        if edge.weight > 0 and (edge.residual_m > LARGE_RESIDUAL_M or edge.residual_deg > LARGE_RESIDUAL_DEG)
+        if edge.weight > 0 and (edge.residual_m > _large_m(report) or edge.residual_deg > LARGE_RESIDUAL_DEG)
     ]
     if large:
         yield (
-            f"At least {len(large)} edges that the solver used are more than {length(LARGE_RESIDUAL_M)} or "
+            f"At least {len(large)} edges that the solver used are more than {length(_large_m(report))} or "
             f"{LARGE_RESIDUAL_DEG:g}° off the result: see the worst edges."
         )
+
+
+def _large_m(report: Report) -> float:
+    return LARGE_RESIDUAL_M * (report.scores.scale if report.scores else 1.0)
 
 
 def _unmatched(report: Report) -> Iterator[str]:
@@ -165,7 +169,7 @@ def _unmatched(report: Report) -> Iterator[str]:
         for name, unmatched, count in zip(report.scores.names, graph.unmatched, graph.counts, strict=True):
             if unmatched > UNMATCHED_SHARE * count:
                 pairs = f"{unmatched} of {count} {GRAPH_NAMES[graph.kind]}"
-                yield f"{name}: {pairs} have no point within {length(NO_NEIGHBOUR_M)} of each other."
+                yield f"{name}: {pairs} have no point within {length(graph.scale * NO_NEIGHBOUR_M)} of each other."
 
 
 def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[str]:

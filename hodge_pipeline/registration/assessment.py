@@ -11,7 +11,9 @@ from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints, Registration
 
 MIN_POINTS = 10
-MIN_SIGMA_M = 1e-3  # no depth sensor is better; keeps noise-free (modelled) pairs finite
+MIN_SIGMA_M, MIN_SIGMA_SHARE = 1e-3, 0.02
+"""No depth sensor is better, nor a scanner of small things than 1/50 of the distance that it is matched within: keeps
+noise-free (modelled) pairs finite."""
 
 FindNearest: TypeAlias = Callable[[Floats], tuple[Ints, Floats]]
 """Rows of the nearest target points, and squared distances in m², for query points (N, 3)."""
@@ -43,8 +45,8 @@ def assess(
 
     The information is that of the point-to-plane error e = n·(p − q) under `i_from_j exp(ξ)`, ξ = (rotation,
     translation) in j's axes: Σ JᵀJ / (s² c), J = (p_j × n_j, n_j), with s the RMS of e over this pair (at least
-    1 mm). c = `points_per_sample` source points count as one independent measurement, since neighbours share their
-    error. Directions that the surfaces do not fix, as within a plane, get none.
+    1 mm, or 1/50 of the distance). c = `points_per_sample` source points count as one independent measurement, since
+    neighbours share their error. Directions that the surfaces do not fix, as within a plane, get none.
     """
     moved = se3.transform(i_from_j, source_points)
     if not np.isfinite(moved).all():
@@ -56,7 +58,8 @@ def assess(
         return NOTHING
     normals = target_normals[rows[near]]
     plane_errors = np.einsum("ij,ij->i", normals, moved[near] - target_points[rows[near]])
-    variance = max(float(np.mean(plane_errors**2)), MIN_SIGMA_M**2)
+    least = min(MIN_SIGMA_M, MIN_SIGMA_SHARE * max_distance_m)
+    variance = max(float(np.mean(plane_errors**2)), least**2)
     jacobian = plane_jacobian(normals, source_points[near], i_from_j)
     return Assessment(
         information=jacobian.T @ jacobian / (variance * points_per_sample),

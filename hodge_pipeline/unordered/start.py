@@ -23,7 +23,6 @@ from hodge_pipeline.unordered.similarity import LocalDescriptors, all_pairs, sim
 from hodge_pipeline.unordered.views import Views
 
 DESCRIBED, VIEWS = "described", "views"
-FEATURE_VOXEL_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ def propose(clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart,
     """The pairs (P, 2) to match: all of a few frames, else each with the most similar ones."""
     if len(rows) <= options.all_pairs_up_to:
         return all_pairs(rows)
-    local = LocalDescriptors(described, clouds, FEATURE_VOXEL_M)
+    local = LocalDescriptors(described, clouds, options.similarity_voxel_m)
     return similar_pairs(local, rows, options, ordered)
 
 
