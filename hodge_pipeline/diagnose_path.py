@@ -13,7 +13,7 @@ from hodge_pipeline import artifacts, registry
 from hodge_pipeline.diagnosis.advice import advice, ranked
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.edges_csv import write_edges_csv
-from hodge_pipeline.diagnosis.energy_tables import energy_rows
+from hodge_pipeline.diagnosis.energy import EnergyRow, energy_rows
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.page import PageContents, render
 from hodge_pipeline.diagnosis.plots import draw, side_by_side
@@ -114,11 +114,12 @@ def _disabled(path: Path, graph: ViewGraph) -> Bools:
 
 @dataclass(frozen=True)
 class Diagnosed:
-    """A subject with its diagnosis, the advice (E,), the commands to type and the pairs to register next."""
+    """A subject with its diagnosis, advice (E,), energy, the commands to type and the pairs to register next."""
 
     subject: Subject
     diagnosis: Diagnosis
     advice: tuple[str, ...]
+    energy: tuple[EnergyRow, ...]
     commands: tuple[str, ...]
     notes: tuple[str, ...]
     suggestions: Suggestions
@@ -134,12 +135,13 @@ def diagnose_subject(subject: Subject) -> Diagnosed:
     found = diagnose(subject.graph, subject.options)
     pieces = int(found.piece.max(initial=-1)) + 1
     apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
-    notes = (*subject.notes, *found.notes, *((apart,) if pieces > 1 else ()))
+    energy, complaints = energy_rows(subject.graph, found.world_from_cam, found.piece, found.kept)
+    notes = (*subject.notes, *found.notes, *((apart,) if pieces > 1 else ()), *complaints)
     suggestions = suggest_pairs(
         subject.graph, found, SUGGESTED, overlapping=_overlapping(subject, found), tried=subject.tried
     )
     commands = _commands(subject, found, suggestions)
-    return Diagnosed(subject, found, advice(found, subject.disabled), commands, notes, suggestions)
+    return Diagnosed(subject, found, advice(found, subject.disabled), energy, commands, notes, suggestions)
 
 
 def _overlapping(subject: Subject, found: Diagnosis) -> Ints | None:
@@ -158,10 +160,13 @@ def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> t
             return (f"hodge solve {subject.path} --out solved.g2o --robust",)
         off = " ".join(f"--disable {pair}" for pair in wrong)
         return (f"hodge solve {subject.path} --out solved.g2o {off}",) if wrong else ()
-    options = f" --disable {','.join(wrong) if len(wrong) <= COMMANDED else WRONG}" if wrong else ""
     useful = suggestions.pairs[suggestions.score >= subject.suggestions.min_gain][:REGISTERED]
-    options += f" --register {','.join(_names(subject.graph, useful))}" if len(useful) else ""
-    return (f"hodge edit {subject.path}{options}", f"hodge solve {subject.path}") if options else ()
+    if not wrong and not len(useful):
+        return ()
+    edit = f"--disable {','.join(wrong) if len(wrong) <= COMMANDED else WRONG}"
+    if not wrong:
+        edit = f"--register {','.join(_names(subject.graph, useful))}"
+    return f"hodge edit {subject.path} {edit}", f"hodge solve {subject.path}"
 
 
 def _names(graph: ViewGraph, pairs: Ints) -> list[str]:
@@ -197,7 +202,6 @@ def _write_poses(path: Path, subject: Subject, found: Diagnosis) -> None:
 
 def _page(diagnosed: Diagnosed) -> PageContents:
     subject, found = diagnosed.subject, diagnosed.diagnosis
-    energy, complaints = energy_rows(subject.graph, found)
     rows = diagnosed.rows[: max(LEAST_PICTURED, min(PICTURED, int((found.verdict != CONSISTENT).sum())))]
     pictures = edge_pictures(subject.graph, found, rows, subject.frames, subject.clouds)
     return PageContents(
@@ -206,10 +210,10 @@ def _page(diagnosed: Diagnosed) -> PageContents:
         graph=subject.graph,
         diagnosis=found,
         advice=diagnosed.advice,
-        energy=energy,
-        plots=draw(subject.graph, found, energy),
+        energy=diagnosed.energy,
+        plots=draw(subject.graph, found, diagnosed.energy),
         edges=pictures,
         suggestions=diagnosed.suggestions,
         commands=diagnosed.commands,
-        notes=(*diagnosed.notes, *complaints),
+        notes=diagnosed.notes,
     )

@@ -20,7 +20,7 @@ from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.energy_tables import energy_rows
+from hodge_pipeline.diagnosis.energy import energy_rows
 from hodge_pipeline.diagnosis.matches import side_by_side
 from hodge_pipeline.diagnosis.plots import side_by_side as pieces_apart
 from hodge_pipeline.diagnosis.two_clouds import FIRST, SECOND, picture, views
@@ -120,6 +120,12 @@ def test_json_has_every_edge(tmp_path: Path) -> None:
     answer = json.loads(hodge(tmp_path / "a.g2o", "--json"))
     assert answer["counts"] == {"consistent": 12, "suspect": 0, "wrong": 0, "untestable": 0}
     assert len(answer["edges"]) == 12 and answer["pieces"] == 1 and answer["commands"] == []
+    for row in answer["energy"]:
+        for kind in ("rotation", "translation"):
+            assert sum(row[kind][part] for part in ("exact", "co-exact", "harmonic")) == pytest.approx(1)
+    text = hodge(tmp_path / "a.g2o")
+    assert text.count("energy   rotation ") == 2 and "only their linearisation" in text
+    assert text.splitlines()[3].startswith("… and 9 more edges")
     joined = {frozenset((edge["i"], edge["j"])) for edge in answer["edges"]}
     nexts = [frozenset((pair["i"], pair["j"])) for pair in answer["register_next"]]
     assert nexts and not joined & set(nexts)
@@ -168,7 +174,8 @@ def test_shares_of_a_piece_add_up_and_pieces_to_the_whole() -> None:
         np.concatenate([graph.i_from_j, ring(6)[0].i_from_j]),
         np.concatenate([graph.information, ring(6)[0].information]),
     )
-    rows, complaints = energy_rows(graph, diagnose(graph))
+    found = diagnose(graph)
+    rows, complaints = energy_rows(graph, found.world_from_cam, found.piece, found.kept)
     assert complaints == ()
     by_name = {(row.group, row.when): row for row in rows}
     assert {"all edges", "piece 0", "piece 1"} == {row.group for row in rows}

@@ -10,12 +10,15 @@ from hodge_pipeline.cli.console import Terminal
 
 if TYPE_CHECKING:
     from hodge_pipeline.diagnose_path import Diagnosed
+    from hodge_pipeline.diagnosis.energy import EnergyRow
 
 SUGGESTED = 3
+LEAST_SHOWN, MOST_BAD = 3, 20
+"""Rows of the table where nobody says how many: the edges that are not consistent, and a few in any case."""
 HEADER = ("edge", "verdict", "right", "why", "what to do")
 
 
-def diagnose(path: Path, out: Path | None, *, top: int, quiet: bool, as_json: bool) -> None:
+def diagnose(path: Path, out: Path | None, *, top: int | None, quiet: bool, as_json: bool) -> None:
     """Judge every edge, print the worst, and leave the rest in a folder where one is given."""
     from hodge_pipeline.diagnose_path import diagnose_subject, open_subject, write_diagnosed
 
@@ -33,9 +36,12 @@ def diagnose(path: Path, out: Path | None, *, top: int, quiet: bool, as_json: bo
         _print(found, out, top)
 
 
-def _print(found: Diagnosed, out: Path | None, top: int) -> None:
+def _print(found: Diagnosed, out: Path | None, top: int | None) -> None:
+    from hodge_pipeline.diagnosis.energy import CAVEAT, in_words
     from hodge_pipeline.diagnosis.page import sentence
 
+    if top is None:
+        top = min(MOST_BAD, max(LEAST_SHOWN, int((found.diagnosis.verdict != "consistent").sum())))
     rows = [_cells(found, int(row)) for row in found.rows[:top]]
     if sys.stdout.isatty():
         _print_rich(rows)
@@ -48,7 +54,9 @@ def _print(found: Diagnosed, out: Path | None, top: int) -> None:
     if left > 0:
         print(f"… and {left} more edges, none of them worse" + ("" if out is None else f": {out / 'edges.csv'}"))
     print(f"verdict  {sentence(found.subject.graph, found.diagnosis)}")
-    for note in found.notes:
+    for line in in_words(found.energy):
+        print(f"energy   {line}")
+    for note in (*found.notes, *((CAVEAT,) if found.energy else ())):
         print(f"note     {note}")
     useful = found.suggestions.score >= found.subject.suggestions.min_gain
     for (i, j), reason in list(zip(_suggested(found), found.suggestions.reason[useful], strict=False))[:SUGGESTED]:
@@ -85,6 +93,19 @@ def _print_rich(rows: list[tuple[str, ...]]) -> None:
     Console(highlight=False).print(table)
 
 
+def _energy(row: EnergyRow) -> dict[str, Any]:
+    from hodge_pipeline.diagnosis.energy import PARTS
+
+    rotation, translation = (dict(zip(PARTS, shares.tolist(), strict=True)) for shares in row.shares)
+    return {
+        "edges_of": row.group,
+        "when": row.when,
+        "edges": row.edges,
+        "rotation": {"rad2": float(row.rotation.sum()), **rotation},
+        "translation": {"m2": float(row.translation.sum()), **translation},
+    }
+
+
 def _as_json(found: Diagnosed, out: Path | None) -> dict[str, Any]:
     graph, diagnosis = found.subject.graph, found.diagnosis
     counts = {name: int((diagnosis.verdict == name).sum()) for name in ("consistent", "suspect", "wrong", "untestable")}
@@ -109,7 +130,7 @@ def _as_json(found: Diagnosed, out: Path | None) -> dict[str, Any]:
         "vertices": graph.vertex_count,
         "pieces": int(diagnosis.piece.max(initial=-1)) + 1,
         "counts": counts,
-        "energy": diagnosis.energy,
+        "energy": [_energy(row) for row in found.energy],
         "commands": list(found.commands),
         "register_next": [
             {"i": i, "j": j, "why": reason, "score": score}

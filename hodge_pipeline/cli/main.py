@@ -126,7 +126,10 @@ def diagnose(
         Optional[Path],  # noqa: UP045
         typer.Option("--out", help="Folder for edges.csv, poses.tum, diagnosis.html and diagnosis.rrd."),
     ] = None,
-    top: Annotated[int, typer.Option(min=0, help="Edges to print.")] = 20,
+    top: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=0, help="Edges to print; default: those that are not consistent, 20 at most."),
+    ] = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:

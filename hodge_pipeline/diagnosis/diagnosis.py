@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.diagnosis.consensus import find_consensus
-from hodge_pipeline.diagnosis.energy import energy_shares
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.noise import Noise, edge_noise
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
@@ -102,7 +101,6 @@ def _report(
     residual = np.where(same, moved, np.nan), np.where(same, np.degrees(angle), np.nan)
     telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
     share = 1 - 1 / (1 + resistance)
-    energy, caveats = energy_shares(graph, world_from_cam, piece, kept)
     counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
     tested = f"{len(cycles.loops)} cycles, {int(cycles.closes.sum())} of them close"
     return Diagnosis(
@@ -118,6 +116,5 @@ def _report(
         witnesses_against=telling[1],
         piece=piece,
         world_from_cam=world_from_cam,
-        energy=energy,
-        notes=(f"edges: {counts}", tested, *describe_components(piece, graph.vertex_ids), *caveats),
+        notes=(f"edges: {counts}", tested, *describe_components(piece, graph.vertex_ids)),
     )

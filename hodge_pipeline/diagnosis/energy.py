@@ -1,10 +1,12 @@
-"""How much of what the edges leave over is gradient, curl of triangles, or loops that no triangle fills."""
+"""Energy of what the edges leave over: how much is gradient, curl of triangles, or loops that no triangle fills."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import clique_counts, flag_complex, orient_edges
@@ -13,49 +15,116 @@ from hodge_pipeline.complex.decomposition import hodge_decomposition
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
+PARTS = ("exact", "co-exact", "harmonic")
+ALL_EDGES = "all edges"
+BEFORE, AFTER = "before", "after"
+MOST_PIECES = 8
 MOST_TRIANGLES, MOST_EDGES = 200_000, 50_000
-CAVEATS = (
+CAVEAT = (
     "energy shares are of ω = log(T_i Z_ij T_j⁻¹) at the robust poses, unit weights, world origin at the centroid of "
-    "each piece; where residual motions are large ω is only their linearisation, and wrong edges dominate it",
+    "each piece; where residual motions are large ω is only their linearisation, and wrong edges dominate it"
+)
+SHARE_CAVEAT = (
+    "Inside one piece the three parts are orthogonal: their shares add up to the whole. Those of one source are "
+    "of the sum of its three parts, which are orthogonal only together with the other sources."
 )
 
 
-def energy_shares(
+@dataclass(frozen=True)
+class EnergyRow:
+    """Energy of some edges' ω: `rotation (3,)` in rad² and `translation (3,)` in m², by `PARTS`."""
+
+    group: str
+    when: str
+    edges: int
+    rotation: Floats
+    translation: Floats
+
+    @property
+    def shares(self) -> tuple[Floats, Floats]:
+        """Shares (3,) that add up to 1, of the rotation and of the translation; zeros where there is no energy."""
+        return _share(self.rotation), _share(self.translation)
+
+
+def _share(energy: Floats) -> Floats:
+    total = float(energy.sum())
+    return energy / total if total > 0 else np.zeros(3)
+
+
+def energy_rows(
     graph: ViewGraph, world_from_cam: Floats, piece: Ints, kept: Bools
-) -> tuple[Mapping[str, Mapping[str, tuple[float, float]]], tuple[str, ...]]:
-    """(rotation, translation) shares of each part, for all edges inside pieces (`before`) and the kept (`after`)."""
-    if graph.edge_count > MOST_EDGES:
-        return {}, (f"energy shares left out: more than {MOST_EDGES} edges",)
+) -> tuple[tuple[EnergyRow, ...], tuple[str, ...]]:
+    """Rows for all edges, each piece (V,) and each source, with every edge (`before`) and the `kept (E,)` ones
+    (`after`); and in a line why there are none, where the graph is too large.
+
+    ω is taken at the poses (V, 4, 4), with unit weights, the world's origin at the centroid of each piece.
+    """
     inside = piece[graph.edges[:, 0]] == piece[graph.edges[:, 1]]
     inside &= graph.edges[:, 0] != graph.edges[:, 1]
-    centred = _centred(world_from_cam, piece)
-    shares: dict[str, Mapping[str, tuple[float, float]]] = {}
-    for name, rows in (("before", inside), ("after", inside & kept)):
-        chosen = graph.select(np.flatnonzero(rows))
-        if not chosen.edge_count:
-            continue
-        if clique_counts(chosen.edges, graph.vertex_count)[2] > MOST_TRIANGLES:
-            return {}, (f"energy shares left out: more than {MOST_TRIANGLES} triangles",)
-        try:
-            shares[name] = _shares(chosen, centred)
-        except GraphError as error:
-            return {}, (f"energy shares left out: {error}",)
-    return shares, CAVEATS
+    rows: list[EnergyRow] = []
+    try:
+        for when, chosen in ((BEFORE, inside), (AFTER, inside & kept)):
+            rows += _rows(graph.select(np.flatnonzero(chosen)), _centred(world_from_cam, piece), piece, when)
+    except GraphError as error:
+        return (), (f"energy shares are left out: {error}",)
+    return tuple(sorted(rows, key=lambda row: _place(row.group))), ()
 
 
-def _shares(graph: ViewGraph, world_from_cam: Floats) -> Mapping[str, tuple[float, float]]:
+def in_words(rows: Sequence[EnergyRow]) -> tuple[str, ...]:
+    """A line each for all edges before and after: 3 % exact, …"""
+    lines = []
+    for row in rows:
+        if row.group == ALL_EDGES:
+            told = [
+                f"{kind} " + ", ".join(f"{100 * share:.1f} % {part}" for share, part in zip(shares, PARTS, strict=True))
+                for kind, shares in zip(("rotation", "translation"), row.shares, strict=True)
+            ]
+            which = "of all edges" if row.when == BEFORE else "of the edges kept"
+            lines.append(f"{'; '.join(told)} ({which})")
+    return tuple(lines)
+
+
+def _place(group: str) -> tuple[int, str]:
+    return (("all", "piece", "source").index(group.split(" ")[0]), group)
+
+
+def _rows(graph: ViewGraph, world_from_cam: Floats, piece: Ints, when: str) -> Iterator[EnergyRow]:
+    if not graph.edge_count:
+        return
+    if graph.edge_count > MOST_EDGES:
+        raise GraphError(f"there are more than {MOST_EDGES} edges")
+    if clique_counts(graph.edges, graph.vertex_count)[2] > MOST_TRIANGLES:
+        raise GraphError(f"there are more than {MOST_TRIANGLES} triangles")
     i, j = graph.edges.T
     omega = se3.log(world_from_cam[i] @ graph.i_from_j @ se3.inverse(world_from_cam[j]))
-    form, weights = orient_edges(graph.edges, graph.vertex_count).pooled(omega, np.ones(graph.edge_count))
+    oriented = orient_edges(graph.edges, graph.vertex_count)
+    form, weights = oriented.pooled(omega, np.ones(graph.edge_count))
     complex_ = flag_complex(graph.edges, graph.vertex_count)
     d0 = coboundary_0(complex_.simplices[1], graph.vertex_count)
-    shares: Mapping[str, tuple[float, float]] = hodge_decomposition(d0, complex_.coboundary(1), form, weights).shares()
-    return shares
+    found = hodge_decomposition(d0, complex_.coboundary(1), form, weights)
+    energy = np.stack([weights[:, None] * part**2 for part in (found.exact, found.coexact, found.harmonic)])
+    source = np.full(len(form), "", graph.source.dtype)
+    source[oriented.row[::-1]] = graph.source[::-1]
+    for group, chosen in _groups(piece[oriented.edges[:, 0]], source):
+        picked = energy[:, chosen]
+        yield EnergyRow(
+            group, when, int(chosen.sum()), picked[:, :, :3].sum(axis=(1, 2)), picked[:, :, 3:].sum(axis=(1, 2))
+        )
+
+
+def _groups(piece: NDArray[np.int64], source: NDArray[np.str_]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    yield ALL_EDGES, np.ones(len(piece), bool)
+    pieces, sources = np.unique(piece), np.unique(source)
+    if len(pieces) > 1:
+        for number in pieces[:MOST_PIECES].tolist():
+            yield f"piece {number}", piece == number
+    if len(sources) > 1:
+        for name in sources.tolist():
+            yield f"source {name}", source == name
 
 
 def _centred(world_from_cam: Floats, piece: Ints) -> Floats:
-    sizes = np.bincount(piece)
-    means = np.stack([np.bincount(piece, world_from_cam[:, axis, 3]) for axis in range(3)], axis=1) / sizes[:, None]
     centred: Floats = np.array(world_from_cam)
-    centred[:, :3, 3] -= means[piece]
+    sums = [np.bincount(piece, centred[:, axis, 3]) for axis in range(3)]
+    centred[:, :3, 3] -= (np.stack(sums, axis=1) / np.bincount(piece)[:, None])[piece]
     return centred

@@ -10,8 +10,7 @@ from html import escape
 import numpy as np
 
 from hodge_pipeline.diagnosis.advice import ranked
-from hodge_pipeline.diagnosis.energy import CAVEATS
-from hodge_pipeline.diagnosis.energy_tables import PARTS, SHARE_CAVEAT, EnergyRow
+from hodge_pipeline.diagnosis.energy import CAVEAT, PARTS, SHARE_CAVEAT, EnergyRow
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.suggestions import Suggestions
 from hodge_pipeline.diagnosis.wording import cycle_error, name_cycle
@@ -213,7 +212,7 @@ def energy_table(rows: Sequence[EnergyRow]) -> Table:
     caption = (
         "Before: all edges inside a piece. After: the edges that are kept. Exact: what moving frames would take away. "
         "Co-exact: curl, seen in triangles. Harmonic: around loops that no triangles fill. "
-        f"{SHARE_CAVEAT} Caveat: {' '.join(CAVEATS)}."
+        f"{SHARE_CAVEAT} Caveat: {CAVEAT}."
     )
     return Table("Energy of the residual motions", header, body, caption, 2)
 

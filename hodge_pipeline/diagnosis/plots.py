@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 
-from hodge_pipeline.diagnosis.energy_tables import PARTS, EnergyRow
+from hodge_pipeline.diagnosis.energy import ALL_EDGES, PARTS, EnergyRow
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.evaluation.plots import Plot
 from hodge_pipeline.types import Floats, Ints, ViewGraph
@@ -49,7 +49,7 @@ def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) 
             "Energy of the residual motions",
             "Rotation left, translation right. Exact: what moving frames would take away. Co-exact: seen in triangles. "
             "Harmonic: around loops that no triangles fill.",
-            lambda figure: _bars(figure, [row for row in energy if row.group == "all edges"]),
+            lambda figure: _bars(figure, [row for row in energy if row.group == ALL_EDGES]),
         )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from numpy import str_
@@ -40,7 +39,7 @@ class Diagnosis:
       0 for one that is not kept.
     - `cycles`; `witnesses_for`, `witnesses_against (E, 3)`: their rows, the most telling first, −1 for none.
     - `piece (V,)`: 0 the largest; `world_from_cam (V, 4, 4)`: each piece in a frame of its own.
-    - `energy`: share of the 1-form that is exact, co-exact and harmonic, by name; `notes`: caveats, one line each.
+    - `notes`: counts and caveats, one line each.
     """
 
     verdict: NDArray[str_]
@@ -55,5 +54,4 @@ class Diagnosis:
     witnesses_against: Ints
     piece: Ints
     world_from_cam: Floats
-    energy: Mapping[str, Mapping[str, tuple[float, float]]]
     notes: tuple[str, ...]

@@ -9,7 +9,7 @@ import rerun as rr
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import clique_counts, flag_complex
-from hodge_pipeline.diagnosis.energy import energy_shares
+from hodge_pipeline.diagnosis.energy import AFTER, ALL_EDGES, PARTS, energy_rows
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import log_markdown, log_notes
@@ -106,9 +106,11 @@ def _energy(graph: ViewGraph, start: Floats, solution: Solution) -> list[Share]:
     for when, poses in (("before", start), ("after", solution.world_from_cam)):
         if not np.isfinite(poses).all():
             continue
-        shares, _ = energy_shares(graph, poses, solution.component, solution.weights > 0)
-        for part, (rotation, translation) in shares.get("after", {}).items():
-            rows.append((when, part, rotation, translation))
+        used = graph.select(solution.weights > 0)
+        found, _ = energy_rows(used, poses, solution.component, np.ones(used.edge_count, bool))
+        for row in found:
+            if row.group == ALL_EDGES and row.when == AFTER:
+                rows += [(when, *part) for part in zip(PARTS, *(share.tolist() for share in row.shares), strict=True)]
     return rows
 
 
