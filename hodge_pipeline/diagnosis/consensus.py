@@ -9,6 +9,7 @@ import numpy as np
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.pieces import align
+from hodge_pipeline.diagnosis.rearrange import rearrange
 from hodge_pipeline.diagnosis.robust_poses import GATE, Fit, fit
 from hodge_pipeline.types import Floats, ViewGraph
 
@@ -29,6 +30,8 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
     """The alignment that the edges speak for; `graph` holds the recentred edges with the information of their noise."""
     rng = np.random.default_rng(options.seed)
     best = fit(evidence, graph, align(evidence, edge_weight(evidence), options.cluster_gain, rng), 2)
+    if evidence.exhaustive:
+        best = rearrange(evidence, graph, best)
     agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
     return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
 

@@ -49,7 +49,8 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     angle, moved = cycle_errors(loops, motions)
     noise = edge_noise(graph, loops, angle, moved, prior, reach_m)
     cycles = judge_cycles(loops, angle, moved, noise, reach_m)
-    if not every_pair_tried(graph.edges, graph.vertex_count):
+    exhaustive = every_pair_tried(graph.edges, graph.vertex_count)
+    if not exhaustive:
         # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
         prior = np.minimum(prior, usual_share(cycles))
     evidence = Evidence(
@@ -60,6 +61,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
         noise=noise,
         support=closing_support(cycles, prior),
         alone=in_no_cycle(graph.edges, graph.vertex_count, cycles),
+        exhaustive=exhaustive,
         reach_m=reach_m,
     )
     consensus = find_consensus(evidence, _with_noise(graph, motions, noise), options)

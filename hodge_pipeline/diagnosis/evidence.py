@@ -15,6 +15,7 @@ class Evidence:
     - `i_from_j (E, 4, 4)`: at the working point; `prior (E,)`: probability by order; `noise`: of each edge.
     - `support (E,)`: how many cycles close over the edge, whose edges are likely right.
     - `alone (E,)`: edges in no cycle.
+    - `exhaustive`: whether registration seems to have been tried on all pairs.
     - `reach_m`: how far overlapping views lie apart.
     """
 
@@ -25,4 +26,5 @@ class Evidence:
     noise: Noise
     support: Floats
     alone: Bools
+    exhaustive: bool
     reach_m: float

@@ -1,0 +1,105 @@
+"""What speaks for laying one set of views against the rest: sums over the pairs that the cut between them separates.
+
+Edges that agree on one placement are one event, since places that look alike give many wrong edges that agree: they
+count by the logarithm of their number. Against a placement speaks that views which it lays upon each other are not
+joined, although their pair was tried. Views that follow each other in a sequence are near each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.joining import Joining
+from hodge_pipeline.types import Bools, Floats, Ints
+
+GATE = 60.0
+"""χ² over six dimensions of an edge that agrees, while the poses are not settled."""
+PER_FOLD = 2.0
+"""Nats for each e-fold of agreeing edges."""
+USUAL_SHARE, SHARE_SPREAD = 0.75, 0.35
+"""Of the edges that a placement makes expected, those that are there, where it is right: more speak for it."""
+PER_EXPECTED_FOLD = 1.0
+"""Nats for each e-fold of expected edges, at one spread from the usual share."""
+JUMP = 1e-4
+"""Share of consecutive views that do not see the same place."""
+SURE = 5.0
+"""Nats, the most that a single edge between consecutive views counts."""
+UNSUPPORTED, SUPPORTED = 0.05, 0.3
+"""Closing cycles over an edge: what counts for none, and what leaves its odds as they are."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The evidence, the law by which views are joined, and the mean of that law over the scene, 0 without an order."""
+
+    evidence: Evidence
+    joining: Joining
+    usual: float
+
+    def layers(self, still: Floats, moved: Floats) -> Floats:
+        """For each ordered pair of views (3, V, V), the first where it is and the second moved: whether an edge agrees
+        (from 1 down to 0), the probability that one would, and the nats of their order.
+        """
+        agreeing, expected = self._agreeing(still, moved), self.joining.between(still, moved)
+        order = np.zeros_like(expected)
+        if self.usual:
+            rows = np.flatnonzero(np.abs(self.evidence.edges[:, 1] - self.evidence.edges[:, 0]) == 1)
+            sure = np.zeros_like(expected)
+            i, j = self.evidence.edges[rows].T
+            for pair in ((i, j), (j, i)):
+                np.maximum.at(sure, pair, consecutive_nats(self.evidence)[rows])
+            order = sure * agreeing
+            first = np.arange(len(still) - 1)
+            for pair in ((first, first + 1), (first + 1, first)):
+                order[pair] += np.log(JUMP + (1 - JUMP) * expected[pair] / self.usual)
+        return np.stack([agreeing, expected, order])
+
+    def _agreeing(self, still: Floats, moved: Floats) -> Floats:
+        out = np.zeros((len(still), len(still)))
+        i, j = self.evidence.edges.T
+        np.maximum.at(out, (i, j), self.agreement(still[i], moved[j]))
+        np.maximum.at(out, (j, i), self.agreement(moved[i], still[j]))
+        return out
+
+    def agreement(self, tails: Floats, heads: Floats) -> Floats:
+        """From 1 down to 0 (E,) how well each edge agrees with the poses of its ends."""
+        noise, left = self.evidence.noise, se3.inverse(self.evidence.i_from_j) @ se3.inverse(tails) @ heads
+        cosine = np.clip((np.trace(left[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)
+        squares = (np.arccos(cosine) / noise.rotation_rad) ** 2
+        squares += np.einsum("ni,ni->n", left[:, :3, 3], left[:, :3, 3]) / noise.translation_m**2
+        return np.asarray(np.sqrt(np.maximum(0.0, 1 - squares / GATE)))
+
+
+def consecutive_nats(evidence: Evidence) -> Floats:
+    """What each edge (E,) counts if it joins consecutive views: its odds by order, and by the cycles over it."""
+    odds = evidence.prior / (1 - evidence.prior) * (evidence.support + UNSUPPORTED) / SUPPORTED
+    return np.minimum(np.log1p(odds), SURE)
+
+
+def nats(sums: Floats) -> Floats:
+    """What speaks for cuts with these sums (3, ...) of their layers."""
+    agreeing, expected, order = sums
+    share = (agreeing / np.maximum(expected, 1e-9) - USUAL_SHARE) / SHARE_SPREAD
+    return np.asarray(
+        PER_FOLD * np.log1p(agreeing) + PER_EXPECTED_FOLD * np.clip(share, -1, 1) * np.log1p(expected) + order
+    )
+
+
+def sums_of(layers: Floats, inside: Bools) -> Floats:
+    """The sums (3,) of layers over the pairs of a view outside and one inside."""
+    return np.asarray(layers[:, ~inside][:, :, inside].sum((1, 2)))
+
+
+def interval_sums(layers: Floats) -> tuple[Ints, Ints, Floats]:
+    """The first view, the one after the last, and the sums (3, I) of every run of consecutive views and the rest."""
+    count = layers.shape[1]
+    low, high = np.triu_indices(count + 1, 1)
+    column, block = np.zeros((3, count + 1)), np.zeros((3, count + 1, count + 1))
+    column[:, 1:] = layers.sum(1).cumsum(1)
+    block[:, 1:, 1:] = layers.cumsum(1).cumsum(2)
+    within = block[:, high, high] - block[:, low, high] - block[:, high, low] + block[:, low, low]
+    return low, high, column[:, high] - column[:, low] - within

@@ -1,0 +1,45 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from diagnosis_graphs import every_pair_tried
+from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.cuts import interval_sums, sums_of
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.joining import Joining, learn_joining
+from hodge_pipeline.evaluation.edges import precision_and_recall
+from hodge_pipeline.types import Floats
+
+
+def _poses(count: int, seed: int) -> Floats:
+    return se3.exp(np.random.default_rng(seed).normal(size=(count, 6)) * np.repeat([1.0, 2.0], 3))
+
+
+def test_the_law_of_joining_is_found_again() -> None:
+    true = Joining(1.0, np.array([0.0, 0.0, 2.0, 5.0, np.log(2.0), np.log(3.0)]))
+    poses = _poses(80, 0)
+    joined = np.triu(np.random.default_rng(1).random((80, 80)) < true.between(poses, poses), 1)
+    found = learn_joining(poses, np.zeros(80, int), joined | joined.T, 1.0)
+    assert np.abs(found.between(poses, poses) - true.between(poses, poses)).mean() < 0.03
+    assert abs(found.x[2] - 2.0) < 0.5, "the point that is seen lies in front"
+
+
+def test_interval_sums_are_the_sums_of_each_run() -> None:
+    layers = np.random.default_rng(0).normal(size=(3, 7, 7)) * ~np.eye(7, dtype=bool)
+    low, high, sums = interval_sums(layers)
+    for row in range(len(low)):
+        inside = (np.arange(7) >= low[row]) & (np.arange(7) < high[row])
+        np.testing.assert_allclose(sums[:, row], sums_of(layers, inside), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_wrong_step_between_consecutive_views_does_not_outvote_the_loops(seed: int) -> None:
+    graph, right, poses = every_pair_tried(seed)
+    found = diagnose(graph)
+    precision, recall = precision_and_recall(found.kept, right)
+    assert precision > 0.95 and recall > 0.95
+    i, j = graph.edges[right].T
+    relative = se3.inverse(found.world_from_cam[i]) @ found.world_from_cam[j]
+    left = relative[:, :3, 3] - (se3.inverse(poses[i]) @ poses[j])[:, :3, 3]
+    assert (np.linalg.norm(left, axis=1) < 0.3).mean() > 0.95
