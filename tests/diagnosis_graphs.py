@@ -46,9 +46,9 @@ def every_pair_tried(
 ) -> tuple[ViewGraph, Bools, Floats]:
     """A graph as registering all pairs of fragments gives it, where its edges are right, and the true poses.
 
-    Two rounds of a room. Views that see the same place are nearly all joined, with heavy-tailed errors; `chance` of the
-    other pairs are joined wrongly; `wrong_steps` of the edges between consecutive views slid along a wall, as did those of
-    the second next; and `alike` places look like others, so that wrong edges between them agree.
+    Two rounds of a room. Views that see the same place are nearly all joined, with heavy-tailed errors; `chance` of
+    the other pairs are joined wrongly; `wrong_steps` of the views slid along a wall when they were joined to the one or
+    two before; and `alike` places look like others, so that wrong edges between them agree.
     """
     rng = np.random.default_rng(seed)
     poses = _walk(views, rng)
