@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 
 class HodgeError(Exception):
     """Root of every error that the command line prints as one line. `exit_code` is 1: the user's input."""
@@ -33,3 +35,9 @@ class CheckError(HodgeError):
     """A result failed its own checks. `exit_code` is 3."""
 
     exit_code = 3
+
+
+def not_written(path: Path, error: OSError) -> WorkspaceError:
+    """What a file that the system refuses to write is told as."""
+    remedy = ": is its folder there?" if isinstance(error, (FileNotFoundError, NotADirectoryError)) else ""
+    return WorkspaceError(f"{path}: cannot be written ({error.strerror or error}){remedy}")

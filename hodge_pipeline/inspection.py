@@ -47,9 +47,8 @@ def guess_reader(path: Path, known: Sequence[Guess] | None = None) -> FrameReade
     best = guesses(path) if known is None else known
     if not best:
         readers = ", ".join(registry.names("readers"))
-        raise SourceError(
-            f"{path}: no reader knows this format (readers: {readers}): name one with --set source.reader="
-        )
+        remedy = "name one with --reader, in a run with --set source.reader="
+        raise SourceError(f"{path}: no reader knows this format (readers: {readers}): {remedy}")
     reader: FrameReader = registry.load("readers", best[0].name)()
     return reader
 

@@ -32,7 +32,11 @@ log = logging.getLogger("hodge_pipeline")
 
 
 class Unfinished(Exception):
-    """A stage, named by its title, that a job which does not compute would need."""
+    """A stage, named by its title, that a job which does not compute would need; `stale` says why, if it was made."""
+
+    def __init__(self, title: str, stale: str = "") -> None:
+        super().__init__(title)
+        self.stale = stale
 
 
 @cache
@@ -91,7 +95,7 @@ class Job:
         self.keys[name] = key
         told = len(self.notes)
         if not (self.computes or title == RECORDING or self.workspace.is_finished(name, key)):
-            raise Unfinished(title)
+            raise Unfinished(title, self._why_stale(name))
         with self.monitor.measure() as cost, self.workspace.stage(name, key) as folder:
             if folder.finished:
                 log.info("%s: already done", title)
@@ -104,7 +108,21 @@ class Job:
                     yield folder, advance
         if not folder.finished:
             log.info("%s: %.1f s wall, %.1f s CPU, %.0f MB", title, cost.wall_s, cost.cpu_s, cost.peak_mb)
-            self.workspace.note(name, {"title": title, "notes": self.notes[told:], **vars(cost)})
+            facts = {"title": title, "notes": self.notes[told:], "versions": versions(), **vars(cost)}
+            self.workspace.note(name, facts)
+
+    def _why_stale(self, name: str) -> str:
+        """Why a stage that lies in the folder is not the one that this job wants; empty where there is none."""
+        path = self.path(name) / KEY_FILE
+        if not path.is_file():
+            return ""
+        made_with = artifacts.read_json(path).get("versions", {})
+        for library, now in versions().items():
+            if made_with.get(library, now) != now:
+                return f"made with {library} {made_with[library]}, here is {now}"
+        computed = [stage for stage in self.keys if not stage.startswith("record")]
+        is_first = not any(self.workspace.is_finished(stage, self.keys[stage]) for stage in computed)
+        return "made from a source that has changed since" if is_first else ""
 
     def costs(self) -> list[dict[str, Any]]:
         """Title, wall_s, cpu_s and peak_mb of each stage so far, those finished before it was resumed included.

@@ -82,9 +82,10 @@ def _overridden(document: Document, override: str) -> Document:
     if not equals or not all(keys):
         raise RecipeError(f"{name}: expected a.b=value")
     value = yaml_file.parse_value(text, name)
-    change, origins = _nested(document.data, keys, value, name), dict(document.origins)
-    origins[_typed(keys)] = name
-    return Document(change, origins)
+    typed, change = _typed(keys), _nested(document.data, keys, value, name)
+    merges = isinstance(value, dict)
+    kept = {key: line for key, line in document.origins.items() if merges or key[: len(typed)] != typed}
+    return Document(change, {**kept, typed: name})
 
 
 def _typed(keys: list[str]) -> Keys:

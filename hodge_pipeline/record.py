@@ -13,7 +13,7 @@ from hodge_pipeline import artifacts, binding, se3, yaml_file
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.fusion.ply import read_ply
-from hodge_pipeline.job import RECORDING, Job, log
+from hodge_pipeline.job import RECORDING, Job, Unfinished, log
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge_parts
 from hodge_pipeline.recording.recorder import APPLICATION, Recorder
@@ -51,7 +51,7 @@ class Recording:
             return
         if error is None:
             self._finish()
-        else:
+        elif not (isinstance(error, Unfinished) and error.stale):
             self._rescue()
         if self._live is not None:
             self._live.close()

@@ -54,4 +54,9 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
                 compute(job, source, recording)
         except Unfinished as unfinished:
             missing = str(unfinished)
+            if unfinished.stale:
+                raise WorkspaceError(
+                    f"{folder}: the stage '{missing}' was {unfinished.stale}: run the recipe again, "
+                    "or record it where it was made"
+                ) from unfinished
     return folder / FILE, missing

@@ -150,7 +150,7 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool) -> None
     if path.exists():
         if path.read_text("utf-8") == text:
             return
-        if not overwrite:
+        if not overwrite and _has_stages(folder):
             change = _first_change(yaml_file.read(path).data, recipe)
             raise WorkspaceError(f"{folder}: holds a run of another recipe ({change}): --overwrite replaces it")
     elif any(entry.name != ".lock" for entry in folder.iterdir()):
@@ -161,10 +161,17 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool) -> None
         artifacts.write_text(path, text)
 
 
+def _has_stages(folder: Path) -> bool:
+    """Whether a stage was begun: a run that failed before, by a source that is not there, is nobody's work."""
+    stages = folder / "stages"
+    return stages.is_dir() and any(stages.iterdir())
+
+
 def _first_change(old: Any, new: Any, key: str = "") -> str:
     """Where two recipes first differ, in words."""
     if isinstance(old, dict) and isinstance(new, dict):
-        for name in [*new, *(name for name in old if name not in new)]:
+        names = [*new, *(name for name in old if name not in new)]
+        for name in sorted(names, key=lambda name: bool(not key and name == "description")):
             if old.get(name) != new.get(name):
                 return _first_change(old.get(name), new.get(name), f"{key}.{name}" if key else name)
     return f"{key} was {old!r}, is {new!r}" if key else "formatting"

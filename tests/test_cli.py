@@ -53,18 +53,41 @@ def test_stages_and_recipes_are_listed() -> None:
         (["inspect", "nowhere"], 1, "no such file or folder"),
         (["stages", "edge"], 1, "did you mean 'edges'"),
         (["view", "nowhere"], 1, "no recording here"),
+        (["run", "demo", "--source", ".", "--set", "solver=hodgee", "--out", "x"], 1, "hodgee: solver: no stage"),
+        (["inspect", "{graph}", "--reader", "tmu"], 1, "did you mean 'tum'"),
+        (["solve", "{graph}", "--out", "{tmp}"], 1, "cannot be written (Is a directory)"),
+        (["solve", "{graph}", "--out", "/proc/x.g2o"], 1, "/proc/x.g2o: cannot be written"),
+        (["convert", "{graph}", "{graph}/x.g2o"], 1, "cannot be written (Not a directory): is its folder there?"),
         (["run", "demo"], 2, "--out"),
         (["fly"], 2, "No such command"),
     ],
 )
 def test_mistakes_are_one_line(arguments: list[str], code: int, message: str, tmp_path: Path) -> None:
-    done = hodge(*(argument.replace("{tmp}", str(tmp_path)) for argument in arguments))
+    graph = tmp_path / "graph.g2o"
+    graph.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    done = hodge(*(argument.format(tmp=tmp_path, graph=graph) for argument in arguments))
     assert done.returncode == code, done.stderr
     assert message in done.stderr
     assert "Traceback" not in done.stderr
     if code == 1:
-        assert done.stderr.startswith("error: ")
-        assert done.stderr.count("\n") == 1
+        assert [line for line in done.stderr.splitlines() if not line.startswith("solve: done")] == [
+            done.stderr.splitlines()[-1]
+        ]
+        assert done.stderr.splitlines()[-1].startswith("error: ")
+
+
+def test_a_run_that_never_began_does_not_hold_its_folder(tmp_path: Path) -> None:
+    missing, out = tmp_path / "nowhere", tmp_path / "run"
+    assert hodge("run", "tum", "--source", missing, "--out", out).returncode == 1
+    other = hodge("run", "seven_scenes", "--source", missing, "--out", out)
+    assert "nowhere" in other.stderr and "another recipe" not in other.stderr
+
+
+def test_version_and_the_schema_of_both_kinds_of_recipe() -> None:
+    assert hodge("--version").stdout.startswith("hodge-pipeline 0.")
+    run, model = (json.loads(hodge("recipes", *name, "--schema").stdout) for name in ((), ("colmap-refine",)))
+    assert "outer_iterations" in run["properties"] and "held_out_share" not in run["properties"]
+    assert "held_out_share" in model["properties"] and "outer_iterations" not in model["properties"]
 
 
 def test_a_run_prints_a_summary_or_json_or_nothing(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811

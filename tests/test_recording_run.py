@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -141,6 +142,21 @@ def test_a_recording_made_again_computes_nothing(run: Run, tmp_path: Path) -> No
     hodge_pipeline.run(small_recipe(run.source.path, *NORMAL), folder, watcher=again)  # back to the recipe's level
     assert set(again.stages) == {"recording"}
     assert layout.COLOUR in entities(folder / "recording.rrd")
+
+
+def test_a_run_of_other_versions_or_of_a_changed_source_keeps_its_recording(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(run.folder, folder)
+    recorded = (folder / "recording.rrd").read_bytes()
+    facts = folder / "stages/clouds/key.json"
+    known = json.loads(facts.read_text())
+    facts.write_text(json.dumps({**known, "key": "of another version", "versions": {"open3d": "0.1"}}))
+    with pytest.raises(WorkspaceError, match=r"stage 'clouds' was made with open3d 0.1, here is .*: run the recipe"):
+        record_again(folder, {})
+    facts.write_text(json.dumps({**known, "key": "of another source"}))
+    with pytest.raises(WorkspaceError, match="made from a source that has changed since"):
+        record_again(folder, {})
+    assert (folder / "recording.rrd").read_bytes() == recorded
 
 
 def test_what_is_no_run_cannot_be_recorded(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ def test_wrong_edges_are_left_out(tmp_path):
     [
         (["--disable", "30-8"], GraphError, "--disable 30-8: no edge joins"),
         (["--disable", "nothing"], GraphError, "no edge joins"),
-        (["--objective", "isotropc"], RecipeError, "did you mean 'isotropic'"),
+        (["--objective", "isotropc"], RecipeError, "expected isotropic or full"),
         (["--start", "odometry"], RecipeError, "expected given or chordal"),
         (["--certificate", "--objective", "full"], RecipeError, "add --objective isotropic"),
         (["--time-limit", "0"], RecipeError, "above zero"),

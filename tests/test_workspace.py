@@ -59,11 +59,23 @@ def test_the_old_result_stays_until_the_new_one_is_whole(tmp_path: Path) -> None
 
 def test_another_recipe_is_refused_and_says_what_differs(tmp_path: Path) -> None:
     other = {"seed": 0, "edges": {"stage": "overlap", "min_iou": 0.5}}
-    Workspace.open(tmp_path / "run", RECIPE).close()
+    with Workspace.open(tmp_path / "run", RECIPE) as workspace, workspace.stage("clouds", "key"):
+        pass
     with pytest.raises(WorkspaceError, match=r"edges.min_iou was 0.3, is 0.5.*--overwrite"):
         Workspace.open(tmp_path / "run", other)
     Workspace.open(tmp_path / "run", other, overwrite=True).close()
     Workspace.open(tmp_path / "run", other).close()
+
+
+def test_the_description_is_the_last_difference_named_and_a_run_that_never_began_holds_nothing(tmp_path: Path) -> None:
+    with Workspace.open(tmp_path / "run", {"description": "one", **RECIPE}) as workspace, workspace.stage("a", "key"):
+        pass
+    with pytest.raises(WorkspaceError, match=r"\(seed was 0, is 1\)"):
+        Workspace.open(tmp_path / "run", {"description": "two", **RECIPE, "seed": 1})
+    with pytest.raises(WorkspaceError, match=r"\(description was"):
+        Workspace.open(tmp_path / "run", {"description": "two", **RECIPE})
+    Workspace.open(tmp_path / "begun", RECIPE).close()
+    Workspace.open(tmp_path / "begun", {**RECIPE, "seed": 1}).close()
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from pathlib import Path
 from typing import Literal
@@ -14,7 +13,8 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters.colmap_cameras import HALF_PIXEL
 from hodge_adapters.colmap_records import CAMERA_MODELS, to_colmap
 from hodge_adapters.colmap_rigs import CAMERA
-from hodge_pipeline.errors import SourceError, WorkspaceError
+from hodge_adapters.text_rows import write_bytes_atomically
+from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.types import Camera, Floats, Frame, Source
 
 
@@ -111,11 +111,7 @@ def _binary_files(cameras: list[Camera], frames: list[Frame]) -> dict[str, bytes
 def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
     try:
         folder.mkdir(exist_ok=True)
-        for name, contents in files.items():
-            temporary = folder / f".{name}.{os.getpid()}.tmp"
-            temporary.write_bytes(contents)
-            os.replace(temporary, folder / name)
     except OSError as error:
-        raise WorkspaceError(
-            f"{folder}: cannot be written ({error.strerror}): is the folder above it there?"
-        ) from error
+        raise not_written(folder, error) from error
+    for name, contents in files.items():
+        write_bytes_atomically(folder / name, contents)

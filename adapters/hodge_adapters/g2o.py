@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass as stage
 from hodge_adapters import g2o_priors
 from hodge_adapters.pose_graph_text import Records, count_tags, read_records, write_lines
 from hodge_adapters.posed import length_notes
+from hodge_adapters.text_rows import write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -243,9 +244,7 @@ def write_g2o(path: Path | str, graph: ViewGraph, world_from_vertex: Floats | No
         poses, information = _pose_columns(known.world_from_vertex, dimension), known.information
         columns = _information_columns(information, dimension)
         g2o_priors.write_priors(lines, dimension, ids[known.vertices], poses, columns)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
-    temporary.replace(path)
+    write_text_atomically(path, "\n".join(lines) + "\n")
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

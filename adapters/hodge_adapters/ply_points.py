@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -10,7 +9,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from hodge_adapters.point_columns import points_of_columns
-from hodge_pipeline.errors import SourceError, WorkspaceError
+from hodge_adapters.text_rows import write_bytes_atomically
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PointCloud
 
 MAX_HEADER_BYTES = 1 << 16
@@ -80,13 +80,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
         table[name] = values
     properties = "".join(f"property {kind} {name}\n" for name, _, kind, _ in columns)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n{properties}end_header\n"
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(header.encode() + table.tobytes())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise WorkspaceError(f"{path}: cannot be written ({error.strerror}): is its folder there?") from error
+    write_bytes_atomically(path, header.encode() + table.tobytes())
 
 
 def _read_header(path: Path, file: BinaryIO) -> PlyHeader:

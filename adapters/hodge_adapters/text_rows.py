@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from hodge_pipeline.errors import SourceError, WorkspaceError
+from hodge_pipeline.errors import SourceError, not_written
 
 SHOWN = 5
 """How many records a note names before it only counts them."""
@@ -62,14 +63,20 @@ def inside(folder: Path, name: str) -> Path | None:
 
 
 def write_text_atomically(path: Path, text: str) -> None:
+    """Write ASCII text in one step; see `write_bytes_atomically`."""
+    write_bytes_atomically(path, text.encode("ascii"))
+
+
+def write_bytes_atomically(path: Path, contents: bytes) -> None:
     """Write the file in one step: a reader sees the old one or the whole new one. Raises `WorkspaceError`."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "w", encoding="ascii", newline="\n") as file:
-            file.write(text)
+        with open(temporary, "wb") as file:
+            file.write(contents)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise WorkspaceError(f"{path}: cannot be written ({error.strerror}): is its folder there?") from error
+        with suppress(OSError):
+            temporary.unlink()
+        raise not_written(path, error) from error

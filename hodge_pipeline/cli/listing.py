@@ -70,13 +70,11 @@ def _print_stage(kind: str, name: str, *, with_options: bool) -> None:
 
 
 def recipes(name: str | None, *, schema: bool) -> None:
-    """Print the recipes' names and first words, one recipe with its defaults, or the JSON schema."""
+    """Print the recipes' names and first words, one recipe with its defaults, or the JSON schema of its kind."""
     from hodge_pipeline import binding, recipe_file, yaml_file
 
     if schema:
-        from hodge_pipeline.recipe import Recipe
-
-        print(json.dumps(binding.json_schema(Recipe), indent=1))
+        print(json.dumps(binding.json_schema(_kind(name)), indent=1))
     elif name is not None:
         print(yaml_file.dump(binding.unbind(_any_recipe(name))), end="")
     else:
@@ -84,14 +82,18 @@ def recipes(name: str | None, *, schema: bool) -> None:
             print(f"{known:<24}{recipe_file.load(known).data.get('description', '')}")
 
 
-def _any_recipe(name: str) -> Any:
-    """The options of a recipe of either kind: of a run, or of the refinement of a model."""
+def _kind(name: str | None) -> type:
+    """What a recipe describes: a run, which is what no name stands for, or the refinement of a model."""
     from hodge_pipeline import recipe_file
+    from hodge_pipeline.recipe import Recipe
+    from hodge_pipeline.refine.model_options import ModelRefinement
 
-    if "model" in recipe_file.load(name).data:
-        from hodge_pipeline.refine.model_options import load_model_refinement
+    return ModelRefinement if name is not None and "model" in recipe_file.load(name).data else Recipe
 
-        return load_model_refinement(name)
-    from hodge_pipeline.recipe import load_recipe
 
-    return load_recipe(name)
+def _any_recipe(name: str) -> Any:
+    """The options of a recipe of either kind."""
+    from hodge_pipeline.recipe import Recipe, load_recipe
+    from hodge_pipeline.refine.model_options import load_model_refinement
+
+    return load_recipe(name) if _kind(name) is Recipe else load_model_refinement(name)

@@ -28,6 +28,7 @@ Examples:
   hodge edit runs/kitchen --disable 12-87        take an edge out of a run,
   hodge solve runs/kitchen                       and solve and fuse it again
   hodge refine trajectory poses.txt --frames DIR --out runs/better
+  hodge refine colmap sparse/0 --out runs/model
 """
 
 app = typer.Typer(
@@ -35,6 +36,24 @@ app = typer.Typer(
 )
 
 app.add_typer(refining.group, name="refine")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"hodge-pipeline {version('hodge-pipeline')}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options of `hodge` itself."""
+
 
 Overrides = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
@@ -203,8 +222,8 @@ def stages(
 
 @app.command()
 def recipes(
-    name: Annotated[Optional[str], typer.Argument(help="Print this recipe with every default.")] = None,  # noqa: UP045
-    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema for editors.")] = False,
+    name: Annotated[Optional[str], typer.Argument(help="Print this one, with every default.")] = None,  # noqa: UP045
+    schema: Annotated[bool, typer.Option("--schema", help="Print NAME's JSON schema for editors.")] = False,
 ) -> None:
     """List the recipes that come with the package."""
     from hodge_pipeline.cli import listing
@@ -252,6 +271,11 @@ def main() -> None:
     """Run the command; what a user can mend is one line and exit code 1 (3: a result that failed its checks)."""
     try:
         app(standalone_mode=True)  # which ends with 130 on Ctrl-C
+    except OSError as error:
+        if error.filename is None and error.errno is None:
+            raise
+        print(f"error: {error.filename or 'a file'}: {error.strerror}", file=sys.stderr)
+        sys.exit(1)
     except Exception as error:
         from hodge_pipeline.errors import HodgeError
 

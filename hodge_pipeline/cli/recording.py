@@ -7,7 +7,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
-from hodge_pipeline import registry
 from hodge_pipeline.cli.console import Terminal, print_table
 from hodge_pipeline.errors import RecipeError, WorkspaceError
 from hodge_pipeline.recording.options import Level
@@ -17,7 +16,7 @@ def record(run_folder: Path, level: str | None, max_megabytes: float | None, *, 
     """Make a run's recording again and say where it is."""
     levels = [name for name in get_args(Level) if name != "off"]
     if level is not None and level not in levels:
-        raise RecipeError(f"--level {level}: expected {', '.join(levels)}{registry.suggestion(level, levels)}")
+        raise RecipeError(f"--level {level}: expected {', '.join(levels)}")
     if max_megabytes is not None and not max_megabytes > 0:
         raise RecipeError(f"--max-megabytes {max_megabytes:g}: expected a size above zero")
     from hodge_pipeline.replay import record_again

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
-from hodge_pipeline import registry
 from hodge_pipeline.cli.console import Terminal
 from hodge_pipeline.edits import read_history
 from hodge_pipeline.errors import CheckError, RecipeError
@@ -33,9 +32,7 @@ def choices(
         ("--start", start, ("given", "chordal")),
     ):
         if value not in known:
-            raise RecipeError(
-                f"{option} {value}: expected {' or '.join(known)}{registry.suggestion(value, list(known))}"
-            )
+            raise RecipeError(f"{option} {value}: expected {' or '.join(known)}")
     if named == "full" and (certificate or sesync_units):
         raise RecipeError("--certificate and --sesync-units are for the isotropic objective: add --objective isotropic")
     if time_limit_s <= 0:
@@ -125,4 +122,6 @@ def _check(summary: dict[str, Any]) -> None:
     if summary["certified"] is False:
         raise CheckError("the result is not proven to be the global minimum: see the notes; try --start chordal")
     if not summary["converged"]:
-        raise CheckError("the solver stopped before it converged, with the best poses so far: raise --time-limit")
+        late = any("time limit" in note for note in summary["notes"])
+        remedy = "raise --time-limit" if late else "if edges may be wrong, hodge diagnose names them, or add --robust"
+        raise CheckError(f"the solver stopped before it converged, with the best poses so far: {remedy}")

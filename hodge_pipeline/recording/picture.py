@@ -13,6 +13,7 @@ from rerun.experimental import ViewerClient
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import binary, layout
 
+HOST = "127.0.0.1"
 START_S = 30.0
 ATTEMPTS = 5
 WINDOW = "1600x900"
@@ -25,9 +26,10 @@ def picture(recording: Path, png: Path, *, story_s: float | None = None, wait_s:
     """
     with tempfile.TemporaryDirectory(prefix="hodge-picture-") as scratch:
         port = _free_port()
-        command = [str(binary.program()), "--headless", "--port", str(port), "--window-size", WINDOW]
+        options = ["--headless", "--bind", HOST, "--port", str(port), "--window-size", WINDOW]
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         environment = binary.quiet_environment(Path(scratch))
-        with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as viewer:
+        with subprocess.Popen([str(binary.program()), *options], env=environment, **silent) as viewer:
             try:
                 client = _connect(port, viewer)
                 client.open(str(recording.resolve()))
@@ -54,7 +56,7 @@ def _save(client: ViewerClient, png: Path) -> None:
 
 def _free_port() -> int:
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+        probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
 
 
@@ -62,7 +64,7 @@ def _connect(port: int, viewer: subprocess.Popen[bytes]) -> ViewerClient:
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline and viewer.poll() is None:
         try:
-            return ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            return ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy")
         except (RuntimeError, ConnectionError, ValueError):
             time.sleep(0.2)
     raise WorkspaceError("no headless Rerun viewer starts here: install a Vulkan driver (mesa-vulkan-drivers)")
