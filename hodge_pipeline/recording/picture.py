@@ -27,9 +27,9 @@ def picture(recording: Path, png: Path, *, story_s: float | None = None, wait_s:
     with tempfile.TemporaryDirectory(prefix="hodge-picture-") as scratch:
         port = _free_port()
         options = ["--headless", "--bind", HOST, "--port", str(port), "--window-size", WINDOW]
-        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        environment = binary.quiet_environment(Path(scratch))
-        with subprocess.Popen([str(binary.program()), *options], env=environment, **silent) as viewer:
+        environment, nowhere = binary.quiet_environment(Path(scratch)), subprocess.DEVNULL
+        command = [str(binary.program()), *options]
+        with subprocess.Popen(command, env=environment, stdout=nowhere, stderr=nowhere) as viewer:
             try:
                 client = _connect(port, viewer)
                 client.open(str(recording.resolve()))
