@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from PIL import Image
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.matches import side_by_side
 from hodge_pipeline.diagnosis.page import EdgePictures
 from hodge_pipeline.diagnosis.result import Diagnosis
-from hodge_pipeline.diagnosis.two_clouds import PAPER, View, picture, views
+from hodge_pipeline.diagnosis.two_clouds import View, picture, views
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.evaluation import splat
 from hodge_pipeline.evaluation.plots import Plot
-from hodge_pipeline.types import Bytes, CloudSet, Floats, Frame, Ints, PointCloud, ViewGraph
+from hodge_pipeline.evaluation.thumbnails import beside, thumbnail
+from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, PointCloud, ViewGraph
 
-GAP = 6
-JPEG_QUALITY = 82
+IMAGE_WIDTH = 420
 LEAST_UP = 0.1
 """Of the mean up direction: where cameras look every way there is none."""
 
@@ -68,26 +67,25 @@ def _views(first: PointCloud, second: PointCloud, motions: Sequence[Floats], up_
 
 
 def _clouds(first: PointCloud, second: PointCloud, i_from_j: Floats, seen: tuple[View, View]) -> bytes:
-    pictures = [picture(first, second, i_from_j, view) for view in seen]
-    return _jpeg(np.hstack([pictures[0], np.full((len(pictures[0]), GAP, 3), PAPER, np.uint8), pictures[1]]))
+    return splat.jpeg(beside([picture(first, second, i_from_j, view) for view in seen]))
 
 
 def _images(first: Frame, second: Frame) -> Iterator[Plot]:
-    """The images; a frame whose image is not there or cannot be read has no picture."""
-    if first.read_colour is None or second.read_colour is None:
-        return
+    """The frames as their cameras saw them; a frame with nothing to show, or nothing that can be read, has none."""
     try:
-        found = side_by_side(first.read_colour(), second.read_colour())
+        images = [thumbnail(frame, IMAGE_WIDTH) for frame in (first, second)]
     except (SourceError, OSError):
         return
+    shown = [image for image in images if image is not None]
+    if len(shown) < 2:
+        return
+    title = f"Images of {first.frame_id} and {second.frame_id}"
+    if first.read_colour is None or second.read_colour is None:
+        yield Plot(title, "Depth where there is no colour: the brighter, the farther.", splat.jpeg(beside(shown)))
+        return
+    found = side_by_side(*shown)
     caption = (
         f"{found.matches} SIFT matches; {found.agreeing} of them (green) agree on one relative pose. Places that look "
         "alike match too: see whether the whole views fit."
     )
-    yield Plot(f"Images of {first.frame_id} and {second.frame_id}", caption, _jpeg(found.image))
-
-
-def _jpeg(image: Bytes) -> bytes:
-    target = io.BytesIO()
-    Image.fromarray(image).save(target, "JPEG", quality=JPEG_QUALITY, optimize=True)
-    return target.getvalue()
+    yield Plot(title, caption, splat.jpeg(found.image))

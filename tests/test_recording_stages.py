@@ -11,10 +11,10 @@ from rerun.chunk import RrdReader
 from hodge_pipeline import se3
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import Contents
+from hodge_pipeline.recording.curl import triangle_curl_m
 from hodge_pipeline.recording.growth import first_frame
 from hodge_pipeline.recording.merge import find_parts, with_pairs
 from hodge_pipeline.recording.registration import chosen_pairs, moved_m
-from hodge_pipeline.recording.triangles import triangle_curl_m
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.types import CloudSet, Model, PointCloud, ViewGraph
 from test_recording import circle, make_solution, record, rgb, ring_graph, rows

@@ -9,10 +9,9 @@ import numpy as np
 
 from hodge_pipeline.descriptors import match, root_sift
 from hodge_pipeline.edges.sift_matching import CONFIDENCE, MOST_RANSAC_STEPS
+from hodge_pipeline.evaluation.thumbnails import GAP, beside
 from hodge_pipeline.types import Bytes, Floats32, Ints
 
-WIDTH = 420
-GAP = 8
 RATIO = 0.8
 MAX_FEATURES = 1000
 MAX_ERROR_PX = 2.0
@@ -31,24 +30,16 @@ class Matched:
 
 def side_by_side(first: Bytes, second: Bytes) -> Matched:
     """Two RGB images with a line for each match: green where one relative pose explains it, else grey."""
-    images = [_scaled(image) for image in (first, second)]
-    height = max(len(image) for image in images)
-    canvas = np.full((height, 2 * WIDTH + GAP, 3), 255, np.uint8)
-    canvas[: len(images[0]), :WIDTH], canvas[: len(images[1]), WIDTH + GAP :] = images
-    found = [_features(image) for image in images]
+    canvas = beside([first, second])
+    found = [_features(image) for image in (first, second)]
     pairs = match(found[0][1], found[1][1], RATIO)
     agreeing = _agreeing(found[0][0], found[1][0], pairs)
-    offset = np.array([WIDTH + GAP, 0], np.float32)
+    offset = np.array([first.shape[1] + GAP, 0], np.float32)
     for colour, rows in ((ODD_COLOUR, ~agreeing), (AGREEING_COLOUR, agreeing)):
         for a, b in pairs[rows]:
             start, end = np.round([found[0][0][a], found[1][0][b] + offset]).astype(int).tolist()
             cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
     return Matched(canvas, len(pairs), int(agreeing.sum()))
-
-
-def _scaled(image: Bytes) -> Bytes:
-    height = max(1, round(image.shape[0] * WIDTH / image.shape[1]))
-    return np.asarray(cv2.resize(np.ascontiguousarray(image), (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _features(image: Bytes) -> tuple[Floats32, Floats32]:

@@ -23,7 +23,10 @@ from hodge_pipeline.types import Floats, Ints, ViewGraph
 LISTED = 20
 CYCLES_EACH = 2
 OUTCOMES = {WRONG: "worse", SUSPECT: "mixed", UNTESTABLE: "unchanged", CONSISTENT: "improved"}
-EXTRA_STYLE = ".wrong { color: #b0207a; font-weight: 600; } .suspect { color: #8a5a00; font-weight: 600; } "
+EXTRA_STYLE = (
+    ".wrong { color: #b0207a; font-weight: 600; } .suspect { color: #8a5a00; font-weight: 600; } "
+    ".cycles { min-width: 17em; } "
+)
 
 
 @dataclass(frozen=True)
@@ -153,12 +156,12 @@ def _edge_row(contents: PageContents, row: int) -> tuple[str, ...]:
 
 def _cycles(contents: PageContents, rows: Ints) -> str:
     cycles = contents.diagnosis.cycles
-    told = [
-        f"{name_cycle(contents.graph, cycles, int(row))} {cycle_error(cycles, int(row))}"
-        for row in rows[:CYCLES_EACH]
-        if row >= 0
-    ]
-    return "; ".join(told) or "none"
+    told: dict[frozenset[int], str] = {}
+    for row in rows[rows >= 0].tolist():
+        # one cycle may be listed twice, begun elsewhere
+        edges = frozenset(cycles.loops.edge[cycles.loops.offsets[row] : cycles.loops.offsets[row + 1]].tolist())
+        told.setdefault(edges, f"{name_cycle(contents.graph, cycles, row)} {cycle_error(cycles, row)}")
+    return "; ".join(list(told.values())[:CYCLES_EACH]) or "none"
 
 
 def _suggestions(contents: PageContents) -> str:
@@ -258,9 +261,8 @@ def _figure(plot: Plot) -> str:
 def _table(table: Table) -> str:
     def cells(tag: str, row: Sequence[str]) -> Iterator[str]:
         for column, cell in enumerate(row):
-            classes = " ".join(
-                (["word"] if column < table.names else []) + ([cell] if cell in (WRONG, SUSPECT) else [])
-            )
+            known = (column < table.names, "word"), (cell in (WRONG, SUSPECT), cell), ("fails by" in cell, "cycles")
+            classes = " ".join(name for applies, name in (*known, ("closes to" in cell, "cycles")) if applies)
             attribute = f' class="{classes}"' if classes else ""
             yield f"<{tag}{attribute}>{escape(cell)}</{tag}>"
 

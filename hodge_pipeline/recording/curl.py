@@ -1,4 +1,4 @@
-"""Triangles of the viewing graph coloured by their curl, and the loops that no triangles fill, drawn as loops."""
+"""Triangles of the viewing graph, coloured by what the motions round each leave over: its curl."""
 
 from __future__ import annotations
 
@@ -6,31 +6,56 @@ import numpy as np
 import rerun as rr
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.cycles import Loops, loop_products
-from hodge_pipeline.complex.holes import unfilled_loops
+from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.diagnosis.result import Cycles
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.stream import log_notes
 from hodge_pipeline.types import Bytes, Floats, Ints, ViewGraph
 
-MOST_TRIANGLES, MOST_LOOPS = 20_000, 200
+MOST_TRIANGLES = 20_000
 OPEN_CHI = 30.0**0.5
 """Of the curl: a cycle whose χ² exceeds its square does not close; the colours end there."""
-LOOP_RADIUS = -2.2
-LOOP_COLOURS = np.array([[255, 255, 255], [230, 60, 160]], float)
 ALPHA = 110
-MOST_NAMED = 12
-BRIGHT_MEDIANS = 4.0
-"""Medians of the loops' errors at which their colours end: the worst stand out, whatever the scene's size."""
 
 
-def log_triangles(
+def log_triangles(stream: rr.RecordingStream, path: str, corners: Floats, colours: Bytes, alpha: Bytes) -> None:
+    """Triangles by their corners (T, 3, 3) in the world, each in one colour (T, 3) and opacity (T,)."""
+    mesh = rr.Mesh3D(
+        vertex_positions=corners.reshape(-1, 3).astype(np.float32),
+        triangle_indices=np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3),
+        vertex_colors=np.repeat(np.column_stack([colours, alpha]), 3, axis=0),
+    )
+    stream.log(path, mesh, static=True)
+
+
+def triangle_curl_m(graph: ViewGraph, triangles: Ints) -> Floats:
+    """What the measured motions round each triangle (T, 3) leave over, in metres; a rotation is its arc at 1 m.
+
+    Of parallel edges the first counts.
+    """
+    ab, bc, ca = (_motions(graph, triangles[:, k], triangles[:, (k + 1) % 3]) for k in range(3))
+    around = ab @ bc @ ca
+    angle_rad = np.linalg.norm(se3.so3_log(around[:, :3, :3]), axis=1)
+    return np.asarray(np.hypot(np.linalg.norm(around[:, :3, 3], axis=1), shapes.RESIDUAL_ARM_M * angle_rad))
+
+
+def _motions(graph: ViewGraph, a: Ints, b: Ints) -> Floats:
+    """The measured `a_from_b` (T, 4, 4) of pairs that have an edge in either direction."""
+    low, high = graph.edges.min(axis=1), graph.edges.max(axis=1)
+    keys, first = np.unique(low * graph.vertex_count + high, return_index=True)
+    rows = first[np.searchsorted(keys, np.minimum(a, b) * graph.vertex_count + np.maximum(a, b))]
+    motions = graph.i_from_j[rows]
+    turned = graph.edges[rows, 0] != a
+    motions[turned] = se3.inverse(motions[turned])
+    return motions
+
+
+def log_tested_triangles(
     stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats, cycles: Cycles
 ) -> tuple[str, ...]:
     """What was left out, in words; each tested triangle in the colour of √χ² of its curl, those that fail in full."""
     rows = np.flatnonzero(cycles.loops.lengths == 3)
-    corners = _tails(graph, cycles.loops, rows).reshape(-1, 3)
+    corners = vertices_along(graph, cycles.loops, rows).reshape(-1, 3)
     finite = np.asarray(np.isfinite(world_from_cam[corners][:, :, :3, 3]).all(axis=(1, 2)))
     rows, corners = rows[finite], corners[finite]
     worst = np.argsort(-cycles.chi2[rows], kind="stable")[:MOST_TRIANGLES]
@@ -41,60 +66,12 @@ def log_triangles(
     colours = shapes.residual_colours(np.sqrt(cycles.chi2[rows]), OPEN_CHI)
     alpha = np.where(cycles.closes[rows], ALPHA, 255).astype(np.uint8)
     if len(rows):
-        mesh = rr.Mesh3D(
-            vertex_positions=world_from_cam[corners.ravel(), :3, 3].astype(np.float32),
-            triangle_indices=np.arange(3 * len(rows)).reshape(-1, 3),
-            vertex_colors=np.repeat(np.column_stack([colours, alpha]), 3, axis=0),
-        )
-        stream.log(layout.TRIANGLES, mesh, static=True)
+        log_triangles(stream, layout.TRIANGLES, world_from_cam[corners, :3, 3], colours, alpha)
     log_notes(stream, 0, notes)
     return notes
 
 
-def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats) -> tuple[str, ...]:
-    """What was left out, in words; each hole's loop as a closed line, its label how far the motions around it close."""
-    notes: tuple[str, ...] = ()
-    try:
-        loops = unfilled_loops(graph.edges, graph.vertex_count)
-    except GraphError as error:
-        notes = (f"recording: no harmonic loops: {error}",)
-        log_notes(stream, 0, notes)
-        return notes
-    chosen = loops.select(np.arange(len(loops))[::-1][:MOST_LOOPS])
-    starts = chosen.offsets[:-1]
-    corners = np.split(_tails(graph, chosen, np.arange(len(chosen))), starts[1:]) if len(chosen) else []
-    lines = [world_from_cam[np.append(each, each[0]), :3, 3].astype(np.float32) for each in corners]
-    kept = np.array([row for row, line in enumerate(lines) if np.isfinite(line).all()], np.int64)
-    left = se3.log(loop_products(chosen, graph.i_from_j))
-    angle, shift_m = np.linalg.norm(left[:, :3], axis=1), np.linalg.norm(left[:, 3:], axis=1)
-    size = np.hypot(shift_m, shapes.RESIDUAL_ARM_M * angle)[kept]
-    strips = rr.LineStrips3D(
-        [lines[row] for row in kept],
-        colors=_loop_colours(size),
-        radii=[LOOP_RADIUS],
-        labels=[_label(graph, corners[row], shift_m[row], angle[row]) for row in kept],
-        show_labels=False,
-    )
-    stream.log(layout.LOOPS, strips, static=True)
-    if len(kept) < len(loops):
-        notes = (f"recording: {len(kept)} of {len(loops)} harmonic loops drawn, the longest",)
-    log_notes(stream, 0, notes)
-    return notes
-
-
-def _loop_colours(size: Floats) -> Bytes:
-    """White to magenta, unlike any triangle."""
-    share = np.clip(size / (BRIGHT_MEDIANS * max(float(np.median(size)), 1e-9)), 0, 1) if len(size) else size
-    mixed = LOOP_COLOURS[0] + share[:, None] * (LOOP_COLOURS[1] - LOOP_COLOURS[0])
-    return np.asarray(mixed.round(), np.uint8)
-
-
-def _label(graph: ViewGraph, corners: Ints, shift_m: float, angle_rad: float) -> str:
-    names = "-".join(map(str, graph.vertex_ids[corners[:MOST_NAMED]])) + ("-…" if len(corners) > MOST_NAMED else "")
-    return f"{names}: {len(corners)} edges, off by {shift_m:.3g} m, {np.degrees(angle_rad):.3g}°"
-
-
-def _tails(graph: ViewGraph, loops: Loops, rows: Ints) -> Ints:
+def vertices_along(graph: ViewGraph, loops: Loops, rows: Ints) -> Ints:
     """The vertices along these loops, one after the other."""
     chosen = loops.select(rows)
     return graph.edges[chosen.edge, np.where(chosen.sign > 0, 0, 1)]

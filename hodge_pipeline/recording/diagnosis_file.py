@@ -11,9 +11,10 @@ import rerun.blueprint as rrb
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.blueprint import scene_view
-from hodge_pipeline.recording.curl import log_loops, log_triangles
+from hodge_pipeline.recording.curl import log_tested_triangles
 from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.eye import Eye
+from hodge_pipeline.recording.loops import log_loops
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import log_markdown, writing
 from hodge_pipeline.types import Floats, ViewGraph
@@ -39,7 +40,7 @@ def write_diagnosis(path: Path, identity: str, graph: ViewGraph, world_from_cam:
         log_diagnosis(
             stream, graph, world_from_cam, diagnosis.verdict, diagnosis.probability, reason, RecordingOptions()
         )
-        log_triangles(stream, graph, world_from_cam, diagnosis.cycles)
+        log_tested_triangles(stream, graph, world_from_cam, diagnosis.cycles)
         log_loops(stream, graph, world_from_cam)
         log_markdown(stream, layout.LEGEND, LEGEND)
 

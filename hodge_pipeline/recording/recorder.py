@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from hodge_pipeline.recording import frames as frame_log
 from hodge_pipeline.recording import graph as graph_log
 from hodge_pipeline.recording import layout, results
+from hodge_pipeline.recording.complex import log_complex
 from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.growth import log_growth
 from hodge_pipeline.recording.merge import Merged, merge
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.registration import log_registration
 from hodge_pipeline.recording.stream import writing
-from hodge_pipeline.recording.triangles import log_complex
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Model, Solution, ViewGraph
 

@@ -7,17 +7,16 @@ from typing import TypeAlias
 import numpy as np
 import rerun as rr
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import clique_counts, flag_complex
 from hodge_pipeline.diagnosis.energy import AFTER, ALL_EDGES, PARTS, energy_rows
 from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording.curl import ALPHA, log_triangles, triangle_curl_m
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import log_markdown, log_notes
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
 MOST_TRIANGLES = 300_000
 TRIANGLE_BYTES, COLUMN_BYTES = 60, 28
-OPACITY = 110
 Share: TypeAlias = tuple[str, str, float, float]
 
 
@@ -46,7 +45,7 @@ def log_complex(
     rows = drawable[np.argsort(curl_m[drawable], kind="stable")][shapes.evenly(len(drawable), kept)]
     colours = shapes.residual_colours(curl_m[rows], options.residual_scale_m)
     if len(rows):
-        _log_mesh(stream, layout.complex_mesh(outer), corners[rows], colours)
+        log_triangles(stream, layout.complex_mesh(outer), corners[rows], colours, np.full(len(rows), ALPHA, np.uint8))
     log_markdown(stream, layout.complex_text(outer), _text(outer, counts, curl_m, _energy(graph, start, solution)))
     drawn = f"recording: {len(rows)} of {len(triangles)} triangles of round {outer} drawn"
     thinned = (drawn,) if len(rows) < len(triangles) else ()
@@ -59,43 +58,6 @@ def _log_columns(stream: rr.RecordingStream, outer: int, triangles: Ints, curl_m
     stream.log(
         layout.complex_columns(outer),
         rr.AnyValues(a=triangles[:, 0], b=triangles[:, 1], c=triangles[:, 2], curl_m=curl_m.astype(np.float32)),
-        static=True,
-    )
-
-
-def triangle_curl_m(graph: ViewGraph, triangles: Ints) -> Floats:
-    """What the measured motions round each triangle (T, 3) leave over, in metres; a rotation is its arc at 1 m.
-
-    Of parallel edges the first counts.
-    """
-    ab, bc, ca = (_motions(graph, triangles[:, k], triangles[:, (k + 1) % 3]) for k in range(3))
-    around = ab @ bc @ ca
-    angle_rad = np.linalg.norm(se3.so3_log(around[:, :3, :3]), axis=1)
-    return np.asarray(np.hypot(np.linalg.norm(around[:, :3, 3], axis=1), shapes.RESIDUAL_ARM_M * angle_rad))
-
-
-def _motions(graph: ViewGraph, a: Ints, b: Ints) -> Floats:
-    """The measured `a_from_b` (T, 4, 4) of pairs that have an edge in either direction."""
-    low, high = graph.edges.min(axis=1), graph.edges.max(axis=1)
-    keys, first = np.unique(low * graph.vertex_count + high, return_index=True)
-    rows = first[np.searchsorted(keys, np.minimum(a, b) * graph.vertex_count + np.maximum(a, b))]
-    motions = graph.i_from_j[rows]
-    turned = graph.edges[rows, 0] != a
-    motions[turned] = se3.inverse(motions[turned])
-    return motions
-
-
-def _log_mesh(
-    stream: rr.RecordingStream, path: str, corners: Floats, colours: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
-) -> None:
-    opaque = np.concatenate([colours, np.full((len(colours), 1), OPACITY, np.uint8)], axis=1)
-    stream.log(
-        path,
-        rr.Mesh3D(
-            vertex_positions=corners.reshape(-1, 3).astype(np.float32),
-            triangle_indices=np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3),
-            vertex_colors=np.repeat(opaque, 3, axis=0),
-        ),
         static=True,
     )
 

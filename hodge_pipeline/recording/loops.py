@@ -1,0 +1,65 @@
+"""The loops of the viewing graph that no triangles fill, drawn as loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.cycles import loop_products
+from hodge_pipeline.complex.holes import unfilled_loops
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording.curl import vertices_along
+from hodge_pipeline.recording.stream import log_notes
+from hodge_pipeline.types import Bytes, Floats, Ints, ViewGraph
+
+MOST_LOOPS = 200
+LOOP_RADIUS = -2.2
+LOOP_COLOURS = np.array([[255, 255, 255], [230, 60, 160]], float)
+MOST_NAMED = 12
+BRIGHT_MEDIANS = 4.0
+"""Medians of the loops' errors at which their colours end: the worst stand out, whatever the scene's size."""
+
+
+def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats) -> tuple[str, ...]:
+    """What was left out, in words; each hole's loop as a closed line, its label how far the motions around it close."""
+    notes: tuple[str, ...] = ()
+    try:
+        loops = unfilled_loops(graph.edges, graph.vertex_count)
+    except GraphError as error:
+        notes = (f"recording: no harmonic loops: {error}",)
+        log_notes(stream, 0, notes)
+        return notes
+    chosen = loops.select(np.arange(len(loops))[::-1][:MOST_LOOPS])
+    starts = chosen.offsets[:-1]
+    corners = np.split(vertices_along(graph, chosen, np.arange(len(chosen))), starts[1:]) if len(chosen) else []
+    lines = [world_from_cam[np.append(each, each[0]), :3, 3].astype(np.float32) for each in corners]
+    kept = np.array([row for row, line in enumerate(lines) if np.isfinite(line).all()], np.int64)
+    left = se3.log(loop_products(chosen, graph.i_from_j))
+    angle, shift_m = np.linalg.norm(left[:, :3], axis=1), np.linalg.norm(left[:, 3:], axis=1)
+    size = np.hypot(shift_m, shapes.RESIDUAL_ARM_M * angle)[kept]
+    strips = rr.LineStrips3D(
+        [lines[row] for row in kept],
+        colors=_loop_colours(size),
+        radii=[LOOP_RADIUS],
+        labels=[_label(graph, corners[row], shift_m[row], angle[row]) for row in kept],
+        show_labels=False,
+    )
+    stream.log(layout.LOOPS, strips, static=True)
+    if len(kept) < len(loops):
+        notes = (f"recording: {len(kept)} of {len(loops)} harmonic loops drawn, the longest",)
+    log_notes(stream, 0, notes)
+    return notes
+
+
+def _loop_colours(size: Floats) -> Bytes:
+    """White to magenta, unlike any triangle."""
+    share = np.clip(size / (BRIGHT_MEDIANS * max(float(np.median(size)), 1e-9)), 0, 1) if len(size) else size
+    mixed = LOOP_COLOURS[0] + share[:, None] * (LOOP_COLOURS[1] - LOOP_COLOURS[0])
+    return np.asarray(mixed.round(), np.uint8)
+
+
+def _label(graph: ViewGraph, corners: Ints, shift_m: float, angle_rad: float) -> str:
+    names = "-".join(map(str, graph.vertex_ids[corners[:MOST_NAMED]])) + ("-…" if len(corners) > MOST_NAMED else "")
+    return f"{names}: {len(corners)} edges, off by {shift_m:.3g} m, {np.degrees(angle_rad):.3g}°"

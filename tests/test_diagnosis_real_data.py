@@ -1,0 +1,60 @@
+"""The diagnosis on real pairwise estimates, of which a known part is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_adapters.pair_log import PairLogReader
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.result import UNTESTABLE
+from hodge_pipeline.diagnosis.solver import DiagnosedSolver
+from hodge_pipeline.evaluation.edges import PairTruth, area_under_roc, pose_recall, precision_and_recall, right_edges
+from hodge_pipeline.types import Bools, ViewGraph
+
+
+def estimates(data_dir: Path, scene: str, method: str) -> tuple[ViewGraph, PairTruth, Bools]:
+    """A graph of real estimates, the truth, and which of its edges are right."""
+    folder = data_dir / "fragments/pair_estimates" / f"{scene}-evaluation"
+    true = PairLogReader(information=folder / "gt.info").open(folder / "gt.log").graph
+    graph = PairLogReader().open(folder / f"{method}.log").graph
+    assert true is not None and graph is not None
+    truth = PairTruth.from_graph(true)
+    return graph, truth, right_edges(truth, graph.edges, graph.i_from_j)
+
+
+@pytest.mark.parametrize(
+    ("scene", "method", "least_precision", "least_recall", "least_auc", "least_pose_recall"),
+    [
+        ("7-scenes-redkitchen", "3dmatch", 0.98, 0.9, 0.98, 0.98),
+        ("iclnuim-office1", "fpfh", 0.9, 0.9, 0.97, 0.8),
+        ("iclnuim-livingroom1", "fpfh", 0.88, 0.9, 0.96, 0.75),
+    ],
+)
+def test_wrong_edges_of_real_scenes_are_told_from_right_ones(
+    data_dir: Path, scene: str, method: str, least_precision: float, least_recall: float, least_auc: float,
+    least_pose_recall: float,
+) -> None:  # fmt: skip
+    graph, truth, right = estimates(data_dir, scene, method)
+    found = diagnose(graph)
+    precision, recall = precision_and_recall(found.kept, right)
+    assert precision >= least_precision and recall >= least_recall
+    assert area_under_roc(found.probability, right) >= least_auc
+    assert pose_recall(truth, found.world_from_cam, found.piece) >= least_pose_recall
+    assert np.isnan(found.probability[found.verdict == UNTESTABLE]).all()
+
+
+def test_few_right_edges_of_a_real_scene_are_blamed_where_all_are_right(data_dir: Path) -> None:
+    graph, truth, right = estimates(data_dir, "7-scenes-redkitchen", "3dmatch")
+    found = diagnose(graph.select(right))
+    assert found.kept.mean() > 0.9
+    assert pose_recall(truth, found.world_from_cam, found.piece) == 1.0
+
+
+def test_the_robust_solver_finds_the_poses_of_a_real_scene(data_dir: Path) -> None:
+    graph, truth, right = estimates(data_dir, "7-scenes-redkitchen", "3dmatch")
+    solution = DiagnosedSolver().solve(graph, np.tile(np.eye(4), (graph.vertex_count, 1, 1)))
+    assert pose_recall(truth, solution.world_from_cam, solution.component) >= 0.98
+    assert (solution.weights[~right] > 0).mean() < 0.1 < 0.8 < (solution.weights[right] > 0).mean()
