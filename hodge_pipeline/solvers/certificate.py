@@ -13,9 +13,9 @@ import numpy as np
 from scipy.sparse import bsr_matrix, csc_matrix, diags_array
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
-from hodge_pipeline.solvers.linear import factorise, negative_pivots
-from hodge_pipeline.solvers.problem import BlockPattern, Problem
-from hodge_pipeline.types import Floats
+from hodge_pipeline.solvers.linear import factorise, fill_reducing_order, negative_pivots
+from hodge_pipeline.solvers.problem import BlockPattern, Problem, laplacian
+from hodge_pipeline.types import Floats, Ints
 
 RELATIVE_SHIFTS = (1e-10, 1e-7)
 """ε over κ's scale, the second where the first is lost in rounding; local minima have eigenvalues far below both."""
@@ -99,7 +99,8 @@ def certify(problem: Problem, rotations: Floats, translations: Floats, cost: flo
     matrix = certificate_matrix(problem, rotations, translations)
     kept = np.ones((problem.count, d + 1), bool)
     kept[free:, d] = False
-    rows = np.flatnonzero(kept.reshape(-1))
+    order = _elimination_order(problem)
+    rows = (order[:, None] * (d + 1) + np.arange(d + 1))[kept[order]]
     ones = np.zeros((problem.count, d + 1))
     ones[:, :d] = 1.0
     matrix = csc_matrix(csc_matrix(matrix)[rows][:, rows])
@@ -116,9 +117,21 @@ def certify(problem: Problem, rotations: Floats, translations: Floats, cost: flo
         note = "not certified as the global minimum: the factorisation broke down"
         return Certificate(False, shift, np.inf, negative, note)
     smallest, vector = _smallest_eigenvalue(matrix, shift, on_rotations)
-    direction = None if vector is None else vector[on_rotations > 0].reshape(problem.count, d)
+    direction = None
+    if vector is not None:
+        direction = np.empty((problem.count, d))
+        direction[order] = vector[on_rotations > 0].reshape(problem.count, d)
     note = f"not certified as the global minimum: {negative} negative eigenvalues, the smallest {smallest:.6g}"
     return Certificate(False, shift, np.inf, negative, note, smallest, direction)
+
+
+def _elimination_order(problem: Problem) -> Ints:
+    """The vertices in an order that keeps the fill low; theirs, where they were put into one."""
+    order = np.arange(problem.count)
+    if not problem.structure.elimination.ordered:
+        free = problem.free_count
+        order[:free] = fill_reducing_order(laplacian(problem.tail, problem.head, problem.kappa, free)).order
+    return order
 
 
 def _shifted(matrix: csc_matrix, shift: float, on_rotations: Floats) -> csc_matrix:

@@ -33,7 +33,7 @@ def initial_rotations(problem: Problem, pinned: Floats) -> Floats:
     """
     plan, edges = problem.structure.elimination, len(problem.kappa)
     factor_s = SECONDS_A_PRODUCT * problem.dimension**3 * plan.work
-    if factor_s < max(ALWAYS_CHORDAL_S, MULTILEVEL_SECONDS_AN_EDGE * edges):
+    if plan.ordered and factor_s < max(ALWAYS_CHORDAL_S, MULTILEVEL_SECONDS_AN_EDGE * edges):
         return chordal_rotations(problem, pinned)
     whole = RotationGraph(problem.count, problem.tail, problem.head, problem.rotations, problem.kappa)
     found = multilevel_rotations(whole, _chordal_alone)

@@ -49,7 +49,7 @@ def relative_covariances(graph: ViewGraph, world_from_cam: Floats, pairs: Ints) 
 
 def _joint_covariance(graph: ViewGraph, world_from_cam: Floats, vertices: Ints) -> tuple[Floats, Setup]:
     """The covariance (K, 6, K, 6) of these vertices together."""
-    setup = prepare(graph, world_from_cam)
+    setup = prepare(graph, world_from_cam, direct=True)
     if not setup.weights.definite:
         raise GraphError("covariances need positive semi-definite information: mend the indefinite matrices")
     problem = setup.problem

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import bsr_matrix
 
+from hodge_pipeline.solvers.backends import Backend
 from hodge_pipeline.solvers.cg import CgResult, truncated_cg
 from hodge_pipeline.solvers.elimination import Elimination
-from hodge_pipeline.solvers.linear import Factor, factorise_blocks
+from hodge_pipeline.solvers.linear import Factor
 from hodge_pipeline.types import Floats
 
 CG_FIRST_TO = 15_000
@@ -42,6 +43,7 @@ class DirectSolver:
     """Solves with one Hessian after another, the latest factor, and how many CG steps went without one."""
 
     plan: Elimination
+    backend: Backend
     factor: Factor | None = None
     tried: int = 0
 
@@ -52,8 +54,13 @@ class DirectSolver:
             return 0
         return worth if worth > FEWEST_CG_STEPS else max(CG_STEPS_TRIED - self.tried, 0)
 
-    def solve(self, hessian: bsr_matrix, gradient: Floats, tolerance: float, enough: float) -> CgResult:
-        """The step x with H x ≈ −g: by CG with the factor of an earlier H where that is quick, else with its own."""
+    def solve(
+        self, hessian: bsr_matrix, gradient: Floats, tolerance: float, enough: float, positions: Floats
+    ) -> CgResult:
+        """The step x with H x ≈ −g: by CG with the factor of an earlier H where that is quick, else with its own.
+
+        Where the poses are does not matter to a factor.
+        """
         wasted = 0
         if self.factor is not None and tolerance < NEARLY_THERE:
             found = self._cg(hessian, gradient, TOLERANCE, enough, self.factor, STALE_STEPS)
@@ -61,7 +68,7 @@ class DirectSolver:
                 return found
             wasted = found.steps
         self.factor = None
-        self.factor = factorise_blocks(self.plan, hessian)
+        self.factor = self.backend.factorise_blocks(self.plan, hessian)
         found = self._cg(hessian, gradient, TOLERANCE, enough, self.factor, FRESH_STEPS)
         return CgResult(found.x, found.residual, wasted + found.steps)
 

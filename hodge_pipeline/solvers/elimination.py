@@ -7,6 +7,7 @@ used for matrices with blocks of any size.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -86,6 +87,11 @@ class Elimination:
     fill: float
 
     @property
+    def ordered(self) -> bool:
+        """Whether an order was looked for."""
+        return math.isfinite(self.work)
+
+    @property
     def size(self) -> int:
         """How many vertices there are."""
         return len(self.order)
@@ -99,6 +105,12 @@ class Elimination:
     def keys(self) -> Ints:
         """Ascending: row · n + column of each slot."""
         return self.slot_rows * self.size + self.slot_columns
+
+
+def unordered(count: int) -> Elimination:
+    """The plan that leaves the vertices as they are, for a graph that will not be factorised."""
+    none = np.zeros(0, np.int64)
+    return Elimination(np.arange(count), 0, (), none, none, math.inf, math.inf)
 
 
 def plan_elimination(tail: Ints, head: Ints, count: int, core_order: Callable[[csc_matrix], Ordering]) -> Elimination:

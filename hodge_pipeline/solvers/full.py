@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.cg import Operator, truncated_cg
 from hodge_pipeline.solvers.direct import DirectSolver
+from hodge_pipeline.solvers.iterative import IterativeSolver
+from hodge_pipeline.solvers.joint import step_solver
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import exponential, lever
@@ -69,12 +71,12 @@ class FullObjective:
 
     problem: Problem
     information: Floats
-    direct: DirectSolver
+    direct: DirectSolver | IterativeSolver
 
     @classmethod
     def of(cls, problem: Problem, information: Floats) -> FullObjective:
         """The objective of a problem."""
-        return cls(problem, information, DirectSolver(problem.structure.elimination))
+        return cls(problem, information, step_solver(problem))
 
     def at(self, rotations: Floats, translations: Floats) -> FullPoint:
         """The point at these poses."""
@@ -92,7 +94,9 @@ class FullObjective:
             spent = found.steps
             self.direct.tried += spent
         if spent >= tried:
-            found = self.direct.solve(hessian, gradient, tolerance, enough)
+            found = self.direct.solve(
+                hessian, gradient, tolerance, enough, point.translations[: self.problem.free_count]
+            )
             spent += found.steps
         slope = 2 * float(gradient @ found.x)
         return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), spent)

@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass as stage
 
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.certificate import Certificate, certify
 from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import cost_at_start, metrics_of, minimise
@@ -31,6 +32,7 @@ def solve(
     start: Floats | None = None,
     objective: ObjectiveName = "full",
     initial: InitialName = "chordal",
+    backend: BackendName = "auto",
     dimension: Literal[2, 3] | None = None,
     fixed: Ints | None = None,
     priors: Priors | None = None,
@@ -47,6 +49,8 @@ def solve(
       indefinite information matrix is solved as isotropic, and a note says so.
     - `start (V, 4, 4)` sets the gauge of each component; with `initial="given"` the descent begins there, else at
       the chordal rotations, which need no start.
+    - `backend` of linear systems: `superlu` and `cholmod` factorise, `multigrid` and `pyamg` precondition conjugate
+      gradients, at a cost that does not depend on the fill; `auto` takes what will be cheaper on this graph.
     - `dimension`: 2 for a graph in the plane; None takes the graph's, and 2 where every edge lies in the plane.
     - `fixed`: rows of vertices that stay at their start; None takes the graph's.
     - `priors`: what is known of single poses; all that have one share the world's gauge. None takes the graph's.
@@ -56,7 +60,7 @@ def solve(
         graph = ViewGraph.from_edges(np.arange(4), edges, i_from_j, information)
         world_from_cam = solve(graph).world_from_cam
 
-    Raises `GraphError` for numbers that are not finite and edges that name no vertex.
+    Raises `GraphError` for numbers that are not finite, edges that name no vertex, and a back end not installed.
     """
     if start is None and (initial == "given" or (fixed is not None and len(fixed))):
         raise GraphError("fixed vertices and a given initial guess need start poses: pass start")
@@ -68,6 +72,7 @@ def solve(
             start=poses,
             objective=objective,
             initial=initial,
+            backend=backend,
             dimension=dimension,
             certificate=certificate,
             max_iterations=max_iterations,
@@ -80,7 +85,7 @@ def solve(
     if fixed is None and start is None and len(graph.fixed):
         notes.append(f"{len(graph.fixed)} fixed vertices have no pose: the first vertex of each piece is held instead")
     rows = NO_ROWS if start is None else np.asarray(graph.fixed if fixed is None else fixed, np.int64)
-    setup = prepare(graph, start, rows, dimension)
+    setup = prepare(graph, start, rows, dimension, backend, direct=certificate)
     notes += [*setup.weights.notes, *describe_components(setup.component, graph.vertex_ids)]
     full = objective == "full" and setup.weights.definite
     if objective == "full" and not full:
@@ -137,6 +142,11 @@ class HodgeSolver:
         description="chordal: rotations from a linear relaxation, whatever the start, so that drift cannot trap it; "
         "given: from the start, for warm calls where it is known to be good",
     )
+    backend: BackendName = Field(
+        "auto",
+        description="of linear systems: superlu and cholmod (scikit-sparse) factorise; multigrid and pyamg "
+        "precondition conjugate gradients, whatever the fill; auto: what will be cheapest here and is installed",
+    )
     certificate: bool = Field(False, description="test whether the isotropic minimum is the global one")
     max_iterations: int = Field(100, gt=0, description="Newton steps; real graphs need 3 to 12")
     relative_tolerance: float = Field(
@@ -151,6 +161,7 @@ class HodgeSolver:
             start=world_from_cam,
             objective=self.objective,
             initial=self.initial,
+            backend=self.backend,
             certificate=self.certificate,
             max_iterations=self.max_iterations,
             relative_tolerance=self.relative_tolerance,

@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import bsr_matrix
 
+from hodge_pipeline.solvers.cg import CgResult
 from hodge_pipeline.solvers.direct import DirectSolver
+from hodge_pipeline.solvers.iterative import IterativeSolver, TranslationSolver
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.objective import Residuals, curvature, gradient, residuals
 from hodge_pipeline.solvers.problem import Problem
@@ -35,6 +37,14 @@ def stiffness(kappa: Floats, turn: Floats) -> Floats:
     return np.asarray(2 * kappa[:, None, None] * (np.eye(3) - half[:, :, None] * half[:, None, :]))
 
 
+def step_solver(problem: Problem) -> DirectSolver | IterativeSolver:
+    """What solves for the steps of all unknowns, by the problem's back end."""
+    structure = problem.structure
+    if structure.backend.precondition is not None:
+        return IterativeSolver(structure.backend.precondition)
+    return DirectSolver(structure.elimination, structure.backend)
+
+
 @dataclass(frozen=True)
 class JointPoint(Point):
     """A point with its residuals."""
@@ -44,28 +54,40 @@ class JointPoint(Point):
 
 @dataclass(frozen=True)
 class JointObjective:
-    """F as a function of rotations and translations."""
+    """F as a function of rotations and translations.
+
+    With an iterative back end the translations follow every turn (`matching`): where soft modes bend a long graph, a
+    straight step of theirs does not go far.
+    """
 
     problem: Problem
-    direct: DirectSolver
+    direct: DirectSolver | IterativeSolver
+    matching: TranslationSolver | None = None
 
     @classmethod
     def of(cls, problem: Problem) -> JointObjective:
         """The objective of a problem."""
-        return cls(problem, DirectSolver(problem.structure.elimination))
+        precondition = problem.structure.backend.precondition
+        matching = None if precondition is None else TranslationSolver.of(problem, precondition)
+        return cls(problem, step_solver(problem), matching)
 
     def at(self, rotations: Floats, translations: Floats) -> JointPoint:
         """The point at these poses."""
+        if self.matching is not None:
+            translations = self.matching.matching(rotations, translations)
         left = residuals(self.problem, rotations, translations)
         return JointPoint(rotations, translations, left.cost, left)
 
     def step(self, point: Point, tolerance: float, enough: float) -> Step:
         """A Gauss-Newton step."""
         assert isinstance(point, JointPoint)
-        slopes, hessian = self.normal_equations(point.left)
-        found = self.direct.solve(hessian, slopes, tolerance, enough)
-        if tolerance < NEWTON_FROM:
-            exact = self.direct.refined(self.hessian(point.left), slopes, enough)
+        slopes, near = gradient(self.problem, point.left).reshape(-1), tolerance < NEWTON_FROM
+        if isinstance(self.direct, IterativeSolver):
+            found = self._iterated(self.direct, point, slopes, tolerance, enough, near)
+        else:
+            positions = point.translations[: self.problem.free_count]
+            found = self.direct.solve(self.normal_matrix(point.left), slopes, tolerance, enough, positions)
+            exact = self.direct.refined(self.hessian(point.left), slopes, enough) if near else None
             found = exact if exact is not None else found
         slope = 2 * float(slopes @ found.x)
         return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), found.steps)
@@ -79,8 +101,21 @@ class JointObjective:
         shifted[:free] += step[:, p:]
         return self.at(turned, shifted)
 
-    def normal_equations(self, left: Residuals) -> tuple[Floats, bsr_matrix]:
-        """Half the gradient (free · (p + d),) and half the Gauss-Newton Hessian."""
+    def _iterated(
+        self, solver: IterativeSolver, point: JointPoint, slopes: Floats, tolerance: float, enough: float, near: bool
+    ) -> CgResult:
+        """The step by the exact Hessian near a minimum, elsewhere or where it is not definite by Gauss-Newton's, which
+        alone gives a preconditioner.
+        """
+        positions = point.translations[: self.problem.free_count]
+        if near and solver.latest is not None:
+            found = solver.solve(self.hessian(point.left), slopes, tolerance, enough, positions)
+            if not found.negative_curvature:
+                return found
+        return solver.solve(self.normal_matrix(point.left), slopes, tolerance, enough, positions)
+
+    def normal_matrix(self, left: Residuals) -> bsr_matrix:
+        """Half the Gauss-Newton Hessian."""
         problem = self.problem
         reach = left.shift + left.arm
 
@@ -90,7 +125,7 @@ class JointObjective:
             levered = problem.tau[edges, None, None] * (np.swapaxes(arm, 1, 2) @ arm)
             return np.stack([own + levered, own, -own, -own])
 
-        return gradient(problem, left).reshape(-1), self._assembled(turned, reach)
+        return self._assembled(turned, reach)
 
     def hessian(self, left: Residuals) -> bsr_matrix:
         """Half the Hessian, the residuals' own curvature included: near a minimum it makes the steps Newton's."""

@@ -32,7 +32,7 @@ def minimise(
     not tried for the isotropic one.
     """
     begin = setup.initial(initial)
-    if full and (known or direct_at_once(setup.problem)):
+    if full and (known or (joint_at_once(setup.problem) and not setup.problem.structure.backend.iterative)):
         objective = full_objective(setup)
         return descend(objective, objective.at(*begin), limits, setup.rounding, watch)
     loose = replace(limits, relative_tolerance=max(limits.relative_tolerance, WARM_START_TOLERANCE))
@@ -53,7 +53,7 @@ def descend_isotropic(
 
     Where a factorisation of all unknowns is cheap, it takes over from CG once that has cost as much.
     """
-    if direct_at_once(problem):
+    if joint_at_once(problem):
         joint = JointObjective.of(problem)
         return descend(joint, joint.at(*begin), limits, floor, watch)
     cheap = steps_are_direct(problem)
@@ -74,8 +74,10 @@ def steps_are_direct(problem: Problem) -> bool:
     return direct.steps_worth_a_factor(problem.structure.elimination, size) <= direct.FEWEST_CG_STEPS
 
 
-def direct_at_once(problem: Problem) -> bool:
-    """Whether such a factorisation is made without a try of CG."""
+def joint_at_once(problem: Problem) -> bool:
+    """Whether steps move all unknowns from the first, by such a factorisation or an iterative back end."""
+    if problem.structure.backend.iterative:
+        return True
     return problem.free_count > direct.CG_FIRST_TO and steps_are_direct(problem)
 
 

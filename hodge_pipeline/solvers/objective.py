@@ -59,12 +59,16 @@ def residuals(problem: Problem, rotations: Floats, translations: Floats) -> Resi
 
 def best_translations(problem: Problem, rotations: Floats, translations: Floats) -> Floats:
     """The translations (n, d) that minimise F for these rotations; the pinned ones stay."""
+    out: Floats = translations.copy()
+    out[: problem.free_count] -= problem.translation_factor.solve(translation_force(problem, rotations, translations))
+    return out
+
+
+def translation_force(problem: Problem, rotations: Floats, translations: Floats) -> Floats:
+    """Half the gradient of F by the free translations (free, d)."""
     arm = np.einsum("eij,ej->ei", rotations[problem.tail], problem.translations)
     shift = problem.tau[:, None] * (translations[problem.head] - translations[problem.tail] - arm)
-    force = (problem.structure.at_head @ shift - problem.structure.at_tail @ shift)[: problem.free_count]
-    out: Floats = translations.copy()
-    out[: problem.free_count] -= problem.translation_factor.solve(force)
-    return out
+    return np.asarray(problem.structure.at_head @ shift - problem.structure.at_tail @ shift)[: problem.free_count]
 
 
 def rotation_gradient(problem: Problem, left: Residuals) -> Floats:

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 
-from hodge_pipeline.solvers.elimination import Elimination, plan_elimination
-from hodge_pipeline.solvers.linear import Factor, corrected, factorise, fill_reducing_order
+from hodge_pipeline.solvers.backends import Backend, BackendName, choose
+from hodge_pipeline.solvers.elimination import Elimination
+from hodge_pipeline.solvers.linear import Factor, corrected
 from hodge_pipeline.types import Bools, Floats, Ints
 
 SAME_RATIO = 1e-13
@@ -90,7 +91,7 @@ class Structure:
 
     - `order (n,)`: the graph's vertex at each position; the first `free_count` positions are unknown.
     - `tail`, `head (E,)`: positions of i and j.
-    - `elimination`: of the free vertices, whose positions are its own.
+    - `elimination`: of the free vertices, whose positions are its own; `backend`: for linear systems on them.
     """
 
     order: Ints
@@ -98,6 +99,7 @@ class Structure:
     tail: Ints
     head: Ints
     elimination: Elimination
+    backend: Backend
 
     @cached_property
     def at_tail(self) -> csr_matrix:
@@ -185,7 +187,7 @@ class Problem:
         """The scalar Laplacian of κ, factorised once."""
         if self.factors is not None:
             return self.factors.rotation
-        return factorise(laplacian(self.tail, self.head, self.kappa, self.free_count), "NATURAL")
+        return self.structure.backend.factorise(laplacian(self.tail, self.head, self.kappa, self.free_count))
 
     @cached_property
     def translation_factor(self) -> Factor:
@@ -196,7 +198,7 @@ class Problem:
         if len(ratio) and np.ptp(ratio) <= SAME_RATIO * ratio[0]:
             solve, scale = self.rotation_factor.solve, 1 / ratio[0]
             return Factor(self.free_count, lambda rhs: scale * solve(rhs))
-        return factorise(laplacian(self.tail, self.head, self.tau, self.free_count), "NATURAL")
+        return self.structure.backend.factorise(laplacian(self.tail, self.head, self.tau, self.free_count))
 
 
 def _indicator(vertices: Ints, count: int) -> csr_matrix:
@@ -220,7 +222,7 @@ def reweighted(problem: Problem, scale: Floats) -> Problem:
     """
     changed = np.flatnonzero(scale != 1)
     new = replace(problem, kappa=scale * problem.kappa, tau=scale * problem.tau, factors=None)
-    if len(changed) > MOST_CORRECTIONS:
+    if len(changed) > MOST_CORRECTIONS or problem.structure.backend.iterative:
         return new
     change = scale[changed] - 1
     ends = np.stack([problem.tail[changed], problem.head[changed]], axis=1)
@@ -230,19 +232,26 @@ def reweighted(problem: Problem, scale: Floats) -> Problem:
 
 
 def make_problem(
-    edges: Ints, rotations: Floats, translations: Floats, kappa: Floats, tau: Floats, pinned: Bools
+    edges: Ints,
+    rotations: Floats,
+    translations: Floats,
+    kappa: Floats,
+    tau: Floats,
+    pinned: Bools,
+    backend: BackendName = "auto",
+    direct: bool = False,
 ) -> Problem:
     """The problem with its vertices in elimination order. `pinned (V,)` must hold one vertex or more of each
-    component; edges must not join a vertex to itself.
+    component; edges must not join a vertex to itself. `direct`: a factorisation will be needed.
     """
     free, rest = np.flatnonzero(~pinned), np.flatnonzero(pinned)
     position = np.empty(len(pinned), np.int64)
     position[free], position[rest] = np.arange(len(free)), len(free) + np.arange(len(rest))
     tail, head = position[edges[:, 0]], position[edges[:, 1]]
-    elimination = plan_elimination(tail, head, len(free), fill_reducing_order)
+    chosen, elimination = choose(backend, tail, head, len(free), direct)
     order = np.concatenate([free[elimination.order], rest])
     position[order] = np.arange(len(order))
-    structure = Structure(order, len(free), position[edges[:, 0]], position[edges[:, 1]], elimination)
+    structure = Structure(order, len(free), position[edges[:, 0]], position[edges[:, 1]], elimination, chosen)
     return Problem(structure, rotations, translations, kappa, tau)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.chordal import initial_rotations
 from hodge_pipeline.solvers.newton import Point
 from hodge_pipeline.solvers.objective import gradient, residuals
@@ -71,9 +72,17 @@ class Setup:
 
 
 def prepare(
-    graph: ViewGraph, start: Floats | None = None, fixed: Ints = NO_ROWS, dimension: Literal[2, 3] | None = None
+    graph: ViewGraph,
+    start: Floats | None = None,
+    fixed: Ints = NO_ROWS,
+    dimension: Literal[2, 3] | None = None,
+    backend: BackendName = "auto",
+    direct: bool = False,
 ) -> Setup:
-    """The set-up of a graph. Raises `GraphError` where its numbers cannot be used."""
+    """The set-up of a graph; `direct`: a factorisation will be needed, whatever it costs.
+
+    Raises `GraphError` where its numbers cannot be used, or the back end is not installed.
+    """
     check_graph(graph)
     if start is not None and start.shape != (graph.vertex_count, 4, 4):
         raise GraphError(f"start poses have shape {start.shape}, expected {(graph.vertex_count, 4, 4)}")
@@ -94,6 +103,8 @@ def prepare(
         weights.kappa[weights.used],
         weights.tau[weights.used],
         pinned_vertices(component, fixed),
+        backend,
+        direct,
     )
     return Setup(weights, size, component, gauge, se3.inverse(gauge) @ poses, problem)
 

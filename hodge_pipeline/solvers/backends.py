@@ -1,0 +1,160 @@
+"""Linear back ends behind one small interface: which library factorises, or preconditions, and on which graph.
+
+A direct one factorises; an iterative one preconditions conjugate gradients, at a cost that grows with the graph alone
+and not with its fill.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
+
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.cg import truncated_cg
+from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
+from hodge_pipeline.solvers.linear import Factor, factorise, factorise_blocks, fill_reducing_order
+from hodge_pipeline.solvers.multigrid import Modes, Preconditioner, Preconditioning, multigrid
+from hodge_pipeline.types import Floats, Ints
+
+BackendName: TypeAlias = Literal["auto", "superlu", "cholmod", "pyamg", "multigrid"]
+ITERATIVE_FROM = 15_000
+"""Vertices: below, a factorisation and a hundred solves cost less than the hierarchies."""
+CHAIN_EDGES_PER_VERTEX = 1.5
+"""With more, so large a graph fills up: its order of elimination is not even looked for."""
+LARGEST_CORE = 50_000
+"""Vertices that the block elimination may leave over for such an order."""
+SECONDS_A_PRODUCT, SECONDS_A_BLOCK = 0.25e-9, 6e-6
+"""Measured, of one Newton step: of products of entries in a factorisation; of blocks of the matrix by multigrid."""
+JOINT_SIZE = 6
+SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
+MODULES = {"cholmod": ("sksparse.cholmod", "scikit-sparse"), "pyamg": ("pyamg", "pyamg")}
+
+
+@dataclass(frozen=True)
+class Backend:
+    """How linear systems of a graph are solved: by factors, or, with `precondition`, by conjugate gradients.
+
+    `factorise_core` gives what solves with a matrix in the order of elimination; None is SuperLU, which can do so in
+    single precision. `precondition` gives an approximate inverse, symmetric and positive definite, of a block matrix.
+    """
+
+    name: BackendName
+    factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]] | None = None
+    precondition: Preconditioning | None = None
+
+    @property
+    def iterative(self) -> bool:
+        """Whether it makes no factors."""
+        return self.precondition is not None
+
+    def factorise(self, laplacian: csc_matrix) -> Factor:
+        """What solves with a scalar Laplacian (n, n) in the order of elimination, to the rounding of a factor."""
+        size = int(laplacian.shape[0])
+        if size and self.precondition is not None:
+            return _conjugate_gradients(csr_matrix(laplacian), self.precondition)
+        if size and self.factorise_core is not None:
+            return Factor(size, self.factorise_core(laplacian))
+        return factorise(laplacian, "NATURAL")
+
+    def factorise_blocks(self, plan: Elimination, matrix: bsr_matrix, single: bool = False) -> Factor:
+        """The factor of a block matrix in the order of elimination; `single`: in float32, where there is a choice.
+
+        An iterative back end leaves it to SuperLU. Raises `GraphError` where the matrix is singular.
+        """
+        return factorise_blocks(plan, matrix, single and self.factorise_core is None, self.factorise_core)
+
+
+def backend(name: BackendName) -> Backend:
+    """The back end of this name, not `auto`. Raises `GraphError` where its library is not installed."""
+    if name in MODULES and not installed(name):
+        raise GraphError(f"back end {name} is not installed: pip install {MODULES[name][1]}, or take backend auto")
+    if name == "cholmod":
+        return Backend(name, factorise_core=_cholmod)
+    if name in ("pyamg", "multigrid"):
+        return Backend(name, precondition=_pyamg if name == "pyamg" else _multigrid)
+    return Backend("superlu")
+
+
+def installed(name: BackendName) -> bool:
+    """Whether the library of a back end can be imported."""
+    module = MODULES.get(name, ("scipy", ""))[0]
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def choose(name: BackendName, tail: Ints, head: Ints, count: int, direct: bool = False) -> tuple[Backend, Elimination]:
+    """The back end for a graph, and its plan of elimination; edges (tail, head), `count` vertices that are not pinned.
+
+    `auto` is the cheaper of a factorisation, whose fill is foretold, and multigrid; where one will be needed
+    (`direct`), it is a factorisation.
+    """
+    factors = backend("cholmod" if installed("cholmod") else "superlu") if name == "auto" else backend(name)
+    if factors.iterative:
+        return factors, unordered(count)
+    if name != "auto" or direct or count <= ITERATIVE_FROM:
+        return factors, plan_elimination(tail, head, count, fill_reducing_order)
+    if len(tail) < CHAIN_EDGES_PER_VERTEX * count:
+        plan = plan_elimination(tail, head, count, _order_of_small)
+        if SECONDS_A_PRODUCT * JOINT_SIZE**3 * plan.work < SECONDS_A_BLOCK * (count + 2 * len(tail)):
+            return factors, plan
+    return backend("multigrid"), unordered(count)
+
+
+def _order_of_small(core: csc_matrix) -> Ordering:
+    """The core's order, at infinite cost where it is too large to be worth the look."""
+    size = int(core.shape[0])
+    return fill_reducing_order(core) if size <= LARGEST_CORE else Ordering(np.arange(size), math.inf, math.inf)
+
+
+def _conjugate_gradients(matrix: csr_matrix, precondition: Preconditioning) -> Factor:
+    blocks = matrix.tobsr((1, 1))
+    apply = precondition(blocks, Modes())
+
+    def solve(rhs: Floats) -> Floats:
+        found = truncated_cg(
+            lambda x: np.asarray(matrix @ x.reshape(rhs.shape)).reshape(-1),
+            lambda r: apply(blocks, r.reshape(rhs.shape)).reshape(-1),
+            -rhs.reshape(-1),
+            SCALAR_TOLERANCE,
+            MAX_SCALAR_STEPS,
+        )
+        return found.x.reshape(rhs.shape)
+
+    return Factor(int(matrix.shape[0]), solve)
+
+
+def _multigrid(matrix: bsr_matrix, modes: Modes) -> Preconditioner:
+    return multigrid(matrix, modes, lambda coarse: factorise(coarse).solve).cycle
+
+
+def _cholmod(matrix: csc_matrix) -> Callable[[Floats], Floats]:
+    from sksparse.cholmod import CholmodError, cholesky
+
+    try:
+        factor = cholesky(csc_matrix(matrix, dtype=float), ordering_method="natural")
+    except CholmodError as error:
+        raise GraphError(f"a linear system of {matrix.shape[0]} unknowns is singular: {error}") from error
+    return lambda rhs: np.asarray(factor(rhs))
+
+
+def _pyamg(matrix: bsr_matrix, modes: Modes) -> Preconditioner:
+    import pyamg
+
+    size = matrix.blocksize[0]
+    near = modes.blocks(matrix.shape[0] // size, size).reshape(-1, size)
+    levels = pyamg.smoothed_aggregation_solver(matrix, B=near, symmetry="symmetric")
+    cycle = levels.aspreconditioner()
+
+    def apply(_: bsr_matrix, r: Floats) -> Floats:
+        columns = r.reshape(len(near), -1)
+        return np.stack([cycle @ column for column in columns.T], axis=1).reshape(r.shape)
+
+    return apply

@@ -1,0 +1,94 @@
+"""Newton steps by conjugate gradients with a multilevel preconditioner, which serves until it has grown too old."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import bsr_matrix, csr_matrix
+
+from hodge_pipeline.solvers.cg import CgResult, truncated_cg
+from hodge_pipeline.solvers.multigrid import Modes, Preconditioner, Preconditioning
+from hodge_pipeline.solvers.objective import translation_force
+from hodge_pipeline.solvers.problem import Problem, laplacian
+from hodge_pipeline.types import Floats
+
+MOST_STEPS = 300
+STALE_STEPS = 25
+"""About what a new preconditioner costs: an old one that needs more is made anew."""
+LOOSEST = 0.1
+"""Of a step's tolerance: the preconditioner reaches it in a few."""
+TRANSLATION_TOLERANCE = 1e-3
+"""Of the translations that go with turned rotations: what is left is the next step's."""
+
+
+@dataclass
+class IterativeSolver:
+    """Solves with one Hessian after another, and the latest preconditioner."""
+
+    precondition: Preconditioning
+    latest: Preconditioner | None = None
+    tried: int = 0
+
+    def steps_to_try(self, size: int) -> int:
+        """None with another preconditioner."""
+        return 0
+
+    def solve(
+        self, hessian: bsr_matrix, gradient: Floats, tolerance: float, enough: float, positions: Floats
+    ) -> CgResult:
+        """The step x with H x ≈ −g, of poses at these positions (free, d)."""
+        tolerance = min(tolerance, LOOSEST)
+        if self.latest is None:
+            return self._afresh(hessian, gradient, tolerance, positions)
+        first = self._cg(self.latest, hessian, gradient, tolerance, STALE_STEPS)
+        if first.steps < STALE_STEPS or first.negative_curvature:
+            return first
+        left = float(np.linalg.norm(first.residual) / np.linalg.norm(gradient))
+        then = self._afresh(hessian, first.residual, min(tolerance / left, 1.0), positions)
+        return CgResult(first.x + then.x, then.residual, first.steps + then.steps, then.negative_curvature)
+
+    def _afresh(self, hessian: bsr_matrix, gradient: Floats, tolerance: float, positions: Floats) -> CgResult:
+        self.latest = None  # the old one's memory is better spent on the new one
+        self.latest = self.precondition(hessian, Modes(positions))
+        found = self._cg(self.latest, hessian, gradient, tolerance, MOST_STEPS)
+        if found.steps:
+            return found
+        self.latest = None  # of a matrix that is not definite
+        return replace(found, negative_curvature=True)
+
+    @staticmethod
+    def _cg(operator: Preconditioner, hessian: bsr_matrix, gradient: Floats, tolerance: float, most: int) -> CgResult:
+        return truncated_cg(
+            lambda x: np.asarray(hessian @ x), lambda r: operator(hessian, r), gradient, tolerance, most
+        )
+
+
+@dataclass(frozen=True)
+class TranslationSolver:
+    """The translations that go with rotations: the Laplacian of τ with its preconditioner."""
+
+    problem: Problem
+    matrix: bsr_matrix
+    precondition: Preconditioner
+
+    @classmethod
+    def of(cls, problem: Problem, precondition: Preconditioning) -> TranslationSolver:
+        """The solver for a problem's τ."""
+        matrix = laplacian(problem.tail, problem.head, problem.tau, problem.free_count).tobsr((1, 1))
+        return cls(problem, matrix, precondition(matrix, Modes()))
+
+    def matching(self, rotations: Floats, translations: Floats) -> Floats:
+        """Translations (n, d) near those that minimise F for these rotations, from a guess; the pinned ones stay."""
+        force = translation_force(self.problem, rotations, translations)
+        csr = csr_matrix((self.matrix.data.reshape(-1), self.matrix.indices, self.matrix.indptr), self.matrix.shape)
+        found = truncated_cg(
+            lambda x: np.asarray(csr @ x.reshape(force.shape)).reshape(-1),
+            lambda r: self.precondition(self.matrix, r.reshape(force.shape)).reshape(-1),
+            force.reshape(-1),
+            TRANSLATION_TOLERANCE,
+            MOST_STEPS,
+        )
+        out: Floats = translations.copy()
+        out[: self.problem.free_count] += found.x.reshape(force.shape)
+        return out
