@@ -8,6 +8,7 @@ from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers import elimination
+from hodge_pipeline.solvers.backends import backend
 from hodge_pipeline.solvers.direct import DirectSolver
 from hodge_pipeline.solvers.elimination import plan_elimination
 from hodge_pipeline.solvers.linear import factorise_blocks, fill_reducing_order
@@ -76,13 +77,14 @@ def test_an_old_factor_serves_a_near_hessian_and_a_far_one_gets_its_own():
     plan = plan_elimination(k[:-1], k[1:], len(k), fill_reducing_order)
     first = block_laplacian(plan, k[:-1], k[1:], 3, rng)
     gradient = rng.normal(size=len(first))
-    direct = DirectSolver(plan)
-    direct.solve(bsr_matrix(first, blocksize=(3, 3)), gradient, 1e-3, 0.0)
+    nowhere = np.zeros((len(k), 3))
+    direct = DirectSolver(plan, backend("superlu"))
+    direct.solve(bsr_matrix(first, blocksize=(3, 3)), gradient, 1e-3, 0.0, nowhere)
     factor = direct.factor
-    near = direct.solve(bsr_matrix(1.01 * first, blocksize=(3, 3)), gradient, 1e-3, 0.0)
+    near = direct.solve(bsr_matrix(1.01 * first, blocksize=(3, 3)), gradient, 1e-3, 0.0, nowhere)
     assert direct.factor is factor
     np.testing.assert_allclose(near.x, -np.linalg.solve(1.01 * first, gradient), rtol=0.02, atol=0.02)
     far = block_laplacian(plan, k[:-1], k[1:], 3, np.random.default_rng(1))
-    found = direct.solve(bsr_matrix(far, blocksize=(3, 3)), gradient, 1e-3, 0.0)
+    found = direct.solve(bsr_matrix(far, blocksize=(3, 3)), gradient, 1e-3, 0.0, nowhere)
     assert direct.factor is not factor
     np.testing.assert_allclose(found.x, -np.linalg.solve(far, gradient), rtol=1e-6, atol=1e-6)
