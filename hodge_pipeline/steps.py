@@ -219,11 +219,14 @@ class BlockStore:
 def fuse(job: Job, source: Source, world_from_cam: Floats, number: int) -> dict[str, Path]:
     """The PLY file of each model, by its name, from the poses of round `number`, the last."""
     last, files = f"solve-{number}", {}
+    # What gave no cloud, such as a scan in other units, was placed by nothing.
+    has_cloud = CloudSet.open(job.path("clouds")).sizes > 0
+    poses = np.where(has_cloud[:, None, None], world_from_cam, np.nan)
     for row, fuser in enumerate(job.recipe.fusion):
         name = f"fuse-{row}"
         with job.stage(name, f"fusion {row + 1}", len(source.frames), fuser, ("source", last)) as (folder, advance):
             if not folder.finished:
-                model = fuser.fuse(source.frames, world_from_cam, advance)
+                model = fuser.fuse(source.frames, poses, advance)
                 write_ply(folder.path / f"{model.name}.ply", model)
                 for note in model.notes:
                     job.note(note)

@@ -13,6 +13,8 @@ from pydantic import ValidationError
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.executors.local import InProcess
+from hodge_pipeline.registration import clouds as clouds_module
+from hodge_pipeline.registration import voxel_means
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud, prepare_clouds
 from hodge_pipeline.types import Camera, CloudSet, Frame, PointCloud
 
@@ -153,3 +155,21 @@ def test_a_real_frame(data_dir: Path, tmp_path: Path) -> None:
         assert np.allclose(lengths, 1, atol=1e-3)
         assert (np.einsum("ij,ij->i", cloud.normals_in_cam, cloud.points_in_cam) <= 0).all()
         assert cloud.colours.any(axis=1).mean() > 0.95
+
+
+def test_a_large_cloud_is_averaged_in_parts_as_it_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    points, colours = rng.normal(size=(5000, 3)).astype(np.float32), rng.integers(0, 256, (5000, 3)).astype(np.uint8)
+    whole = voxel_means.voxel_means(points, colours, 0.3)
+    monkeypatch.setattr(voxel_means, "POINTS_IN_PART", 700)
+    parts = voxel_means.voxel_means(points, colours, 0.3)
+    assert np.allclose(whole[0], parts[0], atol=1e-6) and np.array_equal(whole[1], parts[1])
+    assert len(whole[0]) == len(np.unique(np.floor(points / 0.3), axis=0))
+
+
+def test_a_scan_of_many_points_is_said_to_be_down_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clouds_module, "MANY_POINTS", 1000)
+    points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)).astype(np.float32)
+    frame = Frame(7, 0.0, read_points=lambda: PointCloud(points))
+    _, counts = make_cloud(frame, CloudOptions(voxel_m=0.5, min_range_m=0.0))
+    assert counts.note == f"frame 7: 2000 points, down-sampled to {counts.points}, one a voxel of 0.5 m"

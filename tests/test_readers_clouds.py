@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hodge_adapters import ply_points, point_columns
 from hodge_adapters.clouds import CloudFolderReader, PlyWriter
 from hodge_adapters.log_text import read_log_file
 from hodge_adapters.pcd_points import expand_lzf, read_pcd
@@ -175,3 +176,23 @@ def test_real_fragments_overlap_under_the_given_convention(data_dir: Path) -> No
         ]
         shares.append(len(keys[0] & keys[1]) / len(keys[1]))
     assert shares[0] > 0.6 and shares[0] > 1.5 * shares[1], "matrix (i, j) moves j into i, not i into j"
+
+
+@pytest.mark.parametrize("kind", ["ply", "pcd"])
+def test_files_are_read_in_parts_as_they_are_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    expected = cloud(50)
+    path = tmp_path / f"a.{kind}"
+    for ascii_text in (True, False):
+        made = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(expected.points_in_cam.astype(float)))
+        made.colors = o3d.utility.Vector3dVector(expected.colours / 255.0)  # type: ignore[operator]
+        o3d.io.write_point_cloud(str(path), made, write_ascii=ascii_text)
+        read = {"ply": read_ply, "pcd": read_pcd}[kind]
+        whole = read(path)
+        monkeypatch.setattr(point_columns, "LINES_IN_PART", 7)
+        monkeypatch.setattr(point_columns, "ROWS_IN_PART", 9)
+        monkeypatch.setattr(ply_points, "ROWS_IN_PART", 9)
+        parts = read(path)
+        monkeypatch.undo()
+        assert np.array_equal(whole.points_in_cam, parts.points_in_cam) and len(parts) == 50
+        assert np.array_equal(whole.colours, parts.colours)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(parts.colours, expected.colours)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hodge_adapters.point_columns import points_of_columns
+from hodge_adapters.point_columns import number_rows, parts_of, points_of_parts
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PointCloud
 
@@ -46,12 +48,15 @@ def read_pcd(path: Path) -> PointCloud:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
     header = _read_header(path, contents)
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}[header.kind]
-    columns = read(path, contents, header)
+    return points_of_parts(path, map(_unpacked, read(path, contents, header)))
+
+
+def _unpacked(columns: dict[str, Any]) -> dict[str, Any]:
     for name in _PACKED:
         if name in columns and columns[name].dtype.itemsize == 4:
             packed = np.ascontiguousarray(columns[name]).view(np.uint32)
             columns |= {"red": packed >> 16 & 255, "green": packed >> 8 & 255, "blue": packed & 255}
-    return points_of_columns(path, columns)
+    return columns
 
 
 def expand_lzf(compressed: bytes, size: int) -> bytes | None:
@@ -119,21 +124,21 @@ def _is_type(kind: str, size: str) -> bool:
     return (kind in "IU" and size in ("1", "2", "4", "8")) or (kind == "F" and size in ("4", "8"))
 
 
-def _read_ascii(path: Path, contents: bytes, header: PcdHeader) -> dict[str, Any]:
+def _read_ascii(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dict[str, Any]]:
     width = sum(count for _, _, count in header.fields)
-    try:
-        table = np.array(contents[header.start :].split(), np.float64).reshape(-1, max(width, 1))
-    except ValueError as error:
-        raise SourceError(f"{path}: its points are no rows of {width} numbers: make it again") from error
-    if len(table) != header.count:
-        raise SourceError(f"{path}: says {header.count} points, has {len(table)}: copy it again")
-    columns, at = {}, 0
-    for name, code, count in header.fields:
-        column = table[:, at]
-        # Packed colours are the bits of the number that is written.
-        columns[name] = _as_type(column, code) if name in _PACKED else column
-        at += count
-    return columns
+    file = io.BytesIO(contents)
+    file.seek(header.start)
+    lines = filter(bytes.strip, file)
+    for table in number_rows(path, lines, header.count, width):
+        columns, at = {}, 0
+        for name, code, count in header.fields:
+            column = table[:, at]
+            # Packed colours are the bits of the number that is written.
+            columns[name] = _as_type(column, code) if name in _PACKED else column
+            at += count
+        yield columns
+    if rest := sum(1 for _ in lines):
+        raise SourceError(f"{path}: says {header.count} points, has {header.count + rest}: copy it again")
 
 
 def _as_type(column: Any, code: str) -> Any:
@@ -141,13 +146,13 @@ def _as_type(column: Any, code: str) -> Any:
         return np.ascontiguousarray(column.astype(code))
 
 
-def _read_binary(path: Path, contents: bytes, header: PcdHeader) -> dict[str, Any]:
+def _read_binary(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dict[str, Any]]:
     _check_room(path, header, len(contents) - header.start)
     table = np.frombuffer(contents, header.dtype, header.count, header.start)
-    return {name: table[name] for name, _, count in header.fields if count == 1}
+    yield from parts_of({name: table[name] for name, _, count in header.fields if count == 1})
 
 
-def _read_compressed(path: Path, contents: bytes, header: PcdHeader) -> dict[str, Any]:
+def _read_compressed(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dict[str, Any]]:
     _check_room(path, header, (len(contents) - header.start) * MAX_EXPANSION)
     size = header.count * header.dtype.itemsize
     if len(contents) < header.start + 8:
@@ -164,7 +169,7 @@ def _read_compressed(path: Path, contents: bytes, header: PcdHeader) -> dict[str
         if count == 1:
             columns[name] = column
         at += column.nbytes
-    return columns
+    yield from parts_of(columns)
 
 
 def _check_room(path: Path, header: PcdHeader, room: int) -> None:

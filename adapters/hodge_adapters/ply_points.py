@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from hodge_adapters.point_columns import points_of_columns
+from hodge_adapters.point_columns import ROWS_IN_PART, number_rows, points_of_parts
 from hodge_adapters.text_rows import write_bytes_atomically
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PointCloud
@@ -59,8 +60,8 @@ def read_ply(path: Path) -> PointCloud:
     try:
         with open(path, "rb") as file:
             header = _read_header(path, file)
-            read = _read_binary if header.order else _read_ascii
-            return points_of_columns(path, read(path, file, header))
+            parts = _binary_parts if header.order else _ascii_parts
+            return points_of_parts(path, parts(path, file, header))
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
 
@@ -124,24 +125,20 @@ def _vertices(path: Path, order: str, elements: list[tuple[str, int, list[tuple[
     raise SourceError(f"{path}: no vertices in it: give a PLY with points")
 
 
-def _read_binary(path: Path, file: BinaryIO, header: PlyHeader) -> dict[str, Any]:
+def _binary_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dict[str, Any]]:
     room = path.stat().st_size - header.start
     if header.count * header.dtype.itemsize > room:
         raise SourceError(f"{path}: says {header.count} points, has {max(room, 0)} bytes for them: copy it again")
     file.seek(header.start)
-    table = np.fromfile(file, header.dtype, header.count)
-    return {COLOURS.get(name, name): table[name] for name, _ in header.properties}
+    for start in range(0, max(header.count, 1), ROWS_IN_PART):
+        table = np.fromfile(file, header.dtype, min(ROWS_IN_PART, header.count - start))
+        yield {COLOURS.get(name, name): table[name] for name, _ in header.properties}
 
 
-def _read_ascii(path: Path, file: BinaryIO, header: PlyHeader) -> dict[str, Any]:
+def _ascii_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dict[str, Any]]:
     file.seek(header.start)
-    rows = file.read().split(b"\n")
-    wanted = rows[header.lines : header.lines + header.count]
-    width = len(header.properties)
-    try:
-        table = np.array(b" ".join(wanted).split(), np.float64).reshape(-1, width or 1)
-    except ValueError as error:
-        raise SourceError(f"{path}: its points are no rows of {width} numbers: make it again") from error
-    if len(table) != header.count:
-        raise SourceError(f"{path}: says {header.count} points, has {len(table)}: copy it again")
-    return {COLOURS.get(name, name): table[:, at] for at, (name, _) in enumerate(header.properties)}
+    for _ in range(header.lines):
+        file.readline()
+    names = [COLOURS.get(name, name) for name, _ in header.properties]
+    for table in number_rows(path, file, header.count, len(names)):
+        yield dict(zip(names, table.T, strict=True))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hodge_adapters.point_columns import points_of_columns
+from hodge_adapters.point_columns import ROWS_IN_PART, points_of_columns, points_of_parts
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, PointCloud
@@ -44,15 +44,22 @@ def las_corner(paths: Sequence[Path]) -> tuple[float, float, float]:
 
 def read_las(path: Path, corner: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PointCloud:
     """The points of a LAS or LAZ file counted from a corner: float32 has no room for map coordinates."""
-    with _named(path, "laspy"):
-        las = library("laspy", path).read(path)
-        columns: dict[str, Any] = {name: np.asarray(las[name]) - corner[at] for at, name in enumerate("xyz")}
-        if "red" in las.point_format.dimension_names:
-            colours = np.stack([np.asarray(las[name]) for name in ("red", "green", "blue")])
-            # The standard wants 16 bits a channel; files with 8 bits in them are common.
-            scale = 257 if colours.size and colours.max() > 255 else 1
-            columns.update(zip(("red", "green", "blue"), colours // scale, strict=True))
-    return points_of_columns(path, columns)
+    with _named(path, "laspy"), library("laspy", path).open(path) as file:
+        return points_of_parts(path, (_las_columns(part, corner) for part in _las_parts(file)))
+
+
+def _las_parts(file: Any) -> Iterator[Any]:
+    if not file.header.point_count:
+        yield file.read()
+        return
+    yield from file.chunk_iterator(ROWS_IN_PART)
+
+
+def _las_columns(part: Any, corner: tuple[float, float, float]) -> dict[str, Any]:
+    columns: dict[str, Any] = {name: np.asarray(part[name]) - corner[at] for at, name in enumerate("xyz")}
+    if "red" in part.point_format.dimension_names:
+        columns |= {name: np.asarray(part[name]) for name in ("red", "green", "blue")}
+    return columns
 
 
 def e57_scans(path: Path) -> list[Scan]:

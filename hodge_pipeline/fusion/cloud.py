@@ -14,7 +14,9 @@ from hodge_pipeline.fusion.depth_points import depth_points
 from hodge_pipeline.fusion.views import Skipped, posed
 from hodge_pipeline.fusion.voxel_cloud import VoxelCloud
 from hodge_pipeline.stages import Advance, no_progress
-from hodge_pipeline.types import Floats, Frame, Model, PointCloud
+from hodge_pipeline.types import Bools, Floats, Frame, Model, PointCloud
+
+POINTS_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -64,12 +66,18 @@ class CloudFuser:
         if view is None:
             skipped.add("neither depth image nor points", frame)
             return 0
-        finite = np.isfinite(view.points_in_cam).all(axis=1)
+        finite: Bools = np.asarray(np.isfinite(view.points_in_cam).all(axis=1))
         if not finite.any():
             skipped.add("no point within reach", frame)
-        points = se3.transform(world_from_cam, view.points_in_cam[finite].astype(float))
-        normals = None if view.normals_in_cam is None else view.normals_in_cam[finite] @ world_from_cam[:3, :3].T
-        return cloud.add(points, None if view.colours is None else view.colours[finite], normals)
+        far = 0
+        for start in range(0, len(finite), POINTS_AT_ONCE):
+            part = slice(start, start + POINTS_AT_ONCE)
+            good = finite[part]
+            points = se3.transform(world_from_cam, view.points_in_cam[part][good].astype(float))
+            normals = view.normals_in_cam
+            turned = None if normals is None else normals[part][good] @ world_from_cam[:3, :3].T
+            far += cloud.add(points, None if view.colours is None else view.colours[part][good], turned)
+        return far
 
     def _view(self, frame: Frame) -> PointCloud | None:
         if frame.read_depth and frame.camera:

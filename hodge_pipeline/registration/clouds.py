@@ -13,11 +13,13 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.registration.voxel_means import voxel_means
 from hodge_pipeline.stages import Advance, Workers, no_progress
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats32, Frame, Landmarks, PointCloud
 
 FRAMES_IN_BLOCK = 16
 MIN_POINTS_FOR_NORMALS = 5
+MANY_POINTS = 5_000_000
 MAX_VOXELS_ALONG_AXIS = 2_000_000  # its cube still fits the 64-bit voxel key
 
 
@@ -86,13 +88,16 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     zero where the frame has none. Raises `SourceError` where depth cannot be read or the frame has no geometry.
     """
     samples = _read_samples(frame, options)
-    points, colours = _voxel_means(samples.points_in_cam, samples.colours, options.voxel_m)
+    points, colours = voxel_means(samples.points_in_cam, samples.colours, options.voxel_m)
     landmarks = _landmarks(frame, options)
     cloud = PointCloud(points, _normals(points, options.normal_neighbours), colours, landmarks)
     empty = f"frame {frame.frame_id}: no valid measurement in range, its cloud is empty"
     if samples.note and not len(points):
         empty += f": {samples.note}"
     note = samples.note if len(points) else empty
+    if len(points) and samples.looked_at > MANY_POINTS:
+        note = f"frame {frame.frame_id}: {samples.looked_at} points, down-sampled to {len(points)}, one a voxel of "
+        note += f"{options.voxel_m:.3g} m"
     return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), note)
 
 
@@ -190,37 +195,21 @@ def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
     with np.errstate(over="ignore", invalid="ignore"):
         ranges = np.linalg.norm(points, axis=1)
     kept = (ranges >= options.min_range_m) & (ranges <= options.max_range_m)
-    colours = cloud.colours[kept] if cloud.colours is not None and options.colours else None
-    return _Samples(points[kept], colours, len(points), "" if kept.any() else _out_of_range(ranges, options))
+    colours = cloud.colours if options.colours else None
+    if not kept.all():  # a copy of what may be large
+        points, colours = points[kept], None if colours is None else colours[kept]
+    return _Samples(points, colours, len(kept), "" if kept.any() else _out_of_range(ranges, options))
 
 
 def _out_of_range(ranges: Floats32, options: CloudOptions) -> str:
     """What to do about points none of which is in range: scanners store millimetres as often as metres."""
     finite = ranges[np.isfinite(ranges)]
     if not len(finite):
-        return ""
+        return "there is no point in it"
     usual = float(np.median(finite))
     limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
     unit = " (millimetres? then source.reader.units_per_metre=1000)" if usual > options.max_range_m else ""
     return f"its points lie {usual:.3g} m away, in range are {limits}{unit}"
-
-
-def _voxel_means(points: Floats32, colours: Bytes | None, voxel_m: float) -> tuple[Floats32, Bytes]:
-    """The mean point and colour of every occupied voxel, ordered by voxel, so the same for any order of the input."""
-    if not len(points):
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    cells = np.floor(points / voxel_m).astype(np.int64)
-    cells -= cells.min(axis=0)
-    counts = cells.max(axis=0) + 1
-    keys = (cells[:, 0] * counts[1] + cells[:, 1]) * counts[2] + cells[:, 2]
-    order = np.argsort(keys, kind="stable")
-    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    sizes = np.diff(starts, append=len(keys))[:, None]
-    means = np.add.reduceat(points[order], starts, axis=0, dtype=np.float64) / sizes
-    if colours is None:
-        return means.astype(np.float32), np.zeros((len(means), 3), np.uint8)
-    sums = np.add.reduceat(colours[order], starts, axis=0, dtype=np.int64)
-    return means.astype(np.float32), ((sums + sizes // 2) // sizes).astype(np.uint8)
 
 
 def _normals(points: Floats32, neighbours: int) -> Floats32:
