@@ -18,7 +18,7 @@ CG_FIRST_TO = 15_000
 FEWEST_CG_STEPS = 60
 """Where a factorisation of all unknowns costs no more, it is cheap."""
 CG_STEPS_TRIED = 20
-"""In all, before a cheap factorisation is made: on small graphs they often suffice, and cost next to nothing."""
+"""In all, at most, before a cheap factorisation is made: on small graphs they often suffice."""
 STALE_STEPS = 8
 """CG steps with an old factor that cost about as much as a new one."""
 FRESH_STEPS = 50
@@ -52,7 +52,7 @@ class DirectSolver:
         worth = steps_worth_a_factor(self.plan, size)
         if self.factor is not None or (worth <= FEWEST_CG_STEPS and self.plan.size > CG_FIRST_TO):
             return 0
-        return worth if worth > FEWEST_CG_STEPS else max(CG_STEPS_TRIED - self.tried, 0)
+        return worth if worth > FEWEST_CG_STEPS else max(min(CG_STEPS_TRIED, worth) - self.tried, 0)
 
     def solve(
         self, hessian: bsr_matrix, gradient: Floats, tolerance: float, enough: float, positions: Floats

@@ -122,9 +122,21 @@ def _indefinite(information: Floats) -> Bools:
     checked = information[:1] if same else information
     diagonal = np.einsum("eii->ei", checked)
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    eigenvalues = np.linalg.eigvalsh(checked * scale[:, :, None] * scale[:, None, :])
+    scaled = checked * scale[:, :, None] * scale[:, None, :]
+    if _all_definite(scaled):
+        return np.zeros(len(information), bool)
+    eigenvalues = np.linalg.eigvalsh(scaled)
     found = (eigenvalues[:, 0] < -INDEFINITE_TOLERANCE * np.maximum(eigenvalues[:, -1], 0)) | (diagonal < 0).any(axis=1)
     return np.broadcast_to(found, len(information)) if same else np.asarray(found)
+
+
+def _all_definite(matrices: Floats) -> bool:
+    """Whether every matrix (E, k, k) has a Cholesky factor: a cheap test that most graphs pass."""
+    try:
+        np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _floor(weights: Floats, used: Bools, what: str, notes: list[str]) -> Floats:
