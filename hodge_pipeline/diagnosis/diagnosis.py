@@ -16,6 +16,7 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
 from hodge_pipeline.diagnosis.robust_poses import left_over
+from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors, short_cycles
 from hodge_pipeline.diagnosis.testing_cycles import (
     closing_support,
@@ -66,8 +67,11 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     )
     consensus = find_consensus(evidence, _with_noise(graph, motions, noise), options)
     undecided = unattributable(graph.edges, graph.vertex_count, cycles)
-    untestable = evidence.alone | (undecided >= 0)
-    probability = np.where(untestable, np.nan, consensus.probability)
+    blame = share_blame(cycles, consensus.fit, evidence)
+    unvouched = blame.unvouched & (consensus.probability >= options.consistent_from)
+    untestable = evidence.alone | (undecided >= 0) | unvouched
+    probability = np.where(untestable, np.nan, np.maximum(consensus.probability, blame.probability))
+    undecided = np.where(undecided >= 0, undecided, np.where(unvouched | (blame.probability > 0), blame.cycle, -1))
     verdict = _verdicts(probability, untestable, consensus.fit.used, options)
     kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
     world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))

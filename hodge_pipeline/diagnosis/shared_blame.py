@@ -1,0 +1,55 @@
+"""Edges that share the blame for a loop: one of them is wrong, and nothing in the graph says which."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.result import Cycles
+from hodge_pipeline.diagnosis.robust_poses import Fit
+from hodge_pipeline.types import Bools, Floats, Ints
+
+
+@dataclass(frozen=True)
+class SharedBlame:
+    """Where an alignment had to leave out one of several edges that no cycle tells apart.
+
+    - `unvouched (E,)`: edges in use that alone hold two parts together, over which no cycle closes: they are in use
+      because another one was left out, and either may be the wrong one.
+    - `cycle (E,)`: the shortest failing cycle of each such edge, and of each that was left out for it; −1 elsewhere.
+    - `probability (E,)`: of being right, of an edge left out that shares the blame: by its prior among those it shares
+      it with, of which one is wrong; 0 elsewhere.
+    """
+
+    unvouched: Bools
+    cycle: Ints
+    probability: Floats
+
+
+def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
+    """Who shares the blame, in this alignment."""
+    loops, count = cycles.loops, len(evidence.edges)
+    row, edge = np.repeat(np.arange(len(loops)), loops.lengths), loops.edge
+    untold = np.bincount(edge, cycles.closes[row], count) == 0
+    untold &= ~evidence.alone
+    unvouched = fit.used & np.isinf(fit.resistance) & untold
+    holds = np.bincount(row, unvouched[edge], len(loops)) > 0
+    # an edge that was left out shares the blame where each of its cycles has an edge that nothing vouches for
+    left_out = ~fit.used & untold & (np.bincount(edge, ~holds[row], count) == 0)
+    concerned = unvouched | left_out
+    cycle = _shortest(loops.lengths, row, edge, concerned)
+    odds = (1 - evidence.prior) / evidence.prior
+    among = np.bincount(row, np.where(concerned[edge], odds[edge], 0.0), len(loops))
+    probability = np.zeros(count)
+    probability[left_out] = 1 - odds[left_out] / among[cycle[left_out]]
+    return SharedBlame(unvouched, cycle, probability)
+
+
+def _shortest(lengths: Ints, row: Ints, edge: Ints, concerned: Bools) -> Ints:
+    """The shortest cycle (E,) through each edge that is concerned, −1 for the others."""
+    out = np.full(len(concerned), -1, np.int64)
+    order = np.argsort(-lengths[row], kind="stable")
+    out[edge[order]] = row[order]  # of an edge in several the last, shortest, stays
+    return np.where(concerned, out, -1)
