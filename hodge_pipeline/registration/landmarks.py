@@ -10,6 +10,9 @@ from hodge_pipeline.types import Bools, Camera, Floats32, Frame, Ints, Landmarks
 EDGE_STEP = 0.03
 """A landmark whose 3x3 pixels differ by more than this share of its depth lies on an edge: its depth is a guess."""
 
+CONTRAST = 0.01
+"""A quarter of OpenCV's: of an image with texture the strongest stay the same, one of a bare cabinet gets landmarks."""
+
 
 def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: float, *, scale: int = 1) -> Landmarks:
     """At most `count` landmarks, the strongest first; none for a frame without image, depth image or camera.
@@ -23,7 +26,7 @@ def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: fl
     if scale > 1:
         size = (grey.shape[1] // scale, grey.shape[0] // scale)
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
-    detector = cv2.SIFT_create(nfeatures=count)  # type: ignore[attr-defined]
+    detector = cv2.SIFT_create(nfeatures=count, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]
     found, descriptors = detector.detectAndCompute(grey, None)
     if not found:
         return Landmarks.none()

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline import se3
 from hodge_pipeline.descriptors import match, root_sift
 from hodge_pipeline.registration.assessment import assess, unregistered
 from hodge_pipeline.registration.gicp import Gicp, PreparedCloud
@@ -22,6 +23,8 @@ from hodge_pipeline.types import Floats, Landmarks, PointCloud, Registration
 
 ASSESSED_POINTS = 1000
 ASSESSED_WITHIN_M = 0.05
+SAME_FITNESS = 0.05
+"""What the fitness of two registrations may differ by that surfaces cannot tell apart."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -69,8 +72,8 @@ class Rgbd:
     def register(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats) -> Registration:
         """Frame j (source) moved onto frame i (target); the guess is needed where landmarks do not suffice."""
         visual = self._visual(target, source)
-        if visual is None:
-            found = self.geometry.register(target, source, i_from_j)
+        if visual is None or visual.inliers < self.min_inliers:
+            found = self._by_surfaces(target, source, i_from_j, visual)
             return found if found.fitness >= self.min_fitness else unregistered(found.i_from_j)
         if self.measure == "surfaces":
             return self.near.register(target, source, visual.i_from_j)
@@ -79,9 +82,27 @@ class Rgbd:
     def _visual(self, target: PreparedFrame, source: PreparedFrame) -> VisualMotion | None:
         pairs = match(target.descriptors, source.descriptors, self.ratio)
         found = visual_motion(target.landmarks[pairs[:, 0]], source.landmarks[pairs[:, 1]], self.seed)
-        if found is None or found.inliers < self.min_inliers:
-            return None
-        return replace(found, information=found.information / self.matches_per_sample)
+        return found and replace(found, information=found.information / self.matches_per_sample)
+
+    def _by_surfaces(
+        self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats, hint: VisualMotion | None
+    ) -> Registration:
+        """ICP from the guess; where a few landmarks agree and surfaces fit as well there, the mean of both by their
+        information: surfaces that let the motion slide, as floor and wall do, say nothing of it along themselves.
+        """
+        found = self.geometry.register(target, source, i_from_j)
+        if hint is None or found.correspondences == 0:
+            return found
+        mean = _assessed(target, source, _mean_motion(found, hint))
+        return mean if mean.fitness >= found.fitness - SAME_FITNESS else found
+
+
+def _mean_motion(surfaces: Registration, landmarks: VisualMotion) -> VisualMotion:
+    """The motion that both agree on best to first order, and their information together."""
+    total = surfaces.information + landmarks.information
+    apart = se3.log(se3.inverse(surfaces.i_from_j) @ landmarks.i_from_j)
+    step = np.linalg.solve(total + 1e-9 * np.trace(total) * np.eye(6), landmarks.information @ apart)
+    return replace(landmarks, i_from_j=surfaces.i_from_j @ se3.exp(step), information=total)
 
 
 class PreparedFrame(PreparedCloud):
