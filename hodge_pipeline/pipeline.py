@@ -78,7 +78,7 @@ def solve_again(folder: Path | str, *, watcher: Watcher | None = None) -> Run:
 
 
 def _run(job: Job) -> Run:
-    source = tracked.key_frames(job, steps.read(job))
+    source = read(job)
     with Recording(job, source) as recording:
         rounds, models, scores = compute(job, source, recording)
     refined = None if job.given is None else guarding.finish(job, job.given, rounds)
@@ -86,9 +86,15 @@ def _run(job: Job) -> Run:
     return Run(job.workspace.folder, source, rounds[-1], report, refined)
 
 
+def read(job: Job) -> Source:
+    """The source, of a long one its key frames; the recipe's lengths are those of its scene from here on."""
+    source = steps.read(job)
+    apply_scale(job, source)
+    return tracked.key_frames(job, source)
+
+
 def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round], dict[str, Path], ScoreTable | None]:
     """The rounds, the models' files by name, the scores: every stage in order, each recorded once it is done."""
-    apply_scale(job, source)
     measured = steps.measured(job, source)
     with job.recipe.executor.open() as workers:
         clouds = steps.prepare_clouds(job, source, workers)

@@ -70,9 +70,10 @@ class Recipe:
         description="where the first poses come from: consecutive frames, or `global_start` for frames in no order",
     )
     odometry: OdometryOptions = OdometryOptions()
-    relocalise: bool = Field(
+    relocalise: bool | Literal["auto"] = Field(
         default=False,
-        description="join what odometry leaves apart, by `global_start`: after lost tracking, or several sequences",
+        description="join what odometry leaves apart, by `global_start`: after lost tracking, or several sequences; "
+        "auto: only where it left something apart, true: always, which closes loops that have drifted too far as well",
     )
     global_start: GlobalStart = GlobalStart()
     given: GivenOptions = GivenOptions()
@@ -105,9 +106,13 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path |
     return recipe if source is None else with_source(recipe, source)
 
 
-def cloud_options(recipe: Recipe) -> CloudOptions:
-    """The recipe's clouds, with landmarks where a start without a guess matches frames by them."""
-    matched = (recipe.start == "global" or recipe.relocalise) and recipe.global_start.use != "geometry"
+def cloud_options(recipe: Recipe, apart: bool = False) -> CloudOptions:
+    """The recipe's clouds, with landmarks where a start without a guess matches frames by them.
+
+    `apart`: whether such a start is likely where it is automatic.
+    """
+    relocalises = apart if recipe.relocalise == "auto" else recipe.relocalise
+    matched = (recipe.start == "global" or relocalises) and recipe.global_start.use != "geometry"
     if not matched or recipe.clouds.landmarks:
         return recipe.clouds
     return dataclasses.replace(recipe.clouds, landmarks=recipe.global_start.landmarks)

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hodge_pipeline import artifacts, binding, registry, steps, tracked
+from hodge_pipeline import artifacts, binding, registry
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.job import Job, Unfinished, log, logging_to
-from hodge_pipeline.pipeline import compute
+from hodge_pipeline.pipeline import compute, read
 from hodge_pipeline.recipe import Recipe, load_recipe
 from hodge_pipeline.record import FILE, Recording
 from hodge_pipeline.watch import Nobody, Watcher
@@ -49,7 +49,7 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
         log.info("recording made again from the run folder")
         missing = ""
         try:
-            source = tracked.key_frames(job, steps.read(job))
+            source = read(job)
             with Recording(job, source) as recording:
                 compute(job, source, recording)
         except Unfinished as unfinished:

@@ -15,7 +15,17 @@ from hodge_pipeline.recipe import Recipe
 from hodge_pipeline.types import Floats, Frame, Source
 
 T = TypeVar("T")
-SECTIONS = ("clouds", "odometry", "global_start", "edges", "registration", "acceptance", "solver", "fusion")
+SECTIONS = (
+    "clouds",
+    "odometry",
+    "key_frames",
+    "global_start",
+    "edges",
+    "registration",
+    "acceptance",
+    "solver",
+    "fusion",
+)
 FEWEST_VOXELS, MOST_VOXELS, WANTED_VOXELS = 1500, 40_000, 8000
 """Below the first a scan has too few features to be found again; beyond the second matching two takes many seconds;
 scans of a room have about the third."""

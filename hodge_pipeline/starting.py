@@ -30,9 +30,15 @@ def first_poses(job: Job, source: Source, workers: Workers) -> Round:
         first = tracked.first_poses(job, job.tracked, source)
     else:
         first = steps.odometry(job, source, workers)
-    if not job.recipe.relocalise:
+    if not (job.recipe.relocalise and (job.recipe.relocalise is True or _apart(first))):
         return first
     return _global_start(job, source, first.graph, ("odometry", "source"), workers)
+
+
+def _apart(first: Round) -> bool:
+    """Whether odometry left several parts of more than one frame."""
+    component = connected_components(first.graph.edges, first.graph.vertex_count)
+    return int((np.bincount(component) > 1).sum()) > 1
 
 
 def _global_start(

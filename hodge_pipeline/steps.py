@@ -74,7 +74,7 @@ def prepare_clouds(job: Job, source: Source, workers: Workers) -> CloudSet:
     """The down-sampled cloud of each frame; where the source was tracked they are there."""
     if job.tracked is not None:
         return CloudSet.open(job.path("clouds"))
-    options, total = cloud_options(job.recipe), len(source.frames)
+    options, total = cloud_options(job.recipe, len(sequences_of(source)) > 1), len(source.frames)
     with job.stage("clouds", "clouds", total, options, ("source",)) as (folder, advance):
         if not folder.finished:
             clouds, notes = cloud_stage.prepare_clouds(source.frames, options, workers, advance)

@@ -100,7 +100,7 @@ def tracking_options(recipe: Recipe) -> TrackingOptions:
     """How the recipe's frames are followed: landmarks only where its odometry registers by them, in smaller images."""
     followed = replace(recipe.clouds, landmark_scale=2 * recipe.clouds.landmark_scale)
     return TrackingOptions(
-        clouds=cloud_options(recipe),
+        clouds=cloud_options(recipe, apart=True),
         followed=followed,
         odometry=recipe.odometry,
         distance_m=recipe.key_frames.distance_m,

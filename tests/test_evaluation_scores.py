@@ -13,7 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, REACH_M
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances, evaluation_pairs, score_table
+from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances, evaluation_pairs, evenly, score_table
 from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud, ViewGraph
 
 
@@ -110,6 +110,12 @@ def test_iou_counts_shared_voxels() -> None:
     # Ten by ten voxels of 0.1 m each; a shift by k columns shares 100 − 10k of 100 + 10k: above a half up to k = 3.
     clouds = CloudSet.from_clouds([square(0.05, shift) for shift in (0.0, 0.3, 0.4)])
     assert evaluation_pairs(clouds, identities(3), "iou").tolist() == [[0, 1], [1, 2]]
+
+
+def test_of_many_pairs_some_are_taken_evenly() -> None:
+    pairs = np.arange(20).reshape(10, 2)
+    assert evenly(pairs, 10) is pairs
+    assert evenly(pairs, 4)[:, 0].tolist() == [0, 4, 10, 14]
 
 
 def test_the_distance_graph_joins_near_centroids() -> None:

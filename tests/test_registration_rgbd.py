@@ -86,6 +86,18 @@ def test_landmarks_lie_at_the_measured_depth_and_never_on_its_edges():
     assert len(find_landmarks(torn, 100, 0.2, 6.0)) == 0
 
 
+def test_a_smaller_image_shows_landmarks_at_the_same_places():
+    whole, half = (find_landmarks(textured_frame(), 4000, 0.2, 6.0, scale=scale).points_in_cam for scale in (1, 2))
+    apart = np.linalg.norm(half[:, None, :2] - whole[None, :, :2], axis=2).min(axis=1)
+    assert len(half) > 20 and np.median(apart) < 2.0 / 525.0  # half a pixel of the whole image, at 2 m
+
+
+def test_a_faint_texture_gives_landmarks():
+    frame = textured_frame()
+    faint = (120 + frame.read_colour() // 12).astype(np.uint8)
+    assert len(find_landmarks(replace(frame, read_colour=lambda: faint), 800, 0.2, 6.0)) > 100
+
+
 @pytest.mark.parametrize("lost", ["read_colour", "read_depth", "camera"])
 def test_a_frame_without_image_depth_or_camera_has_no_landmark(lost: str):
     assert len(find_landmarks(replace(textured_frame(), **{lost: None}), 100, 0.2, 6.0)) == 0
@@ -111,13 +123,17 @@ def frames_of(count: int) -> tuple[PointCloud, PointCloud]:
     )
 
 
-def test_landmarks_hold_where_a_plane_slides_and_few_of_them_leave_it_to_the_surfaces():
+def test_landmarks_hold_where_a_plane_slides_and_too_few_of_them_leave_it_to_the_surfaces():
     registrar = Rgbd()
     target, source = (registrar.prepare(cloud) for cloud in frames_of(40))
     found = registrar.register(target, source, np.eye(4))
     np.testing.assert_allclose(found.i_from_j[:3, 3], [0.1, 0, 0], atol=1e-3)
     assert found.fitness > 0.9 and np.linalg.eigvalsh(found.information).min() > 0
     target, source = (registrar.prepare(cloud) for cloud in frames_of(10))
+    mean = registrar.register(target, source, np.eye(4))
+    np.testing.assert_allclose(mean.i_from_j[:3, 3], [0.1, 0, 0], atol=5e-3)
+    assert np.linalg.eigvalsh(found.information - mean.information).max() > 0
+    target, source = (registrar.prepare(cloud) for cloud in frames_of(6))
     assert abs(registrar.register(target, source, np.eye(4)).i_from_j[0, 3]) < 0.05
 
 

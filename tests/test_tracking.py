@@ -12,14 +12,15 @@ import pytest
 import hodge_pipeline
 from hodge_adapters.poses_text import read_tum
 from hodge_adapters.tum import TumReader
-from hodge_pipeline import se3, tracked
+from hodge_pipeline import se3, starting, tracked
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.recipe import Recipe, load_recipe
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, frame_blocks, track_block
+from hodge_pipeline.rounds import Round
 from hodge_pipeline.tracked import Tracked, tracking_options
-from hodge_pipeline.types import CloudSet, Floats32, Source
+from hodge_pipeline.types import CloudSet, Floats32, Source, ViewGraph
 
 FRAMES = 64
 SMALL = (
@@ -112,6 +113,15 @@ def test_frames_without_depth_are_bridged_and_said(sequence: Path, tmp_path: Pat
     assert np.isfinite(poses).all()
     inside = [row for row in dark if dark[0] > 0 and dark[-1] < FRAMES - 1]
     assert all(np.linalg.norm(apart[row, :3, 3]) < 0.09 for row in inside)
+
+
+@pytest.mark.parametrize(
+    ("edges", "apart"),
+    [([[0, 1], [1, 2], [2, 3]], False), ([[0, 1], [2, 3]], True), ([[0, 1], [1, 2]], False)],  # the last: a lone frame
+)
+def test_relocalisation_is_automatic_where_odometry_left_parts(edges: list[list[int]], apart: bool) -> None:
+    graph = ViewGraph.from_edges(np.arange(4), np.array(edges), np.broadcast_to(np.eye(4), (len(edges), 4, 4)))
+    assert starting._apart(Round(graph, np.broadcast_to(np.eye(4), (4, 4, 4)))) == apart
 
 
 def test_a_killed_tracking_keeps_its_blocks(
