@@ -10,8 +10,11 @@ from hodge_pipeline.types import Bools, Camera, Floats32, Frame, Ints, Landmarks
 EDGE_STEP = 0.03
 """A landmark whose 3x3 pixels differ by more than this share of its depth lies on an edge: its depth is a guess."""
 
-CONTRAST = 0.01
-"""A quarter of OpenCV's: of an image with texture the strongest stay the same, one of a bare cabinet gets landmarks."""
+FEW = 150
+"""Features of an image below which it is looked at again for faint ones."""
+CONTRAST, FAINT_CONTRAST = 0.04, 0.01
+"""Of a feature; the first is OpenCV's own. Faint ones match less exactly (TUM fr1/rpy: a tenth more error), but
+without them an image of a bare cabinet has next to none."""
 
 
 def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: float, *, scale: int = 1) -> Landmarks:
@@ -26,8 +29,11 @@ def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: fl
     if scale > 1:
         size = (grey.shape[1] // scale, grey.shape[0] // scale)
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
-    detector = cv2.SIFT_create(nfeatures=count, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]
-    found, descriptors = detector.detectAndCompute(grey, None)
+    for contrast in (CONTRAST, FAINT_CONTRAST):
+        detector = cv2.SIFT_create(nfeatures=count, contrastThreshold=contrast)  # type: ignore[attr-defined]
+        found, descriptors = detector.detectAndCompute(grey, None)
+        if len(found) >= min(FEW, count):
+            break
     if not found:
         return Landmarks.none()
     larger = np.array([depth.shape[1] / grey.shape[1], depth.shape[0] / grey.shape[0]])
