@@ -1,4 +1,4 @@
-"""The run folder of a refined model: `sparse/0`, `poses.tum`, `edges.csv`, the report."""
+"""The run folder of a refined model: `sparse/0`, `poses.tum`, `edges.csv`, report and recording."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.report import write_report
 from hodge_pipeline.monitor import Cost
 from hodge_pipeline.outputs import edge_table
+from hodge_pipeline.record import FILE
+from hodge_pipeline.record_graph import record_graph
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refined_report import model_report
@@ -48,6 +50,7 @@ def write_run_folder(
         _write_models(out, models)
         _write_tables(out, results)
         write_report(out, model_report(results, options, source, cost))
+        _record(out, results[0])
     except OSError as error:
         raise WorkspaceError(f"{out}: cannot be written ({error.strerror}): give another --out") from error
 
@@ -75,6 +78,15 @@ def _write_models(out: Path, models: Sequence[TrackedModel]) -> None:
             os.replace(draft, out / MODELS)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+
+
+def _record(out: Path, first: RefinedModel) -> None:
+    """The recording of the first result, which has most images: its poses before and after, its edges, the solve."""
+    if first.solved is None:
+        (out / FILE).unlink(missing_ok=True)
+        return
+    sets = {"start": first.start.world_from_body, "refined": first.model.world_from_body}
+    record_graph(out, first.model.name, first.solved.graph, sets["start"], first.solved.solution, sets, first.notes)
 
 
 def _write_tables(out: Path, results: Sequence[RefinedModel]) -> None:

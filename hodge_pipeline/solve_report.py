@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import tempfile
 from pathlib import Path
-
-import numpy as np
 
 from hodge_pipeline import artifacts
 from hodge_pipeline.errors import WorkspaceError
@@ -16,7 +12,7 @@ from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.summary import graph_summary, worst_edges
 from hodge_pipeline.job import versions
 from hodge_pipeline.outputs import edge_table
-from hodge_pipeline.recording.recorder import Recorder
+from hodge_pipeline.record_graph import record_graph
 from hodge_pipeline.solve_file import RUN_GRAPH, SolvedFile, write_solved
 from hodge_pipeline.types import Floats
 
@@ -34,7 +30,10 @@ def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
     artifacts.write_text(folder / "edges.csv", edge_table(solved.graph, poses, solved.solution.weights))
     artifacts.write_json(folder / SOLVED, solved.summary())
     write_report(folder, _report(solved))
-    return _record(folder, solved)
+    solution = solved.solution
+    start = solution.world_from_cam if solved.start is None else solved.start
+    notes = solved.source.notes
+    return record_graph(folder, solved.source.name, solved.graph, start, solution, _before(solved), notes)
 
 
 def _before(solved: SolvedFile) -> dict[str, Floats]:
@@ -61,17 +60,3 @@ def _report(solved: SolvedFile) -> Report:
             convergence={"solve": tuple(step.objective for step in solution.history)},
         ),
     )
-
-
-def _record(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
-    """Write `recording.rrd`: the graph as it was read, the film of the solve, the edges under its result."""
-    graph, solution = solved.graph, solved.solution
-    start = solution.world_from_cam if solved.start is None else solved.start
-    identity = hashlib.sha256(np.ascontiguousarray(solution.world_from_cam).tobytes()).hexdigest()[:32]
-    with tempfile.TemporaryDirectory(dir=folder) as parts:
-        recorder = Recorder(Path(parts), identity)
-        notes = [*recorder.frames(solved.source.name, (), solved.source.notes)]
-        notes += [note for name, poses in _before(solved).items() for note in recorder.poses(name, poses)]
-        notes += [*recorder.edges(1, graph, start), *recorder.solution(1, graph, start, solution)]
-        merged = recorder.finish(folder / "recording.rrd")
-    return (*notes, *(merged.notes if merged else ()))

@@ -191,6 +191,8 @@ def test_lund_door(data_dir: Path, tmp_path: Path) -> None:
     assert done.results[0].decision.outcome == "refined"
     after = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     assert error_px(tmp_path / "out/sparse/0") <= 0.355 and tracks(after) == tracks(pycolmap.Reconstruction(model))
+    undisturbed = hodge_pipeline.refine_colmap(model, images="none", overrides=FREE).results[0].decision
+    assert undisturbed.outcome == "optimal", "its poses are without a rig, but for rounding: the size is free"
 
 
 def test_sub_models_are_found(tmp_path: Path) -> None:

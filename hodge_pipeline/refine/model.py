@@ -26,6 +26,8 @@ NO_EDGE = "no edge was found: no two images share enough points, matches or dept
 NO_EDGE_LEFT = "every edge was rejected: no two of them agree"
 CHI2_TOLERANCE = 0.05
 SCORE_TOLERANCE = 0.002
+NO_BASELINE = 1e-9
+"""Of the size of the model: a sensor nearer than this to its rig's origin is off it by rounding alone."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,8 @@ def _adjusted(start: TrackedModel, solved: Solved, weight: float) -> tuple[Track
 
 def _in_the_scale_of(start: TrackedModel, model: TrackedModel, errors: Floats) -> tuple[TrackedModel, Floats]:
     """The model with the size that the start has: nothing measured tells another, unless a rig's baselines do."""
-    if start.body_from_cam[:, :3, 3].any():
+    baselines = np.abs(start.body_from_cam[:, :3, 3]).max()
+    if baselines > NO_BASELINE * np.ptp(start.world_from_body[:, :3, 3], axis=0).max():
         return model, errors
     factor = align(model.world_from_body, start.world_from_body, with_scale=True).scale
     return model.scaled(factor), errors * [1.0, factor]
