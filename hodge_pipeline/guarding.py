@@ -31,6 +31,9 @@ SIGMAS = 3.0
 LEAST_TOLERANCE = 0.002
 """Of the score: what a fraction of a millimetre does."""
 
+LEAST_JOINED = 0.2
+"""Of the key frames: the least that overlap with another one where the given poses are of these frames."""
+
 HEADLINES = {
     "refined": "Better than the poses given",
     "optimal": "The poses given were as good already: they are given back",
@@ -78,6 +81,10 @@ def _decision(job: Job, rounds: Sequence[Round], before: Floats) -> Decision:
         return Decision("nothing", f"no edge joins two frames ({rejected or 'no pair overlaps'}): nothing was refined")
     if not (last.solution.weights > 0).any():
         return Decision("nothing", f"the solver rejected all {last.graph.edge_count} edges: nothing was refined")
+    joined = len(np.unique(last.graph.edges))
+    if joined < LEAST_JOINED * last.graph.vertex_count:
+        found = f"{joined} of {last.graph.vertex_count} key frames overlap with another one"
+        return Decision("nothing", f"under the given poses only {found}: are they the poses of these frames?")
     measures = [*_held_out(job, len(rounds) - 1, before, last.world_from_cam)]
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
     measures.append(Measure("edge chi2, mean", chi2[0], chi2[1], tolerance=CHI2_TOLERANCE * chi2[0]))

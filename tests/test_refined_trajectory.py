@@ -72,6 +72,13 @@ def test_an_open3d_trajectory_in_and_out(frames: tuple[Frame, ...]) -> None:
     np.testing.assert_array_equal(trajectory.parameters[5].extrinsic, se3.inverse(start[5]))
 
 
+def test_poses_of_other_frames_refine_nothing(frames: tuple[Frame, ...]) -> None:
+    poses = np.array([frame.world_from_cam for frame in frames])
+    poses[3:, :3, 3] += 100.0 * np.arange(3, len(poses))[:, None]
+    decision = hodge_pipeline.refine_trajectory(poses, frames, overrides=SMALL).decision
+    assert decision.outcome == "nothing" and "only 2 of 11 key frames" in decision.reason
+
+
 @pytest.mark.parametrize("shape", [(3, 4, 4), (12, 3, 4)])
 def test_poses_that_are_not_one_for_each_frame_are_refused(frames: tuple[Frame, ...], shape: tuple[int, ...]) -> None:
     with pytest.raises(SourceError, match="one 4x4 matrix for each frame"):

@@ -17,6 +17,7 @@ from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, j
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
 from hodge_pipeline.refine.scale import Scale, metric_scale
+from hodge_pipeline.refine.uncertainty import SIGMAS
 from hodge_pipeline.stages import TrackedModel, Workers
 from hodge_pipeline.types import Floats
 
@@ -212,6 +213,6 @@ def _change(start: TrackedModel, scale: Scale, model: TrackedModel, errors: Floa
     return Change(
         translation_m=float(np.sqrt(np.mean(np.sum(moved[:, 3:] ** 2, axis=1)))),
         rotation_deg=float(np.degrees(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=1))))),
-        translation_uncertainty_m=float(position * np.sqrt(3)),
-        rotation_uncertainty_deg=float(np.degrees(rotation * np.sqrt(3))),
+        translation_uncertainty_m=float(SIGMAS * position * np.sqrt(3)),
+        rotation_uncertainty_deg=float(np.degrees(SIGMAS * rotation * np.sqrt(3))),
     )
