@@ -7,7 +7,7 @@ matrix stays as sparse as the graph; by Sylvester's law its negative pivots are 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import bsr_matrix, csc_matrix, diags_array
@@ -59,13 +59,14 @@ def connection_matrix(problem: Problem) -> bsr_matrix:
 def certificate_matrix(problem: Problem, rotations: Floats, translations: Floats) -> bsr_matrix:
     """[[M − Λ, Vᵀ], [V, L_τ]] on (rotation rows, translation) of each vertex, in the problem's order.
 
-    Its Schur complement over the translations is Q − Λ (SE-Sync, equations 15 and 23).
+    Its Schur complement over the translations is Q − Λ (SE-Sync, equations 15 and 23). The rotations (n, r, d) and
+    translations (n, r) may be those of a space of r ≥ d dimensions.
     """
-    d, count = problem.dimension, problem.count
+    d, count, r = problem.dimension, problem.count, translations.shape[1]
     size = d + 1
     matrix = connection_matrix(problem)
     stacked = np.concatenate([np.swapaxes(rotations, 1, 2), translations[:, None, :]], axis=1)
-    image = (matrix @ stacked.reshape(-1, d)).reshape(count, size, d)
+    image = (matrix @ stacked.reshape(-1, r)).reshape(count, size, r)
     multiplier = image[:, :d] @ rotations
     diagonal = np.zeros((count, size, size))
     diagonal[:, :d, :d] = 0.5 * (multiplier + np.swapaxes(multiplier, 1, 2))
@@ -93,18 +94,11 @@ def _blocks(problem: Problem, edges: slice) -> Floats:
 
 def certify(problem: Problem, rotations: Floats, translations: Floats, cost: float) -> Certificate:
     """The certificate of the poses in the problem's order, where its components are pinned by one vertex each."""
-    d, free = problem.dimension, problem.free_count
+    d = problem.dimension
     scale = float(np.median(problem.kappa)) if len(problem.kappa) else 1.0
     rank = d * problem.count
-    matrix = certificate_matrix(problem, rotations, translations)
-    kept = np.ones((problem.count, d + 1), bool)
-    kept[free:, d] = False
     order = _elimination_order(problem)
-    rows = (order[:, None] * (d + 1) + np.arange(d + 1))[kept[order]]
-    ones = np.zeros((problem.count, d + 1))
-    ones[:, :d] = 1.0
-    matrix = csc_matrix(csc_matrix(matrix)[rows][:, rows])
-    on_rotations = ones.reshape(-1)[rows]
+    matrix, on_rotations = _reduced(problem, order, rotations, translations)
     negative = -1
     for relative in RELATIVE_SHIFTS:
         shift = max(relative * scale, RELATIVE_GAP * cost / rank)
@@ -132,6 +126,45 @@ def _elimination_order(problem: Problem) -> Ints:
         free = problem.free_count
         order[:free] = fill_reducing_order(laplacian(problem.tail, problem.head, problem.kappa, free)).order
     return order
+
+
+def lower_bound(problem: Problem, rotations: Floats, translations: Floats, cost: float) -> float:
+    """What F is at least, whatever the rotations: from a point (n, r, d), (n, r) of a higher space that costs `cost`.
+
+    For all R, F(R) ≥ tr Λ + λ_min(Q − Λ) · n d, and tr Λ is the cost. −∞ where the bound would say nothing.
+    """
+    matrix, on_rotations = _reduced(problem, _elimination_order(problem), rotations, translations)
+    gap = RELATIVE_GAP / BRACKET * cost
+    while gap < cost:
+        shift = gap / (problem.dimension * problem.count)
+        if negative_pivots(_shifted(matrix, shift, on_rotations)) == 0:
+            return cost - gap
+        gap *= 2
+    return -math.inf
+
+
+def bounded(answer: Certificate, cost: float, bound: float) -> Certificate:
+    """The answer for poses that cost so much where F is at least the bound: optimal, if the two are close enough."""
+    gap = max(cost - bound, 0.0)
+    if not math.isfinite(gap) or gap >= answer.gap_bound:
+        return answer
+    if gap <= RELATIVE_GAP * cost:
+        note = f"globally optimal: F = {cost:.9g} is within {gap:.3g} of the least (certified)"
+        return replace(answer, optimal=True, gap_bound=gap, note=note)
+    note = f"{answer.note}; no poses have an F lower by more than {gap:.3g} ({gap / cost:.1g} of it)"
+    return replace(answer, gap_bound=gap, note=note)
+
+
+def _reduced(problem: Problem, order: Ints, rotations: Floats, translations: Floats) -> tuple[csc_matrix, Floats]:
+    """The certificate matrix, its vertices in this order, without the pinned translations, and 1 at the rows of rotations."""
+    d = problem.dimension
+    matrix = certificate_matrix(problem, rotations, translations)
+    kept = np.ones((problem.count, d + 1), bool)
+    kept[problem.free_count :, d] = False
+    rows = (order[:, None] * (d + 1) + np.arange(d + 1))[kept[order]]
+    ones = np.zeros((problem.count, d + 1))
+    ones[:, :d] = 1.0
+    return csc_matrix(csc_matrix(matrix)[rows][:, rows]), ones.reshape(-1)[rows]
 
 
 def _shifted(matrix: csc_matrix, shift: float, on_rotations: Floats) -> csc_matrix:

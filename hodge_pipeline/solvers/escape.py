@@ -1,18 +1,20 @@
 """Out of a local minimum: one step of the Riemannian staircase (Boumal 2015; SE-Sync, section IV.B).
 
 The rotations may turn into one more dimension, where the certificate's eigenvector leads down; from the minimum there
-they are rounded back and the descent goes on.
+they are rounded back and the descent goes on. The minimum there also bounds F from below, which says how much an
+escape could have won at most.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import bsr_matrix
 
-from hodge_pipeline.solvers.certificate import Certificate, connection_matrix
+from hodge_pipeline.solvers.certificate import Certificate, connection_matrix, lower_bound
 from hodge_pipeline.solvers.newton import Descent, Limits, Point, descend
 from hodge_pipeline.solvers.objective import IsotropicObjective
 from hodge_pipeline.solvers.problem import Problem
@@ -30,19 +32,31 @@ LOWER = 1e-9
 
 @dataclass(frozen=True)
 class _Lifted:
-    """Frames Y (n, d, d + 1), rows orthonormal, the translations best for them, F, and half its gradient by Y."""
+    """Frames Y (n, d, d + 1), rows orthonormal, the translations (n, d + 1) best for them, F, half its gradient by Y."""
 
     frames: Floats
+    translations: Floats
     cost: float
     gradient: Floats
 
 
+@dataclass(frozen=True)
+class Escape:
+    """A descent to a lower minimum, None where none was found, and what F is at least (−∞: no telling)."""
+
+    descent: Descent | None
+    bound: float
+
+
+NO_WAY = Escape(None, -math.inf)
+
+
 def escape(
     setup: Setup, point: Point, answer: Certificate, limits: Limits, watch: Callable[[Point], None] | None = None
-) -> Descent | None:
-    """A descent to a lower minimum than the point, or None where the certificate shows no way or none is found."""
+) -> Escape:
+    """What a step of the staircase from the point finds, the way down taken from its certificate."""
     if answer.optimal or answer.direction is None:
-        return None
+        return NO_WAY
     problem, d = setup.problem, setup.dimension
     matrix = connection_matrix(problem)
     frames = np.concatenate([np.swapaxes(point.rotations, 1, 2), np.zeros((problem.count, d, 1))], axis=2)
@@ -50,12 +64,15 @@ def escape(
     across[:, :, d] = answer.direction / np.linalg.norm(answer.direction, axis=1).max()
     begin = _line_search(problem, matrix, _at(problem, matrix, frames), across, 1.0)
     if begin is None:
-        return None
+        return NO_WAY
     lowest = _descend(problem, matrix, begin)
     objective = IsotropicObjective(problem)
     rotations = _gauged(setup, _rounded(lowest.frames), point.rotations)
     descent = descend(objective, objective.at(rotations, point.translations), limits, setup.rounding, watch)
-    return descent if descent.point.cost < point.cost * (1 - LOWER) else None
+    if descent.point.cost < point.cost * (1 - LOWER):
+        return Escape(descent, -math.inf)
+    turned = np.ascontiguousarray(np.swapaxes(lowest.frames, 1, 2))
+    return Escape(None, lower_bound(problem, turned, lowest.translations, lowest.cost))
 
 
 def _at(problem: Problem, matrix: bsr_matrix, frames: Floats) -> _Lifted:
@@ -64,7 +81,7 @@ def _at(problem: Problem, matrix: bsr_matrix, frames: Floats) -> _Lifted:
     image = (matrix @ stacked.reshape(-1, r)).reshape(n, d + 1, r)
     stacked[: problem.free_count, d] = -problem.translation_factor.solve(image[: problem.free_count, d])
     image = (matrix @ stacked.reshape(-1, r)).reshape(n, d + 1, r)
-    return _Lifted(frames, float(np.vdot(stacked, image)), image[:, :d])
+    return _Lifted(frames, stacked[:, d], float(np.vdot(stacked, image)), image[:, :d])
 
 
 def _tangent(frames: Floats, vectors: Floats) -> Floats:

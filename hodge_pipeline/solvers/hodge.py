@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass as stage
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backends import BackendName
-from hodge_pipeline.solvers.certificate import Certificate, certify
+from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import cost_at_start, metrics_of, minimise
 from hodge_pipeline.solvers.newton import Limits, Point
@@ -106,11 +106,12 @@ def solve(
     elif certificate:
         answer = _certify(setup, descent.point)
         for _ in range(MOST_ESCAPES):
-            lower = escape(setup, descent.point, answer, limits, watch)
-            if lower is None:
+            found = escape(setup, descent.point, answer, limits, watch)
+            if found.descent is None:
+                answer = bounded(answer, descent.point.cost, found.bound)
                 break
             notes.append(f"a local minimum, F = {descent.point.cost:.9g}, was escaped")
-            descent, answer = lower, _certify(setup, lower.point)
+            descent, answer = found.descent, _certify(setup, found.descent.point)
             metrics |= metrics_of(descent, full)
         notes.append(answer.note)
         metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
