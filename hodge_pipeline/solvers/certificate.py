@@ -26,6 +26,8 @@ RELATIVE_GAP = 1e-6
 BRACKET = 8.0
 """The factor between the shifts among which the smallest eigenvalue is bracketed."""
 MAX_BRACKETS = 40
+GAP_STEP = 4.0
+"""The factor between the gaps that are tried for a bound: each costs a factorisation."""
 EIGENVALUE_TOLERANCE = 1e-3
 
 
@@ -134,12 +136,12 @@ def lower_bound(problem: Problem, rotations: Floats, translations: Floats, cost:
     For all R, F(R) ≥ tr Λ + λ_min(Q − Λ) · n d, and tr Λ is the cost. −∞ where the bound would say nothing.
     """
     matrix, on_rotations = _reduced(problem, _elimination_order(problem), rotations, translations)
-    gap = RELATIVE_GAP / BRACKET * cost
+    gap = RELATIVE_GAP / GAP_STEP * cost
     while gap < cost:
         shift = gap / (problem.dimension * problem.count)
         if negative_pivots(_shifted(matrix, shift, on_rotations)) == 0:
             return cost - gap
-        gap *= 2
+        gap *= GAP_STEP
     return -math.inf
 
 
@@ -156,7 +158,7 @@ def bounded(answer: Certificate, cost: float, bound: float) -> Certificate:
 
 
 def _reduced(problem: Problem, order: Ints, rotations: Floats, translations: Floats) -> tuple[csc_matrix, Floats]:
-    """The certificate matrix, its vertices in this order, without the pinned translations, and 1 at the rows of rotations."""
+    """The certificate matrix, vertices in this order, without pinned translations; 1 at the rows of rotations."""
     d = problem.dimension
     matrix = certificate_matrix(problem, rotations, translations)
     kept = np.ones((problem.count, d + 1), bool)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import bsr_matrix
+from scipy.sparse import bsr_matrix, diags_array
 
+from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backends import Backend
 from hodge_pipeline.solvers.cg import CgResult, truncated_cg
 from hodge_pipeline.solvers.elimination import Elimination
@@ -24,6 +25,8 @@ STALE_STEPS = 8
 FRESH_STEPS = 50
 TOLERANCE = 1e-6
 """Of a step: looser ones leave the soft modes of long chains wrong. A factor in double precision needs one step."""
+DAMPING = 1e-9
+"""Of the diagonal: far above rounding, far below what slows the steps."""
 NEARLY_THERE = 1e-2
 """Of the tolerance asked for, which says how far the minimum is: farther, an old factor leaves soft modes wrong."""
 SECONDS_A_PRODUCT, SECONDS_A_VERTEX = 0.25e-9, 1e-7
@@ -68,9 +71,17 @@ class DirectSolver:
                 return found
             wasted = found.steps
         self.factor = None
-        self.factor = self.backend.factorise_blocks(self.plan, hessian)
+        self.factor = self._factor_of(hessian)
         found = self._cg(hessian, gradient, TOLERANCE, enough, self.factor, FRESH_STEPS)
         return CgResult(found.x, found.residual, wasted + found.steps)
+
+    def _factor_of(self, hessian: bsr_matrix) -> Factor:
+        """Its factor; that of a damped one where rounding has made it singular, as edges of wild lengths do."""
+        try:
+            return self.backend.factorise_blocks(self.plan, hessian)
+        except GraphError:
+            damped = hessian + diags_array(DAMPING * hessian.diagonal())
+            return self.backend.factorise_blocks(self.plan, damped.tobsr(hessian.blocksize))
 
     def refined(self, exact: bsr_matrix, gradient: Floats, enough: float) -> CgResult | None:
         """The step of another Hessian, preconditioned by the latest factor; None where it is not definite."""

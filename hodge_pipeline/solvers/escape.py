@@ -32,7 +32,7 @@ LOWER = 1e-9
 
 @dataclass(frozen=True)
 class _Lifted:
-    """Frames Y (n, d, d + 1), rows orthonormal, the translations (n, d + 1) best for them, F, half its gradient by Y."""
+    """Frames Y (n, d, d + 1), rows orthonormal, the best translations (n, d + 1), F, half its gradient by Y."""
 
     frames: Floats
     translations: Floats

@@ -16,13 +16,14 @@ from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import cost_at_start, metrics_of, minimise
-from hodge_pipeline.solvers.newton import Limits, Point
+from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Limits, Point
 from hodge_pipeline.solvers.priors import with_world, without_world
 from hodge_pipeline.solvers.setup import NO_ROWS, InitialName, Setup, prepare
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, SolverIteration, ViewGraph
 
 ObjectiveName: TypeAlias = Literal["isotropic", "full"]
 MOST_ESCAPES = 3
+WILD_NUMBERS = "the edges' lengths or weights differ too much for more: look for a wrong edge or unit"
 SEVERAL_FIXED = "not certified: with several fixed vertices to a component the dual is another one"
 
 
@@ -117,7 +118,8 @@ def solve(
         metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
         metrics |= {} if answer.optimal else {"smallest_eigenvalue": answer.smallest_eigenvalue}
     if not descent.converged:
-        notes.append(f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far")
+        why = f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far"
+        notes.append(f"{why}; {WILD_NUMBERS}" if descent.reason == ROUNDING_REACHED else why)
     weights = setup.weights.used.astype(float)
     return Solution(setup.poses(descent.point), setup.component, weights, tuple(history), metrics, tuple(notes))
 

@@ -13,6 +13,7 @@ from hodge_pipeline.types import Floats
 SUFFICIENT_DECREASE = 1e-4
 MAX_HALVINGS = 40
 CG_LIMIT_REACHED = "limit of CG steps reached"
+ROUNDING_REACHED = "no further decrease within rounding"
 CG_SHARE = 0.1
 """Of what further steps may still win: where so little is left in a linear system, it is solved."""
 LOOSEST_TOLERANCE, TIGHTEST_TOLERANCE = 0.1, 1e-3
@@ -99,7 +100,7 @@ def descend(
         new = _line_search(objective, point, step)
         if new is None:
             converged = step.predicted <= math.sqrt(limits.relative_tolerance) * point.cost
-            return Descent(point, tuple(costs), cg_steps, converged, "no further decrease within rounding")
+            return Descent(point, tuple(costs), cg_steps, converged, ROUNDING_REACHED)
         decrease, point = point.cost - new.cost, new
         costs.append(point.cost)
         if watch is not None:

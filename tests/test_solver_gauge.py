@@ -1,0 +1,99 @@
+"""What is held while the rest moves: components, fixed vertices, priors; the stage, and its limits."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.hodge import HodgeSolver, solve
+from hodge_pipeline.stages import ConsistencySolver
+from hodge_pipeline.types import Priors, ViewGraph
+from solver_graphs import ladder
+
+
+def test_components_keep_their_own_gauge():
+    graph, truth = ladder(0.0)
+    apart = dataclasses.replace(
+        ViewGraph.from_edges(
+            np.arange(25),
+            np.concatenate([graph.edges, graph.edges + 12]),
+            np.concatenate([graph.i_from_j] * 2),
+            np.concatenate([graph.information] * 2),
+        )
+    )
+    far = se3.exp(np.array([0.1, 0.2, 0.3, 50, 0, 0]))
+    start = np.concatenate([truth, far @ truth, far[None]])
+    start[1:12] = start[13:24] = np.eye(4)
+    solution = solve(apart, start=start)
+    np.testing.assert_allclose(solution.world_from_cam[:12], truth, atol=1e-6)
+    np.testing.assert_allclose(solution.world_from_cam[12:24], far @ truth, atol=1e-6)
+    np.testing.assert_array_equal(solution.world_from_cam[24], far)
+    assert solution.component.tolist() == [0] * 12 + [1] * 12 + [2]
+    assert any("3 pieces" in note for note in solution.notes)
+
+
+def test_fixed_vertices_stay():
+    graph, truth = ladder(0.1)
+    fixed = np.array([0, 5, 11])
+    solution = solve(graph, start=truth, fixed=fixed)
+    np.testing.assert_allclose(solution.world_from_cam[fixed], truth[fixed], atol=1e-12)
+    free = solve(graph, start=truth)
+    assert solution.metrics["objective"] > free.metrics["objective"]
+
+
+def test_limits_give_the_best_so_far_and_say_so():
+    graph, _ = ladder(0.5)
+    one = solve(graph, max_iterations=1, objective="isotropic")
+    best = solve(graph, objective="isotropic")
+    assert any("iteration limit reached" in note for note in one.notes)
+    assert one.metrics["converged"] == 0
+    assert best.metrics["objective"] < one.metrics["objective"]
+    late = solve(graph, time_limit_s=1e-9, objective="isotropic")
+    assert any("time limit reached" in note for note in late.notes)
+
+
+def test_the_stage_keeps_its_protocol_and_history():
+    graph, truth = ladder(0.1)
+    stage = HodgeSolver()
+    assert isinstance(stage, ConsistencySolver)
+    solution = stage.solve(graph, truth)
+    np.testing.assert_allclose(solution.world_from_cam[0], truth[0], atol=1e-12)
+    assert solution.history[-1].objective == solution.metrics["objective"]
+    np.testing.assert_array_equal(solution.history[-1].world_from_cam, solution.world_from_cam)
+
+
+def test_priors_are_edges_from_the_world():
+    """Two ends of a rail are known, one of them twice as well: the rail is stretched between them."""
+    edges = np.array([(0, 1), (1, 2)])
+    motion = np.tile(se3.from_parts(np.eye(3), np.array([1.0, 0, 0])), (2, 1, 1))
+    graph = ViewGraph.from_edges(np.array(["a", "b", "c"]), edges, motion)
+    known = np.stack([np.eye(4), se3.from_parts(np.eye(3), np.array([3.0, 0, 0]))])
+    priors = Priors(np.array([0, 2]), known, np.stack([np.eye(6), 2 * np.eye(6)]))
+    solution = solve(graph, priors=priors)
+    force = 1 / (1 + 1 + 1 + 1 / 2)  # springs in a row, and a metre between their natural length and the ends
+    np.testing.assert_allclose(solution.world_from_cam[:, 0, 3], [force, 1 + 2 * force, 2 + 3 * force], atol=1e-7)
+    assert solution.metrics["objective"] == pytest.approx(force**2 * 3.5, rel=1e-6)
+    assert len(solution.weights) == 2
+    with pytest.raises(GraphError, match="prior 1 names vertex row 7"):
+        solve(graph, priors=Priors(np.array([0, 7]), known, priors.information))
+
+
+def test_priors_join_pieces_and_can_be_certified():
+    graph, truth = ladder(0.0)
+    half = graph.select(np.flatnonzero((graph.edges < 6).all(axis=1) | (graph.edges >= 6).all(axis=1)))
+    priors = Priors(np.array([0, 7]), truth[[0, 7]], np.tile(np.eye(6), (2, 1, 1)))
+    solution = solve(half, priors=priors, objective="isotropic", certificate=True)
+    np.testing.assert_allclose(solution.world_from_cam, truth, atol=1e-6)
+    assert solution.component.max() == 0
+    assert solution.metrics["certified"] == 1
+
+
+def test_the_graph_says_what_is_fixed_and_in_which_plane():
+    graph, truth = ladder(0.1, planar=True)
+    held = dataclasses.replace(graph, fixed=np.array([3, 7]), dimension=2)
+    solution = solve(held, start=truth)
+    np.testing.assert_allclose(solution.world_from_cam[[3, 7]], truth[[3, 7]], atol=1e-12)
+    assert solution.metrics["objective_at_start"] > solution.metrics["objective"]
+    assert any("2 fixed vertices have no pose" in note for note in solve(held).notes)

@@ -1,0 +1,151 @@
+"""Graphs as they should not be: the solver gives a result with a warning, or one clear line."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.hodge import HodgeSolver, solve
+from hodge_pipeline.types import ViewGraph
+from solver_graphs import ladder
+
+
+def test_repeated_edges_count_each_time():
+    graph, _ = ladder(0.1)
+    twice = graph.select(np.repeat(np.arange(graph.edge_count), 2))
+    double = dataclasses.replace(graph, information=2 * graph.information)
+    one, two = solve(twice), solve(double)
+    assert one.metrics["objective"] == pytest.approx(two.metrics["objective"], rel=1e-9)
+
+
+@pytest.mark.parametrize("objective", ["isotropic", "full"])
+@pytest.mark.parametrize("length", [2e7, 1e9, 1e12])
+def test_an_edge_longer_than_the_earth_gives_a_result_and_a_warning(objective, length):
+    graph, truth = ladder(0.0)
+    assert not any("longer than the earth" in note for note in solve(graph, objective=objective).notes)
+    motion = graph.i_from_j.copy()
+    motion[3, :3, 3] += [length, 0, 0]
+    solution = solve(dataclasses.replace(graph, i_from_j=motion), objective=objective)
+    i, j = graph.vertex_ids[graph.edges[3]]
+    assert any(
+        note.startswith("1 edges are longer than the earth") and f"({i}, {j})" in note for note in solution.notes
+    )
+    assert np.isfinite(solution.world_from_cam).all()
+    left = motion - se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
+    assert solution.metrics["objective"] < (left[3, :3, 3] @ left[3, :3, 3]) * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("objective", ["isotropic", "full"])
+def test_two_halves_farther_apart_than_the_earth_is_wide(objective):
+    graph, truth = ladder(0.0)
+    far = truth.copy()
+    far[6:, 0, 3] += 2e7
+    apart = dataclasses.replace(graph, i_from_j=se3.inverse(far[graph.edges[:, 0]]) @ far[graph.edges[:, 1]])
+    np.testing.assert_allclose(solve(apart, objective=objective).world_from_cam, far, rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize("objective", ["isotropic", "full"])
+@pytest.mark.parametrize("length", [1e7, 1e9, 1e15])
+def test_an_edge_that_contradicts_all_others_is_solved_or_the_result_says_that_it_is_not(objective, length):
+    graph, truth = ladder(0.0)
+    motion = graph.i_from_j.copy()
+    motion[3, :3, 3] += [length, 0, 0]
+    wild = dataclasses.replace(graph, i_from_j=motion)
+    solution = solve(wild, objective=objective)
+    near_truth = solve(wild, objective=objective, start=truth, initial="given")
+    assert solution.metrics["objective"] == pytest.approx(near_truth.metrics["objective"], rel=1e-5)
+    said = any("look for a wrong edge" in note for note in solution.notes)
+    assert said or solution.metrics["converged"] == 1
+
+
+def test_many_parallel_edges_join_their_vertices():
+    edges = np.array([(0, 1)] * 256 + [(1, 2)])
+    assert connected_components(edges, 3).tolist() == [0, 0, 0]
+
+
+def test_no_edges_and_one_pose():
+    for count in (1, 3):
+        graph = ViewGraph.from_edges(np.arange(count), np.zeros((0, 2)), np.zeros((0, 4, 4)))
+        start = np.tile(se3.exp(np.arange(6.0)), (count, 1, 1))
+        solution = HodgeSolver().solve(graph, start)
+        np.testing.assert_allclose(solution.world_from_cam, start, atol=1e-12)
+        assert solution.metrics["objective"] == 0
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e4, 1e9])
+def test_scales_do_not_matter(scale):
+    graph, _ = ladder(0.1)
+    reference = solve(graph)
+    motion = graph.i_from_j.copy()
+    motion[:, :3, 3] *= scale
+    information = graph.information.copy()
+    information[:, 3:, 3:] /= scale**2
+    solution = solve(dataclasses.replace(graph, i_from_j=motion, information=information))
+    assert solution.metrics["objective"] == pytest.approx(reference.metrics["objective"], rel=1e-7)
+    heavy = solve(dataclasses.replace(graph, information=scale * graph.information))
+    assert heavy.metrics["objective"] == pytest.approx(scale * reference.metrics["objective"], rel=1e-7)
+
+
+def test_zero_information_is_ignored_and_said():
+    graph, _ = ladder(0.1)
+    wild = np.tile(se3.exp(np.ones(6)), (1, 1, 1))
+    more = ViewGraph.from_edges(
+        graph.vertex_ids,
+        np.concatenate([graph.edges, [[0, 11], [4, 4]]]),
+        np.concatenate([graph.i_from_j, wild, wild]),
+        np.concatenate([graph.information, np.zeros((1, 6, 6)), np.eye(6)[None]]),
+    )
+    solution = solve(more)
+    assert solution.metrics["objective"] == pytest.approx(solve(graph).metrics["objective"], rel=1e-9)
+    assert solution.weights[-2:].tolist() == [0, 0]
+    assert any("1 edges have no information" in note for note in solution.notes)
+    assert any("1 edges join a vertex to itself" in note for note in solution.notes)
+
+
+def test_edges_of_rotation_alone_are_solved():
+    graph, truth = ladder(0.0)
+    information = graph.information.copy()
+    information[0, 3:, 3:] = 0
+    solution = solve(dataclasses.replace(graph, information=information))
+    np.testing.assert_allclose(solution.world_from_cam, truth, atol=1e-6)
+    assert any("say nothing definite on translation" in note for note in solution.notes)
+
+
+def test_indefinite_information_falls_back_and_says_so():
+    graph, _ = ladder(0.1)
+    information = graph.information.copy()
+    information[3, 0, 3] = information[3, 3, 0] = 10.0
+    graph = dataclasses.replace(graph, information=information)
+    solution = solve(graph)
+    assert any("1 of 16 information matrices are indefinite" in note for note in solution.notes)
+    assert solution.metrics["isotropic"] == pytest.approx(solve(graph, objective="isotropic").metrics["objective"])
+
+
+def spoil(what: str) -> ViewGraph:
+    graph, _ = ladder(0.1)
+    motion, information, edges = graph.i_from_j.copy(), graph.information.copy(), graph.edges.copy()
+    if what == "measurement":
+        motion[2, 0, 3] = np.nan
+    elif what == "information":
+        information[2, 0, 0] = np.inf
+    else:
+        edges[2, 1] = 99
+    return dataclasses.replace(graph, i_from_j=motion, information=information, edges=edges)
+
+
+@pytest.mark.parametrize("what", ["measurement", "information", "vertex"])
+def test_numbers_that_cannot_be_used_are_named(what):
+    with pytest.raises(GraphError, match=f"edge 2.*{what}"):
+        solve(spoil(what))
+
+
+def test_contradictory_edges_still_have_a_minimum():
+    edges = np.array(list(itertools.combinations(range(6), 2)) * 3)
+    motions = se3.exp(3 * np.random.default_rng(0).normal(size=(len(edges), 6)))
+    solution = solve(ViewGraph.from_edges(np.arange(6), edges, motions))
+    assert np.isfinite(solution.world_from_cam).all()
+    assert se3.is_motion(solution.world_from_cam, 1e-9).all()
