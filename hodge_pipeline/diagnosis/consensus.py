@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hodge_pipeline.diagnosis.arrangements import best_arrangement
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.pieces import align
-from hodge_pipeline.diagnosis.rearrange import rearrange
 from hodge_pipeline.diagnosis.robust_poses import GATE, Fit, fit
 from hodge_pipeline.types import Floats, ViewGraph
 
@@ -29,9 +29,10 @@ class Consensus:
 def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptions) -> Consensus:
     """The alignment that the edges speak for; `graph` holds the recentred edges with the information of their noise."""
     rng = np.random.default_rng(options.seed)
-    best = fit(evidence, graph, align(evidence, edge_weight(evidence), options.cluster_gain, rng), 2)
+    weight = edge_weight(evidence)
+    best = fit(evidence, graph, align(evidence, weight, options.cluster_gain, rng), 2)
     if evidence.exhaustive:
-        best = rearrange(evidence, graph, best)
+        best = best_arrangement(evidence, graph, best, weight, options.cluster_gain, rng)
     agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
     return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
 

@@ -20,10 +20,14 @@ GATE = 60.0
 """χ² over six dimensions of an edge that agrees, while the poses are not settled."""
 PER_FOLD = 2.0
 """Nats for each e-fold of agreeing edges."""
-USUAL_SHARE, SHARE_SPREAD = 0.75, 0.35
-"""Of the edges that a placement makes expected, those that are there, where it is right: more speak for it."""
+SHARE_SPREAD = 0.35
+"""Of the share of expected edges that are there."""
 PER_EXPECTED_FOLD = 1.0
 """Nats for each e-fold of expected edges, at one spread from the usual share."""
+AGREEING = 2.0
+"""Nats of an agreeing edge by itself, where one is expected."""
+ALIKE = 0.5
+"""Of the edges that are expected where a place is what it looks like, those that are there where it is another."""
 JUMP = 1e-4
 """Share of consecutive views that do not see the same place."""
 SURE = 5.0
@@ -34,11 +38,22 @@ UNSUPPORTED, SUPPORTED = 0.05, 0.3
 
 @dataclass(frozen=True)
 class Scene:
-    """The evidence, the law by which views are joined, and the mean of that law over the scene, 0 without an order."""
+    """What a placement is judged by.
+
+    - `joining`: the law by which views are joined; `usual`: its mean over the scene, 0 where views have no order.
+    - `fair_share`: of the edges that a placement makes expected, those from which on they speak for it.
+    """
 
     evidence: Evidence
     joining: Joining
     usual: float
+    fair_share: float
+
+    def nats(self, sums: Floats) -> Floats:
+        """What speaks for cuts with these sums (3, ...) of their layers."""
+        agreeing, expected, order = sums
+        share = np.clip((agreeing / np.maximum(expected, 1e-9) - self.fair_share) / SHARE_SPREAD, -1, 1)
+        return np.asarray(PER_FOLD * np.log1p(agreeing) + PER_EXPECTED_FOLD * share * np.log1p(expected) + order)
 
     def layers(self, still: Floats, moved: Floats) -> Floats:
         """For each ordered pair of views (3, V, V), the first where it is and the second moved: whether an edge agrees
@@ -80,13 +95,11 @@ def consecutive_nats(evidence: Evidence) -> Floats:
     return np.minimum(np.log1p(odds), SURE)
 
 
-def nats(sums: Floats) -> Floats:
-    """What speaks for cuts with these sums (3, ...) of their layers."""
-    agreeing, expected, order = sums
-    share = (agreeing / np.maximum(expected, 1e-9) - USUAL_SHARE) / SHARE_SPREAD
-    return np.asarray(
-        PER_FOLD * np.log1p(agreeing) + PER_EXPECTED_FOLD * np.clip(share, -1, 1) * np.log1p(expected) + order
-    )
+def pair_nats(layers: Floats) -> Floats:
+    """Each pair (V, V) for itself: an agreeing edge, a missing one against places that only look alike, the order."""
+    agreeing, expected, order = layers
+    missing = np.log((1 - expected) / (1 - ALIKE * expected))
+    return np.asarray(agreeing * np.log1p(np.expm1(AGREEING) * expected) + (1 - agreeing) * missing + order)
 
 
 def sums_of(layers: Floats, inside: Bools) -> Floats:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import expit
 
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -42,7 +43,7 @@ class Joining:
         squares = (a * a).sum(1)[:, None] + (b * b).sum(1)[None] - 2 * a @ b.T
         apart = np.sqrt(np.maximum(squares, 0.0)) / self.reach_m
         odds = self.x[3] - np.exp(self.x[4]) * apart - np.exp(self.x[5]) * _angles(first, second)
-        return np.asarray(CEILING / (1 + np.exp(-odds)))
+        return np.asarray(CEILING * expit(odds))
 
     def _seen(self, poses: Floats) -> Floats:
         return np.asarray(poses[:, :3, :3] @ (self.reach_m * self.x[:3]) + poses[:, :3, 3])
@@ -62,7 +63,7 @@ def learn_joining(poses: Floats, piece: Ints, joined: Bools, reach_m: float, kno
         distance = np.sqrt((apart * apart).sum(1) + 1e-12)
         far, turn = np.exp(x[4]) * distance, np.exp(x[5]) * angle
         odds = x[3] - far - turn
-        left = 1 / (1 + np.exp(-odds)) - there
+        left = expit(odds) - there
         at_point = -np.exp(x[4]) * np.einsum("n,nij,ni->j", left / distance, turned, apart)
         gradient = np.array([*at_point, left.sum(), -left @ far, -left @ turn]) + (x - usual) / SPREAD**2
         prior = float((((x - usual) / SPREAD) ** 2).sum()) / 2

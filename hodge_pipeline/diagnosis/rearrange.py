@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.cuts import GATE, Scene, consecutive_nats, interval_sums, nats, sums_of
+from hodge_pipeline.diagnosis.cuts import GATE, Scene, consecutive_nats, interval_sums, pair_nats, sums_of
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.joining import Joining, learn_joining
 from hodge_pipeline.diagnosis.pieces import Alignment
@@ -25,8 +25,6 @@ TRIED = 60
 """Motions in each round."""
 LEAST_GAIN = 2.0
 """Nats."""
-LARGEST = 400
-"""Views: with more, all pairs of them would cost too much."""
 MOST_PROPOSALS = 2000
 
 
@@ -51,14 +49,12 @@ class _Move:
     piece: int
 
 
-def rearrange(evidence: Evidence, graph: ViewGraph, start: Fit) -> Fit:
-    """The solution after the moves; `start` where there are too many views. `graph` has the recentred edges."""
-    if not 2 < evidence.vertex_count <= LARGEST:
-        return start
+def rearrange(evidence: Evidence, graph: ViewGraph, start: Fit, fair_share: float) -> Fit:
+    """The solution after the moves; `graph` has the recentred edges, for `fair_share` see `Scene`."""
     found, joining = start, None
     for _ in range(ROUNDS):
-        joining = _learned(evidence, found, joining)
-        move = _best_move(_scene(evidence, joining, found), found)
+        joining = learned(evidence, found, joining)
+        move = _best_move(scene_of(evidence, joining, found, fair_share), found)
         if move is None:
             break
         poses, piece = found.poses.copy(), found.component.copy()
@@ -67,18 +63,19 @@ def rearrange(evidence: Evidence, graph: ViewGraph, start: Fit) -> Fit:
     return start if found is start else fit(evidence, graph, Alignment(found.component, found.poses), 2)
 
 
-def _learned(evidence: Evidence, found: Fit, known: Joining | None) -> Joining:
+def learned(evidence: Evidence, found: Fit, known: Joining | None = None) -> Joining:
+    """The law of joining that the edges which a solution uses show."""
     joined = np.zeros((evidence.vertex_count, evidence.vertex_count), bool)
     i, j = evidence.edges[found.used].T
     joined[i, j] = joined[j, i] = True
     return learn_joining(found.poses, found.component, joined, evidence.reach_m, known)
 
 
-def _scene(evidence: Evidence, joining: Joining, found: Fit) -> Scene:
-    if not np.ptp(evidence.prior) > 0:
-        return Scene(evidence, joining, 0.0)
+def scene_of(evidence: Evidence, joining: Joining, found: Fit, fair_share: float = 1.0) -> Scene:
+    """What moves of this solution are judged by."""
     same = found.component[:, None] == found.component[None]
-    return Scene(evidence, joining, float(joining.between(found.poses, found.poses)[same].mean()))
+    usual = float(joining.between(found.poses, found.poses)[same].mean()) if np.ptp(evidence.prior) > 0 else 0.0
+    return Scene(evidence, joining, usual, fair_share)
 
 
 def _best_move(scene: Scene, found: Fit) -> _Move | None:
@@ -86,6 +83,7 @@ def _best_move(scene: Scene, found: Fit) -> _Move | None:
     together = piece[:, None] == piece[None]
     now = scene.layers(poses, poses) * (together & ~np.eye(len(piece), dtype=bool))
     proposals = _proposals(scene, found)
+    runs_now = scene.nats(interval_sums(now)[2])
     best, left = None, np.ones(len(proposals.mover), bool)
     for _ in range(TRIED):
         if not left.any():
@@ -93,13 +91,13 @@ def _best_move(scene: Scene, found: Fit) -> _Move | None:
         row = int(np.argmax(np.where(left, proposals.urgent, -1.0)))
         left &= proposals.alike[row] < 0.5
         left[row] = False
-        move = _move(scene, found, now, proposals, row)
+        move = _move(scene, found, now, runs_now, proposals, row)
         if move is not None and move.gain > (LEAST_GAIN if best is None else best.gain):
             best = move
     return best
 
 
-def _move(scene: Scene, found: Fit, now: Floats, proposals: _Proposals, row: int) -> _Move | None:
+def _move(scene: Scene, found: Fit, now: Floats, runs_now: Floats, proposals: _Proposals, row: int) -> _Move | None:
     """The best set of views to move as one proposal has it."""
     poses, piece = found.poses, found.component
     home, movable = piece[proposals.stayer[row]], piece == piece[proposals.mover[row]]
@@ -110,19 +108,19 @@ def _move(scene: Scene, found: Fit, now: Floats, proposals: _Proposals, row: int
     if not movable[proposals.stayer[row]]:
         sets.append(movable)
     if scene.usual:
-        sets.append(_best_run(then, now, movable))
+        sets.append(_best_run(scene, then, runs_now, movable))
     best = None
     for inside in sets:
-        gain = float(nats(sums_of(then, inside)) - nats(sums_of(now, inside))) if inside.any() else 0.0
+        gain = float(scene.nats(sums_of(then, inside)) - scene.nats(sums_of(now, inside))) if inside.any() else 0.0
         if best is None or gain > best.gain:
             best = _Move(gain, inside, motion, int(home))
     return best
 
 
-def _best_run(then: Floats, now: Floats, movable: Bools) -> Bools:
+def _best_run(scene: Scene, then: Floats, runs_now: Floats, movable: Bools) -> Bools:
     low, high, after = interval_sums(then)
     blocked = np.concatenate([[0], np.cumsum(~movable)])
-    gain = np.where(blocked[high] > blocked[low], -np.inf, nats(after) - nats(interval_sums(now)[2]))
+    gain = np.where(blocked[high] > blocked[low], -np.inf, scene.nats(after) - runs_now)
     best, inside = int(np.argmax(gain)), np.zeros(len(movable), bool)
     if np.isfinite(gain[best]):
         inside[low[best] : high[best]] = True
@@ -131,7 +129,7 @@ def _best_run(then: Floats, now: Floats, movable: Bools) -> Bools:
 
 def _grown(then: Floats, now: Floats, movable: Bools, seed: Ints) -> Bools:
     """The set that grows, and shrinks, one view at a time from the seed while the sum over single pairs improves."""
-    gain = _pair_nats(then) - _pair_nats(now)
+    gain = pair_nats(then) - pair_nats(now)
     inside = np.zeros(len(movable), bool)
     inside[seed] = True
     inside &= movable
@@ -146,13 +144,6 @@ def _grown(then: Floats, now: Floats, movable: Bools, seed: Ints) -> Bools:
         enters -= sign * gain[view]
         leaves += sign * gain[:, view]
     return inside
-
-
-def _pair_nats(layers: Floats) -> Floats:
-    """Each pair (V, V) for itself: an agreeing edge against a look-alike, a missing one against chance."""
-    agreeing, expected, order = layers
-    missing = np.log((1 - expected) / (1 - 0.3 * expected))
-    return np.asarray(agreeing * np.log1p(2.3 * expected) + (1 - agreeing) * missing + order)
 
 
 def _proposals(scene: Scene, found: Fit) -> _Proposals:
@@ -174,11 +165,15 @@ def _proposals(scene: Scene, found: Fit) -> _Proposals:
 
 def _alike(motion: Floats, point: Floats, turn: Floats, shift: Floats) -> Floats:
     quat = se3.to_quat_xyzw(motion)
-    angle = 2 * np.arccos(np.minimum(1.0, np.abs(quat @ quat.T)))
-    landed = np.einsum("nij,nj->ni", motion[:, :3, :3], point) + motion[:, :3, 3]
-    there = (motion[:, :3, :3].reshape(-1, 3) @ point.T).reshape(len(motion), 3, len(point)) + motion[:, :3, 3:]
-    squares = (angle / turn) ** 2 + ((there - landed.T) ** 2).sum(1) / shift**2
-    return np.asarray(np.sqrt(np.maximum(0.0, 1 - squares / GATE)))
+    cosine = np.minimum(1.0, np.abs(quat @ quat.T))
+    first, second = np.nonzero(cosine >= np.cos(np.minimum(np.sqrt(GATE) * turn, np.pi) / 2))
+    at = np.einsum("nij,nj->ni", motion[first, :3, :3] - motion[second, :3, :3], point[second])
+    at += motion[first, :3, 3] - motion[second, :3, 3]
+    squares = (2 * np.arccos(cosine[first, second]) / turn[second]) ** 2
+    squares += np.einsum("ni,ni->n", at, at) / shift[second] ** 2
+    out = np.zeros(cosine.shape)
+    out[first, second] = np.sqrt(np.maximum(0.0, 1 - squares / GATE))
+    return out
 
 
 def _mean_motion(proposals: _Proposals, row: int, poses: Floats) -> Floats:
