@@ -15,7 +15,7 @@ from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.solvers.linear import factorise
-from hodge_pipeline.solvers.multigrid import Modes, aggregates, multigrid
+from hodge_pipeline.solvers.multigrid import Coarsening, Modes, aggregates, multigrid
 from hodge_pipeline.solvers.problem import laplacian
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
@@ -109,7 +109,7 @@ def test_a_back_end_that_is_not_installed_is_named_with_what_to_install(monkeypa
 def test_a_cycle_is_symmetric_and_positive_definite() -> None:
     tail, head, count = grid(80)
     matrix = laplacian(tail, head, np.ones(len(tail)), count).tobsr((1, 1))
-    hierarchy = multigrid(matrix, Modes(), lambda coarse: factorise(coarse).solve)
+    hierarchy = multigrid(matrix, Modes(), lambda coarse: factorise(coarse).solve, Coarsening())
     assert hierarchy.levels
     x, y = np.random.default_rng(0).normal(size=(2, count))
     first, second = hierarchy.cycle(matrix, x), hierarchy.cycle(matrix, y)
@@ -125,7 +125,7 @@ def test_a_rigid_body_s_motion_costs_few_steps_however_long_the_levers() -> None
     tail = np.concatenate([k[:-1], k[:-width]])
     head = np.concatenate([k[1:], k[width:]])
     matrix = rigid_hessian(positions, tail, head)
-    hierarchy = multigrid(matrix, Modes(positions[1:]), lambda coarse: factorise(coarse).solve)
+    hierarchy = multigrid(matrix, Modes(positions[1:]), lambda coarse: factorise(coarse).solve, Coarsening())
     rhs = np.random.default_rng(0).normal(size=matrix.shape[0])
     found = truncated_cg(lambda x: matrix @ x, lambda r: hierarchy.cycle(matrix, r), rhs, 1e-6, 200)
     assert found.steps < 40

@@ -19,7 +19,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
 from hodge_pipeline.solvers.linear import Factor, factorise, factorise_blocks, fill_reducing_order
-from hodge_pipeline.solvers.multigrid import Modes, Preconditioner, Preconditioning, multigrid
+from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioner, Preconditioning, multigrid
 from hodge_pipeline.types import Floats, Ints
 
 BackendName: TypeAlias = Literal["auto", "superlu", "cholmod", "pyamg", "multigrid"]
@@ -77,7 +77,7 @@ def backend(name: BackendName) -> Backend:
     if name == "cholmod":
         return Backend(name, factorise_core=_cholmod)
     if name in ("pyamg", "multigrid"):
-        return Backend(name, precondition=_pyamg if name == "pyamg" else _multigrid)
+        return Backend(name, precondition=_pyamg if name == "pyamg" else _multigrid())
     return Backend("superlu")
 
 
@@ -131,8 +131,10 @@ def _conjugate_gradients(matrix: csr_matrix, precondition: Preconditioning) -> F
     return Factor(int(matrix.shape[0]), solve)
 
 
-def _multigrid(matrix: bsr_matrix, modes: Modes) -> Preconditioner:
-    return multigrid(matrix, modes, lambda coarse: factorise(coarse).solve).cycle
+def _multigrid() -> Preconditioning:
+    """Multigrid for matrices that share their patterns, as those of one problem do."""
+    coarsening = Coarsening()
+    return lambda matrix, modes: multigrid(matrix, modes, lambda coarse: factorise(coarse).solve, coarsening).cycle
 
 
 def _cholmod(matrix: csc_matrix) -> Callable[[Floats], Floats]:

@@ -14,8 +14,10 @@ from hodge_pipeline.solvers.problem import Problem, laplacian
 from hodge_pipeline.types import Floats
 
 MOST_STEPS = 300
-STALE_STEPS = 25
+STALE_STEPS = 40
 """About what a new preconditioner costs: an old one that needs more is made anew."""
+MOST_TURNED, SAMPLES = 0.05, 10_000
+"""Of the levers' length, in a sample of the blocks: from there on an old preconditioner knows the wrong modes."""
 LOOSEST = 0.1
 """Of a step's tolerance: the preconditioner reaches it in a few."""
 TRANSLATION_TOLERANCE = 1e-3
@@ -28,6 +30,7 @@ class IterativeSolver:
 
     precondition: Preconditioning
     latest: Preconditioner | None = None
+    levers: Floats | None = None
     tried: int = 0
 
     def steps_to_try(self, size: int) -> int:
@@ -39,7 +42,7 @@ class IterativeSolver:
     ) -> CgResult:
         """The step x with H x ≈ −g, of poses at these positions (free, d)."""
         tolerance = min(tolerance, LOOSEST)
-        if self.latest is None:
+        if self.latest is None or self._turned(hessian, positions.shape[1]) > MOST_TURNED:
             return self._afresh(hessian, gradient, tolerance, positions)
         first = self._cg(self.latest, hessian, gradient, tolerance, STALE_STEPS)
         if first.steps < STALE_STEPS or first.negative_curvature:
@@ -51,17 +54,30 @@ class IterativeSolver:
     def _afresh(self, hessian: bsr_matrix, gradient: Floats, tolerance: float, positions: Floats) -> CgResult:
         self.latest = None  # the old one's memory is better spent on the new one
         self.latest = self.precondition(hessian, Modes(positions))
+        self.levers = _levers(hessian, positions.shape[1])
         found = self._cg(self.latest, hessian, gradient, tolerance, MOST_STEPS)
         if found.steps:
             return found
         self.latest = None  # of a matrix that is not definite
         return replace(found, negative_curvature=True)
 
+    def _turned(self, hessian: bsr_matrix, dimension: int) -> float:
+        """How far the levers have turned since the latest preconditioner was made, as a share of their length."""
+        assert self.levers is not None
+        change = np.linalg.norm(_levers(hessian, dimension) - self.levers)
+        return float(change / max(np.linalg.norm(self.levers), 1e-300))
+
     @staticmethod
     def _cg(operator: Preconditioner, hessian: bsr_matrix, gradient: Floats, tolerance: float, most: int) -> CgResult:
         return truncated_cg(
             lambda x: np.asarray(hessian @ x), lambda r: operator(hessian, r), gradient, tolerance, most
         )
+
+
+def _levers(hessian: bsr_matrix, dimension: int) -> Floats:
+    """What couples rotations and translations in some blocks spread over the matrix."""
+    some = hessian.data[:: max(len(hessian.data) // SAMPLES, 1)]
+    return np.array(some[:, -dimension:, :-dimension])
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ scalar Laplacians miss, whose levers couple rotations to translations.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -19,12 +19,14 @@ from hodge_pipeline.solvers.linear import fill_reducing_order
 from hodge_pipeline.solvers.rotations import lever
 from hodge_pipeline.types import Floats, Ints
 
-COARSEST = 3000
+COARSEST = 300
 """Vertices that are factorised whatever their fill."""
-MOST_NEIGHBOURS_TRIED = 9
-"""Of a vertex, itself counted: levels with more fill up."""
-FACTOR_WORTH = 20
-"""Products of blocks for each block of the matrix that the factor of a level may take: it saves levels, and steps."""
+ORDERED_TO, MOST_NEIGHBOURS_TRIED = 3000, 6
+"""Vertices, and blocks in a row: a level with more of both fills up, and no order is looked for."""
+FACTOR_WORTH = 5
+"""Products of blocks for each block of the finest matrix that a level's factor may take: it saves levels, and steps."""
+CHUNK, ROWS = 1 << 14, 1 << 17
+"""Blocks, and block rows, that are taken at a time: their copies stay small."""
 LEAST_COARSENING = 0.8
 POWER_STEPS = 10
 SAFE_RADIUS = 1.05
@@ -98,18 +100,34 @@ class Multigrid:
         return np.asarray(x)
 
 
-def multigrid(matrix: bsr_matrix, modes: Modes, coarse: CoarseSolver) -> Multigrid:
+@dataclass(frozen=True)
+class Coarsening:
+    """How the graphs of matrices are coarsened: found once for each pattern, for many matrices on it."""
+
+    known: list[tuple[csr_matrix, Ints | None]] = field(default_factory=list)
+
+    def of(self, matrix: bsr_matrix, finest: int) -> Ints | None:
+        """The aggregate (n,) of each vertex; None where the matrix had better be factorised, `finest` being how many
+        blocks the finest one has.
+        """
+        for pattern, found in self.known:
+            if np.array_equal(pattern.indptr, matrix.indptr) and np.array_equal(pattern.indices, matrix.indices):
+                return found
+        aggregate = None if _worth_a_factor(matrix, finest) else aggregates(matrix)
+        if aggregate is not None and aggregate.max() + 1 > LEAST_COARSENING * len(aggregate):
+            aggregate = None
+        self.known.append((_pattern(matrix), aggregate))
+        return aggregate
+
+
+def multigrid(matrix: bsr_matrix, modes: Modes, coarse: CoarseSolver, coarsening: Coarsening) -> Multigrid:
     """The hierarchy of a symmetric positive definite block matrix with these modes.
 
     `coarse` factorises the matrix of the last level.
     """
-    levels = []
-    while not _worth_a_factor(matrix):
-        size = matrix.blocksize[0]
-        aggregate = aggregates(matrix)
-        count = int(aggregate.max()) + 1
-        if count > LEAST_COARSENING * len(aggregate):
-            break
+    levels, finest = [], len(matrix.indices)
+    while (aggregate := coarsening.of(matrix, finest)) is not None:
+        size, count = matrix.blocksize[0], int(aggregate.max()) + 1
         coarse_modes = modes.gathered(aggregate, count)
         about = None if coarse_modes.positions is None else coarse_modes.positions[aggregate]
         level = _level(matrix, modes.blocks(len(aggregate), size, about), aggregate, count)
@@ -119,17 +137,17 @@ def multigrid(matrix: bsr_matrix, modes: Modes, coarse: CoarseSolver) -> Multigr
     return Multigrid(tuple(levels), coarse(matrix.tocsc()))
 
 
-def _worth_a_factor(matrix: bsr_matrix) -> bool:
+def _worth_a_factor(matrix: bsr_matrix, finest: int) -> bool:
     """Whether the matrix is small, or so like a tree that its factor fills up little."""
     count = len(matrix.indptr) - 1
     if count <= COARSEST:
         return True
-    if len(matrix.indices) > MOST_NEIGHBOURS_TRIED * count:
+    if count > ORDERED_TO and len(matrix.indices) > MOST_NEIGHBOURS_TRIED * count:
         return False
     pattern = _pattern(matrix)
     pattern.data[:] = -1.0
     laplacian = pattern + diags_array(np.diff(pattern.indptr).astype(np.float32))
-    return fill_reducing_order(laplacian).work < FACTOR_WORTH * len(matrix.indices)
+    return fill_reducing_order(laplacian).work < FACTOR_WORTH * finest
 
 
 def _pattern(matrix: bsr_matrix) -> csr_matrix:
@@ -167,14 +185,36 @@ def _level(matrix: bsr_matrix, blocks: Floats, aggregate: Ints, count: int) -> L
     rows = np.repeat(np.arange(n, dtype=np.int32), np.diff(matrix.indptr))
     inverse = np.linalg.inv(matrix.data[rows == matrix.indices])
     damped = inverse * (4 / 3 / _spectral_radius(matrix, inverse))
-    shape = (n * size, count * size)
-    rigid = bsr_matrix((blocks, aggregate, np.arange(n + 1)), shape=shape)
-    smooth = _as_blocks(matrix @ rigid, size)
-    owner = np.repeat(np.arange(n), np.diff(smooth.indptr))
-    np.matmul(-damped[owner], smooth.data, out=smooth.data)
-    prolong = _as_blocks(rigid + smooth, size)
-    restrict = _as_blocks(prolong.transpose(), size)
-    return Level(damped, prolong, restrict, _as_blocks(restrict @ (matrix @ prolong), size))
+    rigid = bsr_matrix((blocks, aggregate, np.arange(n + 1)), shape=(n * size, count * size))
+    prolong = _as_blocks(matrix @ rigid, size)
+    owner = np.repeat(np.arange(n, dtype=np.int32), np.diff(prolong.indptr))
+    for begin in range(0, len(owner), CHUNK):
+        some = slice(begin, begin + CHUNK)
+        prolong.data[some] = np.matmul(-damped[owner[some]], prolong.data[some])
+    own = np.flatnonzero(prolong.indices == aggregate[owner])
+    if len(own) == n:
+        prolong.data[own] += blocks
+    else:  # scipy leaves out what cancels, where blocks are numbers
+        prolong = _as_blocks(prolong + rigid, size)
+    return Level(damped, prolong, _as_blocks(prolong.transpose(), size), _galerkin(matrix, prolong))
+
+
+def _galerkin(matrix: bsr_matrix, prolong: bsr_matrix) -> bsr_matrix:
+    """Pᵀ A P, some rows of A at a time, for the memory of A P."""
+    size, count = matrix.blocksize[0], prolong.shape[1]
+    total = bsr_matrix((count, count), blocksize=(size, size))
+    for begin in range(0, len(matrix.indptr) - 1, ROWS):
+        image = _rows(matrix, begin) @ prolong
+        total = total + _rows(prolong, begin).transpose() @ image
+    return _as_blocks(total, size)
+
+
+def _rows(matrix: bsr_matrix, begin: int) -> bsr_matrix:
+    """Some block rows of a matrix, its data shared."""
+    indptr = matrix.indptr[begin : begin + ROWS + 1]
+    part, size = slice(indptr[0], indptr[-1]), matrix.blocksize[0]
+    shape = ((len(indptr) - 1) * size, matrix.shape[1])
+    return bsr_matrix((matrix.data[part], matrix.indices[part], indptr - indptr[0]), shape=shape)
 
 
 def _spectral_radius(matrix: bsr_matrix, inverse: Floats) -> float:

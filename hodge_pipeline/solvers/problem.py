@@ -24,17 +24,22 @@ MOST_CORRECTIONS = 32
 """Edges whose weights a factor follows by a low-rank correction; a new one costs about as much as this many solves."""
 
 
-CHUNK = 1 << 14
+CHUNK = 1 << 12
 """Edges whose blocks are made at a time: they stay in the cache, and memory never holds those of all edges."""
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """A chunk of edges: the blocks that they contribute to, and the matrix that sums their contributions into those."""
+    """A chunk of edges: the blocks that they contribute to, and the matrix that sums their contributions into those.
+
+    Contributions `alone` are all there is of the blocks `places`.
+    """
 
     edges: slice
     targets: Ints
     scatter: csr_matrix
+    places: Ints
+    alone: Ints
 
 
 @dataclass(frozen=True)
@@ -56,22 +61,22 @@ class BlockPattern:
         """
         keys = rows * shape[1] + columns
         keys[(rows >= shape[0]) | (columns >= shape[1])] = -1
-        unique = np.unique(keys)
-        unique = unique[np.searchsorted(unique, 0) :]
+        flat = np.sort(keys.reshape(-1))
+        flat = flat[np.searchsorted(flat, 0) :]
+        first = np.flatnonzero(np.diff(flat, prepend=-1))
+        unique, single = flat[first], np.diff(first, append=len(flat)) == 1
+        del flat, first
         pieces = []
         for begin in range(0, rows.shape[1], CHUNK):
             edges = slice(begin, min(begin + CHUNK, rows.shape[1]))
             part = keys[:, edges].reshape(-1)
             kept = np.flatnonzero(part >= 0)
-            found, inverse = np.unique(part[kept], return_inverse=True)
-            entries = (np.ones(len(kept)), (inverse.reshape(-1), kept))
-            pieces.append(
-                _Piece(
-                    edges,
-                    np.asarray(np.searchsorted(unique, found), np.int64),
-                    csr_matrix(entries, (len(found), len(part))),
-                )
-            )
+            place = np.searchsorted(unique, part[kept])
+            lone = single[place]
+            found, inverse = np.unique(place[~lone], return_inverse=True)
+            entries = (np.ones(len(inverse)), (inverse.reshape(-1), kept[~lone]))
+            scatter = csr_matrix(entries, (len(found), len(part)))
+            pieces.append(_Piece(edges, found, scatter, place[lone], kept[lone]))
         indptr = np.searchsorted(unique, np.arange(shape[0] + 1) * shape[1]).astype(np.int32)
         return cls(tuple(pieces), indptr, (unique % max(shape[1], 1)).astype(np.int32), shape)
 
@@ -80,7 +85,9 @@ class BlockPattern:
         rows, columns = size
         data = np.zeros((len(self.indices), rows * columns))
         for piece in self.pieces:
-            data[piece.targets] += piece.scatter @ blocks(piece.edges).reshape(-1, rows * columns)
+            parts = blocks(piece.edges).reshape(-1, rows * columns)
+            data[piece.targets] += piece.scatter @ parts
+            data[piece.places] = parts[piece.alone]
         shape = (self.shape[0] * rows, self.shape[1] * columns)
         return bsr_matrix((data.reshape(-1, rows, columns), self.indices, self.indptr), shape=shape)
 

@@ -64,7 +64,7 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
     information = graph.information
     if dimension == 2:
         information = information[:, PLANAR_AXES[:, None], PLANAR_AXES]
-    information = 0.5 * (information + np.swapaxes(information, 1, 2))
+    information = _symmetric(information)
     p = information.shape[-1] - dimension
     kappa = _mean_precision(information[:, :p, :p]) / (2 if dimension == 3 else 1)
     tau = _mean_precision(information[:, p:, p:])
@@ -85,6 +85,14 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
         notes.append(f"{int(indefinite.sum())} of {graph.edge_count} information matrices are indefinite")
     kappa, tau = _floor(kappa, used, "rotation", notes), _floor(tau, used, "translation", notes)
     return Weights(kappa, tau, information, used, not indefinite.any(), tuple(notes))
+
+
+def _symmetric(matrices: Floats) -> Floats:
+    """The symmetric parts (E, k, k): the matrices themselves where they are symmetric, for the memory of a copy."""
+    pairs = [(i, j) for i in range(matrices.shape[-1]) for j in range(i)]
+    if all(np.array_equal(matrices[:, i, j], matrices[:, j, i]) for i, j in pairs):
+        return matrices
+    return np.asarray(0.5 * (matrices + np.swapaxes(matrices, 1, 2)))
 
 
 def _mean_precision(blocks: Floats) -> Floats:
