@@ -11,6 +11,7 @@ from hodge_adapters.association import interpolated_poses, nearest_pairs
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Source, Trajectory
 from readers_data import HEIGHT, WIDTH, agreement, some_poses, tum_folder, tum_line
@@ -42,6 +43,25 @@ def test_frames_of_a_folder(folder: Path) -> None:
     assert source.frames[0].read_depth().max() < 0.8, "5000 units a metre"
     assert TumReader(depth_scale=1000).open(folder).frames[0].read_depth().max() > 3
     assert source.notes == ("intrinsics from intrinsics.txt", "no ground truth")
+
+
+@pytest.mark.parametrize("lists", [("depth.txt",), ("rgb.txt",), ("depth.txt", "rgb.txt")])
+def test_lists_that_are_missing_are_made_from_the_names_of_the_images(folder: Path, lists: tuple[str, ...]) -> None:
+    expected = TumReader().open(folder)
+    for name in lists:
+        (folder / name).unlink()
+    assert TumReader().sniff(folder).confidence >= 0.5
+    assert guess_reader(folder).__class__.__name__ == "TumReader"
+    source = TumReader().open(folder)
+    assert [frame.stamp_s for frame in source.frames] == [frame.stamp_s for frame in expected.frames]
+    assert colour_names(source) == colour_names(expected)
+    assert all(any(f"no {name}: the stamps of" in note for note in source.notes) for name in lists)
+
+
+def test_a_truth_alone_says_what_else_is_needed(tmp_path: Path) -> None:
+    (tmp_path / "groundtruth.txt").write_text(tum_line(1.0, some_poses(1)[0]))
+    with pytest.raises(SourceError, match=r"no depth\.txt.*unpack the whole sequence"):
+        guess_reader(tmp_path).open(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -122,6 +142,7 @@ def test_colour_that_is_absent_or_too_late(folder: Path) -> None:
     assert colour_names(source) == [None] * 3
     assert "3 depth images have no colour image within 0.005 s" in source.notes
     (folder / "rgb.txt").unlink()
+    (folder / "rgb").rename(folder / "elsewhere")
     assert "no rgb.txt: frames have no colour" in TumReader().open(folder).notes
 
 

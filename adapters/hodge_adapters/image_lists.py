@@ -15,6 +15,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
 
 ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
+_STAMP_NAME = re.compile(r"\d+\.\d+\.(png|jpg|jpeg)", re.IGNORECASE)
 _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
 
 
@@ -70,21 +71,44 @@ def read_pairs(folder: Path, max_difference_s: float, notes: list[str]) -> Stamp
 
 def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> StampedImages:
     depth_list, colour_list = folder / "depth.txt", folder / "rgb.txt"
-    if not depth_list.is_file():
-        raise SourceError(f"{folder}: no depth.txt and no associations.txt in it: give the folder that holds one")
-    depth_stamps_s, depth = _read_list(depth_list, notes)
-    if not depth:
+    depth_stamps_s, depth = _listed_or_named(depth_list, folder / "depth", notes)
+    if not depth and depth_list.is_file():
         raise SourceError(f"{depth_list}: no line `stamp file` that can be used in it: write one for each depth image")
-    if not colour_list.is_file():
+    if not depth:
+        raise SourceError(
+            f"{folder}: no depth.txt, no associations.txt and no depth images named by their stamps in it: give the "
+            "folder that holds them, or unpack the whole sequence"
+        )
+    lists = tuple(path for path in (depth_list, colour_list) if path.is_file())
+    colour_stamps_s, colour = _listed_or_named(colour_list, folder / "rgb", notes)
+    if not colour and not colour_list.is_file():
         notes.append("no rgb.txt: frames have no colour")
-        return StampedImages(depth_stamps_s, depth, [None] * len(depth), (depth_list,))
-    colour_stamps_s, colour = _read_list(colour_list, notes)
+        return StampedImages(depth_stamps_s, depth, [None] * len(depth), lists)
     columns = nearest_pairs(depth_stamps_s, colour_stamps_s, max_difference_s)
     alone = int((columns < 0).sum())
     if alone:
         notes.append(f"{alone} depth images have no colour image within {max_difference_s:g} s")
     paired = [colour[column] if column >= 0 else None for column in columns.tolist()]
-    return StampedImages(depth_stamps_s, depth, paired, (depth_list, colour_list))
+    return StampedImages(depth_stamps_s, depth, paired, lists)
+
+
+def stamped_images(folder: Path) -> list[tuple[float, Path]]:
+    """The images of a folder whose names are stamps with a fraction, as TUM names them; none where there are none."""
+    try:
+        names = sorted(path for path in folder.iterdir() if _STAMP_NAME.fullmatch(path.name))
+    except OSError:
+        return []
+    return [(float(path.stem), path) for path in names]
+
+
+def _listed_or_named(path: Path, images: Path, notes: list[str]) -> tuple[Floats, list[Path]]:
+    """Stamps and paths by the list or, where it is missing, by the names of the images."""
+    if path.is_file():
+        return _read_list(path, notes)
+    found = stamped_images(images)
+    if found:
+        notes.append(f"no {path.name}: the stamps of {len(found)} images are those of their names in {images.name}/")
+    return np.array([stamp for stamp, _ in found]), [image for _, image in found]
 
 
 def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path]]:

@@ -16,6 +16,7 @@ from hodge_pipeline.types import Floats
 
 COLOUR_FOLDERS = ("image", "color", "rgb")
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
+TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
 _NUMBER = re.compile(r"\D*(\d+)")
 _IMAGES = (".png", ".jpg", ".jpeg")
 
@@ -30,9 +31,11 @@ class NumberedImages:
 
 
 def is_redwood(folder: Path) -> bool:
-    """Whether the folder has a depth and a colour folder and no list of stamps."""
+    """Whether the folder has a depth and a colour folder, and nothing of a TUM sequence that lost its lists."""
+    if any((folder / name).is_file() for name in TUM_FILES):
+        return False
     has_colour = any((folder / name).is_dir() for name in COLOUR_FOLDERS)
-    return has_colour and (folder / "depth").is_dir() and not (folder / "depth.txt").is_file()
+    return has_colour and (folder / "depth").is_dir()
 
 
 def list_images(folder: Path, notes: list[str]) -> NumberedImages:

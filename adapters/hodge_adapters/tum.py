@@ -17,7 +17,7 @@ from hodge_adapters import images
 from hodge_adapters.association import interpolated_poses
 from hodge_adapters.camera_files import Intrinsics, checked, fit_note, read_intrinsics
 from hodge_adapters.image_frames import image_frame
-from hodge_adapters.image_lists import find_association_file, read_pairs
+from hodge_adapters.image_lists import find_association_file, read_pairs, stamped_images
 from hodge_adapters.lens import Lens
 from hodge_adapters.poses_text import parse_tum
 from hodge_pipeline.errors import SourceError
@@ -79,12 +79,17 @@ class TumReader:
     every: int = Field(1, ge=1, description="take every n-th frame")
 
     def sniff(self, path: Path) -> Sniff:
-        """Sure where `depth.txt` lies beside `rgb.txt`, less sure of an association file."""
+        """Sure where `depth.txt` lies beside `rgb.txt`, less sure of an association file, or of parts of a sequence."""
         path = Path(path)
         try:
             if (path / "depth.txt").is_file():
                 return Sniff(0.9, "depth.txt and rgb.txt") if (path / "rgb.txt").is_file() else Sniff(0.6, "depth.txt")
             association = find_association_file(path)
+            halves = [name for name in ("rgb.txt", TRUTH_FILE) if (path / name).is_file()]
+            if not association and stamped_images(path / "depth"):
+                return Sniff(0.8, "depth images named by their stamps, but no depth.txt")
+            if not association and halves:
+                return Sniff(0.5, f"{halves[0]}, but no depth.txt")
         except OSError:
             return Sniff(0.0, "not a folder that can be read")
         return Sniff(0.6, association.name) if association else Sniff(0.0, "no depth.txt and no associations.txt")
