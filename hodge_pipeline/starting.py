@@ -32,7 +32,7 @@ def first_poses(job: Job, source: Source, workers: Workers) -> Round:
         first = steps.odometry(job, source, workers)
     if not (job.recipe.relocalise and (job.recipe.relocalise is True or _apart(first))):
         return first
-    return _global_start(job, source, first.graph, ("odometry", "source"), workers)
+    return _global_start(job, source, first, ("odometry", "source"), workers)
 
 
 def _apart(first: Round) -> bool:
@@ -41,13 +41,12 @@ def _apart(first: Round) -> bool:
     return int((np.bincount(component) > 1).sum()) > 1
 
 
-def _global_start(
-    job: Job, source: Source, known: ViewGraph | None, inputs: tuple[str, ...], workers: Workers
-) -> Round:
+def _global_start(job: Job, source: Source, known: Round | None, inputs: tuple[str, ...], workers: Workers) -> Round:
     options, total = job.recipe.global_start, 2 * len(source.frames)
     with job.stage(START, "start without a guess", total, options, inputs) as (folder, advance):
         if not folder.finished:
-            scene = Scene(source.frames, job.path("clouds"), steps.vertex_ids(source), known)
+            graph, drifted = (None, None) if known is None else (known.graph, known.world_from_cam)
+            scene = Scene(source.frames, job.path("clouds"), steps.vertex_ids(source), graph, drifted)
             scratch = folder.path / "scratch"
             found = find_start(scene, options, scratch, workers, advance)
             shutil.rmtree(scratch, ignore_errors=True)

@@ -8,6 +8,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.edges.drift import DriftEdges
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.global_landmarks import LandmarkConsensus
 from hodge_pipeline.registration.global_registrars import FpfhConsensus
@@ -63,6 +64,11 @@ class GlobalStart:
         ge=1,
         description="frames: after odometry, of so many consecutive ones only the most similar is matched, and none so "
         "near, since odometry has joined them",
+    )
+    drift: DriftEdges | None = Field(
+        default=DriftEdges(),
+        description="after odometry, which pairs are matched as well: those whose poses bring them together with a "
+        "tolerance that grows along the trajectory; null: none",
     )
     landmarks: int = Field(
         default=1000, ge=15, description="landmarks of a frame, where `clouds.landmarks` leaves it to the start; 60 ms"

@@ -37,12 +37,15 @@ class Start:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is to be joined: frames, their clouds (a folder), and edges that are known already (odometry), or none."""
+    """What is to be joined: frames, their clouds (a folder), and edges and poses (N, 4, 4) that are known already, from
+    odometry, or none.
+    """
 
     frames: Sequence[Frame]
     clouds: Path
     vertex_ids: NDArray[np.generic]
     given: ViewGraph | None = None
+    drifted: Floats | None = None
 
 
 def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance) -> Start:
@@ -56,7 +59,7 @@ def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Worke
     registrar: GlobalRegistrar = options.images if by_image else options.registrar
     describe_clouds(scene.clouds, registrar, rows, scratch / DESCRIBED, workers, advance)
     notes = [] if by_image else [*check_scans(clouds, scene.vertex_ids)]
-    pairs = propose(clouds, rows, scratch / DESCRIBED, options, scene.given is not None)
+    pairs = propose(scene, clouds, rows, scratch / DESCRIBED, options)
     matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
     views = Views.make(scene.frames, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, not by_image, workers)
@@ -78,12 +81,16 @@ def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
     return int((np.diff(clouds.marks) >= options.limits.min_inliers).sum()) * 2 >= int((clouds.sizes > 0).sum())
 
 
-def propose(clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart, ordered: bool) -> Ints:
-    """The pairs (P, 2) to match: all of a few frames, else each with the most similar ones."""
+def propose(scene: Scene, clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart) -> Ints:
+    """The pairs (P, 2) to match: all of a few frames, else each with those most similar, or near by drifted poses."""
     if len(rows) <= options.all_pairs_up_to:
         return all_pairs(rows)
     local = LocalDescriptors(described, clouds, options.similarity_voxel_m)
-    return similar_pairs(local, rows, options, ordered)
+    pairs = similar_pairs(local, rows, options, scene.given is not None)
+    if options.drift is None or scene.drifted is None:
+        return pairs
+    near = options.drift.propose(scene.frames, clouds, scene.drifted).pairs
+    return np.unique(np.concatenate([pairs, near]), axis=0)
 
 
 def _tried(count: int, pairs: Ints, hypotheses: Hypotheses) -> str:
