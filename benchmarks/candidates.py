@@ -1,8 +1,8 @@
 """Which pairs are worth trying: recall of truly overlapping pairs and CPU seconds, beside trying them all.
 
 `python benchmarks/candidates.py SCENE [EVERY]`, a 7-Scenes folder with true poses. Truly overlapping: a voxel IoU
-(0.1 m) above 0.3 under the true poses, more than 5 frames apart. The drifted poses are those of odometry. "One in reach"
-counts a pair as found where one within 5 frames of it is, since the rounds find its neighbours then.
+(0.1 m) above 0.3 under the true poses, more than 5 frames apart. The drifted poses are those of odometry. "One in
+reach" counts a pair as found where one within 5 frames of it is, since the rounds find its neighbours then.
 """
 
 from __future__ import annotations
