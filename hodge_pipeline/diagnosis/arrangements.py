@@ -21,7 +21,7 @@ from hodge_pipeline.diagnosis.robust_poses import Fit, fit
 from hodge_pipeline.types import Floats, ViewGraph
 
 FAIR_SHARES = (0.75, 0.5)
-LARGEST = 400
+LARGEST = 150
 """Views: with more, all pairs of them would cost too much."""
 
 
