@@ -27,7 +27,8 @@ from hodge_pipeline.workspace import RECIPE_FILE, Workspace
 class Run:
     """A finished run: its folder, what was read, its last round (graph, solution, poses in frame order), the report.
 
-    Where it started from given poses the source holds the key frames, and `refined` the decision and all poses.
+    Where it started from given poses the source holds the key frames, and `refined` the decision and all poses. Of a
+    long source it holds the key frames too, and `tracked.all_poses(result.world_from_cam)` are the poses of all frames.
     """
 
     folder: Path
@@ -35,6 +36,7 @@ class Run:
     result: Round
     report: Report
     refined: Refined | None = None
+    tracked: tracked.Tracked | None = None
 
 
 def run(
@@ -83,7 +85,7 @@ def _run(job: Job) -> Run:
         rounds, models, scores = compute(job, source, recording)
     refined = None if job.given is None else guarding.finish(job, job.given, rounds)
     report = outputs.write(job, source, rounds, models, scores, refined)
-    return Run(job.workspace.folder, source, rounds[-1], report, refined)
+    return Run(job.workspace.folder, source, rounds[-1], report, refined, job.tracked)
 
 
 def read(job: Job) -> Source:
