@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import bsr_matrix, csr_matrix
+from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.solvers.cg import CgResult, truncated_cg
 from hodge_pipeline.solvers.multigrid import Modes, Preconditioner, Preconditioning
-from hodge_pipeline.solvers.objective import translation_force
-from hodge_pipeline.solvers.problem import Problem, laplacian
 from hodge_pipeline.types import Floats
 
 MOST_STEPS = 300
@@ -20,8 +18,6 @@ MOST_TURNED, SAMPLES = 0.05, 10_000
 """Of the levers' length, in a sample of the blocks: from there on an old preconditioner knows the wrong modes."""
 LOOSEST = 0.1
 """Of a step's tolerance: the preconditioner reaches it in a few."""
-TRANSLATION_TOLERANCE = 1e-3
-"""Of the translations that go with turned rotations: what is left is the next step's."""
 
 
 @dataclass
@@ -78,33 +74,3 @@ def _levers(hessian: bsr_matrix, dimension: int) -> Floats:
     """What couples rotations and translations in some blocks spread over the matrix."""
     some = hessian.data[:: max(len(hessian.data) // SAMPLES, 1)]
     return np.array(some[:, -dimension:, :-dimension])
-
-
-@dataclass(frozen=True)
-class TranslationSolver:
-    """The translations that go with rotations: the Laplacian of τ with its preconditioner."""
-
-    problem: Problem
-    matrix: bsr_matrix
-    precondition: Preconditioner
-
-    @classmethod
-    def of(cls, problem: Problem, precondition: Preconditioning) -> TranslationSolver:
-        """The solver for a problem's τ."""
-        matrix = laplacian(problem.tail, problem.head, problem.tau, problem.free_count).tobsr((1, 1))
-        return cls(problem, matrix, precondition(matrix, Modes()))
-
-    def matching(self, rotations: Floats, translations: Floats) -> Floats:
-        """Translations (n, d) near those that minimise F for these rotations, from a guess; the pinned ones stay."""
-        force = translation_force(self.problem, rotations, translations)
-        csr = csr_matrix((self.matrix.data.reshape(-1), self.matrix.indices, self.matrix.indptr), self.matrix.shape)
-        found = truncated_cg(
-            lambda x: np.asarray(csr @ x.reshape(force.shape)).reshape(-1),
-            lambda r: self.precondition(self.matrix, r.reshape(force.shape)).reshape(-1),
-            force.reshape(-1),
-            TRANSLATION_TOLERANCE,
-            MOST_STEPS,
-        )
-        out: Floats = translations.copy()
-        out[: self.problem.free_count] += found.x.reshape(force.shape)
-        return out

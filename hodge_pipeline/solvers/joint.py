@@ -14,11 +14,12 @@ from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.solvers.cg import CgResult
 from hodge_pipeline.solvers.direct import DirectSolver
-from hodge_pipeline.solvers.iterative import IterativeSolver, TranslationSolver
+from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.objective import Residuals, curvature, gradient, residuals
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import axial, exponential, lever
+from hodge_pipeline.solvers.translations import TranslationSolver
 from hodge_pipeline.types import Floats
 
 NEWTON_FROM = 0.1
@@ -40,9 +41,7 @@ def stiffness(kappa: Floats, turn: Floats) -> Floats:
 def step_solver(problem: Problem) -> DirectSolver | IterativeSolver:
     """What solves for the steps of all unknowns, by the problem's back end."""
     structure = problem.structure
-    if structure.backend.precondition is not None:
-        return IterativeSolver(structure.backend.precondition)
-    return DirectSolver(structure.elimination, structure.backend)
+    return structure.iterative or DirectSolver(structure.elimination, structure.backend)
 
 
 @dataclass(frozen=True)

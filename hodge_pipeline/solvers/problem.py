@@ -16,6 +16,7 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 
 from hodge_pipeline.solvers.backends import Backend, BackendName, choose
 from hodge_pipeline.solvers.elimination import Elimination
+from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.linear import Factor, corrected
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -107,6 +108,14 @@ class Structure:
     head: Ints
     elimination: Elimination
     backend: Backend
+
+    @cached_property
+    def iterative(self) -> IterativeSolver | None:
+        """The solver for steps of all unknowns, where the back end is iterative: its preconditioner serves one descent
+        after another.
+        """
+        precondition = self.backend.precondition
+        return None if precondition is None else IterativeSolver(precondition)
 
     @cached_property
     def at_tail(self) -> csr_matrix:

@@ -10,6 +10,8 @@ from hodge_pipeline.types import Bools, Floats
 POLAR_STEPS = 12
 POLAR_TOLERANCE = 1e-8
 """Of the last step: Newton's iteration squares it."""
+NEARLY_ROTATIONS = 1e-8
+"""Off orthonormal: one step without an inverse mends it to rounding."""
 
 
 def exponential(omega: Floats) -> Floats:
@@ -55,6 +57,9 @@ def project(matrices: Floats) -> Floats:
         cosine = matrices[:, 0, 0] + matrices[:, 1, 1]
         sine = matrices[:, 1, 0] - matrices[:, 0, 1]
         return exponential(np.arctan2(sine, cosine)[:, None])
+    gram = matrices @ np.swapaxes(matrices, 1, 2)
+    if np.abs(gram - np.eye(3)).max(initial=0.0) < NEARLY_ROTATIONS and (np.linalg.det(matrices) > 0).all():
+        return np.asarray(1.5 * matrices - 0.5 * (gram @ matrices))
     rotations, good = _polar(matrices)
     if not good.all():
         rotations[~good] = se3.project_to_so3(matrices[~good])
