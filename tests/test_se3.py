@@ -125,3 +125,12 @@ def test_is_motion_tells_bad_matrices() -> None:
     loose[:3, :3] *= 0.9998
     verdict = se3.is_motion(np.array([good, loose, nan, singular, mirror, row]))
     assert verdict.tolist() == [True, True, False, False, False, False]
+
+
+def test_a_quaternion_has_no_negative_scalar_part() -> None:
+    turns = np.radians(170) * np.concatenate([np.eye(3), -np.eye(3)])
+    quats = se3.to_quat_xyzw(se3.exp(np.hstack([turns, np.zeros((6, 3))])))
+    assert (quats[:, 3] >= 0).all()
+    np.testing.assert_allclose(
+        quats[:, :3], np.sin(np.radians(85)) * np.concatenate([np.eye(3), -np.eye(3)]), atol=1e-12
+    )
