@@ -16,7 +16,7 @@ from hodge_pipeline.recipe import Recipe, load_recipe
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 CHAIN = (
-    "clouds.voxel_m=0.06", "fusion=[]", "executor.workers=0", "recording.level=summary", "evaluation.tables=false",
+    "clouds.voxel_m=0.06", "fusion=[]", "executor.workers=0", "recording.level=off", "evaluation.tables=false",
     "outer_iterations=1", "edges={stage: sequential}",
 )  # fmt: skip
 
@@ -45,7 +45,7 @@ def run(tiny_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:  
 def test_rounds_of_suggestions_make_a_chain_testable_and_end_by_themselves(run: Run, tmp_path: Path) -> None:
     assert {row["verdict"] for row in rows_of(run.folder)} == {"untestable"}
     assert run.source.path is not None
-    recipe = chain(run.source.path, "suggestions={rounds: 9, pairs: 12}")
+    recipe = chain(run.source.path, "suggestions={rounds: 9, pairs: 12, min_gain: 0.8}")
     more = hodge_pipeline.run(recipe, tmp_path / "more")
     rows = rows_of(more.folder)
     verdicts = [row["verdict"] for row in rows]
@@ -94,6 +94,18 @@ def test_a_pair_that_sees_nothing_in_common_is_registered_rejected_and_said(run:
     solve_again(run.folder)
     row = next(row for row in again.result.rejected_pairs.tolist() if row == [0, 12])
     assert row and any("0-12 was registered and rejected" in note for note in again.report.notes)
+
+
+def test_two_pieces_are_joined_without_a_guess(run: Run) -> None:
+    hodge("edit", run.folder, "--disable", "11-12", "--register", "11-13,10-12")
+    again = solve_again(run.folder)
+    hodge("edit", run.folder, "--undo")
+    solve_again(run.folder)
+    ends = again.result.graph.edges.tolist()
+    assert [again.result.graph.source[ends.index(pair)] for pair in ([10, 12], [11, 13])] == ["by_hand"] * 2
+    assert [part.count for part in again.report.graph.components] == [24]
+    errors = {row.name: row.ate_rmse_m for row in again.report.trajectories}
+    assert errors["result"] < errors["round 1"] + 0.02
 
 
 def test_mistakes_are_one_line(run: Run, tmp_path: Path) -> None:
