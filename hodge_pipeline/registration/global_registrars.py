@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,22 +55,19 @@ class FpfhRansac:
 
     def match(self, target: DescribedCloud, source: DescribedCloud) -> Match:
         """Where the source lies in the target."""
-        if not len(target) or not len(source):
-            return Match(np.eye(4), 0, 0)
-        from hodge_pipeline.registration.one_thread import o3d
 
-        o3d.utility.random.seed(self.seed)
-        registration = o3d.pipelines.registration
-        found = registration.registration_ransac_based_on_feature_matching(
-            source.geometry, target.geometry, source.open3d_features, target.open3d_features, self.mutual,
-            TOLERANCE_VOXELS * self.voxel_m, registration.TransformationEstimationPointToPoint(False), 3,
-            [
-                registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-                registration.CorrespondenceCheckerBasedOnDistance(TOLERANCE_VOXELS * self.voxel_m),
-            ],
-            registration.RANSACConvergenceCriteria(self.max_iterations, 0.999),
-        )  # fmt: skip
-        return _from_open3d(found, len(source))
+        def register(methods: Any, *clouds: Any) -> Any:
+            within_m = TOLERANCE_VOXELS * self.voxel_m
+            return methods.registration_ransac_based_on_feature_matching(
+                *clouds, self.mutual, within_m, methods.TransformationEstimationPointToPoint(False), 3,
+                [
+                    methods.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                    methods.CorrespondenceCheckerBasedOnDistance(within_m),
+                ],
+                methods.RANSACConvergenceCriteria(self.max_iterations, 0.999),
+            )  # fmt: skip
+
+        return _by_open3d(register, target, source, self.seed)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -85,19 +83,13 @@ class FpfhFgr:
 
     def match(self, target: DescribedCloud, source: DescribedCloud) -> Match:
         """Where the source lies in the target."""
-        if not len(target) or not len(source):
-            return Match(np.eye(4), 0, 0)
-        from hodge_pipeline.registration.one_thread import o3d
 
-        o3d.utility.random.seed(self.seed)
-        registration = o3d.pipelines.registration
-        option = registration.FastGlobalRegistrationOption(
-            maximum_correspondence_distance=TOLERANCE_VOXELS * self.voxel_m
-        )
-        found = registration.registration_fgr_based_on_feature_matching(
-            source.geometry, target.geometry, source.open3d_features, target.open3d_features, option
-        )
-        return _from_open3d(found, len(source))
+        def register(methods: Any, *clouds: Any) -> Any:
+            within_m = TOLERANCE_VOXELS * self.voxel_m
+            option = methods.FastGlobalRegistrationOption(maximum_correspondence_distance=within_m)
+            return methods.registration_fgr_based_on_feature_matching(*clouds, option)
+
+        return _by_open3d(register, target, source, self.seed)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -156,9 +148,17 @@ def _mutual_matches(target: DescribedCloud, source: DescribedCloud) -> Ints:
     return mutual_matches(target, source)
 
 
-def _from_open3d(found: Any, matches: int) -> Match:
+def _by_open3d(register: Callable[..., Any], target: DescribedCloud, source: DescribedCloud, seed: int) -> Match:
+    """What a method of open3d, given its module, two clouds and their features, finds with this seed."""
+    if not len(target) or not len(source):
+        return Match(np.eye(4), 0, 0)
+    from hodge_pipeline.registration.one_thread import o3d
+
+    o3d.utility.random.seed(seed)
+    clouds = source.geometry, target.geometry, source.open3d_features, target.open3d_features
+    found = register(o3d.pipelines.registration, *clouds)
     motion: Floats = np.asarray(found.transformation, float)
     if not se3.is_motion(motion) or not len(found.correspondence_set):
-        return Match(np.eye(4), 0, matches)
+        return Match(np.eye(4), 0, len(source))
     motion = se3.from_parts(se3.project_to_so3(motion[:3, :3]), motion[:3, 3])
-    return Match(motion, len(found.correspondence_set), matches)
+    return Match(motion, len(found.correspondence_set), len(source))
