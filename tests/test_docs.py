@@ -10,6 +10,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer.main
@@ -109,6 +110,16 @@ def test_python_of_the_quick_start(workplace: Path, monkeypatch: pytest.MonkeyPa
     shown = 'hodge_pipeline.run("tum", "runs/mine", source="SEQUENCE")'
     assert shown in code
     exec(code.replace(shown, f"hodge_pipeline.run({given})"), {"load_recipe": load_recipe})
+
+
+def test_arrays_in_hand(capsys: pytest.CaptureFixture[str]) -> None:
+    code = next(block for block in blocks(DOCS.parent / "README.md", "python") if "from_edges" in block)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    solution = names["solution"]
+    assert solution.metrics["certified"] == 1
+    assert 0 < solution.metrics["objective"] < 25 * 0.1**2
+    assert "globally optimal" in capsys.readouterr().out
 
 
 def tiny(workplace: Path) -> Path:
