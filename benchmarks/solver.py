@@ -64,7 +64,8 @@ Made by `OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/solver.py --
 CPU seconds are medians over the repeats, reading excluded. F is the isotropic objective, chi² the full one: two
 problems with two minima, each with its own seconds. `gradient` is its norm at the end of F over that at the start.
 GTSAM's seconds are for its chordal start and Gauss-Newton on its own objective (3-D graphs only), g2o's for
-Levenberg-Marquardt from the file's poses, its quaternions normalised, in the same run. The last ratios are how many times as long GTSAM took as
+Levenberg-Marquardt from the file's poses, its quaternions normalised, in the same run.
+The last ratios are how many times as long GTSAM took as
 F without the certificate, and as chi². Peak memory is of the process after solving F. `sphere` has the noise of
 sphere_bignoise; the graphs below it show how the cost grows.
 """
