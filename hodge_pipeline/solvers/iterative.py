@@ -52,7 +52,7 @@ class IterativeSolver:
         self.latest = self.precondition(hessian, Modes(positions))
         self.levers = _levers(hessian, positions.shape[1])
         found = self._cg(self.latest, hessian, gradient, tolerance, MOST_STEPS)
-        if found.steps:
+        if found.steps and not found.negative_curvature:
             return found
         self.latest = None  # of a matrix that is not definite
         return replace(found, negative_curvature=True)
