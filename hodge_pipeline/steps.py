@@ -29,7 +29,7 @@ from hodge_pipeline.registration import pairs as pair_stage
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.stages import FrameReader, Workers
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Source, ViewGraph
+from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Source, ViewGraph
 from hodge_pipeline.unordered.tour import propose_along_tour
 
 HELD_OUT = "held_out.npz"
@@ -216,17 +216,14 @@ class BlockStore:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def fuse(job: Job, source: Source, world_from_cam: Floats, number: int) -> dict[str, Path]:
-    """The PLY file of each model, by its name, from the poses of round `number`, the last."""
+def fuse(job: Job, frames: Sequence[Frame], world_from_cam: Floats, number: int) -> dict[str, Path]:
+    """The PLY file of each model, by its name, from the poses (N, 4, 4) that follow from round `number`, the last."""
     last, files = f"solve-{number}", {}
-    # What gave no cloud, such as a scan in other units, was placed by nothing.
-    has_cloud = CloudSet.open(job.path("clouds")).sizes > 0
-    poses = np.where(has_cloud[:, None, None], world_from_cam, np.nan)
     for row, fuser in enumerate(job.recipe.fusion):
         name = f"fuse-{row}"
-        with job.stage(name, f"fusion {row + 1}", len(source.frames), fuser, ("source", last)) as (folder, advance):
+        with job.stage(name, f"fusion {row + 1}", len(frames), fuser, ("source", last)) as (folder, advance):
             if not folder.finished:
-                model = fuser.fuse(source.frames, poses, advance)
+                model = fuser.fuse(frames, world_from_cam, advance)
                 write_ply(folder.path / f"{model.name}.ply", model)
                 for note in model.notes:
                     job.note(note)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.rounds import Round, sequences_of
 from hodge_pipeline.stages import Advance, Workers
-from hodge_pipeline.types import Bools, Floats, Ints, Source
+from hodge_pipeline.types import Bools, CloudSet, Floats, Frame, Ints, Source
 from hodge_pipeline.workspace import key_of
 
 CLOUDS = "clouds"
@@ -114,6 +115,17 @@ def first_poses(job: Job, tracked: Tracked, source: Source) -> Round:
         advance(1)
     ids = np.array([frame.frame_id for frame in source.frames])
     return Round(tracked.steps.as_graph(ids, np.full(len(tracked.steps.pairs), "sequential")), tracked.world_from_key)
+
+
+def frames_to_fuse(job: Job, source: Source, world_from_cam: Floats) -> tuple[Sequence[Frame], Floats]:
+    """Every frame with a pose of its own, key frame or not, and the poses (N, 4, 4); those of frames that nothing
+    placed, such as a scan in other units, are not finite.
+    """
+    if job.tracked is not None:
+        poses = job.tracked.all_poses(world_from_cam)
+        return job.tracked.whole.frames, np.asarray(np.where(job.tracked.found[:, None, None], poses, np.nan))
+    has_cloud = CloudSet.open(job.path(CLOUDS)).sizes > 0
+    return source.frames, np.asarray(np.where(has_cloud[:, None, None], world_from_cam, np.nan))
 
 
 def _track(

@@ -71,6 +71,16 @@ def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeli
     assert rows["result"].ate_rmse_m < 0.02
 
 
+def test_every_frame_that_was_found_is_fused(run: hodge_pipeline.Run) -> None:
+    assert run.tracked is not None
+    job = hodge_pipeline.job.Job(small_recipe(run.folder), None, hodge_pipeline.watch.Nobody())  # type: ignore[arg-type]
+    found = np.arange(FRAMES) != 5
+    job.tracked = replace(run.tracked, found=found)
+    frames, poses = tracked.frames_to_fuse(job, run.source, run.result.world_from_cam)
+    assert len(frames) == FRAMES
+    np.testing.assert_array_equal(np.isfinite(poses).all((1, 2)), found)
+
+
 def test_a_source_that_is_short_enough_is_registered_whole(sequence: Path) -> None:
     recipe = small_recipe(sequence, "key_frames.whole_up_to=64")
     source = TumReader().open(sequence)
