@@ -14,6 +14,7 @@ from hodge_pipeline.solvers.backends import BackendName, backend, choose, instal
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.hodge import solve
+from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.linear import factorise
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, aggregates, multigrid
 from hodge_pipeline.solvers.problem import laplacian
@@ -142,6 +143,19 @@ def rigid_hessian(positions: Floats, tail: Ints, head: Ints) -> bsr_matrix:
     indptr = np.arange(0, 2 * len(tail) + 1, 2)
     matrix = csr_matrix(bsr_matrix((blocks, both.reshape(-1), indptr), shape=(6 * len(tail), 6 * count)))[:, 6:]
     return (matrix.T @ matrix).tobsr((6, 6))
+
+
+def test_a_preconditioner_that_is_not_definite_ends_cg_and_is_made_anew() -> None:
+    matrix = bsr_matrix(np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), blocksize=(6, 6))
+    gradient = np.arange(1.0, 7.0)
+    found = truncated_cg(lambda x: matrix @ x, lambda r: -r, gradient, 1e-9, 50)
+    assert found.negative_curvature
+    assert not found.x.any()
+    solver = IterativeSolver(lambda matrix, modes: lambda matrix, r: r)
+    solver.latest, solver.levers = (lambda matrix, r: -r), np.zeros((1, 3, 3))
+    assert solver.refined(matrix, gradient, 1e-9) is None
+    step = solver.solve(matrix, gradient, 1e-9, 0.0, np.zeros((1, 3)))
+    np.testing.assert_allclose(matrix @ step.x, -gradient, atol=1e-6)
 
 
 def test_aggregates_take_every_vertex_once_and_are_connected() -> None:

@@ -34,6 +34,7 @@ def truncated_cg(
     """The Newton direction to within a tolerance, or up to the first direction of negative curvature (Steihaug 1983).
 
     `tolerance` is on the residual's norm in the preconditioner's metric, relative to that of g.
+    It ends as at negative curvature where the preconditioner turns out not to be definite.
     It also ends where a step, times the steps so far, wins less than `enough` of xᵀ H x + 2 gᵀ x.
     """
     x, r = np.zeros_like(gradient), gradient.copy()
@@ -42,7 +43,7 @@ def truncated_cg(
     direction = -z
     for step in range(1, max_steps + 1):
         if rz <= 0:
-            return CgResult(x, r, step - 1)
+            return CgResult(x, r, step - 1, rz < 0)
         image = apply(direction)
         curvature = float(direction @ image)
         if curvature <= 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import bsr_matrix
@@ -36,26 +36,29 @@ class IterativeSolver:
     def solve(
         self, hessian: bsr_matrix, gradient: Floats, tolerance: float, enough: float, positions: Floats
     ) -> CgResult:
-        """The step x with H x ≈ −g, of poses at these positions (free, d)."""
+        """The step x with H x ≈ −g, H not indefinite, of poses at these positions (free, d)."""
         tolerance = min(tolerance, LOOSEST)
         if self.latest is None or self._turned(hessian, positions.shape[1]) > MOST_TURNED:
             return self._afresh(hessian, gradient, tolerance, positions)
         first = self._cg(self.latest, hessian, gradient, tolerance, STALE_STEPS)
-        if first.steps < STALE_STEPS or first.negative_curvature:
+        if first.steps < STALE_STEPS and not first.negative_curvature:
             return first
         left = float(np.linalg.norm(first.residual) / np.linalg.norm(gradient))
         then = self._afresh(hessian, first.residual, min(tolerance / left, 1.0), positions)
-        return CgResult(first.x + then.x, then.residual, first.steps + then.steps, then.negative_curvature)
+        return CgResult(first.x + then.x, then.residual, first.steps + then.steps)
+
+    def refined(self, exact: bsr_matrix, gradient: Floats, tolerance: float) -> CgResult | None:
+        """The step of another Hessian; None where the latest preconditioner does not serve it, or it is indefinite."""
+        if self.latest is None:
+            return None
+        found = self._cg(self.latest, exact, gradient, min(tolerance, LOOSEST), STALE_STEPS)
+        return None if found.negative_curvature or found.steps == STALE_STEPS else found
 
     def _afresh(self, hessian: bsr_matrix, gradient: Floats, tolerance: float, positions: Floats) -> CgResult:
         self.latest = None  # the old one's memory is better spent on the new one
         self.latest = self.precondition(hessian, Modes(positions))
         self.levers = _levers(hessian, positions.shape[1])
-        found = self._cg(self.latest, hessian, gradient, tolerance, MOST_STEPS)
-        if found.steps and not found.negative_curvature:
-            return found
-        self.latest = None  # of a matrix that is not definite
-        return replace(found, negative_curvature=True)
+        return self._cg(self.latest, hessian, gradient, tolerance, MOST_STEPS)
 
     def _turned(self, hessian: bsr_matrix, dimension: int) -> float:
         """How far the levers have turned since the latest preconditioner was made, as a share of their length."""

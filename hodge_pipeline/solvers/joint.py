@@ -106,11 +106,11 @@ class JointObjective:
         """The step by the exact Hessian near a minimum, elsewhere or where it is not definite by Gauss-Newton's, which
         alone gives a preconditioner.
         """
-        positions = point.translations[: self.problem.free_count]
-        if near and solver.latest is not None:
-            found = solver.solve(self.hessian(point.left), slopes, tolerance, enough, positions)
-            if not found.negative_curvature:
+        if near:
+            found = solver.refined(self.hessian(point.left), slopes, tolerance)
+            if found is not None:
                 return found
+        positions = point.translations[: self.problem.free_count]
         return solver.solve(self.normal_matrix(point.left), slopes, tolerance, enough, positions)
 
     def normal_matrix(self, left: Residuals) -> bsr_matrix:
