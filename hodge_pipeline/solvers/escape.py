@@ -26,6 +26,8 @@ MAX_STEPS = 500
 SETTLED = 1e-6
 """Relative decrease in ten steps below which the lifted descent is over: the rounding costs more."""
 MAX_HALVINGS = 30
+ASKEW = 0.01
+"""Of the way down, added to it at random: a symmetric way can end in a saddle of its symmetry."""
 LOWER = 1e-9
 """Relative decrease of F that counts as an escape."""
 
@@ -62,6 +64,7 @@ def escape(
     frames = np.concatenate([np.swapaxes(point.rotations, 1, 2), np.zeros((problem.count, d, 1))], axis=2)
     across = np.zeros_like(frames)
     across[:, :, d] = answer.direction / np.linalg.norm(answer.direction, axis=1).max()
+    across += ASKEW * np.random.default_rng(0).normal(size=across.shape)
     begin = _line_search(problem, matrix, _at(problem, matrix, frames), across, 1.0)
     if begin is None:
         return NO_WAY
