@@ -11,8 +11,8 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.pieces import Alignment
 from hodge_pipeline.diagnosis.resistance import effective_resistance
-from hodge_pipeline.solvers.newton import Limits, descend
-from hodge_pipeline.solvers.objective import IsotropicObjective
+from hodge_pipeline.solvers.minimise import descend_isotropic
+from hodge_pipeline.solvers.newton import Limits
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -63,8 +63,7 @@ def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> 
     for _ in range(2 if large else 4):
         share = weight[setup.weights.used]
         problem = replace(setup.problem, kappa=share * setup.problem.kappa, tau=share * setup.problem.tau)
-        objective = IsotropicObjective(problem)
-        point = descend(objective, objective.at(rotations, translations), limits, setup.rounding).point
+        point = descend_isotropic(problem, (rotations, translations), limits, setup.rounding).point
         rotations, translations, poses = point.rotations, point.translations, setup.poses(point)
         angle, moved = left_over(chosen, poses)
         squares = (angle / evidence.noise.rotation_rad[used]) ** 2 + (moved / evidence.noise.translation_m[used]) ** 2

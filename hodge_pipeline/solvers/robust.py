@@ -16,8 +16,9 @@ from pydantic.dataclasses import dataclass as stage
 
 from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
 from hodge_pipeline.solvers.hodge import ObjectiveName, solve
-from hodge_pipeline.solvers.newton import Limits, Point, descend
-from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
+from hodge_pipeline.solvers.minimise import descend_isotropic
+from hodge_pipeline.solvers.newton import Limits, Point
+from hodge_pipeline.solvers.objective import residuals
 from hodge_pipeline.solvers.setup import NO_ROWS, Setup, prepare
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
@@ -173,10 +174,9 @@ def _solved(setup: Setup, weights: Floats, point: Point | None) -> Point:
     held = np.maximum(weights, WEIGHT_FLOOR)
     problem = replace(setup.problem, kappa=held * setup.problem.kappa, tau=held * setup.problem.tau)
     weighted = replace(setup, problem=problem)
-    objective = IsotropicObjective(problem)
-    rotations, translations = weighted.initial("chordal") if point is None else (point.rotations, point.translations)
+    begin = weighted.initial("chordal") if point is None else (point.rotations, point.translations)
     limits = Limits(FIRST_STEPS, 1e-3) if point is None else Limits(STEPS_EACH, 1e-6)
-    return descend(objective, objective.at(rotations, translations), limits, weighted.rounding).point
+    return descend_isotropic(problem, begin, limits, weighted.rounding).point
 
 
 def _squares(setup: Setup, point: Point) -> Floats:
