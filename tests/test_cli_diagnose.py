@@ -192,8 +192,12 @@ def test_there_is_a_loop_for_each_hole(seed: int) -> None:
     rng = np.random.default_rng(seed)
     edges = rng.integers(0, 14, (40, 2))
     edges = edges[edges[:, 0] != edges[:, 1]]
-    loops = unfilled_loops(edges, 14)
-    assert len(loops) == betti_numbers(flag_complex(edges, 14))[1]
+    holes = unfilled_loops(edges, 14)
+    loops = holes.loops
+    assert holes.count == len(loops) == betti_numbers(flag_complex(edges, 14))[1]
+    longest = unfilled_loops(edges, 14, most_loops=2)
+    assert longest.count == holes.count
+    np.testing.assert_array_equal(longest.loops.lengths, loops.lengths[-2:])
     poses = se3.exp(rng.normal(size=(14, 6)))
     closed = loop_products(loops, se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]])
     np.testing.assert_allclose(closed, np.broadcast_to(np.eye(4), closed.shape), atol=1e-9)
@@ -201,7 +205,7 @@ def test_there_is_a_loop_for_each_hole(seed: int) -> None:
 
 def test_a_graph_of_too_many_triangles_is_refused() -> None:
     edges = np.array([(i, j) for j in range(9) for i in range(j)])
-    assert len(unfilled_loops(edges, 9)) == 0
+    assert unfilled_loops(edges, 9).count == 0
     with pytest.raises(GraphError, match="at most 10 triangles"):
         unfilled_loops(edges, 9, most_triangles=10)
 

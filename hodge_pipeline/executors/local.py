@@ -78,8 +78,7 @@ class SpawnedWorkers:
         waiting = list(range(len(blocks) - 1, -1, -1))
         running: dict[Future[Any], int] = {}
         while waiting or running:
-            # no more than the pool has hands for: when a worker dies, only blocks that were begun are charged a try
-            while waiting and len(running) < 2 * self._count:
+            while waiting and self._may_begin(waiting[-1], list(running.values()), tries):
                 try:
                     future = self._submit(task, blocks[waiting[-1]])
                 except BrokenProcessPool:  # a worker died with nothing to do, or a moment ago
@@ -96,6 +95,10 @@ class SpawnedWorkers:
                 running.clear()
                 self._recover(lost, tries)
                 waiting += sorted(lost, reverse=True)
+
+    def _may_begin(self, row: int, running: list[int], tries: list[int]) -> bool:
+        """No more blocks than the pool has hands for; one lost before runs alone, so its next death is its own."""
+        return not running or (len(running) < 2 * self._count and not any(tries[other] for other in (row, *running)))
 
     def _recover(self, lost: list[int], tries: list[int]) -> None:
         self.kill()

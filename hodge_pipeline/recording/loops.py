@@ -26,12 +26,12 @@ def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floa
     """What was left out, in words; each hole's loop as a closed line, its label how far the motions around it close."""
     notes: tuple[str, ...] = ()
     try:
-        loops = unfilled_loops(graph.edges, graph.vertex_count)
+        holes = unfilled_loops(graph.edges, graph.vertex_count, most_loops=MOST_LOOPS)
     except GraphError as error:
         notes = (f"recording: no harmonic loops: {error}",)
         log_notes(stream, 0, notes)
         return notes
-    chosen = loops.select(np.arange(len(loops))[::-1][:MOST_LOOPS])
+    chosen = holes.loops.select(np.arange(len(holes.loops))[::-1])
     starts = chosen.offsets[:-1]
     corners = np.split(vertices_along(graph, chosen, np.arange(len(chosen))), starts[1:]) if len(chosen) else []
     lines = [world_from_cam[np.append(each, each[0]), :3, 3].astype(np.float32) for each in corners]
@@ -47,8 +47,8 @@ def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floa
         show_labels=False,
     )
     stream.log(layout.LOOPS, strips, static=True)
-    if len(kept) < len(loops):
-        notes = (f"recording: {len(kept)} of {len(loops)} harmonic loops drawn, the longest",)
+    if len(kept) < holes.count:
+        notes = (f"recording: {len(kept)} of {holes.count} harmonic loops drawn, the longest",)
     log_notes(stream, 0, notes)
     return notes
 
