@@ -113,7 +113,7 @@ def make_report(
     job: Job, source: Source, rounds: Sequence[Round], scores: ScoreTable | None, refined: Refined | None = None
 ) -> Report:
     """Everything that the run measured."""
-    last = rounds[-1]
+    last, whole = rounds[-1], _whole(job, source)
     sets = pose_sets(rounds)
     assert last.solution is not None
     component = last.solution.component
@@ -125,8 +125,9 @@ def make_report(
         source=SourceSummary(
             name=source.name,
             path=str(source.path),
-            frames=len(source.frames),
-            frames_with_truth=sum(frame.world_from_cam is not None for frame in source.frames),
+            frames=len(whole.frames),
+            frames_with_truth=sum(frame.world_from_cam is not None for frame in whole.frames),
+            key_frames=len(source.frames) if len(source.frames) < len(whole.frames) else None,
             sequences=tuple(name for name in sequences_of(source) if name),
             notes=source.notes,
         ),
@@ -146,6 +147,13 @@ def make_report(
         ),
         refinement=None if refined is None else summary(refined.decision),
     )
+
+
+def _whole(job: Job, source: Source) -> Source:
+    """The source with all of its frames, where a run works on key frames alone."""
+    if job.tracked is not None:
+        return job.tracked.whole
+    return source if job.given is None else job.given.whole
 
 
 def _trajectories(job: Job, source: Source, sets: Mapping[str, Floats], component: Ints) -> tuple[TrajectoryRow, ...]:

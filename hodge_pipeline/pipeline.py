@@ -75,7 +75,7 @@ def solve_again(folder: Path | str, *, watcher: Watcher | None = None) -> Run:
     folder = Path(folder)
     listed_edges(folder)
     recipe = load_recipe(str(folder / RECIPE_FILE))
-    with Workspace.open(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
+    with Workspace.reopen(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
         return _run(Job(recipe, workspace, watcher or Nobody(), scoring=False))
 
 

@@ -44,7 +44,7 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
     )
     if changed.recording.level == "off":
         raise WorkspaceError(f"{folder}: its recipe records nothing: add --level normal")
-    with Workspace.open(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
+    with Workspace.reopen(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
         job = Job(changed, workspace, watcher or Nobody(), computes=False, scoring=not _solved_without_scores(folder))
         log.info("recording made again from the run folder")
         missing = ""

@@ -18,9 +18,9 @@ from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.evaluation.scaled_scores import scaled_score_table
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphScores, ScoreTable
 from hodge_pipeline.fusion.ply import write_ply
-from hodge_pipeline.inspection import guess_reader
-from hodge_pipeline.job import Job, source_key, unnamed_key
+from hodge_pipeline.job import Job, unnamed_key
 from hodge_pipeline.measured import digest, joined, measured_edges, without_measured
+from hodge_pipeline.opening import open_source
 from hodge_pipeline.recipe import cloud_options
 from hodge_pipeline.refine.held_out import is_held_out
 from hodge_pipeline.registration import clouds as cloud_stage
@@ -28,7 +28,7 @@ from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
-from hodge_pipeline.stages import FrameReader, Workers
+from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Source, ViewGraph
 from hodge_pipeline.unordered.tour import propose_along_tour
 
@@ -40,7 +40,7 @@ def read(job: Job) -> Source:
     path = job.recipe.source.path
     if path is None:
         raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
-    source, key = (job.opened, unnamed_key()) if job.opened else _open(path, job.recipe.source.reader)
+    source, key = (job.opened, unnamed_key()) if job.opened else open_source(path, job.recipe.source.reader)
     if not source.frames:
         raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
     for note in source.notes:
@@ -52,13 +52,6 @@ def read(job: Job) -> Source:
         return source
     job.given = given.given_poses(job, source)
     return given.key_source(job.given, job.recipe.given.poses == "frames")
-
-
-def _open(path: Path, reader: FrameReader | None) -> tuple[Source, str]:
-    """The source at a path and its key."""
-    reader = reader or guess_reader(path)
-    source = reader.open(path)
-    return source, source_key(source, reader)
 
 
 def measured(job: Job, source: Source) -> ViewGraph:

@@ -53,11 +53,18 @@ class Workspace:
         self._lock = lock
 
     @classmethod
-    def open(cls, folder: Path, recipe: dict[str, Any], *, overwrite: bool = False) -> Workspace:
+    def open(
+        cls,
+        folder: Path,
+        recipe: dict[str, Any],
+        *,
+        overwrite: bool = False,
+        refusal: str = "holds a run of another recipe ({change}): --overwrite replaces it",
+    ) -> Workspace:
         """The run folder for this recipe, made if it is not there.
 
-        Raises `WorkspaceError` where the folder is something else, belongs to another recipe (without `overwrite`)
-        or is in use.
+        Raises `WorkspaceError` where the folder is something else, belongs to another recipe (without `overwrite`;
+        `refusal` then says so, with the first `{change}`) or is in use.
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -66,12 +73,22 @@ class Workspace:
             raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
         _hold(lock, folder)
         try:
-            _check_recipe(folder, recipe, overwrite)
+            _check_recipe(folder, recipe, overwrite, refusal)
             (folder / "stages").mkdir(exist_ok=True)
         except BaseException:
             lock.close()
             raise
         return cls(folder, lock)
+
+    @classmethod
+    def reopen(cls, folder: Path, recipe: dict[str, Any]) -> Workspace:
+        """The run folder of a run that is there, by its own recipe.
+
+        Raises `WorkspaceError` as `open` does, and where another version, which knew other options, has made it.
+        """
+        again = f"hodge run {folder / RECIPE_FILE} --out {folder} --overwrite"
+        refusal = f"was made by another version (the recipe's {{change}}): '{again}' brings it up to date first"
+        return cls.open(folder, recipe, refusal=refusal)
 
     @property
     def identity(self) -> str:
@@ -143,7 +160,7 @@ def _hold(lock: IO[str], folder: Path) -> None:
         raise WorkspaceError(f"{folder}: another run uses this folder: wait for it, or name another folder") from error
 
 
-def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool) -> None:
+def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal: str) -> None:
     """Write the resolved recipe, or refuse a folder that is not this recipe's."""
     path = folder / RECIPE_FILE
     text = yaml_file.dump(recipe)
@@ -152,7 +169,7 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool) -> None
             return
         if not overwrite and _has_stages(folder):
             change = _first_change(yaml_file.read(path).data, recipe)
-            raise WorkspaceError(f"{folder}: holds a run of another recipe ({change}): --overwrite replaces it")
+            raise WorkspaceError(f"{folder}: {refusal.replace('{change}', change)}")
     elif any(entry.name != ".lock" for entry in folder.iterdir()):
         with suppress(OSError):
             (folder / ".lock").unlink()

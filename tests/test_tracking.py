@@ -66,6 +66,9 @@ def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeli
     poses = read_tum(run.folder / "poses.tum")
     assert len(poses) == FRAMES
     assert any("of 64 frames are key frames" in note for note in run.report.notes)
+    keys = len(run.result.world_from_cam)
+    assert run.report.source.counted == f"64 frames, {keys} of them key frames"
+    assert f"64 frames, {keys} of them key frames" in (run.folder / "report.html").read_text("utf-8")
     rows = {row.name: row for row in run.report.trajectories}
     assert rows["result"].frames == FRAMES
     assert rows["result"].ate_rmse_m < 0.02

@@ -67,6 +67,16 @@ def test_another_recipe_is_refused_and_says_what_differs(tmp_path: Path) -> None
     Workspace.open(tmp_path / "run", other).close()
 
 
+def test_a_run_of_another_version_is_told_the_command_that_mends_it(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with Workspace.open(folder, RECIPE) as workspace, workspace.stage("clouds", "key"):
+        pass
+    Workspace.reopen(folder, RECIPE).close()
+    with pytest.raises(WorkspaceError, match=r"another version \(.*pace was None, is 2\)") as refused:
+        Workspace.reopen(folder, {**RECIPE, "pace": 2})
+    assert f"hodge run {folder / 'recipe.yaml'} --out {folder} --overwrite" in str(refused.value)
+
+
 def test_the_description_is_the_last_difference_named_and_a_run_that_never_began_holds_nothing(tmp_path: Path) -> None:
     with Workspace.open(tmp_path / "run", {"description": "one", **RECIPE}) as workspace, workspace.stage("a", "key"):
         pass

@@ -46,7 +46,9 @@ class IclNuimReader:
     every: int = Field(1, ge=1, description="take every n-th frame")
 
     def sniff(self, path: Path) -> Sniff:
-        """Sure of POV-Ray files and of a `.gt.freiburg` beside image lists, less sure of Redwood's folders."""
+        """Sure of POV-Ray files and of a `.gt.freiburg` beside image lists, less sure of Redwood's folders and of
+        lists that number their images.
+        """
         path = Path(path)
         try:
             if path.is_file():
@@ -58,6 +60,9 @@ class IclNuimReader:
                 return Sniff(0.95, "scene_00_0000.depth files")
             if is_redwood(path):
                 return Sniff(0.7, "depth/ and image/ or color/ without lists of stamps")
+            association = find_association_file(path)
+            if association and _is_numbered(association):
+                return Sniff(0.5, f"{association.name} with frame numbers for stamps")
         except (OSError, SourceError):
             return Sniff(0.0, "not a folder that can be read")
         return Sniff(0.0, "no .gt.freiburg, no scene_00_0000.depth, no depth/ beside image/ or color/")
@@ -156,6 +161,13 @@ class IclNuimReader:
 
 def _find_truth(folder: Path) -> Path | None:
     return next(iter(sorted(folder.glob(TRUTH_PATTERN))), None)
+
+
+def _is_numbered(association: Path) -> bool:
+    """Whether its first row has a frame number where TUM has a time."""
+    with association.open(encoding="utf-8", errors="replace") as lines:
+        row = next((line.split() for line in lines if line.strip() and not line.startswith("#")), [""])
+    return row[0].isdigit()
 
 
 def _trajectory(frames: list[Frame]) -> Trajectory | None:

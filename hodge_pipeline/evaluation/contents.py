@@ -13,7 +13,10 @@ from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 @dataclass(frozen=True)
 class SourceSummary:
-    """What was read: how many frames, how many of them with a true pose, and what the reader remarked."""
+    """What was read: how many frames, how many of them with a true pose, and what the reader remarked.
+
+    `key_frames` is None where every frame is a vertex of the graph.
+    """
 
     name: str
     path: str
@@ -21,6 +24,13 @@ class SourceSummary:
     frames_with_truth: int = 0
     sequences: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    key_frames: int | None = None
+
+    @property
+    def counted(self) -> str:
+        """`600 frames`, or `600 frames, 54 of them key frames`."""
+        keys = "" if self.key_frames is None else f", {self.key_frames} of them key frames"
+        return f"{self.frames} frames{keys}"
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from hodge_pipeline.evaluation.tables import (
     score_tables,
     source_table,
     stages_table,
+    vertex_name,
     worst_edges_table,
 )
 from hodge_pipeline.evaluation.verdict import Outcome, judge, percent, suspicions
@@ -98,7 +99,7 @@ def _head(report: Report) -> str:
     )
     return (
         f"<header><h1>{escape(report.title)}</h1>"
-        f'<p class="soft">{escape(source.name)}: {source.frames} frames{sequences}, {truth}. '
+        f'<p class="soft">{escape(source.name)}: {source.counted}{sequences}, {truth}. '
         f"The poses of the frames were made globally consistent; this page says whether that helped.</p></header>"
     )
 
@@ -123,7 +124,10 @@ def _tiles(report: Report) -> str:
     if report.graph is not None:
         parts = len(report.graph.components)
         tiles.append(
-            (f"{report.graph.edges} edges", f"{report.graph.vertices} frames, {_plural(parts, 'connected part')}")
+            (
+                f"{report.graph.edges} edges",
+                f"{report.graph.vertices} {vertex_name(report)}, {_plural(parts, 'connected part')}",
+            )
         )
     if report.stages:
         seconds = sum(stage.wall_s for stage in report.stages)

@@ -27,7 +27,7 @@ def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
     """The report in a few (label, text) lines for a terminal."""
     lines = [("verdict", judge(report).sentence)]
     source, graph = report.source, report.graph
-    lines.append(("source", f"{source.name}, {source.frames} frames, {source.frames_with_truth} with a true pose"))
+    lines.append(("source", f"{source.name}, {source.counted}, {source.frames_with_truth} with a true pose"))
     if graph is not None:
         by_source = ", ".join(f"{count} {name}" for name, count in graph.edges_by_source.items())
         lines.append(("graph", f"{graph.edges} edges ({by_source}), {len(graph.components)} connected part(s)"))
@@ -35,6 +35,11 @@ def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
         wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
         lines.append(("time", f"{wall:.1f} s, {cpu:.1f} CPU s, at most {_peak(report):.0f} MB"))
     return (*lines, *(("note", line) for line in suspicions(report)))
+
+
+def vertex_name(report: Report) -> str:
+    """What the vertices of the viewing graph are."""
+    return "frames" if report.source.key_frames is None else "key frames"
 
 
 def _peak(report: Report) -> float:
@@ -57,7 +62,9 @@ def graph_tables(report: Report) -> Iterator[Table]:
         yield _graph(report)
         if len(report.graph.components) > 1:
             parts = tuple((str(n), str(part.count), part.frames) for n, part in enumerate(report.graph.components))
-            yield Table("Connected parts", ("part", "frames", "which"), parts, "Nothing measured joins two parts.", 3)
+            yield Table(
+                "Connected parts", ("part", vertex_name(report), "which"), parts, "Nothing measured joins two parts.", 3
+            )
     if report.loops:
         yield _loops(report)
 
@@ -120,7 +127,7 @@ def _graph(report: Report) -> Table:
     graph = report.graph
     assert graph is not None
     rows = [
-        ("frames", str(graph.vertices)),
+        (vertex_name(report), str(graph.vertices)),
         ("edges", str(graph.edges)),
         *((f"edges: {name}", str(count)) for name, count in graph.edges_by_source.items()),
         ("edges ignored by the solver", str(graph.edges_ignored)),
@@ -147,6 +154,7 @@ def source_table(report: Report) -> Table:
         ("format", source.name),
         ("path", source.path),
         ("frames", str(source.frames)),
+        *((("key frames", str(source.key_frames)),) if source.key_frames is not None else ()),
         ("frames with a true pose", str(source.frames_with_truth)),
         ("sequences", ", ".join(source.sequences) or "one"),
         *(("reader's remark", note) for note in source.notes),

@@ -1,0 +1,58 @@
+"""A path read by a recipe for another format: the error, or a note, names the right one."""
+
+from pathlib import Path
+
+import pytest
+
+from hodge_adapters.icl_nuim import IclNuimReader
+from hodge_adapters.seven_scenes import SevenScenesReader
+from hodge_adapters.tum import TumReader
+from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.opening import open_source
+
+
+@pytest.fixture(scope="module")
+def tum_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    options = DemoOptions(frames=3, width=80, height=60, stride=1)
+    return make_sequence(tmp_path_factory.mktemp("tum") / "sequence", options)
+
+
+def numbered(folder: Path, tum_folder: Path) -> Path:
+    """The same images as ICL-NUIM lists them: frame numbers for stamps."""
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir()
+        for row, image in enumerate(sorted((tum_folder / name).iterdir())):
+            (folder / name / f"{row}{image.suffix}").write_bytes(image.read_bytes())
+    colour = sorted((folder / "rgb").iterdir())[0].suffix
+    (folder / "associations.txt").write_text("".join(f"{k} depth/{k}.png {k} rgb/{k}{colour}\n" for k in range(3)))
+    return folder
+
+
+def test_a_folder_of_another_format_is_refused_with_its_recipe(tum_folder: Path) -> None:
+    with pytest.raises(SourceError, match=r"no frame-000000.*looks like tum \(.*\): try the recipe tum"):
+        open_source(tum_folder, SevenScenesReader())
+
+
+def test_what_can_be_read_all_the_same_is_noted(tum_folder: Path) -> None:
+    source, _ = open_source(tum_folder, IclNuimReader())
+    assert any("read as icl_nuim, but it looks like tum" in note for note in source.notes)
+
+
+def test_the_right_reader_says_nothing(tum_folder: Path, tmp_path: Path) -> None:
+    for reader in (TumReader(), None):
+        source, _ = open_source(tum_folder, reader)
+        assert len(source.frames) == 3
+        assert not any("looks like" in note for note in source.notes)
+    source, _ = open_source(numbered(tmp_path, tum_folder), IclNuimReader())
+    assert len(source.frames) == 3
+    assert not any("looks like" in note for note in source.notes)
+
+
+def test_a_path_that_is_nothing_keeps_its_own_error(tmp_path: Path) -> None:
+    with pytest.raises(SourceError) as refused:
+        open_source(tmp_path / "absent", TumReader())
+    assert "looks like" not in str(refused.value)
+    with pytest.raises(SourceError, match="no depth.txt") as refused:
+        open_source(tmp_path, TumReader())
+    assert "looks like" not in str(refused.value)
