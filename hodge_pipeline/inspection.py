@@ -12,6 +12,7 @@ from hodge_pipeline.errors import HodgeError, SourceError
 from hodge_pipeline.inspection_frames import frame_facts, trajectory_facts
 from hodge_pipeline.inspection_graph import graph_facts
 from hodge_pipeline.stages import FrameReader, Sniff
+from hodge_pipeline.unknown_path import unknown
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,7 @@ def guess_reader(path: Path, known: Sequence[Guess] | None = None) -> FrameReade
         raise SourceError(f"{path}: neither a file nor a folder: give one that holds data")
     best = guesses(path) if known is None else known
     if not best:
-        readers = ", ".join(registry.names("readers"))
-        remedy = "name one with --reader, in a run with --set source.reader="
-        raise SourceError(f"{path}: no reader knows this format (readers: {readers}): {remedy}")
+        raise unknown(path)
     reader: FrameReader = registry.load("readers", best[0].name)()
     return reader
 

@@ -42,10 +42,14 @@ def no_progress(done: int) -> None:
 
 @dataclass(frozen=True)
 class Sniff:
-    """How sure a reader is that a path is its format: `confidence` in [0, 1], and why, in a few words."""
+    """How sure a reader is that a path is its format: `confidence` in [0, 1], and why, in a few words.
+
+    `advice` says what a path is that the reader knows but cannot open, and what to give instead.
+    """
 
     confidence: float
     reason: str
+    advice: str = ""
 
 
 @runtime_checkable

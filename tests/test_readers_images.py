@@ -125,3 +125,16 @@ def test_the_common_size_survives_a_damaged_and_an_odd_image(tmp_path: Path) -> 
     assert images.common_size(paths) == (WIDTH, HEIGHT)
     with pytest.raises(SourceError, match="0.png"):
         images.common_size(paths[:1])
+
+
+def test_a_jpeg_that_was_overwritten_in_part_is_refused(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
+    for flags in ([], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 4]):
+        path = tmp_path / "image.jpg"
+        contents = bytearray(cv2.imencode(".jpg", image, flags)[1].tobytes())
+        path.write_bytes(contents + b"\xff\xd9 behind the end")
+        assert images.read_colour(path).shape == (120, 160, 3)
+        contents[-3000:-1000] = np.random.default_rng(1).bytes(2000)
+        path.write_bytes(contents)
+        with pytest.raises(SourceError, match="truncated or damaged"):
+            images.read_colour(path)

@@ -14,6 +14,20 @@ from hodge_pipeline.recording.merge import find_parts
 from test_recording import circle, record, record_all, rows
 from test_recording_run import entities
 
+TRIES = 120
+
+
+def merged_when_it_holds(wanted: set[str], saved: Path) -> Path:
+    """What a listener saved, as one good recording: it writes what it received a moment later, so look again."""
+    mended = saved.with_name("mended.rrd")
+    merge = ["rrd", "merge", "--continue-on-error", str(saved), "-o", str(mended)]
+    for _ in range(TRIES):
+        binary.run(merge, binary.quiet_environment(saved.parent))
+        if entities(mended) >= wanted:
+            return mended
+        time.sleep(0.5)
+    raise AssertionError(f"{wanted - entities(mended)} never came")
+
 
 def test_a_viewer_gets_each_part_once(tmp_path: Path) -> None:
     port, saved = live.free_port(0), tmp_path / "saved.rrd"
@@ -27,14 +41,10 @@ def test_a_viewer_gets_each_part_once(tmp_path: Path) -> None:
         record_all(record(tmp_path / "parts"))
         shown.show(find_parts(tmp_path / "parts"))
         shown.close()
-        time.sleep(1)
+        mended = merged_when_it_holds({layout.COLOUR, layout.FILM_EDGES, layout.MODEL, layout.LEGEND}, saved)
     finally:
         listener.terminate()
-        listener.wait(timeout=10)
-    mended = tmp_path / "mended.rrd"
-    merge = ["rrd", "merge", "--continue-on-error", str(saved), "-o", str(mended)]
-    binary.run(merge, binary.quiet_environment(tmp_path))
-    assert entities(mended) >= {layout.COLOUR, layout.FILM_EDGES, layout.MODEL, layout.LEGEND}
+        listener.wait()
     assert len(rows(mended, layout.poses("odometry"), layout.FRAME)) == 12
 
 

@@ -22,7 +22,7 @@ from hodge_adapters.colmap_cameras import (
 from hodge_adapters.colmap_database import database_pairs
 from hodge_adapters.colmap_depth import depth_map_size, sensor_depth, stereo_depth
 from hodge_adapters.colmap_edges import Pair, covisible_pairs, measured_graph
-from hodge_adapters.colmap_files import find_database, find_folder, find_model, load_model, parent_of
+from hodge_adapters.colmap_files import find_database, find_folder, find_model, load_model, parent_of, part_of_model
 from hodge_adapters.colmap_records import CameraRecord, ImageRecord, Model
 from hodge_adapters.colmap_scale import metres_per_unit, scaled_graph, scaled_poses
 from hodge_adapters.text_rows import inside, listed
@@ -75,7 +75,7 @@ class ColmapReader:
         except OSError:
             return Sniff(0.0, "not a folder that can be read")
         if model is None:
-            return Sniff(0.0, "no cameras.bin and images.bin, nor .txt")
+            return Sniff(0.0, "no cameras.bin and images.bin, nor .txt", part_of_model(Path(path)))
         return Sniff(0.9, f"cameras and images in {model.name or model}")
 
     def open(self, path: Path) -> Source:

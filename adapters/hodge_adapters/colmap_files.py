@@ -14,12 +14,22 @@ from hodge_pipeline.errors import SourceError
 
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
 PARENTS = 3
+MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 _DIGITS = re.compile(r"(\d+)")
 
 
 def find_model(path: Path) -> Path | None:
     """The folder with the cameras and images of a model: the path itself, or its usual places below."""
     return next((path / place for place in MODEL_PLACES if model_ending(path / place)), None)
+
+
+def part_of_model(path: Path) -> str:
+    """What to give instead of a file of COLMAP's, empty for any other."""
+    if path.suffix == ".db" and path.is_file():
+        return "a database of COLMAP's has matches, no poses: give the folder of a model, with --database for this one"
+    if path.stem in MODEL_FILES and path.suffix in (".bin", ".txt") and model_ending(path.parent):
+        return f"one file of a COLMAP model: give its folder {path.parent}"
+    return ""
 
 
 def model_ending(folder: Path) -> str | None:

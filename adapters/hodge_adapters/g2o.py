@@ -13,7 +13,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as stage
 
 from hodge_adapters import g2o_priors
-from hodge_adapters.pose_graph_text import Records, count_tags, read_records, write_lines
+from hodge_adapters.pose_graph_text import LANDMARK_TAGS, Records, count_tags, read_records, write_lines
 from hodge_adapters.posed import length_notes
 from hodge_adapters.text_rows import write_text_atomically
 from hodge_pipeline import se3
@@ -167,11 +167,22 @@ def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: in
 def skipped(other: dict[str, int]) -> list[str]:
     """A note for each kind of line that is not read, with its count."""
     shown = sorted(other.items(), key=lambda item: -item[1])
-    notes = [f"{count} lines of kind {tag} are not read" for tag, count in shown[:SKIPPED_TAGS_SHOWN]]
+    notes = [f"{count} lines of kind {tag} are not read{_meaning(tag)}" for tag, count in shown[:SKIPPED_TAGS_SHOWN]]
     if len(shown) > SKIPPED_TAGS_SHOWN:
         rest = shown[SKIPPED_TAGS_SHOWN:]
         notes.append(f"{sum(count for _, count in rest)} lines of {len(rest)} more kinds are not read")
     return notes
+
+
+def _meaning(tag: str) -> str:
+    return ": landmarks, where only edges between poses are solved" if tag in LANDMARK_TAGS else ""
+
+
+def refuse_landmarks_alone(path: Path, other: dict[str, int]) -> None:
+    """Raise `SourceError` for a file without poses that has landmarks."""
+    tags = sorted(LANDMARK_TAGS & set(other))
+    if tags:
+        raise SourceError(f"{path}: holds landmarks alone ({', '.join(tags)}): edges between poses are needed")
 
 
 KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1, **g2o_priors.KEYS}
@@ -196,6 +207,7 @@ def load_g2o(path: Path | str) -> Source:
     if spatial and planar:
         raise SourceError(f"{path}: holds both EDGE_SE3:QUAT and EDGE_SE2: split it, one dimension to a file")
     if not spatial and not planar and not len(records["VERTEX_SE3:QUAT"]) and not len(records["VERTEX_SE2"]):
+        refuse_landmarks_alone(path, other)
         raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
     dimension = 2 if planar or len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"]) else 3
     half = _planar(records) if dimension == 2 else _spatial(records)
@@ -212,9 +224,12 @@ class G2oReader:
     def sniff(self, path: Path) -> Sniff:
         """How sure it is: by the tags of the first lines."""
         tags = count_tags(path)
-        known = sum(count for tag, count in tags.items() if tag in KEYS)
+        known = [tag for tag in tags if tag in KEYS]
         if known:
-            return Sniff(0.95, f"lines of kind {next(tag for tag in tags if tag in KEYS)}")
+            return Sniff(0.95, f"lines of kind {known[0]}")
+        landmarks = sorted(LANDMARK_TAGS & set(tags))
+        if landmarks:
+            return Sniff(0.5, f"landmarks: lines of kind {landmarks[0]}")
         return Sniff(0.2 if path.suffix == ".g2o" else 0.0, "no g2o line at its beginning")
 
     def open(self, path: Path) -> Source:

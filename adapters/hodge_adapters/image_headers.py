@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from dataclasses import dataclass
@@ -13,8 +14,11 @@ MAX_PIXELS = 1 << 26
 """No depth or colour camera is larger than 64 megapixels; a header that says so would only exhaust memory."""
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_START, _JPEG_END = b"\xff\xd8", 0xD9
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_BETWEEN_SCANS = frozenset((0xC4, 0xCC, 0xDA, 0xDB, 0xDC, 0xDD, 0xFE, *range(0xE0, 0xF0)))
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7]", re.DOTALL)
+"""Within coded data 0xFF is followed by 0 or a restart marker."""
 _JPEG_BARE_MARKERS = frozenset((0x01, *range(0xD0, 0xD9)))
 
 
@@ -45,7 +49,10 @@ def parse_header(contents: bytes, path: Path) -> ImageHeader:
 
 
 def is_complete(contents: bytes, header: ImageHeader) -> bool:
-    """Whether the file goes on to its end marker, and a PNG's checksums hold; a JPEG has none."""
+    """Whether the file goes on to its end marker, and a PNG's checksums hold.
+
+    A JPEG has none: what overwrote a part of it is seen by markers that cannot stand there, a few changed bits are not.
+    """
     return _png_is_complete(contents) if header.media_type == "image/png" else _jpeg_is_complete(contents, header)
 
 
@@ -69,7 +76,18 @@ def _parse_jpeg(contents: bytes, path: Path) -> ImageHeader:
 
 def _jpeg_is_complete(contents: bytes, header: ImageHeader) -> bool:
     # An embedded thumbnail has an end marker of its own, so only one after the header counts.
-    return contents.rfind(_JPEG_END) >= header.body
+    at = header.body
+    while found := _JPEG_MARKER.search(contents, at):
+        marker, at = contents[found.end() - 1], found.end()
+        if marker == _JPEG_END:
+            return True
+        if marker == 0xFF:
+            at -= 1
+        elif marker in _JPEG_BETWEEN_SCANS and at + 2 <= len(contents):
+            at += struct.unpack_from(">H", contents, at)[0]
+        else:
+            return False
+    return False
 
 
 def _png_is_complete(contents: bytes) -> bool:

@@ -14,6 +14,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 
 METADATA = "metadata.yaml"
+SQLITE_REMEDY = "convert it with `ros2 bag convert` to storage mcap"
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,15 @@ def sniff_recording(path: Path) -> Sniff:
         if path.is_file():
             with open(path, "rb") as file:
                 is_mcap = file.read(len(MAGIC)) == MAGIC
-            return Sniff(1.0, "starts as an MCAP file") if is_mcap else Sniff(0.0, "does not start as an MCAP file")
+            if is_mcap:
+                return Sniff(1.0, "starts as an MCAP file")
+            return Sniff(0.0, "does not start as an MCAP file", _other_recording(path))
         if path.is_dir() and any(path.glob("*.mcap")):
             return Sniff(0.9, METADATA) if (path / METADATA).is_file() else Sniff(0.7, "a folder with .mcap files")
     except OSError:
         return Sniff(0.0, "cannot be read")
-    return Sniff(0.0, "neither an MCAP file nor a folder with one")
+    advice = f"no .mcap file in this bag: {_remedy(path)}" if (path / METADATA).is_file() else ""
+    return Sniff(0.0, "neither an MCAP file nor a folder with one", advice)
 
 
 def find_files(path: Path, notes: list[str]) -> Listing:
@@ -78,6 +82,18 @@ def _listed(metadata: Path, notes: list[str]) -> list[Path]:
     return [path for path in dict.fromkeys(paths) if path]
 
 
+def _other_recording(path: Path) -> str:
+    """What to do with a file that is nearly a recording, empty for any other."""
+    if path.name == METADATA and any(path.parent.glob("*.mcap")):
+        return f"the list of a bag's files: give its folder {path.parent}"
+    if path.suffix == ".bag":
+        return "a ROS 1 bag: convert it with `mcap convert` and give the .mcap file"
+    if path.suffix == ".db3":
+        return f"an SQLite bag: {SQLITE_REMEDY}"
+    packed = ".mcap." in path.name or path.name.endswith((".tar", ".tar.gz", ".tar.xz", ".tar.zst", ".zip", ".7z"))
+    return "packed: unpack it first" if packed else ""
+
+
 def _names(files: list[Path]) -> str:
     return listed([file.name for file in files])
 
@@ -87,5 +103,5 @@ def _remedy(path: Path) -> str:
     if packed:
         return f"unpack {listed(sorted(packed))} first"
     if any(path.glob("*.db3")):
-        return "convert the SQLite bag with `ros2 bag convert` to storage mcap"
+        return SQLITE_REMEDY
     return "give the folder that a recording was written to"

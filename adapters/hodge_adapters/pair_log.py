@@ -21,6 +21,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Ints, Source, ViewGraph
 
+INFORMATION_ALONE = "the information of pairs alone: give the .log beside it"
 MAX_INFORMATION = 1e100
 """Sums of larger ones are no numbers any more."""
 SPARSE = 10
@@ -41,7 +42,11 @@ class PairLogReader:
         """By the ending, and a first head `i j n` with i ≠ j: a trajectory has i = j."""
         path = Path(path)
         if path.suffix != ".log" or not path.is_file():
-            return Sniff(0.0, "not a .log file")
+            return Sniff(
+                0.0,
+                "not a .log file",
+                INFORMATION_ALONE if path.suffix == ".info" else "",
+            )
         try:
             with path.open(encoding="ascii") as file:
                 head = next((line.split() for line in file if line.strip()), [])

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -38,6 +39,13 @@ class Records:
             raise SourceError(f"{self.path}:{self.line_numbers[np.argmax(wrong)]}: {why}")
 
 
+LANDMARK_TAGS = frozenset(
+    ("LANDMARK", "POINT2", "POINT3", "VERTEX_XY", "VERTEX_TRACKXYZ", "VERTEX_POINT_XYZ")
+    + ("EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_SE3_TRACKXYZ", "EDGE_SE3_XYZ", "EDGE_SE2_POINT_XY")
+)
+"""Landmarks and their measurements, of iSAM, TORO and g2o: known, but only edges between poses are solved."""
+
+
 def count_tags(path: Path) -> Counter[str]:
     """How often each first word occurs in the first lines; empty where the path is no readable text."""
     try:
@@ -48,8 +56,13 @@ def count_tags(path: Path) -> Counter[str]:
     return Counter(line.split(None, 1)[0] for line in lines if line.strip() and not line.startswith("#"))
 
 
-def read_records(path: Path, keys: Mapping[str, int], columns: Columns) -> tuple[dict[str, Records], dict[str, int]]:
-    """The records of each known tag (all tags present, empty where the file has none) and counts of other tags."""
+def read_records(
+    path: Path, keys: Mapping[str, int], columns: Columns, other_names: Mapping[str, str] = MappingProxyType({})
+) -> tuple[dict[str, Records], dict[str, int]]:
+    """The records of each known tag (all tags present, empty where the file has none) and counts of other tags.
+
+    A tag that is among the `other_names` is read as the one it stands for.
+    """
     try:
         lines = Path(path).read_text(encoding="ascii").split("\n")
     except (OSError, UnicodeDecodeError) as error:
@@ -61,7 +74,7 @@ def read_records(path: Path, keys: Mapping[str, int], columns: Columns) -> tuple
         parts = line.split(None, 1)
         if not parts or parts[0].startswith("#"):
             continue
-        tag = parts[0]
+        tag = other_names.get(parts[0], parts[0])
         if tag in numbers:
             numbers[tag].append(number)
             rests[tag].append(parts[1] if len(parts) > 1 else "")

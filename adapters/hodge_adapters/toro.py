@@ -1,4 +1,4 @@
-"""TORO (and iSAM) pose graphs: VERTEX2/3, EDGE2/3 and EQUIV lines with Euler angles, information in radians.
+"""TORO (and iSAM) pose graphs: VERTEX2/3, EDGE2/3, ODOMETRY and EQUIV lines with Euler angles, information in radians.
 
 Two dialects of EDGE2 information occur: TORO's own order xx xy yy θθ xθ yθ, and iSAM's, row by row, xx xy xθ yy yθ θθ,
 in files without vertices. iSAM writes a square root of the information; since no file says so, it is read as it stands.
@@ -18,6 +18,7 @@ from hodge_adapters.g2o import (
     as_source,
     lift_information,
     lift_poses,
+    refuse_landmarks_alone,
     skipped,
     upper_triangle,
 )
@@ -29,6 +30,8 @@ from hodge_pipeline.types import Floats, Ints, Source
 
 KEYS = {"VERTEX2": 1, "EDGE2": 2, "VERTEX3": 1, "EDGE3": 2, "EQUIV": 2}
 COLUMNS = {"VERTEX2": (3,), "EDGE2": (9, 3), "VERTEX3": (6,), "EDGE3": (27, 6), "EQUIV": (0,)}
+OTHER_NAMES = {"ODOMETRY": "EDGE2", "EDGE": "EDGE2", "VERTEX": "VERTEX2"}
+"""As iSAM names the edges of the vehicle's own path, and as both were named at first."""
 TORO_ORDER = np.array([0, 1, 4, 2, 5, 3])
 """Where xx xy xθ yy yθ θθ stand in TORO's xx xy yy θθ xθ yθ."""
 
@@ -85,11 +88,12 @@ def load_toro(path: Path | str) -> Source:
     Raises `SourceError` with file and line where one is malformed.
     """
     path = Path(path)
-    records, other = read_records(path, KEYS, COLUMNS)
+    records, other = read_records(path, KEYS, COLUMNS, OTHER_NAMES)
     spatial, planar = len(records["EDGE3"]), len(records["EDGE2"])
     if spatial and planar:
         raise SourceError(f"{path}: holds both EDGE3 and EDGE2: split it, one dimension to a file")
     if not spatial and not planar:
+        refuse_landmarks_alone(path, other)
         raise SourceError(f"{path}: no TORO edge in it: expected lines such as EDGE3 or EDGE2")
     notes = skipped(other)
     half = _planar(records, notes) if planar else _spatial(records)
@@ -105,7 +109,7 @@ class ToroReader:
 
     def sniff(self, path: Path) -> Sniff:
         """How sure it is: by the tags of the first lines."""
-        known = [tag for tag in count_tags(path) if tag in KEYS]
+        known = [tag for tag in count_tags(path) if tag in KEYS or tag in OTHER_NAMES]
         if known:
             return Sniff(0.9, f"lines of kind {known[0]}")
         return Sniff(0.0, "no TORO line at its beginning")

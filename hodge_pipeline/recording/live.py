@@ -26,7 +26,7 @@ from hodge_pipeline.recording.stream import log_markdown, open_stream
 HOST = "127.0.0.1"
 PORT = 9876
 WEB_PORT = 9090
-START_S = 15.0
+START_S = 60.0
 
 
 class Live:

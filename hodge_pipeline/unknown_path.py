@@ -1,0 +1,69 @@
+"""What to say of a path that no reader knows: what it nearly is, or which of the paths in it are known."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from hodge_pipeline import registry
+from hodge_pipeline.errors import HodgeError, SourceError
+from hodge_pipeline.stages import FrameReader
+
+LOOKED_AT = 60
+"""Paths inside a folder that the readers are asked about: some hundredths of a second."""
+DEPTH = 3
+NAMED = 3
+
+
+def unknown(path: Path) -> SourceError:
+    """The error for a path that no reader knows, in one line that says what to do."""
+    readers = {name: registry.load("readers", name)() for name in _loadable()}
+    advice = [sniff.advice for sniff in (reader.sniff(path) for reader in readers.values()) if sniff.advice]
+    inside = [] if advice else _inside(path, readers)
+    if advice:
+        return SourceError(f"{path}: {advice[0]}")
+    if inside:
+        named = ", ".join(f"{found} ({name})" for found, name in inside[:NAMED])
+        more = "" if len(inside) <= NAMED else " and others"
+        return SourceError(f"{path}: is no source itself, but holds some: give {named}{more}")
+    remedy = "name one with --reader, in a run with --set source.reader="
+    return SourceError(f"{path}: no reader knows this format (readers: {', '.join(readers)}): {remedy}")
+
+
+def _loadable() -> Iterator[str]:
+    for name in registry.names("readers"):
+        try:
+            registry.load("readers", name)()
+        except HodgeError:
+            continue
+        yield name
+
+
+def _inside(folder: Path, readers: dict[str, FrameReader]) -> list[tuple[Path, str]]:
+    """Paths in the folder that a reader knows, with its name; what lies in one of them is its own."""
+    found: list[tuple[Path, str]] = []
+    level, left = [folder] if folder.is_dir() else [], LOOKED_AT
+    for _ in range(DEPTH):
+        deeper = []
+        for path in (child for parent in level for child in _children(parent)):
+            if left == 0 or len(found) > NAMED:
+                return found
+            left -= 1
+            sniffs = [(reader.sniff(path).confidence, name) for name, reader in readers.items()]
+            confidence, name = max(sniffs)
+            if confidence > 0:
+                found.append((path, name))
+            elif path.is_dir() and not path.is_symlink():
+                deeper.append(path)
+        level = deeper
+    return found
+
+
+def _children(folder: Path) -> list[Path]:
+    """Folders first, each by name; none where the folder may not be read."""
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError:
+        return []
+    return sorted((folder / name for name in names if not name.startswith(".")), key=lambda path: not path.is_dir())

@@ -1,0 +1,97 @@
+"""A path that no reader opens is told what it is, or what to give instead, in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hodge_adapters.g2o import load_g2o
+from hodge_adapters.toro import load_toro
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.inspection import guess_reader, inspect
+from readers_data import tum_folder
+
+ISAM = (
+    "ODOMETRY 0 1 1 0 0.1 4 0 0 9 0 1\n"
+    "LANDMARK 0 5 2 3 0.4 0 0.4\n"
+    "ODOMETRY 1 2 1 0 0.1 4 0 0 9 0 1\n"
+    "LANDMARK 1 5 1 3 0.4 0 0.4\n"
+)  # fmt: skip
+
+
+def complaint(path: Path) -> str:
+    with pytest.raises(SourceError) as error:
+        inspect(path)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_a_folder_of_sources_names_them(tmp_path: Path) -> None:
+    tum_folder(tmp_path / "data/room/first")
+    (tmp_path / "data/loop.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    (tmp_path / "data/again").symlink_to(tmp_path)
+    told = complaint(tmp_path)
+    assert told.endswith(f"give {tmp_path / 'data/loop.g2o'} (g2o), {tmp_path / 'data/room/first'} (tum)")
+
+
+def test_a_folder_of_many_sources_names_a_few(tmp_path: Path) -> None:
+    for number in range(200):
+        (tmp_path / f"{number:03}.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    assert complaint(tmp_path).endswith("002.g2o (g2o) and others")
+
+
+def test_a_folder_of_nothing_known_says_so(tmp_path: Path) -> None:
+    (tmp_path / "a/b/c/d").mkdir(parents=True)
+    (tmp_path / "a/words.md").write_text("words\n")
+    assert "no reader knows this format" in complaint(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("images.txt", "one file of a COLMAP model: give its folder"),
+        ("points3D.txt", "one file of a COLMAP model: give its folder"),
+        ("database.db", "give the folder of a model, with --database for this one"),
+        ("gt.info", "give the .log beside it"),
+        ("drive.bag", "a ROS 1 bag: convert it with `mcap convert`"),
+        ("drive_0.db3", "an SQLite bag: convert it with `ros2 bag convert`"),
+        ("drive.mcap.zstd", "packed: unpack it first"),
+        ("bag.tar.xz", "packed: unpack it first"),
+    ],
+)
+def test_a_file_that_is_nearly_a_source(tmp_path: Path, name: str, advice: str) -> None:
+    for part in ("cameras.txt", "images.txt", name):
+        (tmp_path / part).write_text("")
+    assert advice in complaint(tmp_path / name)
+
+
+def test_a_bag_of_sqlite_files(tmp_path: Path) -> None:
+    for part in ("metadata.yaml", "drive_0.db3"):
+        (tmp_path / part).write_text("")
+    assert "no .mcap file in this bag: convert it with `ros2 bag convert`" in complaint(tmp_path)
+
+
+def test_of_a_graph_with_landmarks_the_poses_are_solved(tmp_path: Path) -> None:
+    path = tmp_path / "drive.txt"
+    path.write_text(ISAM)
+    source = guess_reader(path).open(path)
+    assert source.graph is not None and source.graph.edges.tolist() == [[0, 1], [1, 2]]
+    assert "2 lines of kind LANDMARK are not read: landmarks, where only edges between poses are solved" in source.notes
+
+
+def test_landmarks_alone_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "isam.txt").write_text("LANDMARK 0 5 2 3 0.4 0 0.4\n")
+    (tmp_path / "g2o.txt").write_text("VERTEX_XY 5 1 2\nEDGE_SE2_XY 0 5 2 3 0.4 0 0.4\n")
+    assert "holds landmarks alone (LANDMARK)" in complaint(tmp_path / "isam.txt")
+    assert "holds landmarks alone (EDGE_SE2_XY, VERTEX_XY)" in complaint(tmp_path / "g2o.txt")
+    with pytest.raises(SourceError, match="landmarks alone"):
+        load_toro(tmp_path / "isam.txt")
+    with pytest.raises(SourceError, match="landmarks alone"):
+        load_g2o(tmp_path / "g2o.txt")
+
+
+def test_the_first_names_of_edges_and_vertices(tmp_path: Path) -> None:
+    (tmp_path / "old.graph").write_text("VERTEX 0 0 0 0\nVERTEX 1 1 0 0\nEDGE 0 1 1 0 0 1 0 1 1 0 0\n")
+    facts = inspect(tmp_path / "old.graph")
+    assert facts["graph"]["edges"] == 1 and facts["trajectory poses"] == 2
