@@ -87,7 +87,8 @@ def test_gtsam_keys_of_64_bits_survive(tmp_path):
 def test_what_is_not_read_is_counted(tmp_path):
     path = write(tmp_path / "a.g2o", "VERTEX_XY 5 1 1", EDGE, "VERTEX_XY 6 1 1", "VERTEX_SE3:QUAT 7 0 0 0 0 0 0 1")
     notes = G2oReader().open(path).notes
-    assert "2 lines of kind VERTEX_XY are not read" in notes
+    meaning = "landmarks, where only edges between poses are solved"
+    assert f"2 lines of kind VERTEX_XY are not read: {meaning}" in notes
     assert "1 of 2 vertices are named by edges only: no initial poses" in notes
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+ALONE = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+"""What is on it would be imported before the wheel."""
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +37,7 @@ def hodge(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (site / "libraries.pth").write_text("".join(f"{path}\n" for path in libraries))
     where = subprocess.run(
         [python, "-c", "import hodge_pipeline as p, hodge_adapters as a; print(p.__file__, a.__file__)"],
-        check=True, capture_output=True, text=True, cwd=home,
+        check=True, capture_output=True, text=True, cwd=home, env=ALONE,
     ).stdout  # fmt: skip
     assert where.count(str(site)) == 2
     return home / "bin" / "hodge"
@@ -49,7 +51,9 @@ def test_the_wheel_holds_both_packages_and_the_recipes(wheel: Path) -> None:
 
 def test_it_finds_its_recipes_and_stages(hodge: Path, tmp_path: Path) -> None:
     def output(*arguments: str) -> str:
-        return subprocess.run([hodge, *arguments], check=True, capture_output=True, text=True, cwd=tmp_path).stdout
+        return subprocess.run(
+            [hodge, *arguments], check=True, capture_output=True, text=True, cwd=tmp_path, env=ALONE
+        ).stdout
 
     assert "seven_scenes" in output("recipes")
     assert "broken" not in output("stages")
@@ -60,7 +64,7 @@ def test_it_runs_the_demo(hodge: Path, tmp_path: Path) -> None:
     light = ["clouds.voxel_m=0.08", "outer_iterations=1", "fusion=[{stage: cloud, voxel_m: 0.05}]"]
     light += ["evaluation.tables=false", "recording.level=summary"]
     command = [hodge, "demo", "--out", "run", *(word for change in light for word in ("--set", change))]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, env=dict(os.environ))
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, env=ALONE)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "run/recording.rrd").stat().st_size > 10_000
     assert "Improved" in done.stdout

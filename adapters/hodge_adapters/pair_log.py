@@ -42,11 +42,7 @@ class PairLogReader:
         """By the ending, and a first head `i j n` with i ≠ j: a trajectory has i = j."""
         path = Path(path)
         if path.suffix != ".log" or not path.is_file():
-            return Sniff(
-                0.0,
-                "not a .log file",
-                INFORMATION_ALONE if path.suffix == ".info" else "",
-            )
+            return Sniff(0.0, "not a .log file", INFORMATION_ALONE if path.suffix == ".info" else "")
         try:
             with path.open(encoding="ascii") as file:
                 head = next((line.split() for line in file if line.strip()), [])
