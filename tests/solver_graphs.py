@@ -3,10 +3,11 @@
 import dataclasses
 
 import numpy as np
+from scipy.sparse import csc_matrix
 
 from hodge_adapters.g2o import information_for_file, load_g2o
 from hodge_pipeline import se3
-from hodge_pipeline.types import ViewGraph
+from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 CERTIFIED_OPTIMA = {
     "smallGrid3D": 1025.39806,
@@ -54,3 +55,12 @@ def as_sesync_reads_it(data_dir, name):
     return dataclasses.replace(
         file.graph, information=np.roll(information_for_file(file.graph.information), (3, 3), axis=(1, 2))
     )
+
+
+def laplacian(tail: Ints, head: Ints, weights: Floats, free_count: int) -> csc_matrix:
+    """The weighted graph Laplacian of the first `free_count` vertices, the others pinned."""
+    rows = np.concatenate([tail, head, tail, head])
+    columns = np.concatenate([tail, head, head, tail])
+    values = np.concatenate([weights, weights, -weights, -weights])
+    kept = (rows < free_count) & (columns < free_count)
+    return csc_matrix((values[kept], (rows[kept], columns[kept])), shape=(free_count, free_count))

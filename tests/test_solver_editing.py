@@ -8,8 +8,8 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.editing import GraphEditor
 from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.solvers.linear import corrected, factorise
-from hodge_pipeline.solvers.problem import laplacian
 from hodge_pipeline.types import Solution, ViewGraph
+from solver_graphs import laplacian
 
 
 def ring(seed: int = 0, noise: float = 0.1, count: int = 10) -> ViewGraph:

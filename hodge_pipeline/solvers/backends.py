@@ -14,6 +14,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.cg import truncated_cg
@@ -27,8 +28,10 @@ ITERATIVE_FROM = 15_000
 """Vertices: below, a factorisation and a hundred solves cost less than the hierarchies."""
 CHAIN_EDGES_PER_VERTEX = 1.5
 """With more, so large a graph fills up: its order of elimination is not even looked for."""
-LARGEST_CORE = 50_000
-"""Vertices that the block elimination may leave over for such an order."""
+WIDEST = 5.0
+"""Of the levels of what the block elimination leaves over, as a share of the square root of its vertices: those of
+street maps are half as wide. Of wider ones, as in a lattice or a tangle, the order itself would cost too much.
+"""
 SECONDS_A_PRODUCT, SECONDS_A_BLOCK = 0.25e-9, 6e-6
 """Measured, of one Newton step: of products of entries in a factorisation; of blocks of the matrix by multigrid."""
 JOINT_SIZE = 6
@@ -102,16 +105,26 @@ def choose(name: BackendName, tail: Ints, head: Ints, count: int, direct: bool =
     if name != "auto" or direct or count <= ITERATIVE_FROM:
         return factors, plan_elimination(tail, head, count, fill_reducing_order)
     if len(tail) < CHAIN_EDGES_PER_VERTEX * count:
-        plan = plan_elimination(tail, head, count, _order_of_small)
+        plan = plan_elimination(tail, head, count, _order_of_narrow)
         if SECONDS_A_PRODUCT * JOINT_SIZE**3 * plan.work < SECONDS_A_BLOCK * (count + 2 * len(tail)):
             return factors, plan
     return backend("multigrid"), unordered(count)
 
 
-def _order_of_small(core: csc_matrix) -> Ordering:
-    """The core's order, at infinite cost where it is too large to be worth the look."""
+def _order_of_narrow(core: csc_matrix) -> Ordering:
+    """The core's order, at infinite cost where the core is too wide to be worth the look."""
     size = int(core.shape[0])
-    return fill_reducing_order(core) if size <= LARGEST_CORE else Ordering(np.arange(size), math.inf, math.inf)
+    if not size or _width(core) <= WIDEST * math.sqrt(size):
+        return fill_reducing_order(core)
+    return Ordering(np.arange(size), math.inf, math.inf)
+
+
+def _width(core: csc_matrix) -> float:
+    """How many vertices lie within one level of a breadth-first search, by the median of a narrow order's band."""
+    place = np.argsort(reverse_cuthill_mckee(csr_matrix(core), symmetric_mode=True))
+    columns = np.repeat(np.arange(core.shape[1]), np.diff(core.indptr))
+    reach = np.abs(place[core.indices] - place[columns])
+    return float(np.median(np.maximum.reduceat(reach, core.indptr[:-1])))
 
 
 def _conjugate_gradients(matrix: csr_matrix, precondition: Preconditioning) -> Factor:

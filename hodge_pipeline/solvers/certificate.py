@@ -14,7 +14,7 @@ from scipy.sparse import bsr_matrix, csc_matrix, diags_array
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
 from hodge_pipeline.solvers.linear import factorise, fill_reducing_order, negative_pivots
-from hodge_pipeline.solvers.problem import BlockPattern, Problem, laplacian
+from hodge_pipeline.solvers.problem import BlockPattern, Problem
 from hodge_pipeline.types import Floats, Ints
 
 RELATIVE_SHIFTS = (1e-10, 1e-7)
@@ -126,7 +126,7 @@ def _elimination_order(problem: Problem) -> Ints:
     order = np.arange(problem.count)
     if not problem.structure.elimination.ordered:
         free = problem.free_count
-        order[:free] = fill_reducing_order(laplacian(problem.tail, problem.head, problem.kappa, free)).order
+        order[:free] = fill_reducing_order(problem.structure.laplacian(problem.kappa)).order
     return order
 
 

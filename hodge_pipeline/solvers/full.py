@@ -86,6 +86,8 @@ class FullObjective:
     def step(self, point: Point, tolerance: float, enough: float) -> Step:
         """A Gauss-Newton step by PCG: first with the two Laplacians, with a direct factor once they prove too weak."""
         assert isinstance(point, FullPoint)
+        if isinstance(self.direct, IterativeSolver):
+            self.direct.look(self.problem.tau, point.left.reach)
         gradient, hessian = self.normal_equations(point.left)
         spent, tried = 0, self.direct.steps_to_try(hessian.blocksize[0])
         if tried:

@@ -15,19 +15,31 @@ MOST_STEPS = 300
 STALE_STEPS = 40
 """About what a new preconditioner costs: an old one that needs more is made anew."""
 MOST_TURNED, SAMPLES = 0.05, 10_000
-"""Of the levers' length, in a sample of the blocks: from there on an old preconditioner knows the wrong modes."""
+"""Of the levers' length, in a sample of the edges: from there on an old preconditioner knows the wrong modes."""
 LOOSEST = 0.1
 """Of a step's tolerance: the preconditioner reaches it in a few."""
 
 
 @dataclass
 class IterativeSolver:
-    """Solves with one Hessian after another, and the latest preconditioner."""
+    """Solves with one Hessian after another, and the latest preconditioner, with the levers that it was made for."""
 
     precondition: Preconditioning
     latest: Preconditioner | None = None
     levers: Floats | None = None
+    seen: Floats | None = None
     tried: int = 0
+
+    def look(self, weights: Floats, levers: Floats) -> None:
+        """Take note of the edges' levers (E, d), to be called before a step's matrix is made: a preconditioner that
+        they have turned away from is let go, memory and all.
+        """
+        some = slice(None, None, max(len(levers) // SAMPLES, 1))
+        self.seen = weights[some, None] * levers[some]
+        if self.latest is not None and self.levers is not None:
+            change = np.linalg.norm(self.seen - self.levers)
+            if change > MOST_TURNED * np.linalg.norm(self.levers):
+                self.latest = None
 
     def steps_to_try(self, size: int) -> int:
         """None with another preconditioner."""
@@ -38,7 +50,7 @@ class IterativeSolver:
     ) -> CgResult:
         """The step x with H x ≈ −g, H not indefinite, of poses at these positions (free, d)."""
         tolerance = min(tolerance, LOOSEST)
-        if self.latest is None or self._turned(hessian, positions.shape[1]) > MOST_TURNED:
+        if self.latest is None:
             return self._afresh(hessian, gradient, tolerance, positions)
         first = self._cg(self.latest, hessian, gradient, tolerance, STALE_STEPS)
         if first.steps < STALE_STEPS and not first.negative_curvature:
@@ -57,23 +69,11 @@ class IterativeSolver:
     def _afresh(self, hessian: bsr_matrix, gradient: Floats, tolerance: float, positions: Floats) -> CgResult:
         self.latest = None  # the old one's memory is better spent on the new one
         self.latest = self.precondition(hessian, Modes(positions))
-        self.levers = _levers(hessian, positions.shape[1])
+        self.levers = self.seen
         return self._cg(self.latest, hessian, gradient, tolerance, MOST_STEPS)
-
-    def _turned(self, hessian: bsr_matrix, dimension: int) -> float:
-        """How far the levers have turned since the latest preconditioner was made, as a share of their length."""
-        assert self.levers is not None
-        change = np.linalg.norm(_levers(hessian, dimension) - self.levers)
-        return float(change / max(np.linalg.norm(self.levers), 1e-300))
 
     @staticmethod
     def _cg(operator: Preconditioner, hessian: bsr_matrix, gradient: Floats, tolerance: float, most: int) -> CgResult:
         return truncated_cg(
             lambda x: np.asarray(hessian @ x), lambda r: operator(hessian, r), gradient, tolerance, most
         )
-
-
-def _levers(hessian: bsr_matrix, dimension: int) -> Floats:
-    """What couples rotations and translations in some blocks spread over the matrix."""
-    some = hessian.data[:: max(len(hessian.data) // SAMPLES, 1)]
-    return np.array(some[:, -dimension:, :-dimension])

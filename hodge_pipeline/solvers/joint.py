@@ -22,7 +22,7 @@ from hodge_pipeline.solvers.rotations import axial, exponential, lever
 from hodge_pipeline.solvers.translations import TranslationSolver
 from hodge_pipeline.types import Floats
 
-NEWTON_FROM = 0.1
+NEWTON_FROM = 0.05
 """Of the tolerance asked for, which says how far the minimum is: from there on the exact Hessian pays."""
 
 
@@ -106,6 +106,7 @@ class JointObjective:
         """The step by the exact Hessian near a minimum, elsewhere or where it is not definite by Gauss-Newton's, which
         alone gives a preconditioner.
         """
+        solver.look(self.problem.tau, point.left.shift + point.left.arm)
         if near:
             found = solver.refined(self.hessian(point.left), slopes, tolerance)
             if found is not None:

@@ -25,8 +25,8 @@ ORDERED_TO, MOST_NEIGHBOURS_TRIED = 3000, 6
 """Vertices, and blocks in a row: a level with more of both fills up, and no order is looked for."""
 FACTOR_WORTH = 5
 """Products of blocks for each block of the finest matrix that a level's factor may take: it saves levels, and steps."""
-CHUNK, ROWS = 1 << 14, 1 << 17
-"""Blocks, and block rows, that are taken at a time: their copies stay small."""
+CHUNK, ROWS = 1 << 14, 1 << 11
+"""Blocks, and block rows of a coarser matrix, that are taken at a time: their copies stay small."""
 LEAST_COARSENING = 0.8
 POWER_STEPS = 10
 SAFE_RADIUS = 1.05
@@ -196,17 +196,17 @@ def _level(matrix: bsr_matrix, blocks: Floats, aggregate: Ints, count: int) -> L
         prolong.data[own] += blocks
     else:  # scipy leaves out what cancels, where blocks are numbers
         prolong = _as_blocks(prolong + rigid, size)
-    return Level(damped, prolong, _as_blocks(prolong.transpose(), size), _galerkin(matrix, prolong))
+    restrict = _as_blocks(prolong.transpose(), size)
+    return Level(damped, prolong, restrict, _galerkin(matrix, prolong, restrict))
 
 
-def _galerkin(matrix: bsr_matrix, prolong: bsr_matrix) -> bsr_matrix:
-    """Pᵀ A P, some rows of A at a time, for the memory of A P."""
-    size, count = matrix.blocksize[0], prolong.shape[1]
-    total = bsr_matrix((count, count), blocksize=(size, size))
-    for begin in range(0, len(matrix.indptr) - 1, ROWS):
-        image = _rows(matrix, begin) @ prolong
-        total = total + _rows(prolong, begin).transpose() @ image
-    return _as_blocks(total, size)
+def _galerkin(matrix: bsr_matrix, prolong: bsr_matrix, restrict: bsr_matrix) -> bsr_matrix:
+    """Pᵀ A P, some of its rows at a time, for the memory of Pᵀ A."""
+    size, count = matrix.blocksize[0], prolong.shape[1] // matrix.blocksize[0]
+    parts = [_rows(restrict, begin) @ matrix @ prolong for begin in range(0, count, ROWS)]
+    data, indices = np.concatenate([p.data for p in parts]), np.concatenate([p.indices for p in parts])
+    indptr = np.cumsum(np.concatenate([[0], *(np.diff(p.indptr) for p in parts)]))
+    return _as_blocks(bsr_matrix((data, indices, indptr), shape=(count * size, count * size)), size)
 
 
 def _rows(matrix: bsr_matrix, begin: int) -> bsr_matrix:

@@ -16,7 +16,7 @@ CG_LIMIT_REACHED = "limit of CG steps reached"
 ROUNDING_REACHED = "no further decrease within rounding"
 CG_SHARE = 0.1
 """Of what further steps may still win: where so little is left in a linear system, it is solved."""
-LOOSEST_TOLERANCE, TIGHTEST_TOLERANCE = 0.1, 1e-3
+LOOSEST_TOLERANCE, TIGHTEST_TOLERANCE = 0.05, 1e-3
 
 
 @dataclass(frozen=True)

@@ -118,12 +118,12 @@ class Structure:
         return None if precondition is None else IterativeSolver(precondition)
 
     @cached_property
-    def at_tail(self) -> csr_matrix:
+    def at_tail(self) -> csc_matrix:
         """The matrix (n, E) that sums edge values at the vertex i of each."""
         return _indicator(self.tail, len(self.order))
 
     @cached_property
-    def at_head(self) -> csr_matrix:
+    def at_head(self) -> csc_matrix:
         """The matrix (n, E) that sums edge values at the vertex j of each."""
         return _indicator(self.head, len(self.order))
 
@@ -133,6 +133,16 @@ class Structure:
         rows = np.stack([self.tail, self.head, self.tail, self.head])
         columns = np.stack([self.tail, self.head, self.head, self.tail])
         return BlockPattern.of(rows, columns, (self.free_count, self.free_count))
+
+    def laplacian(self, weights: Floats) -> csc_matrix:
+        """The weighted graph Laplacian of the free vertices."""
+
+        def entries(edges: slice) -> Floats:
+            own = weights[edges]
+            return np.stack([own, own, -own, -own])[..., None, None]
+
+        found = self.symmetric_pattern.assemble(entries, (1, 1))
+        return csc_matrix((found.data.reshape(-1), found.indices, found.indptr), found.shape)
 
     @cached_property
     def coupling_pattern(self) -> BlockPattern:
@@ -203,7 +213,7 @@ class Problem:
         """The scalar Laplacian of κ, factorised once."""
         if self.factors is not None:
             return self.factors.rotation
-        return self.structure.backend.factorise(laplacian(self.tail, self.head, self.kappa, self.free_count))
+        return self.structure.backend.factorise(self.structure.laplacian(self.kappa))
 
     @cached_property
     def translation_factor(self) -> Factor:
@@ -214,21 +224,12 @@ class Problem:
         if len(ratio) and np.ptp(ratio) <= SAME_RATIO * ratio[0]:
             solve, scale = self.rotation_factor.solve, 1 / ratio[0]
             return Factor(self.free_count, lambda rhs: scale * solve(rhs))
-        return self.structure.backend.factorise(laplacian(self.tail, self.head, self.tau, self.free_count))
+        return self.structure.backend.factorise(self.structure.laplacian(self.tau))
 
 
-def _indicator(vertices: Ints, count: int) -> csr_matrix:
+def _indicator(vertices: Ints, count: int) -> csc_matrix:
     edges = len(vertices)
-    return csr_matrix((np.ones(edges), (vertices, np.arange(edges))), shape=(count, edges))
-
-
-def laplacian(tail: Ints, head: Ints, weights: Floats, free_count: int) -> csc_matrix:
-    """The weighted graph Laplacian of the first `free_count` vertices, the others pinned."""
-    rows = np.concatenate([tail, head, tail, head])
-    columns = np.concatenate([tail, head, head, tail])
-    values = np.concatenate([weights, weights, -weights, -weights])
-    kept = (rows < free_count) & (columns < free_count)
-    return csc_matrix((values[kept], (rows[kept], columns[kept])), shape=(free_count, free_count))
+    return csc_matrix((np.ones(edges), vertices, np.arange(edges + 1)), shape=(count, edges))
 
 
 def reweighted(problem: Problem, scale: Floats) -> Problem:

@@ -94,7 +94,6 @@ def prepare(
     used = graph.edges[weights.used]
     component = connected_components(used, graph.vertex_count)
     gauge = _gauge(component, fixed, start)
-    poses = np.broadcast_to(np.eye(4), gauge.shape) if start is None else start
     motion = graph.i_from_j[weights.used]
     problem = make_problem(
         used,
@@ -106,13 +105,14 @@ def prepare(
         backend,
         direct,
     )
-    return Setup(weights, size, component, gauge, se3.inverse(gauge) @ poses, problem)
+    return Setup(weights, size, component, gauge, gauge if start is None else se3.inverse(gauge) @ start, problem)
 
 
 def _gauge(component: Ints, fixed: Ints, start: Floats | None) -> Floats:
-    gauge: Floats = np.broadcast_to(np.eye(4), (len(component), 4, 4)).copy()
+    identity = np.broadcast_to(np.eye(4), (len(component), 4, 4))
     if start is None:
-        return gauge
+        return identity
+    gauge: Floats = identity.copy()
     first = np.unique(component, return_index=True)[1]
     held = np.zeros(len(first), bool)
     held[component[fixed]] = True

@@ -10,7 +10,7 @@ from scipy.sparse import bsr_matrix, csr_matrix
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.multigrid import Modes, Preconditioner, Preconditioning
 from hodge_pipeline.solvers.objective import translation_force
-from hodge_pipeline.solvers.problem import Problem, laplacian
+from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.types import Floats
 
 TOLERANCE, MOST_STEPS = 1e-3, 300
@@ -28,7 +28,7 @@ class TranslationSolver:
     @classmethod
     def of(cls, problem: Problem, precondition: Preconditioning) -> TranslationSolver:
         """The solver for a problem's τ."""
-        matrix = laplacian(problem.tail, problem.head, problem.tau, problem.free_count).tobsr((1, 1))
+        matrix = problem.structure.laplacian(problem.tau).tobsr((1, 1))
         return cls(problem, matrix, precondition(matrix, Modes()))
 
     def matching(self, rotations: Floats, translations: Floats) -> Floats:
