@@ -7,6 +7,7 @@ matrix stays as sparse as the graph; by Sylvester's law its negative pivots are 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +30,8 @@ MAX_BRACKETS = 40
 GAP_STEP = 4.0
 """The factor between the gaps that are tried for a bound: each costs a factorisation."""
 EIGENVALUE_TOLERANCE = 1e-3
+REGULAR = 1e-8
+"""ε over the largest entry of Q, whose null space are the turns of the whole."""
 
 
 @dataclass(frozen=True)
@@ -158,15 +161,34 @@ def bounded(answer: Certificate, cost: float, bound: float) -> Certificate:
 
 
 def _reduced(problem: Problem, order: Ints, rotations: Floats, translations: Floats) -> tuple[csc_matrix, Floats]:
-    """The certificate matrix, vertices in this order, without pinned translations; 1 at the rows of rotations."""
-    d = problem.dimension
-    matrix = certificate_matrix(problem, rotations, translations)
-    kept = np.ones((problem.count, d + 1), bool)
-    kept[problem.free_count :, d] = False
-    rows = (order[:, None] * (d + 1) + np.arange(d + 1))[kept[order]]
-    ones = np.zeros((problem.count, d + 1))
-    ones[:, :d] = 1.0
-    return csc_matrix(csc_matrix(matrix)[rows][:, rows]), ones.reshape(-1)[rows]
+    """The certificate matrix in this order of vertices, and 1 at the rows of rotations."""
+    rows, size = _rows(problem, order), problem.dimension + 1
+    matrix = csc_matrix(certificate_matrix(problem, rotations, translations))
+    return csc_matrix(matrix[rows][:, rows]), (rows % size < size - 1).astype(float)
+
+
+def _rows(problem: Problem, order: Ints) -> Ints:
+    """The rows of M, vertices in this order, without pinned translations."""
+    size = problem.dimension + 1
+    rows = order[:, None] * size + np.arange(size)
+    return np.asarray(rows[(rows % size < size - 1) | (order < problem.free_count)[:, None]])
+
+
+def inverse_of_data_matrix(problem: Problem, matrix: bsr_matrix) -> Callable[[Floats], Floats]:
+    """The inverse of Q + εI on vectors (n, d, r), from M: Q's translations eliminated with the rest."""
+    d, rows = problem.dimension, _rows(problem, _elimination_order(problem))
+    shift = REGULAR * float(np.abs(matrix.diagonal()).max(initial=0.0))
+    on_rotations = (rows % (d + 1) < d).astype(float)
+    factor = factorise(_shifted(csc_matrix(csc_matrix(matrix)[rows][:, rows]), shift, on_rotations), "NATURAL")
+
+    def apply(vectors: Floats) -> Floats:
+        stacked = np.zeros((problem.count, d + 1, vectors.shape[2]))
+        stacked[:, :d] = vectors
+        flat = stacked.reshape(-1, vectors.shape[2])
+        flat[rows] = factor.solve(flat[rows])
+        return flat.reshape(stacked.shape)[:, :d]
+
+    return apply
 
 
 def _shifted(matrix: csc_matrix, shift: float, on_rotations: Floats) -> csc_matrix:

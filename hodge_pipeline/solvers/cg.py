@@ -15,12 +15,16 @@ Operator: TypeAlias = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class CgResult:
-    """A descent direction x with H x ≈ −g, its residual H x + g, the steps taken, and why it may be short."""
+    """A descent direction x with H x ≈ −g, its residual H x + g, the steps taken, and why it may be short.
+
+    `downhill`: the direction p of negative curvature, gᵀ p ≤ 0, at which it ended, where one was found.
+    """
 
     x: Floats
     residual: Floats
     steps: int
     negative_curvature: bool = False
+    downhill: Floats | None = None
 
 
 def truncated_cg(
@@ -48,8 +52,8 @@ def truncated_cg(
         curvature = float(direction @ image)
         if curvature <= 0:
             if step == 1:
-                return CgResult(direction, image + gradient, step, True)
-            return CgResult(x, r, step, True)
+                return CgResult(direction, image + gradient, step, True, direction)
+            return CgResult(x, r, step, True, direction)
         alpha = rz / curvature
         x += alpha * direction
         r += alpha * image

@@ -22,7 +22,6 @@ from hodge_pipeline.solvers.setup import NO_ROWS, InitialName, Setup, prepare
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, SolverIteration, ViewGraph
 
 ObjectiveName: TypeAlias = Literal["isotropic", "full"]
-MOST_ESCAPES = 3
 WILD_NUMBERS = "the edges' lengths or weights differ too much for more: look for a wrong edge or unit"
 SEVERAL_FIXED = "not certified: with several fixed vertices to a component the dual is another one"
 
@@ -106,14 +105,13 @@ def solve(
         notes.append("only the isotropic objective can be certified")
     elif certificate:
         answer = _certify(setup, descent.point)
-        for _ in range(MOST_ESCAPES):
+        if not answer.optimal and answer.direction is not None:
             found = escape(setup, descent.point, answer, limits, watch)
-            if found.descent is None:
-                answer = bounded(answer, descent.point.cost, found.bound)
-                break
-            notes.append(f"a local minimum, F = {descent.point.cost:.9g}, was escaped")
-            descent, answer = found.descent, _certify(setup, found.descent.point)
-            metrics |= metrics_of(descent, full)
+            if found.descent is not None:
+                notes.append(f"a local minimum, F = {descent.point.cost:.9g}, was escaped")
+                descent = found.descent
+                metrics |= metrics_of(descent, full)
+            answer = bounded(found.certificate, descent.point.cost, found.bound)
         notes.append(answer.note)
         metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
         metrics |= {} if answer.optimal else {"smallest_eigenvalue": answer.smallest_eigenvalue}
