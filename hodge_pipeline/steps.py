@@ -26,6 +26,7 @@ from hodge_pipeline.refine.held_out import is_held_out
 from hodge_pipeline.registration import clouds as cloud_stage
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
+from hodge_pipeline.registration.gaps import has_gap
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.stages import Workers
@@ -67,7 +68,9 @@ def prepare_clouds(job: Job, source: Source, workers: Workers) -> CloudSet:
     """The down-sampled cloud of each frame; where the source was tracked they are there."""
     if job.tracked is not None:
         return CloudSet.open(job.path("clouds"))
-    options, total = cloud_options(job.recipe, len(sequences_of(source)) > 1), len(source.frames)
+    sequences = list(sequences_of(source).values())
+    apart = len(sequences) > 1 or has_gap(sequences, np.array([frame.stamp_s for frame in source.frames]))
+    options, total = cloud_options(job.recipe, apart), len(source.frames)
     with job.stage("clouds", "clouds", total, options, ("source",)) as (folder, advance):
         if not folder.finished:
             clouds, notes = cloud_stage.prepare_clouds(source.frames, options, workers, advance)

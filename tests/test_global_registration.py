@@ -17,6 +17,7 @@ from hodge_pipeline.registration.global_features import describe, mutual_matches
 from hodge_pipeline.registration.global_registrars import FpfhConsensus, FpfhFgr, FpfhRansac, KissMatcher
 from hodge_pipeline.stages import GlobalRegistrar
 from hodge_pipeline.types import Camera, Floats, PointCloud
+from hodge_pipeline.unordered.options import HypothesisLimits
 
 KISS = importlib.util.find_spec("kiss_matcher") is not None
 CAMERA = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
@@ -116,11 +117,32 @@ def test_a_handful_of_points_matches_nothing(registrar: GlobalRegistrar, count: 
         assert registrar.match(target, source).inliers == 0
 
 
+def degenerate_points(kind: str) -> Floats:
+    rng = np.random.default_rng(3)
+    cube = rng.uniform(-1, 1, (4000, 3))
+    line = np.linspace(0, 20, 4000)[:, None] * np.array([1.0, 0, 0])
+    return {"one place": np.zeros((500, 3)), "none": cube[:0], "NaN": np.full((500, 3), np.nan), "line": line,
+            "sparse": 50 * cube[:1000], "vast": 1e5 * cube, "tiny": 1e-3 * cube}[kind]  # fmt: skip
+
+
 @pytest.mark.skipif(not KISS, reason="the extra kiss is not installed")
-def test_kiss_matcher_survives_a_handful_of_points() -> None:
+@pytest.mark.parametrize("kind", ["one place", "none", "NaN", "line", "sparse", "vast", "tiny"])
+def test_kiss_matcher_is_kept_from_degenerate_clouds(kind: str) -> None:
     registrar = KissMatcher()
-    few = registrar.describe(cloud_of(np.zeros((500, 3))))
-    assert registrar.match(few, few).inliers == 0
+    odd = registrar.describe(cloud_of(degenerate_points(kind)))
+    scene = registrar.describe(cloud_of(furnished_corner(1)))
+    for target, source in ((odd, odd), (odd, scene), (scene, odd)):
+        assert registrar.match(target, source).inliers < HypothesisLimits().min_inliers
+
+
+@pytest.mark.skipif(not KISS, reason="the extra kiss is not installed")
+def test_kiss_matcher_finds_clouds_in_map_coordinates() -> None:
+    registrar, far = KissMatcher(), np.array([4e5, 5e6, 100.0])
+    points = furnished_corner(1)
+    cloud = registrar.describe(PointCloud(points.astype(np.float64) + far))  # type: ignore[arg-type]
+    found = registrar.match(cloud, registrar.describe(cloud_of(points)))
+    assert found.inliers > 15
+    assert np.linalg.norm(found.i_from_j[:3, 3] - far) < 0.1
 
 
 def test_matches_are_mutual_and_the_nearest_come_first() -> None:

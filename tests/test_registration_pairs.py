@@ -11,6 +11,7 @@ from hodge_pipeline.executors.dask import DaskExecutor
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
+from hodge_pipeline.registration.gaps import has_gap, over_gap
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.registration.pairs import Acceptance, Registered, register_pairs
@@ -140,6 +141,30 @@ def test_empty_frames_are_bridged_and_a_lost_one_is_said(tmp_path: Path) -> None
     assert np.abs(se3.log(se3.inverse(poses[good]) @ found.world_from_cam[good])).max() < 0.02
     assert np.array_equal(found.world_from_cam[3], found.world_from_cam[2])
     assert np.abs(se3.log(se3.inverse(poses[7]) @ found.world_from_cam[7])).max() < 0.05  # constant velocity
+
+
+def test_over_a_hole_in_the_recording_a_step_must_be_sure(folder: Path) -> None:
+    stamps = np.arange(FRAMES) / 30
+    stamps[7:] += 1.0
+    with HERE.open() as workers:
+        usual = odometry(folder, [np.arange(FRAMES)], stamps, OdometryOptions(), workers)
+        strict = odometry(folder, [np.arange(FRAMES)], stamps, OdometryOptions(sure_fitness=1.0), workers)
+    assert [6, 7] in usual.steps.pairs.tolist()
+    assert [6, 7] not in strict.steps.pairs.tolist()
+    assert len(strict.steps.pairs) == FRAMES - 2
+    assert "rows 6 and 7 (a hole in the recording" in strict.notes[0]
+
+
+def test_a_hole_is_a_step_much_longer_than_the_others_of_its_sequence() -> None:
+    slow, fast = np.arange(6.0), np.array([0, 0.1, 0.2, 3.0, 3.1])
+    rows = [np.arange(6), np.arange(6, 11)]
+    stamps = np.concatenate([slow, fast])
+    pairs = np.array([[0, 1], [0, 5], [6, 7], [8, 9]])
+    assert over_gap(pairs, rows, stamps).tolist() == [False, False, False, True]
+    assert has_gap(rows, stamps)
+    assert not has_gap(rows[:1], stamps)
+    assert not has_gap(rows, stamps[::-1])  # no clock
+    assert not has_gap([], stamps)
 
 
 def test_sequences_are_not_joined_and_stand_apart(folder: Path) -> None:

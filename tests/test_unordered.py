@@ -15,8 +15,10 @@ from hodge_pipeline.edges.sequential import SequentialEdges
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.recipe import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
+from hodge_pipeline.registration.global_evidence import DepthView
 from hodge_pipeline.stages import no_progress
-from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud
+from hodge_pipeline.types import Camera, CloudSet, Floats, Frame, PointCloud, ViewGraph
+from hodge_pipeline.unordered.folds import Pieces, contradictions, unfolded, within_parts
 from hodge_pipeline.unordered.hypotheses import allowed_violation
 from hodge_pipeline.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.unordered.pieces import laid_apart
@@ -167,3 +169,38 @@ def test_what_a_run_allows_its_pairs_to_see_through_follows_its_camera() -> None
     assert allowed_violation(np.array([0.01, 0.01, np.nan, 0.3]), limits) == pytest.approx(0.08)
     assert allowed_violation(np.full(5, 0.2), limits) == limits.max_violation
     assert allowed_violation(np.full(2, np.nan), limits) == limits.violation_floor
+
+
+def test_parts_grow_from_the_strongest_edges_and_hold_no_forbidden_pair() -> None:
+    #  0 -9- 1 -2- 2 -8- 3 -1- 0     0 and 3 exclude each other
+    edges = np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
+    strength = np.array([9.0, 2.0, 8.0, 1.0])
+    assert within_parts(edges, strength, np.array([[0, 3]]), 4).tolist() == [True, False, True, False]
+    assert within_parts(edges, strength, np.zeros((0, 2), np.int64), 4).all()
+    given = np.array([9.0, np.inf, 8.0, 1.0])
+    assert within_parts(edges, given, np.array([[0, 3]]), 4).tolist() == [True, True, False, False]
+
+
+def wall_at(depth_m: float) -> tuple[PointCloud, DepthView]:
+    camera = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
+    column, row = np.meshgrid(np.arange(80), np.arange(60))
+    rays = np.stack([(column - 39.5) / 60, (row - 29.5) / 60, np.ones((60, 80))], axis=-1).reshape(-1, 3)
+    return read(depth_m * rays), DepthView(np.full((60, 80), depth_m, np.float32), 1, camera)
+
+
+@pytest.mark.parametrize("far_m", [4.0, 2.0])
+def test_frames_that_see_through_each_other_are_cut_apart_although_their_edges_agree(far_m: float) -> None:
+    seen = [wall_at(2.0), wall_at(2.0), wall_at(far_m), wall_at(far_m)]
+    clouds, views = CloudSet.from_clouds([cloud for cloud, _ in seen]), [view for _, view in seen]
+    graph = ViewGraph.from_edges(np.arange(4), np.array([[0, 1], [2, 3], [1, 2]]), np.tile(np.eye(4), (3, 1, 1)))
+    graph.correspondences[:] = [900, 900, 100]
+    pieces = Pieces(graph, np.zeros(4, np.int64), np.tile(np.eye(4), (4, 1, 1)))
+    limits, options = HypothesisLimits(), GlobalStart().diagnosis
+    assert contradictions(clouds, pieces, views.__getitem__, limits).folded == (far_m > 2)
+    found = unfolded(clouds, pieces, 0, views.__getitem__, limits, options)
+    if far_m == 2:
+        assert found is pieces
+    else:
+        assert found.graph.edges.tolist() == [[0, 1], [2, 3]]
+        assert found.piece[0] == found.piece[1] != found.piece[2] == found.piece[3]
+        assert "4 contradict each other" in found.notes[0]

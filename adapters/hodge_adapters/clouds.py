@@ -25,6 +25,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, PointCloud, Source, Trajectory, ViewGraph
 
+OTHER_SCANS = frozenset((".xyz", ".pts", ".ptx", ".asc", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
 _NUMBER = re.compile(r"(\d{1,15})\D*$")
 
 
@@ -56,8 +57,8 @@ class CloudFolderReader:
     def open(self, path: Path) -> Source:
         """Fragments in natural order of their names; id and stamp are the last number in the name, else the row."""
         path = Path(path)
-        files = [path] if path.is_file() else self._files(path)
         notes: list[str] = []
+        files = [path] if path.is_file() else self._files(path, notes)
         for file in files:
             _require(file)
         fragments = _fragments(files, notes)
@@ -87,16 +88,19 @@ class CloudFolderReader:
             path.resolve().name, path, frames[:: self.every], trajectory, graph, tuple(notes), (*files, *found)
         )
 
-    def _files(self, path: Path) -> list[Path]:
+    def _files(self, path: Path, notes: list[str]) -> list[Path]:
         try:
-            found = sorted(file for file in path.glob(self.pattern) if file.suffix.lower() in READERS)
+            listing = [file for file in path.glob(self.pattern) if not file.name.startswith(".")]
         except (OSError, ValueError, NotImplementedError) as error:
             raise SourceError(f"{path}: cannot be listed with pattern {self.pattern!r}: {error}") from error
-        found = [file for file in found if file.is_file()]
+        found = [file for file in listing if file.suffix.lower() in READERS and file.is_file()]
         if not found:
             raise SourceError(
                 f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it: give a folder of fragments"
             )
+        others = sorted(file.name for file in listing if file.suffix.lower() in OTHER_SCANS)
+        if others:
+            notes.append(f"{len(others)} files are scans of another format, left out: {listed(others)}: convert to PLY")
         return sorted(found, key=lambda file: natural(file.name))
 
     def _log(self, folder: Path) -> Path | None:

@@ -12,14 +12,17 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline import se3
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.registration.consensus import rigid_consensus
-from hodge_pipeline.types import Floats, Floats32, Ints, Match, PointCloud
+from hodge_pipeline.types import Floats, Ints, Match, PointCloud
 
 if TYPE_CHECKING:
     from hodge_pipeline.registration.global_features import DescribedCloud
 
 TOLERANCE_VOXELS = 1.5
 FEWEST_KISS_VOXELS = 200
-"""KISS-Matcher brings the process down where its own down-sampling leaves it too few points."""
+KISS_RADIUS_VOXELS, FEWEST_KISS_NEIGHBOURS = 3.0, 5
+"""KISS-Matcher brings the process down where its own down-sampling leaves it too few points with a neighbourhood."""
+MOST_KISS_VOXELS_ACROSS = 100_000
+"""Nor may the number of a voxel be larger than it counts to."""
 _VOXEL = "metres: the scale of the features. 0.05 serves rooms; about 1/60 of a scan's extent elsewhere"
 
 
@@ -99,14 +102,20 @@ class KissMatcher:
     voxel_m: float = Field(default=0.05, gt=0, description=_VOXEL)
 
     def describe(self, cloud: PointCloud) -> Any:
-        """The points (N, 3) of a cloud, float32: it makes its features for each pair."""
+        """The points (N, 3) of a cloud about an origin, and that: its own, or a corner of far coordinates."""
         _kiss_matcher()
-        points = np.asarray(cloud.points_in_cam, np.float32)
-        return np.ascontiguousarray(points[np.isfinite(points).all(axis=1)])
+        points = np.asarray(cloud.points_in_cam, float)
+        points = points[np.isfinite(points).all(axis=1)]
+        if not _has_surface(points, self.voxel_m):
+            points = np.zeros((0, 3))
+        far = np.abs(points).max(initial=0) > MOST_KISS_VOXELS_ACROSS * self.voxel_m
+        corner = points.min(axis=0) if far else np.zeros(3)
+        return np.ascontiguousarray(points - corner, np.float32), corner
 
     def match(self, target: Any, source: Any) -> Match:
         """Where the source lies in the target."""
-        if min(_voxel_count(cloud, self.voxel_m) for cloud in (target, source)) < FEWEST_KISS_VOXELS:
+        (target, target_corner), (source, source_corner) = target, source
+        if not (len(target) and len(source)):
             return Match(np.eye(4), 0, 0)
         library = _kiss_matcher()
         matcher = library.KISSMatcher(library.KISSMatcherConfig(self.voxel_m))
@@ -117,13 +126,20 @@ class KissMatcher:
         matches = len(matcher.get_initial_correspondences())
         if not found.valid or not se3.is_motion(motion):
             return Match(np.eye(4), 0, matches)
-        return Match(
-            se3.from_parts(se3.project_to_so3(rotation), motion[:3, 3]), int(matcher.get_num_final_inliers()), matches
-        )
+        rotation = se3.project_to_so3(rotation)
+        shift = motion[:3, 3] + target_corner - rotation @ source_corner
+        return Match(se3.from_parts(rotation, shift), int(matcher.get_num_final_inliers()), matches)
 
 
-def _voxel_count(points: Floats32, voxel_m: float) -> int:
-    return len(np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0)) if len(points) else 0
+def _has_surface(points: Floats, voxel_m: float) -> bool:
+    """Whether enough voxels of these points (N, 3) have neighbours within the radius that features look at."""
+    from scipy.spatial import cKDTree
+
+    if not len(points) or np.ptp(points, axis=0).max() > MOST_KISS_VOXELS_ACROSS * voxel_m:
+        return False
+    voxels = np.unique(np.floor((points - points.min(axis=0)) / voxel_m).astype(np.int64), axis=0)
+    near = cKDTree(voxels).query_ball_point(voxels, KISS_RADIUS_VOXELS, return_length=True)
+    return int((near > FEWEST_KISS_NEIGHBOURS).sum()) >= FEWEST_KISS_VOXELS
 
 
 def _kiss_matcher() -> Any:

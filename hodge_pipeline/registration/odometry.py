@@ -12,6 +12,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
+from hodge_pipeline.registration.gaps import over_gap
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import Registered, prepared_clouds
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
@@ -31,7 +32,8 @@ class OdometryOptions:
         default=0.7,
         ge=0,
         le=1,
-        description="below it a second registration starts from no motion, and the fitter one is kept",
+        description="below it a second registration starts from no motion, and the fitter one is kept; over a hole in "
+        "the recording (a step ten times as long as usual) it must be reached, or tracking is lost",
     )
     min_fitness: float = Field(
         default=0.3,
@@ -80,11 +82,13 @@ def odometry(
         results[number] = result
         advance(len(result.pairs))
     steps = Registered.joined([results[number] for number in range(len(blocks))])
-    lost = ~(steps.fitness >= options.min_fitness)
+    gap = over_gap(steps.pairs, sequences, stamps_s)
+    lost = ~(steps.fitness >= np.where(gap, max(options.sure_fitness, options.min_fitness), options.min_fitness))
     poses = chained(len(sizes), sequences, steps)
     notes = tuple(
-        f"tracking was lost between rows {i} and {j} (fitness {fitness:.2f}): no edge there, the motion is guessed"
-        for (i, j), fitness in zip(steps.pairs[lost], steps.fitness[lost], strict=True)
+        f"tracking was lost between rows {i} and {j} ({'a hole in the recording, ' if hole else ''}fitness "
+        f"{fitness:.2f}): no edge there, the motion is guessed"
+        for (i, j), fitness, hole in zip(steps.pairs[lost], steps.fitness[lost], gap[lost], strict=True)
     )
     return Odometry(poses, steps.select(~lost), notes)
 

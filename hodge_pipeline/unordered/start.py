@@ -14,6 +14,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, ViewGraph
+from hodge_pipeline.unordered.folds import Pieces, unfolded
 from hodge_pipeline.unordered.graphs import joined_graph, without_wrong
 from hodge_pipeline.unordered.hypotheses import Hypotheses, weigh
 from hodge_pipeline.unordered.options import GlobalStart
@@ -67,11 +68,13 @@ def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Worke
     measured = hypotheses.as_graph(scene.vertex_ids, "landmarks" if by_image else "features")
     graph = measured if scene.given is None else joined_graph(scene.given, measured)
     found = diagnose(graph, options.diagnosis)
-    kept, piece, poses = without_wrong(graph, found)
     notes += [f"{int((~found.kept).sum())} of {graph.edge_count} edges are distrusted"]
-    notes += describe_components(piece, scene.vertex_ids)
+    given = int(found.kept[: graph.edge_count - measured.edge_count].sum())
+    pieces = Pieces(*without_wrong(graph, found))
+    pieces = unfolded(clouds, pieces, given, views, options.limits, options.diagnosis)
+    notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
-    return Start(laid_apart(piece, poses, clouds), kept, piece, tuple(notes))
+    return Start(laid_apart(pieces.piece, pieces.poses, clouds), pieces.graph, pieces.piece, tuple(notes))
 
 
 def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:

@@ -1,0 +1,34 @@
+"""Holes in a recording: no motion over one can be guessed, and what little two frames share may be another place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hodge_pipeline.types import Bools, Floats, Ints
+
+LONGEST_USUAL = 10.0
+"""Times the median step of a sequence; cameras that drop some frames, or keep some of them, stay below it."""
+
+
+def longest_usual_step_s(stamps_s: Floats) -> float:
+    """What a step of a sequence with these stamps (N,) may last; ∞ where they do not ascend, and so are no clock."""
+    steps = np.diff(stamps_s)
+    if len(steps) < 2 or not (steps > 0).all():
+        return float("inf")
+    return LONGEST_USUAL * float(np.median(steps))
+
+
+def over_gap(pairs: Ints, sequences: Sequence[Ints], stamps_s: Floats) -> Bools:
+    """Where (P,) rows of one sequence lie on the two sides of a hole in it."""
+    longest = np.full(len(stamps_s), np.inf)
+    for rows in sequences:
+        longest[rows] = longest_usual_step_s(stamps_s[rows])
+    return np.asarray(stamps_s[pairs[:, 1]] - stamps_s[pairs[:, 0]] > longest[pairs[:, 0]])
+
+
+def has_gap(sequences: Sequence[Ints], stamps_s: Floats) -> bool:
+    """Whether a sequence has a hole."""
+    steps = [np.stack([rows[:-1], rows[1:]], axis=1) for rows in sequences]
+    return bool(over_gap(np.concatenate(steps), sequences, stamps_s).any()) if steps else False
