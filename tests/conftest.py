@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, which says why
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 

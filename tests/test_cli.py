@@ -12,7 +12,7 @@ import pytest
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 LIGHT = ["--set", "fusion=[]", "--set", "recording.level=off", "--set", "evaluation.tables=false"]
-LIGHT += ["--set", "executor.workers=0", "--set", "outer_iterations=1"]
+LIGHT += ["--set", "executor.workers=0", "--set", "outer_iterations=1", "--set", "edges.max_edges_per_frame=3"]
 
 
 def hodge(*arguments: str | Path) -> subprocess.CompletedProcess[str]:

@@ -22,7 +22,10 @@ from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recipe import Recipe, load_recipe
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
-SMALL = ("clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=1", "recording.level=summary")
+SMALL = (
+    "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=1", "recording.level=summary",
+    "edges.max_edges_per_frame=4",
+)  # fmt: skip
 STAGES = ("clouds", "odometry", "edges-1", "register-1", "solve-1", "edges-2", "register-2", "solve-2", "fuse-0")
 
 

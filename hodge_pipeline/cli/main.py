@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Optional
@@ -9,6 +10,10 @@ from typing import Annotated, Optional
 import typer
 
 from hodge_pipeline.cli import refining
+
+# OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
+# for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 HELP = """Globally consistent poses from many scans.
 

@@ -55,11 +55,11 @@ def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) 
 
 def plot(title: str, caption: str, paint: Callable[[Figure], None], size: tuple[float, float] = (5.0, 4.2)) -> Plot:
     """A painted figure as a picture."""
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
     paint(figure)
     target = io.BytesIO()
-    figure.savefig(target, dpi=DOTS_PER_INCH, metadata={"Software": None})
+    canvas.print_png(target, metadata={"Software": None})  # savefig lays out and draws it all twice
     return Plot(title, caption, target.getvalue())
 
 

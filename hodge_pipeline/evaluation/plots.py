@@ -69,15 +69,15 @@ def _plots(report: Report) -> Iterator[Plot]:
 
 
 def _plot(title: str, caption: str, paint: Callable[[Figure, Report], None], report: Report) -> Plot:
-    figure = Figure(figsize=(5.0, 3.9), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(5.0, 3.9), dpi=DOTS_PER_INCH, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
     paint(figure, report)
     for axes in figure.axes:
         axes.grid(alpha=0.25, linewidth=0.5)
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
     target = io.BytesIO()
-    figure.savefig(target, dpi=DOTS_PER_INCH, metadata={"Software": None})
+    canvas.print_png(target, metadata={"Software": None})  # savefig lays out and draws it all twice
     return Plot(title, caption, target.getvalue())
 
 
