@@ -41,7 +41,7 @@ def open_source(path: Path, reader: FrameReader | None) -> tuple[Source, str]:
 
 def _likelier(path: Path, chosen: FrameReader) -> Guess | None:
     """The surest reader, where it is another than the chosen one and much surer."""
-    if not path.exists():
+    if not path.exists() or chosen.sniff(path).confidence > 1 - MARGIN:
         return None
     best = next(iter(guesses(path)), None)
     if best is None or best.name == registry.name_of(chosen) or best.sniff.confidence < SURE:

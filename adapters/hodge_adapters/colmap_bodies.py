@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 
+from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 

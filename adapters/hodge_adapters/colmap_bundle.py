@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
 
 from hodge_adapters.colmap_bodies import Bodies
+from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PositionPriors
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 
 from hodge_adapters import images
 from hodge_adapters.colmap_depth import read_depth_map
 from hodge_adapters.colmap_records import CameraRecord
+from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32
 

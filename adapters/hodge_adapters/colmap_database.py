@@ -10,11 +10,11 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-import pycolmap
 
 from hodge_adapters.colmap_edges import Pair, camera_table, positions
 from hodge_adapters.colmap_records import Model
 from hodge_adapters.colmap_relative import Sighting
+from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Ints
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 from scipy.sparse import coo_array
 
 from hodge_adapters.colmap_cameras import colmap_camera
 from hodge_adapters.colmap_records import NO_POINT, Model
 from hodge_adapters.colmap_relative import Relative, Sighting, estimate
+from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import pycolmap
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
@@ -21,6 +20,7 @@ from hodge_adapters.colmap_scale import other_camera_note
 from hodge_adapters.colmap_ties import similarity, tie_points
 from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, read_reconstruction
 from hodge_adapters.colmap_union import united
+from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Frame
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 
+from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
 

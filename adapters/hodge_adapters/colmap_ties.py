@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
 from hodge_adapters.colmap_database import database_matches
 from hodge_adapters.colmap_records import NO_POINT
+from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.types import Floats, Ints
 
 MERGE_ERROR_PX = 4.0

@@ -13,7 +13,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from hodge_adapters.colmap_bodies import Bodies, bodies_of, body_graph
 from hodge_adapters.colmap_bundle import adjust
@@ -25,6 +24,7 @@ from hodge_adapters.colmap_records import Model
 from hodge_adapters.colmap_scale import depth_ratios
 from hodge_adapters.colmap_ties import merge_matched_points
 from hodge_adapters.colmap_uncertainty import standard_errors
+from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Frame, Ints, ModelQuality, PositionPriors, ViewGraph

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
+
+from hodge_adapters.pycolmap_import import pycolmap
 
 SAME_PARAMS = 1e-9
 

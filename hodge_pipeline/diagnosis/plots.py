@@ -59,7 +59,8 @@ def plot(title: str, caption: str, paint: Callable[[Figure], None], size: tuple[
     canvas = FigureCanvasAgg(figure)
     paint(figure)
     target = io.BytesIO()
-    canvas.print_png(target, metadata={"Software": None})  # savefig lays out and draws it all twice
+    # savefig would lay out and draw it all twice
+    canvas.print_png(target, metadata={"Software": None})  # type: ignore[no-untyped-call]
     return Plot(title, caption, target.getvalue())
 
 

@@ -77,7 +77,8 @@ def _plot(title: str, caption: str, paint: Callable[[Figure, Report], None], rep
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
     target = io.BytesIO()
-    canvas.print_png(target, metadata={"Software": None})  # savefig lays out and draws it all twice
+    # savefig would lay out and draw it all twice
+    canvas.print_png(target, metadata={"Software": None})  # type: ignore[no-untyped-call]
     return Plot(title, caption, target.getvalue())
 
 
