@@ -134,7 +134,8 @@ class ViewGraph:
       Parallel edges are legal.
     - `information (E, 6, 6)`: inverse covariance of ξ = (rotation, translation) in `i_from_j · exp(ξ)`, radians and
       metres in j's axes.
-    - `fitness (E,)`: share of cloud j with a correspondence; `rmse_m (E,)`: their RMS distance; NaN where unknown.
+    - `fitness (E,)`: share of cloud j with a correspondence, or of i where the registrar says so; `rmse_m (E,)`: their
+      RMS distance; NaN where unknown.
     - `source (E,)`: where the edge comes from (sequential, overlap, sift, colmap, g2o, …).
     - `correspondences (E,)`: how many; 0 where unknown.
     - `dimension`: 2 for a graph in the plane z = 0, lifted, with no information out of it; it stays one when written.

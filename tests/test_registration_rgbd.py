@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from hodge_pipeline import se3
 from hodge_pipeline.descriptors import match, root_sift
+from hodge_pipeline.registration.guided import guided_match
 from hodge_pipeline.registration.landmarks import back_projected, find_landmarks
 from hodge_pipeline.registration.rgbd import Rgbd
 from hodge_pipeline.registration.visual import rigid_motions, visual_motion
@@ -135,6 +136,64 @@ def test_landmarks_hold_where_a_plane_slides_and_too_few_of_them_leave_it_to_the
     assert np.linalg.eigvalsh(found.information - mean.information).max() > 0
     target, source = (registrar.prepare(cloud) for cloud in frames_of(6))
     assert abs(registrar.register(target, source, np.eye(4)).i_from_j[0, 3]) < 0.05
+
+
+def twins(cloud: PointCloud) -> PointCloud:
+    """The cloud with landmarks that look alike two by two, as the handles of a cabinet do."""
+    marks = cloud.landmarks
+    assert marks is not None
+    half = len(marks) // 2
+    return replace(cloud, landmarks=Landmarks(marks.points_in_cam, np.tile(marks.descriptors[:half], (2, 1))))
+
+
+def test_landmarks_that_look_alike_are_told_apart_by_where_they_are():
+    target, source = (twins(cloud) for cloud in frames_of(60))
+    blind, guided = Rgbd(guided_m=0), Rgbd()
+    slid = blind.register(blind.prepare(target), blind.prepare(source), np.eye(4))
+    assert abs(slid.i_from_j[0, 3]) < 0.05
+    found = guided.register(guided.prepare(target), guided.prepare(source), np.eye(4))
+    np.testing.assert_allclose(found.i_from_j[:3, 3], [0.1, 0, 0], atol=2e-3)
+    assert found.fitness > 0.9
+
+
+def test_guided_matches_lie_near_the_guess_and_are_mutual():
+    target, source = (Rgbd().prepare(twins(cloud)) for cloud in frames_of(60))
+    assert len(match(target.descriptors, source.descriptors, 0.8)) < 10  # twins differ by rounding alone
+    pairs = guided_match(target, source, np.eye(4), 0.15)
+    moved = np.linalg.norm(target.landmarks[pairs[:, 0]] - source.landmarks[pairs[:, 1]], axis=1)
+    assert len(pairs) > 50 and (moved < 0.15).all()
+    assert len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
+    assert (pairs[:, 0] == pairs[:, 1]).mean() > 0.9
+    assert len(guided_match(target, source, np.eye(4), 0.01)) < 5
+    bare = Rgbd().prepare(replace(frames_of(60)[0], landmarks=None))
+    assert guided_match(bare, source, np.eye(4), 0.15).shape == (0, 2)
+
+
+def test_unlike_landmarks_near_a_guess_agree_on_nothing():
+    target, source = frames_of(400)
+    assert source.landmarks is not None
+    other = np.random.default_rng(9).integers(0, 255, (400, 128), dtype=np.uint8)
+    source = replace(source, landmarks=Landmarks(source.landmarks.points_in_cam, other))
+    found, alone = (
+        one.register(one.prepare(target), one.prepare(source), np.eye(4)) for one in (Rgbd(), Rgbd(guided_m=0))
+    )
+    np.testing.assert_array_equal(found.i_from_j, alone.i_from_j)
+
+
+def test_a_frame_with_much_behind_what_the_other_saw_is_not_lost():
+    target, source = frames_of(40)
+    behind = np.column_stack([np.random.default_rng(2).uniform(-3, 3, (20000, 2)), np.full(20000, 5.0)])
+    assert source.normals_in_cam is not None
+    wide = PointCloud(
+        np.concatenate([source.points_in_cam, behind.astype(np.float32)]),
+        np.concatenate([source.normals_in_cam, np.tile(source.normals_in_cam[:1], (20000, 1))]),
+        None,
+        source.landmarks,
+    )
+    registrar = Rgbd()
+    found = registrar.register(registrar.prepare(target), registrar.prepare(wide), np.eye(4))
+    np.testing.assert_allclose(found.i_from_j[:3, 3], [0.1, 0, 0], atol=1e-3)
+    assert found.fitness > 0.9
 
 
 def test_landmarks_survive_the_disk(tmp_path: Path):

@@ -5,14 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from hodge_pipeline.types import Bools, Camera, Floats32, Frame, Ints, Landmarks
+from hodge_pipeline.types import Bools, Bytes, Camera, Floats, Floats32, Frame, Ints, Landmarks
 
 EDGE_STEP = 0.03
 """A landmark whose 3x3 pixels differ by more than this share of its depth lies on an edge: its depth is a guess."""
 
 FEW = 150
-"""Features of an image below which it is looked at again for faint ones."""
-CONTRAST, FAINT_CONTRAST = 0.04, 0.01
+"""Landmarks of a frame below which its image is looked at again for faint ones."""
+CONTRAST, FAINT_CONTRAST = 0.04, 0.005
 """Of a feature; the first is OpenCV's own. Faint ones match less exactly (TUM fr1/rpy: a tenth more error), but
 without them an image of a bare cabinet has next to none."""
 
@@ -29,19 +29,29 @@ def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: fl
     if scale > 1:
         size = (grey.shape[1] // scale, grey.shape[0] // scale)
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+    marks = Landmarks.none()
     for contrast in (CONTRAST, FAINT_CONTRAST):
-        detector = cv2.SIFT_create(nfeatures=count, contrastThreshold=contrast)  # type: ignore[attr-defined]
-        found, descriptors = detector.detectAndCompute(grey, None)
-        if len(found) >= min(FEW, count):
+        pixels, descriptors = _features(grey, depth.shape, count, contrast)
+        if not len(pixels):
+            continue
+        z, sound = _depth_at(depth, np.round(pixels).astype(np.int64), min_range_m, max_range_m)
+        points = back_projected(pixels[sound].astype(np.float32), z[sound], frame.camera)
+        marks = Landmarks(points, descriptors[sound])
+        if len(marks) >= min(FEW, count):
             break
+    return marks
+
+
+def _features(grey: Bytes, depth_shape: tuple[int, ...], count: int, contrast: float) -> tuple[Floats, Bytes]:
+    """At most `count` features, the strongest first: pixels (n, 2) of the depth image, and descriptors (n, 128)."""
+    detector = cv2.SIFT_create(nfeatures=count, contrastThreshold=contrast)  # type: ignore[attr-defined]
+    found, descriptors = detector.detectAndCompute(grey, None)
     if not found:
-        return Landmarks.none()
-    larger = np.array([depth.shape[1] / grey.shape[1], depth.shape[0] / grey.shape[0]])
+        return np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
+    larger = np.array([depth_shape[1] / grey.shape[1], depth_shape[0] / grey.shape[0]])
     strongest = np.argsort([-point.response for point in found], kind="stable")[:count]
     pixels = (np.array([found[row].pt for row in strongest]) + 0.5) * larger - 0.5
-    z, sound = _depth_at(depth, np.round(pixels).astype(np.int64), min_range_m, max_range_m)
-    points = back_projected(pixels[sound].astype(np.float32), z[sound], frame.camera)
-    return Landmarks(points, np.asarray(descriptors)[strongest[sound]].astype(np.uint8))
+    return pixels, np.asarray(descriptors)[strongest].astype(np.uint8)
 
 
 def back_projected(pixels: Floats32, depth_m: Floats32, camera: Camera) -> Floats32:

@@ -7,6 +7,7 @@ error of poses from surfaces, and the mean of both, however weighted, in between
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -16,10 +17,11 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.descriptors import match, root_sift
-from hodge_pipeline.registration.assessment import assess, unregistered
+from hodge_pipeline.registration.assessment import Assessment, assess, unregistered
 from hodge_pipeline.registration.gicp import Gicp, PreparedCloud
+from hodge_pipeline.registration.guided import guided_match
 from hodge_pipeline.registration.visual import VisualMotion, visual_motion
-from hodge_pipeline.types import Floats, Landmarks, PointCloud, Registration
+from hodge_pipeline.types import Floats, Ints, Landmarks, PointCloud, Registration
 
 ASSESSED_POINTS = 1000
 ASSESSED_WITHIN_M = 0.05
@@ -57,6 +59,12 @@ class Rgbd:
     min_inliers: int = Field(
         default=15, ge=8, description="matches that must agree on one motion; unrelated frames have at most about 8"
     )
+    guided_m: float = Field(
+        default=0.15,
+        ge=0,
+        description="metres: where too few matches agree, landmarks are matched again with those alone that lie this "
+        "near where the surfaces' motion puts them, which tells the handles of a cabinet apart; 0: they are not",
+    )
     matches_per_sample: float = Field(
         default=75.0,
         gt=0,
@@ -71,18 +79,48 @@ class Rgbd:
 
     def register(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats) -> Registration:
         """Frame j (source) moved onto frame i (target); the guess is needed where landmarks do not suffice."""
-        visual = self._visual(target, source)
-        if visual is None or visual.inliers < self.min_inliers:
+        pairs = match(target.descriptors, source.descriptors, self.ratio)
+        visual = self._visual(target, source, pairs)
+        if not self._suffices(visual):
             found = self._by_surfaces(target, source, i_from_j, visual)
-            return found if found.fitness >= self.min_fitness else unregistered(found.i_from_j)
+            visual = self._guided(target, source, [found, visual])
+            if visual is None:
+                return found if found.fitness >= self.min_fitness else unregistered(found.i_from_j)
+        assert visual is not None
         if self.measure == "surfaces":
             return self.near.register(target, source, visual.i_from_j)
-        return _assessed(target, source, visual)
+        return self._by_landmarks(target, source, visual)
 
-    def _visual(self, target: PreparedFrame, source: PreparedFrame) -> VisualMotion | None:
-        pairs = match(target.descriptors, source.descriptors, self.ratio)
+    def _visual(self, target: PreparedFrame, source: PreparedFrame, pairs: Ints) -> VisualMotion | None:
         found = visual_motion(target.landmarks[pairs[:, 0]], source.landmarks[pairs[:, 1]], self.seed)
         return found and replace(found, information=found.information / self.matches_per_sample)
+
+    def _suffices(self, visual: VisualMotion | None) -> bool:
+        return visual is not None and visual.inliers >= self.min_inliers
+
+    def _guided(
+        self, target: PreparedFrame, source: PreparedFrame, starts: Sequence[Registration | VisualMotion | None]
+    ) -> VisualMotion | None:
+        """The motion that most landmarks agree on near a start, None where too few do or surfaces disagree."""
+        found = [
+            self._visual(target, source, guided_match(target, source, start.i_from_j, self.guided_m))
+            for start in starts
+            if start is not None and self.guided_m > 0
+        ]
+        best = max(filter(self._suffices, found), key=lambda one: one.inliers if one else 0, default=None)
+        if best is None or self._by_landmarks(target, source, best).fitness < self.min_fitness:
+            return None
+        return best
+
+    def _by_landmarks(self, target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
+        """Their motion. Its fitness, where it is low, is the other way round if this is larger: a frame that shows what
+        is near and, behind it, what the other did not see shares little with it, but all of the other is in it.
+        """
+        found = _assessed(target, source, visual)
+        if found.fitness >= self.min_fitness:
+            return found
+        back = _within(source, target, se3.inverse(found.i_from_j))
+        return replace(found, fitness=max(found.fitness, back.fitness))
 
     def _by_surfaces(
         self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats, hint: VisualMotion | None
@@ -115,17 +153,21 @@ class PreparedFrame(PreparedCloud):
         self.descriptors = root_sift(np.asarray(landmarks.descriptors))
 
 
-def _assessed(target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
-    """The landmarks' motion with what the clouds say of it: a false one shows in the fitness."""
-    seen = assess(
+def _within(target: PreparedFrame, source: PreparedFrame, i_from_j: Floats) -> Assessment:
+    return assess(
         source_points=source.sample_points(ASSESSED_POINTS),
         target_points=target.points,
         target_normals=target.normals,
         find_nearest=target.find_nearest,
-        i_from_j=visual.i_from_j,
+        i_from_j=i_from_j,
         max_distance_m=ASSESSED_WITHIN_M,
         points_per_sample=1.0,
     )
+
+
+def _assessed(target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
+    """The landmarks' motion with what the clouds say of it: a false one shows in the fitness."""
+    seen = _within(target, source, visual.i_from_j)
     return Registration(
         i_from_j=visual.i_from_j,
         information=visual.information,
