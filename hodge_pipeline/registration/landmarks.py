@@ -25,7 +25,8 @@ def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: fl
     """
     if frame.read_colour is None or frame.read_depth is None or frame.camera is None:
         return Landmarks.none()
-    grey, depth = cv2.cvtColor(frame.read_colour(), cv2.COLOR_RGB2GRAY), frame.read_depth()
+    grey: Bytes = np.asarray(cv2.cvtColor(frame.read_colour(), cv2.COLOR_RGB2GRAY), np.uint8)
+    depth = frame.read_depth()
     if scale > 1:
         size = (grey.shape[1] // scale, grey.shape[0] // scale)
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
