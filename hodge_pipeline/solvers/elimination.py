@@ -141,12 +141,19 @@ def plan_elimination(tail: Ints, head: Ints, count: int, core_order: Callable[[c
                 for b in range(a + 1, k):
                     first, second = neighbours[:, a], neighbours[:, b]
                     fill.append(np.minimum(first, second) * count + np.maximum(first, second))
-        pairs = np.unique(np.concatenate([pairs[~touched], *fill]))
+        pairs = _merged(pairs[~touched], fill)
         alive &= ~chosen
         left = int(alive.sum())
     rest = np.flatnonzero(alive)
     low, high = np.divmod(pairs, count)
     return _planned(count, rounds, _ordered_core(rest, low, high, count, core_order), low, high)
+
+
+def _merged(ascending: Ints, more: list[Ints]) -> Ints:
+    """Distinct keys, ascending, of some that are so already and others: two runs, which the sort merges."""
+    keys = np.concatenate([ascending, np.sort(np.concatenate([*more, ascending[:0]]))])
+    keys.sort(kind="stable")
+    return keys[np.diff(keys, prepend=-1) > 0]
 
 
 def _independent(low: Ints, high: Ints, alive: Bools, left: int, priority: Ints) -> Bools | None:

@@ -12,12 +12,12 @@ from hodge_pipeline.solvers.multigrid import Modes, Preconditioner, Precondition
 from hodge_pipeline.types import Floats
 
 MOST_STEPS = 300
-STALE_STEPS = 40
+STALE_STEPS = 30
 """About what a new preconditioner costs: an old one that needs more is made anew."""
 MOST_TURNED, SAMPLES = 0.05, 10_000
 """Of the levers' length, in a sample of the edges: from there on an old preconditioner knows the wrong modes."""
-LOOSEST = 0.1
-"""Of a step's tolerance: the preconditioner reaches it in a few."""
+LOOSEST = 1e-3
+"""Of a step's tolerance: a new preconditioner reaches it in a few."""
 
 
 @dataclass
@@ -60,11 +60,15 @@ class IterativeSolver:
         return CgResult(first.x + then.x, then.residual, first.steps + then.steps)
 
     def refined(self, exact: bsr_matrix, gradient: Floats, tolerance: float) -> CgResult | None:
-        """The step of another Hessian; None where the latest preconditioner does not serve it, or it is indefinite."""
+        """The step of another Hessian; None where that is indefinite, or the latest preconditioner does not serve it:
+        one that is too old is let go.
+        """
         if self.latest is None:
             return None
         found = self._cg(self.latest, exact, gradient, min(tolerance, LOOSEST), STALE_STEPS)
-        return None if found.negative_curvature or found.steps == STALE_STEPS else found
+        if found.steps == STALE_STEPS:
+            self.latest = None
+        return None if found.negative_curvature or self.latest is None else found
 
     def _afresh(self, hessian: bsr_matrix, gradient: Floats, tolerance: float, positions: Floats) -> CgResult:
         self.latest = None  # the old one's memory is better spent on the new one

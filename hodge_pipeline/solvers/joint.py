@@ -106,13 +106,13 @@ class JointObjective:
         """The step by the exact Hessian near a minimum, elsewhere or where it is not definite by Gauss-Newton's, which
         alone gives a preconditioner.
         """
-        solver.look(self.problem.tau, point.left.shift + point.left.arm)
-        if near:
-            found = solver.refined(self.hessian(point.left), slopes, tolerance)
+        left, positions = point.left, point.translations[: self.problem.free_count]
+        solver.look(self.problem.tau, left.shift + left.arm)
+        if near and solver.latest is not None:
+            found = solver.refined(self.hessian(left), slopes, tolerance)
             if found is not None:
                 return found
-        positions = point.translations[: self.problem.free_count]
-        return solver.solve(self.normal_matrix(point.left), slopes, tolerance, enough, positions)
+        return solver.solve(self.normal_matrix(left), slopes, tolerance, enough, positions)
 
     def normal_matrix(self, left: Residuals) -> bsr_matrix:
         """Half the Gauss-Newton Hessian."""
