@@ -15,11 +15,12 @@ from hodge_pipeline.edges.sequential import SequentialEdges
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.recipe import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
+from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView
 from hodge_pipeline.stages import no_progress
 from hodge_pipeline.types import Camera, CloudSet, Floats, Frame, PointCloud, ViewGraph
 from hodge_pipeline.unordered.folds import Pieces, contradictions, unfolded, within_parts
-from hodge_pipeline.unordered.hypotheses import allowed_violation
+from hodge_pipeline.unordered.hypotheses import allowed_hue_conflict, allowed_violation
 from hodge_pipeline.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.unordered.pieces import laid_apart
 from hodge_pipeline.unordered.scan_checks import check_scans, unregistrable
@@ -204,3 +205,29 @@ def test_frames_that_see_through_each_other_are_cut_apart_although_their_edges_a
         assert found.graph.edges.tolist() == [[0, 1], [2, 3]]
         assert found.piece[0] == found.piece[1] != found.piece[2] == found.piece[3]
         assert "4 contradict each other" in found.notes[0]
+
+
+def painted(poster: tuple[int, int, int]) -> PointCloud:
+    flat = np.random.default_rng(5).uniform(-1, 1, (4000, 2))
+    colours = np.full((4000, 3), 180, np.uint8)
+    colours[(np.abs(flat) < 0.3).all(axis=1)] = poster
+    return PointCloud(np.column_stack([flat, np.full(4000, 2.0)]).astype(np.float32), None, colours)
+
+
+def test_colours_tell_two_places_of_one_shape_apart_in_any_light() -> None:
+    red = painted((200, 40, 40))
+    assert red.colours is not None
+    darker = PointCloud(red.points_in_cam, None, (0.6 * red.colours).astype(np.uint8))
+    bare = PointCloud(red.points_in_cam)
+    clouds = CloudSet.from_clouds([red, darker, painted((40, 60, 200)), bare])
+    conflicts = hue_conflicts(clouds, np.array([[0, 1], [0, 2], [1, 2]]), np.tile(np.eye(4), (3, 1, 1)))
+    assert conflicts[0] < 0.01
+    assert (conflicts[1:] > 0.05).all()
+    assert np.isnan(hue_conflicts(CloudSet.from_clouds([bare, bare]), np.array([[0, 1]]), np.eye(4)[None])).all()
+
+
+def test_what_hues_may_differ_by_follows_the_best_pairs_of_a_run() -> None:
+    limits = HypothesisLimits()
+    assert allowed_hue_conflict(np.array([]), limits) == limits.hue_floor
+    assert allowed_hue_conflict(np.array([0.0, 0.0, 0.1, np.nan]), limits) == limits.hue_floor
+    assert np.isclose(allowed_hue_conflict(np.full(5, 0.01), limits), 0.12)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView, free_directions_of, violation
 from hodge_pipeline.registration.global_pairs import Matches
 from hodge_pipeline.registration.pairs import Registered, register_pairs
@@ -19,6 +20,7 @@ from hodge_pipeline.unordered.options import HypothesisLimits
 
 POINTS_PROJECTED = 1500
 USUAL_VIOLATIONS = 8.0
+USUAL_HUE_CONFLICTS = 12.0
 ViewOf = Callable[[int], DepthView | None]
 
 
@@ -104,6 +106,8 @@ def weigh(
     reason = np.full(len(chosen), "", "U64")
     if needs_all_directions:
         reason[free != ""] = "what they share leaves a motion open"
+    hue = hue_conflicts(clouds, chosen.pairs, registered.i_from_j)
+    reason[hue > allowed_hue_conflict(hue, limits)] = "their colours differ"
     reason[seen_through > allowed_violation(seen_through, limits)] = "one camera saw through the other's surface"
     reason[~(registered.rmse_m <= limits.max_rmse_m)] = "points too far apart"
     reason[~(overlap >= limits.min_overlap)] = "too little overlap"
@@ -115,6 +119,13 @@ def allowed_violation(seen_through: Floats, limits: HypothesisLimits) -> float:
     known = seen_through[np.isfinite(seen_through)]
     usual = float(np.median(known)) if len(known) else 0.0
     return float(np.clip(USUAL_VIOLATIONS * usual, limits.violation_floor, limits.max_violation))
+
+
+def allowed_hue_conflict(conflicts: Floats, limits: HypothesisLimits) -> float:
+    """The hue conflict up to which a pair may be right, from those (P,) of a run, a quarter of which are right."""
+    known = conflicts[np.isfinite(conflicts)]
+    good = float(np.quantile(known, 0.25)) if len(known) else 0.0
+    return max(USUAL_HUE_CONFLICTS * good, limits.hue_floor)
 
 
 def _frame_of(clouds: CloudSet, row: int) -> tuple[Floats, float]:
