@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
+from hodge_pipeline.diagnosis.short_cycles import short_cycles
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.edges import area_under_roc
 from hodge_pipeline.types import ViewGraph
@@ -110,3 +112,25 @@ def test_empty_and_odd_graphs_have_answers_and_bad_numbers_are_refused() -> None
         diagnose(ViewGraph.from_edges(np.arange(2), np.array([[0, 1]]), bad))
     with pytest.raises(GraphError, match="vertex row"):
         diagnose(ViewGraph.from_edges(np.arange(2), np.array([[0, 7]]), np.eye(4)[None]))
+
+
+def test_no_cycle_is_listed_twice() -> None:
+    k = np.arange(12)
+    rings = [np.stack([k, (k + 1) % 12], 1), np.stack([k + 12, (k + 1) % 12 + 12], 1)]
+    grid = np.concatenate([*rings, np.stack([k, k + 12], 1)])
+    loops = short_cycles(np.concatenate([grid, grid[:2]]), 24, 64)
+    named = [tuple(sorted(loops.edge[a:b].tolist())) for a, b in pairwise(loops.offsets.tolist())]
+    assert len(set(named)) == len(named) and set(loops.edge.tolist()) == set(range(38))
+    assert {len(name) for name in named} >= {2, 4}
+
+
+def test_a_reason_names_what_spoke_against_an_edge_whose_cycles_all_close() -> None:
+    # the two edges 2-9 close over each other, and over nothing else
+    clean = measured(poses_on_a_ring(16), np.concatenate([near_pairs(16, 3), [[2, 9]] * 2]))
+    graph, _ = spoiled(clean, np.array([48, 49]))
+    motion = graph.i_from_j.copy()
+    motion[49] = motion[48]
+    found = diagnose(replace(graph, i_from_j=motion), QUICK)
+    for row in (48, 49):
+        assert found.verdict[row] == WRONG
+        assert found.reason[row].startswith("1 of 1 cycles close, each over another edge that is left out; against it")

@@ -73,9 +73,12 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     probability = np.where(untestable, np.nan, np.maximum(consensus.probability, blame.probability))
     undecided = np.where(undecided >= 0, undecided, np.where(unvouched | (blame.probability > 0), blame.cycle, -1))
     verdict = _verdicts(probability, untestable, consensus.fit.used, options)
+    bridge = consensus.fit.used & np.isinf(consensus.fit.resistance)
     kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
     world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
-    return _report(graph, cycles, probability, verdict, kept, undecided, world_from_cam, consensus.fit.resistance)
+    return _report(
+        graph, cycles, probability, verdict, kept, undecided, bridge, world_from_cam, consensus.fit.resistance
+    )
 
 
 def _with_noise(graph: ViewGraph, motions: Floats, noise: Noise) -> ViewGraph:
@@ -98,6 +101,7 @@ def _report(
     verdict: NDArray[np.str_],
     kept: Bools,
     undecided: Ints,
+    bridge: Bools,
     world_from_cam: Floats,
     resistance: Floats,
 ) -> Diagnosis:
@@ -112,7 +116,7 @@ def _report(
     return Diagnosis(
         verdict=verdict,
         probability=probability,
-        reason=reasons(graph, cycles, verdict, residual, telling, undecided),
+        reason=reasons(graph, cycles, verdict, residual, telling, undecided, bridge),
         kept=kept,
         residual_m=residual[0],
         residual_deg=residual[1],

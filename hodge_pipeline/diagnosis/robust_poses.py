@@ -42,18 +42,19 @@ def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, rounds: int)
     poses, component = alignment.piece_from, alignment.piece
     used = component[evidence.edges[:, 0]] == component[evidence.edges[:, 1]]
     resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
-    chi2 = _chi2(evidence, graph, poses, component, resistance)
+    chi2 = _chi2(evidence, graph, poses, component, resistance, np.zeros(graph.edge_count))
     used = chi2 < FIRST_GATE
     for _ in range(rounds):
         component = connected_components(evidence.edges[used], evidence.vertex_count)
-        poses = _solve(evidence, graph, poses, used)
+        poses, say = _solve(evidence, graph, poses, used)
         resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
-        chi2 = _chi2(evidence, graph, poses, component, resistance)
+        chi2 = _chi2(evidence, graph, poses, component, resistance, say)
         used = chi2 < GATE
     return Fit(poses, component, chi2, used, resistance)
 
 
-def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> Floats:
+def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> tuple[Floats, Floats]:
+    """Poses, and what each edge (E,) weighed, 1 for one that fits and 0 for one that is not used."""
     chosen = graph.select(np.flatnonzero(used))
     large = graph.edge_count > LARGE
     limits = Limits(3 if large else 20, 1e-3 if large else 1e-6)
@@ -68,7 +69,9 @@ def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> 
         angle, moved = left_over(chosen, poses)
         squares = (angle / evidence.noise.rotation_rad[used]) ** 2 + (moved / evidence.noise.translation_m[used]) ** 2
         weight = (FREEDOM + DIMENSION) / (FREEDOM + squares)
-    return poses
+    say = np.zeros(graph.edge_count)
+    say[used] = FREEDOM / (FREEDOM + squares)
+    return poses, say
 
 
 def left_over(graph: ViewGraph, poses: Floats) -> tuple[Floats, Floats]:
@@ -77,9 +80,16 @@ def left_over(graph: ViewGraph, poses: Floats) -> tuple[Floats, Floats]:
     return np.linalg.norm(se3.so3_log(motion[:, :3, :3]), axis=1), np.linalg.norm(motion[:, :3, 3], axis=1)
 
 
-def _chi2(evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats) -> Floats:
-    """χ² (E,) in the edge's noise and the poses' own: angles drift as a random walk, positions with them."""
+def _chi2(
+    evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats, say: Floats
+) -> Floats:
+    """χ² (E,) in the edge's noise and the poses' own: angles drift as a random walk, positions with them.
+
+    Of an edge that has its say in the poses, what it would be without that.
+    """
     angle, moved = left_over(graph, poses)
+    pulled = 1 + say * np.where(np.isfinite(resistance), resistance, 0.0)
+    angle, moved = pulled * angle, pulled * moved
     turn, shift = evidence.noise.rotation_rad**2, evidence.noise.translation_m**2
     known = np.where(np.isfinite(resistance), resistance, 0.0)
     swing = turn * evidence.reach_m**2 * known**3 / 3

@@ -28,7 +28,7 @@ def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
         covered |= _covered(found[-1:], len(edges))
     if not covered.all():
         found.append(_tree_loops(edges, vertex_count, covered))
-    return _joined(found)
+    return _distinct(_joined(found), len(edges))
 
 
 def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
@@ -69,6 +69,19 @@ def _joined(found: list[Loops]) -> Loops:
     return Loops(
         offsets, np.concatenate([loops.edge for loops in found]), np.concatenate([loops.sign for loops in found])
     )
+
+
+def _distinct(loops: Loops, edge_count: int) -> Loops:
+    """Each cycle once: a square is found from each of its edges that lack a triangle, and again as a loop of the tree.
+
+    Cycles are the same where the sums of random numbers of their edges are, 64 bits each.
+    """
+    if not len(loops):
+        return loops
+    numbers = np.random.default_rng(0).integers(0, 2**64, edge_count, np.uint64)
+    sums = np.add.reduceat(numbers[loops.edge], loops.offsets[:-1])
+    first = np.sort(np.unique(sums, return_index=True)[1])
+    return loops if len(first) == len(loops) else loops.select(first)
 
 
 def _of_equal_length(edge: Ints, sign: Ints) -> Loops:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE, Cycles
-from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LONGEST_NAMED = 12
 
@@ -29,12 +29,17 @@ def reasons(
     residual: tuple[Floats, Floats],
     witnesses: tuple[Ints, Ints],
     undecided: Ints,
+    bridge: Bools,
 ) -> tuple[str, ...]:
-    """One line for each edge: what the cycles say, and how far it is from the poses."""
+    """One line for each edge: what the cycles say, and how far it is from the poses.
+
+    `bridge (E,)`: edges in use that alone hold two parts together, against others that were left out.
+    """
     count = graph.edge_count
     passing = np.bincount(cycles.loops.edge, minlength=count)
     closing = np.repeat(cycles.closes, cycles.loops.lengths)
     closed = np.bincount(cycles.loops.edge, closing, count).astype(np.int64)
+    sound = _sound(cycles, (verdict == CONSISTENT) | (verdict == UNTESTABLE))
     lines = []
     for edge in range(count):
         if undecided[edge] >= 0:
@@ -45,10 +50,36 @@ def reasons(
             good = verdict[edge] == CONSISTENT
             witness = int(witnesses[0 if good else 1][edge, 0])
             text = f"{closed[edge]} of {passing[edge]} cycles close"
+            distance = _distance(residual[0][edge], residual[1][edge])
             if witness >= 0:
                 text += f"; {name_cycle(graph, cycles, witness)} {cycle_error(cycles, witness)}"
-            lines.append(f"{text}; {_distance(residual[0][edge], residual[1][edge])}")
+            elif not good:
+                text += _over_what(int(closed[edge]), int(sound[edge]))
+                distance = _against(bool(bridge[edge]), distance)
+            lines.append(f"{text}; {distance}")
     return tuple(lines)
+
+
+def _sound(cycles: Cycles, kept: Bools) -> Ints:
+    """How many cycles (E,) close over an edge of which all other edges are kept."""
+    loops = cycles.loops
+    row = np.repeat(np.arange(len(loops)), loops.lengths)
+    left_out = np.bincount(row, ~kept[loops.edge], len(loops))
+    others = left_out[row] - ~kept[loops.edge]
+    return np.bincount(loops.edge, cycles.closes[row] & (others == 0), len(kept)).astype(np.int64)
+
+
+def _over_what(closed: int, sound: int) -> str:
+    if not closed:
+        return ""
+    return f", {sound} of them over kept edges alone" if sound else ", each over another edge that is left out"
+
+
+def _against(is_bridge: bool, distance: str) -> str:
+    """What speaks against an edge none of whose cycles fails."""
+    if is_bridge:
+        return "it alone holds two parts together, which edges that were left out would join otherwise"
+    return f"against it speaks where all kept edges together lay its ends: {distance}"
 
 
 def _undecided(graph: ViewGraph, cycles: Cycles, row: int) -> str:
