@@ -80,8 +80,8 @@ def _distinct(loops: Loops, edge_count: int) -> Loops:
         return loops
     numbers = np.random.default_rng(0).integers(0, 2**64, edge_count, np.uint64)
     sums = np.add.reduceat(numbers[loops.edge], loops.offsets[:-1])
-    first = np.sort(np.unique(sums, return_index=True)[1])
-    return loops if len(first) == len(loops) else loops.select(first)
+    last = len(loops) - 1 - np.unique(sums[::-1], return_index=True)[1]
+    return loops if len(last) == len(loops) else loops.select(np.sort(last))
 
 
 def _of_equal_length(edge: Ints, sign: Ints) -> Loops:
