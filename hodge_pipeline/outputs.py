@@ -140,6 +140,7 @@ def make_report(
         notes=tuple(job.notes),
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(job.recipe)),
+        last_shift_m=_last_shift(rounds, component),
         pictures=dataclasses.replace(
             _pictures(source, rounds, sets),
             sides=four_sides(CloudSet.open(job.path("clouds")), sets[rounds[0].name], sets["result"], component),
@@ -147,6 +148,16 @@ def make_report(
         ),
         refinement=None if refined is None else summary(refined.decision),
     )
+
+
+def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
+    """How far the last round moved the positions (root mean square, aligned); None where it is the first to solve, or
+    that of edits, which are meant to move them.
+    """
+    if len(rounds) < 3 or rounds[-1].disabled is not None:
+        return None
+    shift_m = absolute_error(rounds[-2].world_from_cam, rounds[-1].world_from_cam, component).rmse_m
+    return float(shift_m) if np.isfinite(shift_m) else None
 
 
 def _whole(job: Job, source: Source) -> Source:

@@ -121,7 +121,7 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
         recording.diagnosis(rounds[-1])
         scores = steps.evaluate(job, source, rounds, workers)
         recording.scores(scores)
-    frames, poses = tracked.frames_to_fuse(job, source, rounds[-1].world_from_cam)
+    frames, poses = tracked.frames_to_fuse(job, source, rounds[-1])
     models = steps.fuse(job, frames, poses, len(rounds) - 1)
     recording.models(models)
     return rounds, models, scores

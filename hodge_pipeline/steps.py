@@ -216,8 +216,8 @@ def fuse(job: Job, frames: Sequence[Frame], world_from_cam: Floats, number: int)
     """The PLY file of each model, by its name, from the poses (N, 4, 4) that follow from round `number`, the last."""
     last, files = f"solve-{number}", {}
     for row, fuser in enumerate(job.recipe.fusion):
-        name = f"fuse-{row}"
-        with job.stage(name, f"fusion {row + 1}", len(frames), fuser, ("source", last)) as (folder, advance):
+        name, options = f"fuse-{row}", fuser if job.tracked is None else (fuser, len(frames))
+        with job.stage(name, f"fusion {row + 1}", len(frames), options, ("source", last)) as (folder, advance):
             if not folder.finished:
                 model = fuser.fuse(frames, world_from_cam, advance)
                 write_ply(folder.path / f"{model.name}.ply", model)

@@ -117,14 +117,20 @@ def first_poses(job: Job, tracked: Tracked, source: Source) -> Round:
     return Round(tracked.steps.as_graph(ids, np.full(len(tracked.steps.pairs), "sequential")), tracked.world_from_key)
 
 
-def frames_to_fuse(job: Job, source: Source, world_from_cam: Floats) -> tuple[Sequence[Frame], Floats]:
+def frames_to_fuse(job: Job, source: Source, last: Round) -> tuple[Sequence[Frame], Floats]:
     """Every frame with a pose of its own, key frame or not, and the poses (N, 4, 4); those of frames that nothing
-    placed, such as a scan in other units, are not finite.
+    placed, such as a scan in other units, are not finite. After an edit a person waits: of a long source the key frames
+    alone.
     """
-    if job.tracked is not None:
+    world_from_cam = last.world_from_cam
+    if job.tracked is not None and (job.scoring or last.disabled is None):
         poses = job.tracked.all_poses(world_from_cam)
         return job.tracked.whole.frames, np.asarray(np.where(job.tracked.found[:, None, None], poses, np.nan))
-    has_cloud = CloudSet.open(job.path(CLOUDS)).sizes > 0
+    if job.tracked is not None:
+        job.note(
+            f"fused after an edit: the {len(source.frames)} key frames alone; hodge run, as before, fuses all frames"
+        )
+    has_cloud = CloudSet.open(job.path("clouds")).sizes > 0
     return source.frames, np.asarray(np.where(has_cloud[:, None, None], world_from_cam, np.nan))
 
 

@@ -224,6 +224,18 @@ def test_what_to_distrust_is_said(report: Report) -> None:
         assert expected in said
 
 
+@pytest.mark.parametrize(
+    ("shift_m", "spread", "said"), [(None, 1.0, False), (0.009, 1.0, False), (0.33, 1.0, True), (0.33, 100.0, False)]
+)
+def test_a_result_that_has_not_settled_is_not_to_be_trusted(shift_m: float | None, spread: float, said: bool) -> None:
+    path = Path3D("result", np.array([[0.0, 0, 0], [4, 0, 0], [4, 4, 0]]) * spread)
+    report = Report("r", SourceSummary("tum", "x", 3), last_shift_m=shift_m, pictures=Pictures(paths=(path,)))
+    lines = suspicions(report)
+    assert ("not to be trusted" in "".join(lines)) == said
+    if said:
+        assert "33 cm" in lines[0]
+
+
 def test_an_ignored_edge_is_not_called_used(report: Report) -> None:
     ignored = EdgeRow("1", "2", "overlap", 0.5, 0.0, 1.0, 20.0)
     assert not any("that the solver used" in line for line in suspicions(replace(report, worst_edges=(ignored,))))

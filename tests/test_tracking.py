@@ -14,7 +14,9 @@ from hodge_adapters.poses_text import read_tum
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3, starting, tracked
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.edits import Edit, History, write_history
 from hodge_pipeline.executors.local import InProcess
+from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe import Recipe, load_recipe
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, frame_blocks, track_block
@@ -79,9 +81,22 @@ def test_every_frame_that_was_found_is_fused(run: hodge_pipeline.Run) -> None:
     job = hodge_pipeline.job.Job(small_recipe(run.folder), None, hodge_pipeline.watch.Nobody())  # type: ignore[arg-type]
     found = np.arange(FRAMES) != 5
     job.tracked = replace(run.tracked, found=found)
-    frames, poses = tracked.frames_to_fuse(job, run.source, run.result.world_from_cam)
+    frames, poses = tracked.frames_to_fuse(job, run.source, run.result)
     assert len(frames) == FRAMES
     np.testing.assert_array_equal(np.isfinite(poses).all((1, 2)), found)
+
+
+def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(sequence: Path, tmp_path: Path) -> None:
+    recipe = small_recipe(sequence, "fusion=[cloud]")
+    before = hodge_pipeline.run(recipe, tmp_path / "run")
+    keys = len(before.result.world_from_cam)
+    i, j = before.result.graph.vertex_ids[before.result.graph.edges[0]]
+    write_history(before.folder, History((Edit(disable=(f"{i}-{j}",)),)))
+    edited = solve_again(before.folder)
+    assert any(f"the {keys} key frames alone" in note for note in edited.report.notes)
+    again = hodge_pipeline.run(recipe, before.folder)
+    assert not any("key frames alone" in note for note in again.report.notes)
+    np.testing.assert_array_equal(again.result.world_from_cam, edited.result.world_from_cam)
 
 
 def test_a_source_that_is_short_enough_is_registered_whole(sequence: Path) -> None:

@@ -183,6 +183,7 @@ class Report:
     """Everything that `report.html` and `report.json` say about one run.
 
     `before` and `after` name the sets of poses that the verdict compares, as in `scores` and `trajectories`.
+    `last_shift_m` is how far the last round moved the positions (root mean square), None where it had none before it.
     """
 
     title: str
@@ -199,4 +200,5 @@ class Report:
     notes: tuple[str, ...] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
     recipe: str = ""
+    last_shift_m: float | None = None
     pictures: Pictures = field(default_factory=Pictures)

@@ -6,8 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
 from hodge_pipeline.evaluation.contents import GraphSummary, Report, TrajectoryRow
+from hodge_pipeline.types import Floats
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
 
@@ -17,6 +20,9 @@ SAME = 0.02
 LARGE_RESIDUAL_M = 0.1
 LARGE_RESIDUAL_DEG = 5.0
 UNMATCHED_SHARE = 0.01
+UNSETTLED_M, UNSETTLED_SHARE = 0.05, 0.01
+"""By how much (root mean square), and by which share of the path, the last of several rounds may move the positions.
+Runs that end near the truth move by less than 1 cm, one whose edges slide along a bare floor by 30."""
 NO_MEASURE = "there were neither overlapping clouds nor true poses to compare the poses by."
 
 
@@ -116,12 +122,28 @@ def suspicions(report: Report) -> tuple[str, ...]:
     """What a reader should distrust, one line each; the run's own notes come first."""
     graph = () if report.graph is None else tuple(_graph_suspicions(report.graph))
     return (
+        *_unsettled(report),
         *report.notes,
         *graph,
         *_edge_suspicions(report),
         *_unmatched(report),
         *(line for row in report.trajectories for line in _trajectory_suspicions(row)),
     )
+
+
+def _unsettled(report: Report) -> Iterator[str]:
+    scale = report.scores.scale if report.scores else 1.0
+    path_m = max((_path_m(path.positions) for path in report.pictures.paths if path.name == report.after), default=0.0)
+    if report.last_shift_m is not None and report.last_shift_m > max(UNSETTLED_M * scale, UNSETTLED_SHARE * path_m):
+        yield (
+            "The result is not to be trusted: the last round still moved the cameras by "
+            f"{length(report.last_shift_m)}, so the registered pairs do not agree on one scene. Frames nearer to each "
+            "other, or more texture, would help."
+        )
+
+
+def _path_m(positions: Floats) -> float:
+    return float(np.nansum(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
 
 
 def _graph_suspicions(graph: GraphSummary) -> Iterator[str]:
