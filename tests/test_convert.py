@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from hodge_adapters.poses_text import read_tum
 from hodge_pipeline.cli.converting import convert, writer_name
+from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.types import Source
@@ -37,3 +39,14 @@ def test_the_name_tells_the_writer(tmp_path: Path) -> None:
         convert(tmp_path / "nothing", tmp_path / "a.tum")
     convert(path, tmp_path / "b.any", to="kitti")
     assert (tmp_path / "b.any").read_text().count(" ") == 11
+
+
+def test_what_is_read_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "graph.g2o").write_text("# mine\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    (tmp_path / "same.g2o").symlink_to("graph.g2o")
+    before = (tmp_path / "graph.g2o").read_bytes()
+    for command in (["convert", "graph.g2o", "same.g2o"], ["solve", "graph.g2o", "--out", "same.g2o"]):
+        given = [str(tmp_path / word) if word.endswith(".g2o") else word for word in command]
+        with pytest.raises(RecipeError, match="is what is read"):
+            CliRunner().invoke(app, given, catch_exceptions=False)
+    assert (tmp_path / "graph.g2o").read_bytes() == before

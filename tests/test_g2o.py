@@ -228,3 +228,18 @@ def test_priors_pull_the_poses_to_where_they_are_known(tmp_path):
     )
     solution = solve(load_g2o(path).graph)
     np.testing.assert_allclose(solution.world_from_cam[:, :3, 3], [[10, 0, 0], [11, 0, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("head", [b"# caf\xe9\r\n", b"\xef\xbb\xbf", "# Größe\n".encode()])
+def test_comments_in_any_encoding_and_a_byte_order_mark(tmp_path, head):
+    good, other = write(tmp_path / "good.g2o", EDGE), tmp_path / "other.txt"
+    other.write_bytes(head + good.read_bytes())
+    assert G2oReader().sniff(other).confidence > 0.9
+    np.testing.assert_array_equal(load_g2o(other).graph.i_from_j, load_g2o(good).graph.i_from_j)
+
+
+def test_binary_junk_is_no_text(tmp_path):
+    (tmp_path / "junk.g2o").write_bytes(bytes(range(256)))
+    assert G2oReader().sniff(tmp_path / "junk.g2o").confidence < 0.5
+    with pytest.raises(SourceError, match="cannot be read as text"):
+        load_g2o(tmp_path / "junk.g2o")

@@ -3,6 +3,7 @@ import math
 from typer.testing import CliRunner
 
 from hodge_pipeline.cli.main import app
+from hodge_pipeline.guarding import chi2_measure
 from hodge_pipeline.refine.guard import Change, Measure, decide
 
 BETTER = Measure("held-out distance", 0.010, 0.009)
@@ -37,6 +38,11 @@ def test_a_measure_within_its_tolerance_is_not_worse_and_a_lost_one_is():
     assert Measure("x", 1.0, 1.2, tolerance=0.1).is_worse
     assert Measure("x", 1.0, math.nan).is_worse
     assert not Measure("x", math.nan, 1.0).is_worse
+
+
+def test_chi2_may_grow_by_a_fiftieth():
+    assert not chi2_measure(200.0, 203.9).is_worse
+    assert chi2_measure(200.0, 204.1).is_worse
 
 
 def test_an_uncertainty_that_is_unknown_never_calls_a_change_insignificant():

@@ -116,3 +116,16 @@ def test_names_and_suggestions(tmp_path: Path) -> None:
         recipe_file.find(str(tmp_path / "none.yaml"))
     with pytest.raises(RecipeError, match="no recipe"):
         recipe_file.find("../recipes/demo")
+
+
+@pytest.mark.parametrize(("length", "allowed"), [(8, True), (9, False)])
+def test_recipes_extend_each_other_eight_times_at_most(tmp_path: Path, length: int, allowed: bool) -> None:
+    (tmp_path / "0.yaml").write_text("seed: 5\n")
+    for number in range(1, length + 1):
+        (tmp_path / f"{number}.yaml").write_text(f"extends: {number - 1}.yaml\n")
+    last = str(tmp_path / f"{length}.yaml")
+    if allowed:
+        assert recipe_file.load(last).data["seed"] == 5
+    else:
+        with pytest.raises(RecipeError, match="a chain of at most 8"):
+            recipe_file.load(last)

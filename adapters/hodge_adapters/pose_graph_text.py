@@ -49,9 +49,9 @@ LANDMARK_TAGS = frozenset(
 def count_tags(path: Path) -> Counter[str]:
     """How often each first word occurs in the first lines; empty where the path is no readable text."""
     try:
-        with Path(path).open(encoding="ascii") as file:
-            lines = list(islice(file, SNIFFED_LINES))
-    except (OSError, UnicodeDecodeError):
+        with Path(path).open("rb") as file:
+            lines = _text(b"".join(islice(file, SNIFFED_LINES))).split("\n")
+    except (OSError, ValueError):
         return Counter()
     return Counter(line.split(None, 1)[0] for line in lines if line.strip() and not line.startswith("#"))
 
@@ -64,8 +64,8 @@ def read_records(
     A tag that is among the `other_names` is read as the one it stands for.
     """
     try:
-        lines = Path(path).read_text(encoding="ascii").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
+        lines = _text(Path(path).read_bytes()).split("\n")
+    except (OSError, ValueError) as error:
         raise SourceError(f"{path}: cannot be read as text ({error}): expected a pose-graph file") from error
     numbers: dict[str, list[int]] = {tag: [] for tag in keys}
     rests: dict[str, list[str]] = {tag: [] for tag in keys}
@@ -82,6 +82,13 @@ def read_records(
             other[tag] += 1
     records = {tag: _parse(path, tag, numbers[tag], rests[tag], keys[tag], columns[tag]) for tag in keys}
     return records, dict(other)
+
+
+def _text(contents: bytes) -> str:
+    """The text, whatever the encoding of its comments; raises `ValueError` for what is none."""
+    if b"\0" in contents:
+        raise ValueError("it has zero bytes")
+    return contents.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
 
 
 def _parse(

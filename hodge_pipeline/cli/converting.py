@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import registry
+from hodge_pipeline.cli.paths import keep_source
 from hodge_pipeline.cli.reader_choice import choose_reader
 from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.stages import Writer
@@ -35,6 +36,7 @@ def convert(
 
     Prints what was written and every note of the reader. Raises `RecipeError` where no writer is meant by the name.
     """
+    keep_source(source, out)
     opened = with_trajectory(choose_reader(source, reader, settings).open(source))
     name = to or writer_name(out, opened)
     writer: Writer = registry.load("writers", name)()

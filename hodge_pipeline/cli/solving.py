@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.cli.paths import keep_source
 from hodge_pipeline.edits import read_history
 from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.solve_file import Choices, SolvedFile, solve_file, write_solved
@@ -56,6 +57,8 @@ def solve(
         options = replace(options, disable=(*options.disable, *history.disabled))
         if out is None and not (path / RECIPE_FILE).is_file():
             run_folder = run_folder or path
+    if out is not None:
+        keep_source(path, out)
     if out is not None and not out.parent.is_dir():
         raise RecipeError(f"--out {out}: there is no folder {out.parent}: make it first")
     with Terminal(quiet or as_json) as terminal, terminal.stage("solve", 1):
