@@ -183,8 +183,8 @@ def _level(matrix: bsr_matrix, blocks: Floats, aggregate: Ints, count: int) -> L
     """The level with prolongation (I − ω D⁻¹ A) P, where P moves each aggregate as one."""
     size, n = matrix.blocksize[0], len(aggregate)
     rows = np.repeat(np.arange(n, dtype=np.int32), np.diff(matrix.indptr))
-    inverse = np.linalg.inv(matrix.data[rows == matrix.indices])
-    damped = inverse * (4 / 3 / _spectral_radius(matrix, inverse))
+    damped = np.linalg.inv(matrix.data[rows == matrix.indices])
+    damped *= 4 / 3 / _spectral_radius(matrix, damped)
     rigid = bsr_matrix((blocks, aggregate, np.arange(n + 1)), shape=(n * size, count * size))
     prolong = _as_blocks(matrix @ rigid, size)
     owner = np.repeat(np.arange(n, dtype=np.int32), np.diff(prolong.indptr))
@@ -196,6 +196,7 @@ def _level(matrix: bsr_matrix, blocks: Floats, aggregate: Ints, count: int) -> L
         prolong.data[own] += blocks
     else:  # scipy leaves out what cancels, where blocks are numbers
         prolong = _as_blocks(prolong + rigid, size)
+    del blocks, rigid, owner, own, rows  # their memory is better spent on what follows
     restrict = _as_blocks(prolong.transpose(), size)
     return Level(damped, prolong, restrict, _galerkin(matrix, prolong, restrict))
 
