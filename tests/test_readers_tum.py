@@ -14,7 +14,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Source, Trajectory
-from readers_data import HEIGHT, WIDTH, agreement, some_poses, tum_folder, tum_line
+from readers_data import HEIGHT, WIDTH, agreement, depth_values, some_poses, tum_folder, tum_line, write_depth
 
 
 @pytest.fixture
@@ -217,6 +217,25 @@ def test_outside_the_trajectory_there_is_no_pose() -> None:
     poses = interpolated_poses(trajectory, np.array([0.99, 1.0, 1.5, 2.0, 2.01]), 1.0)
     assert np.isnan(poses[:, 0, 0]).tolist() == [True, False, False, False, True]
     np.testing.assert_allclose(poses[[1, 3]], trajectory.world_from_cam, atol=1e-12)
+
+
+def test_a_pose_at_a_frames_own_stamp_is_its_truth_however_sparse_the_truth_is() -> None:
+    trajectory = Trajectory(np.array([1.0, 2.0, 3.0]), some_poses(3))
+    stamps_s = np.array([1.01, 1.5, 1.985, 3.01])
+    poses = interpolated_poses(trajectory, stamps_s, 0.1, 0.02)
+    assert np.isnan(poses[:, 0, 0]).tolist() == [False, True, False, True]
+    dense = interpolated_poses(trajectory, stamps_s[[0, 2]], 1.0)
+    np.testing.assert_array_equal(poses[[0, 2]], dense)
+
+
+def test_the_largest_value_is_no_depth(tmp_path: Path) -> None:
+    folder = tum_folder(tmp_path / "folder")
+    values = depth_values()
+    values[0, 0] = 65535
+    depth = next(iter(sorted((folder / "depth").iterdir())))
+    write_depth(depth, values)
+    frame = TumReader().open(folder).frames[0]
+    assert frame.read_depth is not None and frame.read_depth()[0, 0] == 0 and frame.read_depth().max() < 13
 
 
 def test_fr1_by_contract_and_convention(data_dir: Path) -> None:

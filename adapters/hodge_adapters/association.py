@@ -34,9 +34,9 @@ def nearest_pairs(depth_stamps_s: Floats, colour_stamps_s: Floats, max_differenc
     return colour_of
 
 
-def interpolated_poses(trajectory: Trajectory, stamps_s: Floats, max_gap_s: float) -> Floats:
+def interpolated_poses(trajectory: Trajectory, stamps_s: Floats, max_gap_s: float, near_s: float = 0.0) -> Floats:
     """Poses (N, 4, 4) at the stamps, on the geodesic between the two neighbours; NaN where one is farther than
-    `max_gap_s`. A stamp of the trajectory itself needs no neighbours.
+    `max_gap_s`, unless the other is within `near_s`. A stamp of the trajectory itself needs no neighbours.
     """
     poses = np.full((len(stamps_s), 4, 4), np.nan)
     times = trajectory.stamps_s
@@ -46,9 +46,9 @@ def interpolated_poses(trajectory: Trajectory, stamps_s: Floats, max_gap_s: floa
     exact = times[after] == stamps_s
     before = np.where(exact, after, np.maximum(after - 1, 0))
     to_before, to_after = stamps_s - times[before], times[after] - stamps_s
-    good = exact | (
-        (before < after) & (to_before >= 0) & (to_after >= 0) & (np.maximum(to_before, to_after) <= max_gap_s)
-    )
+    between = (before < after) & (to_before >= 0) & (to_after >= 0)
+    both_near = np.maximum(to_before, to_after) <= max_gap_s
+    good = exact | (between & (both_near | (np.minimum(to_before, to_after) <= near_s)))
     span = np.where(after > before, times[after] - times[before], 1.0)
     share = to_before / span
     a, b = trajectory.world_from_cam[before[good]], trajectory.world_from_cam[after[good]]

@@ -21,7 +21,7 @@ def image_frame(
     colour: Path | None,
     *,
     units_per_metre: float,
-    no_depth: tuple[int, ...] = (0,),
+    no_depth: tuple[int, ...] = (0, 65535),
     world_from_cam: Floats,
     sequence: str = "",
     lens: Lens | None = None,

@@ -59,7 +59,7 @@ class McapReader:
     depth_scale: float = Field(
         UNITS_PER_METRE, gt=0, description="units per metre of 16-bit depth; ROS (REP 118) has millimetres"
     )
-    no_depth: tuple[int, ...] = Field((0,), description="16-bit values that mean no depth")
+    no_depth: tuple[int, ...] = Field((0, 65535), description="16-bit values that mean no depth; 65535 is the largest")
     max_difference_s: float = Field(
         0.02, ge=0, description="seconds between the stamps of a depth image and its colour image, as for TUM"
     )

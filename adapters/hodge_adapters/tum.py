@@ -60,9 +60,12 @@ class TumReader:
     depth_scale: float | None = Field(
         None, gt=0, description="stored units per metre; none: DepthMapFactor of the camera file, else TUM's 5000"
     )
-    no_depth: tuple[int, ...] = Field((0,), description="stored values that mean no depth")
+    no_depth: tuple[int, ...] = Field((0, 65535), description="stored values that mean no depth; 65535 is the largest")
     max_difference_s: float = Field(
-        0.02, ge=0, description="seconds between a depth image and its colour image; TUM's own tool takes 0.02"
+        0.02,
+        ge=0,
+        description="seconds between a depth image and its colour image, or its true pose where `max_gap_s` has none; "
+        "TUM's own tools take 0.02",
     )
     truth: str = Field(TRUTH_FILE, description="file of the ground truth in the folder, TUM text; empty: none")
     truth_match: Literal["stamp", "row"] = Field(
@@ -184,7 +187,7 @@ class TumReader:
         """Poses (N, 4, 4) at the frames' stamps, NaN where the truth has none."""
         if trajectory is None:
             return np.full((len(stamps_s), 4, 4), np.nan)
-        poses = interpolated_poses(trajectory, stamps_s, self.max_gap_s)
+        poses = interpolated_poses(trajectory, stamps_s, self.max_gap_s, self.max_difference_s)
         without = int(np.isnan(poses[:, 0, 0]).sum())
         if without:
             hint = ": are its stamps of another clock? see truth_match" if without == len(stamps_s) else ""
