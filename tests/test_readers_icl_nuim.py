@@ -201,3 +201,18 @@ def test_the_authors_poses(data_dir: Path) -> None:
     trajectory = check_reader(IclNuimReader(), path).trajectory
     assert trajectory.stamps_s[0] == 1 and len(trajectory) > 880
     np.testing.assert_allclose(trajectory.world_from_cam[0, :3, 3], [0, 0, -2.25], atol=1e-9)
+
+
+def test_the_authors_images_without_their_list(tmp_path: Path) -> None:
+    poses = some_poses(4)
+    for number in range(3):
+        write_depth(tmp_path / f"depth/{number}.png", depth_values(number))
+        write_colour(tmp_path / f"rgb/{number}.png")
+    (tmp_path / "livingRoom1.gt.freiburg").write_text("".join(tum_line(n, poses[n]) for n in (1, 2, 3)))
+    assert IclNuimReader().sniff(tmp_path).confidence > 0.8
+    assert IclNuimReader().open(tmp_path).frames[0].camera.fy == -480
+    source = IclNuimReader(intrinsics=SMALL).open(tmp_path)
+    assert source.frames[0].read_depth is not None
+    np.testing.assert_allclose(source.frames[0].read_depth(), depth_values(0) / 5000, rtol=1e-6)
+    assert [frame.world_from_cam is not None for frame in source.frames] == [False, True, True]
+    assert "no associations.txt: images are paired by the numbers in their names" in source.notes

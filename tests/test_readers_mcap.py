@@ -217,6 +217,15 @@ def test_topics_by_type_and_by_option(tmp_path: Path) -> None:
         McapReader(frames="points").open(path)
 
 
+def test_an_uncalibrated_camera_is_said_to_be_one(tmp_path: Path) -> None:
+    log = depth_log(some_images())
+    zero = {**foxglove_header(100, OPTICAL), **calibration(WIDTH, HEIGHT, 0, 0, 0, 0)}
+    log.messages = [message for message in log.messages if message[0] != INFO]
+    log.add(INFO, CALIBRATION, zero, CDR)
+    with pytest.raises(SourceError, match=r"/cam/depth/camera_info: 1 left out: .*matrix K.*: give option camera"):
+        McapReader().open(log.write(tmp_path / "zero.mcap"))
+
+
 def test_calibrations_that_do_not_fit(tmp_path: Path) -> None:
     log = Log()
     for row in range(2):

@@ -208,3 +208,20 @@ def test_a_folder_that_may_not_be_read(sequence: Path) -> None:
             SevenScenesReader().open(sequence)
     finally:
         sequence.chmod(0o755)
+
+
+def test_sequences_that_are_still_packed_are_named(scene: Path, tmp_path: Path) -> None:
+    for name in ("seq-03.zip", "seq-05.zip"):
+        (scene / name).write_bytes(b"PK")
+    notes = SevenScenesReader().open(scene).notes
+    assert "sequences that are still packed left out: seq-05.zip" in notes, "seq-03 lies unpacked beside its archive"
+    assert not any("packed" in note for note in SevenScenesReader(split="test").open(scene).notes)
+    asked = SevenScenesReader(sequences=("seq-01", "seq-05")).open(scene).notes
+    assert [note for note in asked if "seq-05" in note] == ["sequences that are still packed left out: seq-05.zip"]
+
+
+def test_a_scene_as_it_is_downloaded(tmp_path: Path) -> None:
+    (tmp_path / "seq-01.zip").write_bytes(b"PK")
+    assert SevenScenesReader().sniff(tmp_path).advice == "its sequences are packed: unpack seq-01.zip in it"
+    with pytest.raises(SourceError, match=r"packed: unpack seq-01\.zip"):
+        SevenScenesReader().open(tmp_path)

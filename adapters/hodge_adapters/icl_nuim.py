@@ -16,7 +16,7 @@ from hodge_adapters.association import interpolated_poses
 from hodge_adapters.camera_files import Intrinsics, checked
 from hodge_adapters.icl_pov import list_pov, pov_frames
 from hodge_adapters.image_frames import image_frame
-from hodge_adapters.image_lists import find_association_file, read_pairs
+from hodge_adapters.image_lists import StampedImages, find_association_file, read_pairs
 from hodge_adapters.poses_text import parse_tum
 from hodge_adapters.redwood import find_log, is_redwood, list_images, read_log
 from hodge_adapters.tum import frame_ids
@@ -56,6 +56,8 @@ class IclNuimReader:
                 return Sniff(0.9, "a .gt.freiburg file") if truth_alone else Sniff(0.0, "not a folder")
             if _find_truth(path) and (find_association_file(path) or (path / "depth.txt").is_file()):
                 return Sniff(0.95, "a .gt.freiburg file beside image lists")
+            if _find_truth(path) and is_redwood(path):
+                return Sniff(0.9, "a .gt.freiburg file beside depth/ and rgb/")
             if list_pov(path):
                 return Sniff(0.95, "scene_00_0000.depth files")
             if is_redwood(path):
@@ -85,7 +87,7 @@ class IclNuimReader:
         if find_association_file(path) or (path / "depth.txt").is_file():
             return self._open_lists(path)
         if is_redwood(path):
-            return self._open_redwood(path)
+            return self._open_unlisted(path) if _find_truth(path) else self._open_redwood(path)
         raise SourceError(
             f"{path}: no associations.txt, no scene_00_0000.depth, no depth/ beside image/ or color/ in it"
         )
@@ -96,6 +98,16 @@ class IclNuimReader:
     def _open_lists(self, path: Path) -> Source:
         notes: list[str] = []
         listing = read_pairs(path, 0.0, notes)
+        return self._numbered(path, listing, notes)
+
+    def _open_unlisted(self, path: Path) -> Source:
+        """The TUM-like layout without its list: images are paired by the numbers in their names."""
+        notes = ["no associations.txt: images are paired by the numbers in their names"]
+        found = list_images(path, notes)
+        listing = StampedImages(np.array(found.numbers, float), found.depth, found.colour, ())
+        return self._numbered(path, listing, notes)
+
+    def _numbered(self, path: Path, listing: StampedImages, notes: list[str]) -> Source:
         camera = self._camera(ICL).camera(images.common_size(listing.depth))
         truth = _find_truth(path)
         trajectory, poses = None, np.full((len(listing.depth), 4, 4), np.nan)

@@ -132,7 +132,8 @@ class McapReader:
         images = one_per_stamp(topic, depth[topic], notes)
         camera = self._camera(recording, topic, images[0], notes)
         if camera is None:
-            raise SourceError(f"{path}: no calibration for {topic}: give option camera (fx fy cx cy)")
+            why = "".join(f"; {note}" for note in recording.complaints.notes() if "matrix K" in note)
+            raise SourceError(f"{path}: no calibration for {topic}{why}: give option camera (fx fy cx cy)")
         if self.colour_topic:
             colour = dict([named_topic(colour, self.colour_topic, "colour_topic")])
         colour_topic = best_colour(colour, topic, images[0], notes)

@@ -15,10 +15,11 @@ from hodge_pipeline.types import Floats, Trajectory
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses (N, 4, 4) of the frames, NaN where there is none, and the whole trajectory."""
+    """Poses (N, 4, 4) of the frames, NaN where there is none, the whole trajectory, and whether it is the camera's."""
 
     of_frames: Floats
     trajectory: Trajectory | None
+    linked: bool = True
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ def find_poses(
     else:
         poses = _from_transforms(recording, camera_frame, stamps_s, options, notes)
     without = int(np.isnan(poses.of_frames[:, 0, 0]).sum())
-    if without and poses.trajectory is not None:
+    if without and poses.trajectory is not None and poses.linked:
         notes.append(f"{without} of {len(stamps_s)} frames have no pose within {options.max_gap_s:g} s of their stamp")
     return poses
 
@@ -69,7 +70,7 @@ def _from_topic(
         return Poses(of_frames, trajectory)
     body_from_cam = _body_from_cam(recording, name, topic, body, camera_frame, stamps_s, notes)
     if body_from_cam is None:
-        return Poses(np.full_like(of_frames, np.nan), trajectory)
+        return Poses(np.full_like(of_frames, np.nan), trajectory, linked=False)
     along = recording.transforms.lookup(body, camera_frame, trajectory.stamps_s) if body != camera_frame else None
     if along is not None:
         trajectory = _finite(Trajectory(trajectory.stamps_s, trajectory.world_from_cam @ along))

@@ -24,6 +24,7 @@ from hodge_adapters.image_frames import image_frame
 from hodge_adapters.seven_scenes_files import (
     FRAME_FILE,
     FrameFiles,
+    packed_sequences,
     read_poses,
     sequence_folders,
     sequence_number,
@@ -90,7 +91,9 @@ class SevenScenesReader:
                             return Sniff(0.95, f"frame-*.depth.png in {folder.name}")
         except (OSError, SourceError):
             return Sniff(0.0, "not a folder that can be read")
-        return Sniff(0.0, "no frame-000000.depth.png in it or in a folder seq-01")
+        packed = list(packed_sequences(path).values())
+        advice = f"its sequences are packed: unpack {listed(packed)} in it" if packed else ""
+        return Sniff(0.0, "no frame-000000.depth.png in it or in a folder seq-01", advice)
 
     def open(self, path: Path) -> Source:
         """The frames of all chosen sequences, in order; `frame_id` and `stamp_s` are the number in the file name.
@@ -122,11 +125,15 @@ class SevenScenesReader:
                 raise SourceError(f"{path}: no sequences to choose from: give the scene's folder, with seq-01 in it")
             return [(path.resolve().name, path)]
         numbers = {name: sequence_number(name, str(path)) for name, _ in folders}
+        packed = packed_sequences(path)
         by_name = {sequence_number(name, "the option sequences") for name in self.sequences}
         by_split = split_numbers(path, self.split) if self.split != "all" else set()
-        absent = sorted((by_name | by_split) - set(numbers.values()))
+        absent = sorted((by_name | by_split) - set(numbers.values()) - set(packed))
         if absent:
             notes.append(f"sequences asked for but not there: {listed([f'seq-{number:02d}' for number in absent])}")
+        left = [name for number, name in packed.items() if number in (by_name or by_split or packed)]
+        if left:
+            notes.append(f"sequences that are still packed left out: {listed(left)}")
         for wanted in filter(None, (by_name, by_split)):
             folders = [(name, folder) for name, folder in folders if numbers[name] in wanted]
         if not folders:

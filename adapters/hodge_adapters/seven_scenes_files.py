@@ -20,6 +20,7 @@ SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 
 FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)$", re.IGNORECASE)
 _SEQUENCE = re.compile(r"(?:seq|sequence)-?(\d+)$", re.IGNORECASE)
+_PACKED = re.compile(r"(?:seq|sequence)-?(\d+)\.zip$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,17 @@ def sequence_folders(path: Path) -> list[tuple[str, Path]]:
             f"{path}: not a folder that can be read ({error.strerror}): give a 7-Scenes folder"
         ) from error
     return sorted(((entry.name, entry) for entry in inside), key=lambda item: (sequence_number(item[0], ""), item[0]))
+
+
+def packed_sequences(path: Path) -> dict[int, str]:
+    """The archives seq-01.zip, … of a scene, as it is downloaded, by number: those that no folder lies beside."""
+    try:
+        names = sorted(os.listdir(path))
+    except OSError:
+        return {}
+    folders = {int(match[1]) for name in names if (match := _SEQUENCE.match(name)) and (path / name).is_dir()}
+    packed = {int(match[1]): name for name in names if (match := _PACKED.match(name))}
+    return {number: name for number, name in packed.items() if number not in folders}
 
 
 def sequence_number(name: str, where: str) -> int:
@@ -73,6 +85,9 @@ def with_depth(path: Path, chosen: Sequence[tuple[str, Path]], notes: list[str])
         complete = [number for number in sorted(listing) if "depth" in listing[number]]
         missing.extend(f"{name}/{number:06d}" for number in sorted(listing.keys() - complete))
         usable.extend(FrameFiles(name, number, rank, listing[number]) for rank, number in enumerate(complete))
+    if not usable and packed_sequences(path):
+        packed = list(packed_sequences(path).values())
+        raise SourceError(f"{path}: its sequences are packed: unpack {listed(packed)} in it")
     if not usable:
         raise SourceError(
             f"{path}: no frame-000000.depth.png in it: give a sequence folder, or a scene with seq-01 in it"
