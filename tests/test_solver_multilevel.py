@@ -8,6 +8,7 @@ from hodge_pipeline.solvers import chordal, multilevel
 from hodge_pipeline.solvers.elimination import independent_set
 from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.solvers.multilevel import RotationGraph, multilevel_rotations
+from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import ViewGraph
 
 
@@ -36,17 +37,32 @@ def test_consistent_edges_give_the_truth(size):
     np.testing.assert_allclose(relative, np.broadcast_to(relative[:1], relative.shape), atol=1e-9)
 
 
-def test_the_minimum_is_that_of_the_chordal_start(monkeypatch):
+def noisy_lattice(side, sigma):
     rng = np.random.default_rng(1)
-    edges = lattice(8)
+    edges = lattice(side)
     count = edges.max() + 1
     truth = se3.exp(np.concatenate([rng.normal(size=(count, 3)), 10 * rng.random((count, 3))], axis=1))
-    noise = se3.exp(rng.normal(size=(len(edges), 6)) * 0.1)
+    noise = se3.exp(rng.normal(size=(len(edges), 6)) * sigma)
     measured = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ noise
-    graph = ViewGraph.from_edges(np.arange(count), edges, measured)
+    return ViewGraph.from_edges(np.arange(count), edges, measured)
+
+
+@pytest.mark.parametrize(("sigma", "same"), [(0.05, False), (0.3, True)])
+def test_noise_brings_the_chordal_start_back(sigma, same, monkeypatch):
+    monkeypatch.setattr(multilevel, "COARSEST", 50)
+    monkeypatch.setattr(chordal, "MULTILEVEL_SECONDS_AN_EDGE", 0.0)
+    problem = prepare(noisy_lattice(6, sigma)).problem
+    pinned = np.eye(3)[None]
+    exact, found = chordal.chordal_rotations(problem, pinned), chordal.initial_rotations(problem, pinned)
+    assert np.array_equal(exact, found) == same
+    np.testing.assert_allclose(found, exact, atol=0.5)
+
+
+def test_the_minimum_is_that_of_the_chordal_start(monkeypatch):
+    graph = noisy_lattice(8, 0.1)
     chordal_start = solve(graph, objective="isotropic")
     monkeypatch.setattr(multilevel, "COARSEST", 50)
-    monkeypatch.setattr(chordal, "ALWAYS_CHORDAL_S", 0.0)
+    monkeypatch.setattr(chordal, "AFFORDABLE_S", 0.0)
     monkeypatch.setattr(chordal, "MULTILEVEL_SECONDS_AN_EDGE", 0.0)
     other = solve(graph, objective="isotropic")
     assert other.metrics["converged"] == 1

@@ -21,22 +21,28 @@ from hodge_pipeline.types import Floats
 
 LARGE = 60_000
 """Unknowns above which the factor is kept in single precision."""
-ALWAYS_CHORDAL_S, MULTILEVEL_SECONDS_AN_EDGE = 0.3, 5e-6
+MULTILEVEL_SECONDS_AN_EDGE = 2.5e-6
 """Where a factorisation takes longer, by the count of its products, the multilevel scheme takes its place."""
+AFFORDABLE_S, NOISY = 0.3, 0.1
+"""So long a factorisation is worth it where the edges miss by more, as a mean square of 2 sin(θ/2) √2: 0.2 rad. Up to
+there both starts lead to the same minimum; with more noise the chordal one does so more often.
+"""
 CG_TOLERANCE, MAX_CG_STEPS = 1e-5, 50
 
 
 def initial_rotations(problem: Problem, pinned: Floats) -> Floats:
-    """Rotations (n, d, d) to start from: the chordal ones, or those of the multilevel scheme where that is cheaper.
+    """Rotations (n, d, d) to start from: the chordal ones, or those of the multilevel scheme where that is cheaper and
+    as good.
 
     `pinned (n − free, d, d)` are the rotations of the pinned vertices.
     """
-    plan, edges = problem.structure.elimination, len(problem.kappa)
-    factor_s = SECONDS_A_PRODUCT * problem.dimension**3 * plan.work
-    if plan.ordered and factor_s < max(ALWAYS_CHORDAL_S, MULTILEVEL_SECONDS_AN_EDGE * edges):
+    factor_s = SECONDS_A_PRODUCT * problem.dimension**3 * problem.structure.elimination.work
+    if factor_s <= MULTILEVEL_SECONDS_AN_EDGE * len(problem.kappa):
         return chordal_rotations(problem, pinned)
     whole = RotationGraph(problem.count, problem.tail, problem.head, problem.rotations, problem.kappa)
     found = multilevel_rotations(whole, _chordal_alone)
+    if factor_s < AFFORDABLE_S and _misfit(whole, found) > NOISY:
+        return chordal_rotations(problem, pinned)
     component = connected_components(np.stack([problem.tail, problem.head], axis=1), problem.count)
     held = np.arange(problem.free_count, problem.count)
     turn = np.broadcast_to(np.eye(problem.dimension), (component.max() + 1, *pinned.shape[1:])).copy()
@@ -44,6 +50,12 @@ def initial_rotations(problem: Problem, pinned: Floats) -> Floats:
     found = np.asarray(turn[component] @ found)
     found[held] = pinned
     return found
+
+
+def _misfit(graph: RotationGraph, rotations: Floats) -> float:
+    """The weighted mean of ‖R_j − R_i R_ij‖²."""
+    missed = rotations[graph.head] - rotations[graph.tail] @ graph.turns
+    return float(np.average(np.einsum("eij,eij->e", missed, missed), weights=graph.weights))
 
 
 def _chordal_alone(graph: RotationGraph) -> Floats:

@@ -16,10 +16,10 @@ from hodge_pipeline.solvers.elimination import independent_set
 from hodge_pipeline.solvers.rotations import project
 from hodge_pipeline.types import Floats, Ints
 
-COARSEST = 2000
+COARSEST = 500
 """Vertices: so few are solved in milliseconds."""
 LEAST_COARSENING = 0.8
-SWEEPS = 4
+SWEEPS = 8
 DAMPING = 0.7
 """Of a step to the neighbours' mean: whole steps would swing on graphs without odd cycles."""
 
