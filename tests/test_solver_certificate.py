@@ -64,8 +64,11 @@ def test_a_lower_bound_holds_for_all_poses_and_is_tight_at_the_best():
         translations = best_translations(problem, rotations, poses[:, :3, 3])
         cost = residuals(problem, rotations, translations).cost
         lifted = np.concatenate([rotations, np.zeros((len(rotations), 1, 3))], axis=1)
-        bound = lower_bound(problem, lifted, np.pad(translations, ((0, 0), (0, 1))), cost)
+        padded = np.pad(translations, ((0, 0), (0, 1)))
+        bound = lower_bound(problem, lifted, padded, cost, np.nan)
         assert least < bound / best.metrics["objective"] < 1 + 1e-9
+        pessimistic = lower_bound(problem, lifted, padded, cost, -1e-3 * cost)
+        assert pessimistic <= cost * (1 - 1e-3 * 3 * len(poses))
 
 
 def test_a_bound_close_enough_is_a_certificate():

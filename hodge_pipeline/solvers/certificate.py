@@ -14,7 +14,8 @@ import numpy as np
 from scipy.sparse import bsr_matrix, csc_matrix, diags_array
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
-from hodge_pipeline.solvers.linear import factorise, fill_reducing_order, negative_pivots
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.linear import Factor, definite_factor, fill_reducing_order, negative_pivots
 from hodge_pipeline.solvers.problem import BlockPattern, Problem
 from hodge_pipeline.types import Floats, Ints
 
@@ -22,16 +23,16 @@ RELATIVE_SHIFTS = (1e-10, 1e-7)
 """ε over κ's scale, the second where the first is lost in rounding; local minima have eigenvalues far below both."""
 RELATIVE_GAP = 1e-6
 """ε is taken larger where even then the bound on the gap stays below this share of F."""
-
-
 BRACKET = 8.0
-"""The factor between the shifts among which the smallest eigenvalue is bracketed."""
+"""The factor between the shifts that are tried until a matrix is definite."""
 MAX_BRACKETS = 40
 GAP_STEP = 4.0
 """The factor between the gaps that are tried for a bound: each costs a factorisation."""
 EIGENVALUE_TOLERANCE = 1e-3
-REGULAR = 1e-8
-"""ε over the largest entry of Q, whose null space are the turns of the whole."""
+ABOVE = 1.01
+"""The first gap that is tried, over what the smallest eigenvalue says."""
+FIRST_SHIFT = 1e-3
+"""Over κ's scale: that of an inverse to precondition with; the smaller, the fewer steps, the more factorisations."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,14 @@ def certificate_matrix(problem: Problem, rotations: Floats, translations: Floats
     stacked = np.concatenate([np.swapaxes(rotations, 1, 2), translations[:, None, :]], axis=1)
     image = (matrix @ stacked.reshape(-1, r)).reshape(count, size, r)
     multiplier = image[:, :d] @ rotations
+    return _less(matrix, 0.5 * (multiplier + np.swapaxes(multiplier, 1, 2)))
+
+
+def _less(matrix: bsr_matrix, multiplier: Floats) -> bsr_matrix:
+    """M − Λ, of the multiplier's blocks (n, d, d) on the rotation rows."""
+    (count, d, _), size = multiplier.shape, matrix.blocksize[0]
     diagonal = np.zeros((count, size, size))
-    diagonal[:, :d, :d] = 0.5 * (multiplier + np.swapaxes(multiplier, 1, 2))
+    diagonal[:, :d, :d] = multiplier
     vertices = np.arange(count + 1, dtype=np.int32)
     return (matrix - bsr_matrix((diagonal, vertices[:-1], vertices), shape=matrix.shape)).tobsr((size, size))
 
@@ -100,10 +107,10 @@ def _blocks(problem: Problem, edges: slice) -> Floats:
 def certify(problem: Problem, rotations: Floats, translations: Floats, cost: float) -> Certificate:
     """The certificate of the poses in the problem's order, where its components are pinned by one vertex each."""
     d = problem.dimension
-    scale = float(np.median(problem.kappa)) if len(problem.kappa) else 1.0
+    scale = _scale(problem)
     rank = d * problem.count
-    order = _elimination_order(problem)
-    matrix, on_rotations = _reduced(problem, order, rotations, translations)
+    order = elimination_order(problem)
+    matrix, on_rotations = _reduced(problem, order, certificate_matrix(problem, rotations, translations))
     negative = -1
     for relative in RELATIVE_SHIFTS:
         shift = max(relative * scale, RELATIVE_GAP * cost / rank)
@@ -124,7 +131,11 @@ def certify(problem: Problem, rotations: Floats, translations: Floats, cost: flo
     return Certificate(False, shift, np.inf, negative, note, smallest, direction)
 
 
-def _elimination_order(problem: Problem) -> Ints:
+def _scale(problem: Problem) -> float:
+    return float(np.median(problem.kappa)) if len(problem.kappa) else 1.0
+
+
+def elimination_order(problem: Problem) -> Ints:
     """The vertices in an order that keeps the fill low; theirs, where they were put into one."""
     order = np.arange(problem.count)
     if not problem.structure.elimination.ordered:
@@ -133,15 +144,22 @@ def _elimination_order(problem: Problem) -> Ints:
     return order
 
 
-def lower_bound(problem: Problem, rotations: Floats, translations: Floats, cost: float) -> float:
+def lower_bound(
+    problem: Problem, rotations: Floats, translations: Floats, cost: float, smallest_eigenvalue: float
+) -> float:
     """What F is at least, whatever the rotations: from a point (n, r, d), (n, r) of a higher space that costs `cost`.
 
+    `smallest_eigenvalue`: about that of Q − Λ there, NaN where it is not known.
     For all R, F(R) ≥ tr Λ + λ_min(Q − Λ) · n d, and tr Λ is the cost. −∞ where the bound would say nothing.
     """
-    matrix, on_rotations = _reduced(problem, _elimination_order(problem), rotations, translations)
-    gap = RELATIVE_GAP / GAP_STEP * cost
+    matrix, on_rotations = _reduced(
+        problem, elimination_order(problem), certificate_matrix(problem, rotations, translations)
+    )
+    rank = problem.dimension * problem.count
+    least = RELATIVE_GAP / GAP_STEP * cost
+    gap = max(least, ABOVE * -smallest_eigenvalue * rank) if math.isfinite(smallest_eigenvalue) else least
     while gap < cost:
-        shift = gap / (problem.dimension * problem.count)
+        shift = gap / rank
         if negative_pivots(_shifted(matrix, shift, on_rotations)) == 0:
             return cost - gap
         gap *= GAP_STEP
@@ -160,26 +178,16 @@ def bounded(answer: Certificate, cost: float, bound: float) -> Certificate:
     return replace(answer, gap_bound=gap, note=note)
 
 
-def _reduced(problem: Problem, order: Ints, rotations: Floats, translations: Floats) -> tuple[csc_matrix, Floats]:
-    """The certificate matrix in this order of vertices, and 1 at the rows of rotations."""
-    rows, size = _rows(problem, order), problem.dimension + 1
-    matrix = csc_matrix(certificate_matrix(problem, rotations, translations))
-    return csc_matrix(matrix[rows][:, rows]), (rows % size < size - 1).astype(float)
+def definite_inverse(
+    problem: Problem, order: Ints, connection: bsr_matrix, multiplier: Floats
+) -> Callable[[Floats], Floats]:
+    """The inverse of Q − Λ + s · I on vectors (n, d, r), s such that it is definite; its translations are eliminated.
 
-
-def _rows(problem: Problem, order: Ints) -> Ints:
-    """The rows of M, vertices in this order, without pinned translations."""
-    size = problem.dimension + 1
-    rows = order[:, None] * size + np.arange(size)
-    return np.asarray(rows[(rows % size < size - 1) | (order < problem.free_count)[:, None]])
-
-
-def inverse_of_data_matrix(problem: Problem, matrix: bsr_matrix) -> Callable[[Floats], Floats]:
-    """The inverse of Q + εI on vectors (n, d, r), from M: Q's translations eliminated with the rest."""
-    d, rows = problem.dimension, _rows(problem, _elimination_order(problem))
-    shift = REGULAR * float(np.abs(matrix.diagonal()).max(initial=0.0))
-    on_rotations = (rows % (d + 1) < d).astype(float)
-    factor = factorise(_shifted(csc_matrix(csc_matrix(matrix)[rows][:, rows]), shift, on_rotations), "NATURAL")
+    `connection` is M, `multiplier (n, d, d)` Λ, `order (n,)` that of elimination.
+    """
+    d, rows = problem.dimension, _rows(problem, order)
+    matrix, on_rotations = _reduced(problem, order, _less(connection, multiplier))
+    factor, _ = _definite(matrix, FIRST_SHIFT * _scale(problem), on_rotations)
 
     def apply(vectors: Floats) -> Floats:
         stacked = np.zeros((problem.count, d + 1, vectors.shape[2]))
@@ -189,6 +197,32 @@ def inverse_of_data_matrix(problem: Problem, matrix: bsr_matrix) -> Callable[[Fl
         return flat.reshape(stacked.shape)[:, :d]
 
     return apply
+
+
+def _definite(matrix: csc_matrix, shift: float, on_rotations: Floats) -> tuple[Factor, float]:
+    """The factor of the first matrix that is definite as the shift grows, and that shift.
+
+    Raises `GraphError` where none is.
+    """
+    for _ in range(MAX_BRACKETS):
+        factor = definite_factor(_shifted(matrix, shift, on_rotations))
+        if factor is not None:
+            return factor, shift
+        shift *= BRACKET
+    raise GraphError(f"a linear system of {matrix.shape[0]} unknowns stays indefinite: check for contradictory weights")
+
+
+def _reduced(problem: Problem, order: Ints, matrix: bsr_matrix) -> tuple[csc_matrix, Floats]:
+    """The matrix in this order of vertices, and 1 at the rows of rotations."""
+    rows, size = _rows(problem, order), problem.dimension + 1
+    return csc_matrix(csc_matrix(matrix)[rows][:, rows]), (rows % size < size - 1).astype(float)
+
+
+def _rows(problem: Problem, order: Ints) -> Ints:
+    """The rows of M, vertices in this order, without pinned translations."""
+    size = problem.dimension + 1
+    rows = order[:, None] * size + np.arange(size)
+    return np.asarray(rows[(rows % size < size - 1) | (order < problem.free_count)[:, None]])
 
 
 def _shifted(matrix: csc_matrix, shift: float, on_rotations: Floats) -> csc_matrix:
@@ -201,11 +235,7 @@ def _smallest_eigenvalue(matrix: csc_matrix, shift: float, on_rotations: Floats)
     By Lanczos on the inverse of Q − Λ + s · I for the first s in a geometric row that makes it definite, so that the
     wanted eigenvalue lies apart from all others. NaN and None where that does not settle.
     """
-    for _ in range(MAX_BRACKETS):
-        shift *= BRACKET
-        if negative_pivots(_shifted(matrix, shift, on_rotations)) == 0:
-            break
-    factor = factorise(_shifted(matrix, shift, on_rotations), "NATURAL")
+    factor, shift = _definite(matrix, BRACKET * shift, on_rotations)
     rows = np.flatnonzero(on_rotations)
 
     def inverse(vector: Floats) -> Floats:

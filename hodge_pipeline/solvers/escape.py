@@ -23,7 +23,9 @@ from hodge_pipeline.solvers.rotations import project
 from hodge_pipeline.solvers.setup import Setup
 from hodge_pipeline.types import Floats, Ints
 
-MOST_RUNGS, MOST_CG_STEPS = 5, 2000
+MOST_RUNGS, MOST_CG_STEPS = 10, 2000
+CG_STEPS_OF_RUNG = 100
+"""At most, times the rung: valleys are straighter the higher it is, and a lower one need not be followed to its end."""
 LIFTED_TOLERANCE = 1e-7
 """Relative: a bound from there is no closer than that."""
 LOWER = 1e-9
@@ -50,12 +52,14 @@ def escape(
     lifted = LiftedObjective.of(problem)
     loose = replace(limits, relative_tolerance=max(limits.relative_tolerance, LIFTED_TOLERANCE))
     here, cg_steps = lifted.at(np.swapaxes(point.rotations, 1, 2), point.translations), 0
-    for _ in range(MOST_RUNGS):
+    for rung in range(MOST_RUNGS):
         below = None if answer.optimal or answer.direction is None else lifted.below(here, answer.direction)
         if below is None or cg_steps > MOST_CG_STEPS or time.monotonic() > limits.deadline_s:
             break
-        climb = descend(lifted, below, loose, setup.rounding, most_cg_steps=MOST_CG_STEPS - cg_steps)
+        most = min(CG_STEPS_OF_RUNG * (rung + 1), MOST_CG_STEPS - cg_steps)
+        climb = descend(lifted, below, loose, setup.rounding, most_cg_steps=most)
         cg_steps += climb.cg_steps
+        won = here.cost - climb.point.cost
         here = lifted.at(climb.point.rotations, climb.point.translations)
         descent = _rounded_descent(setup, here, point, limits, watch)
         if descent.point.cost < lowest * (1 - LOWER):
@@ -64,6 +68,8 @@ def escape(
             if best.certificate.optimal:
                 return best
         answer = certify(problem, np.ascontiguousarray(np.swapaxes(here.rotations, 1, 2)), here.translations, here.cost)
+        if won < LIFTED_TOLERANCE * here.cost:
+            break
     return replace(best, bound=_bound(problem, here, answer))
 
 
@@ -71,7 +77,7 @@ def _bound(problem: Problem, here: LiftedPoint, answer: Certificate) -> float:
     if answer.optimal:
         return here.cost - answer.gap_bound
     turned = np.ascontiguousarray(np.swapaxes(here.rotations, 1, 2))
-    return lower_bound(problem, turned, here.translations, here.cost)
+    return lower_bound(problem, turned, here.translations, here.cost, answer.smallest_eigenvalue)
 
 
 def _rounded_descent(

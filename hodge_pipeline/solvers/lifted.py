@@ -7,17 +7,16 @@ translations, which live in that space too, eliminated. It is never turned as a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import bsr_matrix
 
-from hodge_pipeline.solvers.certificate import connection_matrix, inverse_of_data_matrix
+from hodge_pipeline.solvers.certificate import connection_matrix, definite_inverse, elimination_order
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.problem import Problem
-from hodge_pipeline.types import Floats
+from hodge_pipeline.types import Floats, Ints
 
 MAX_CG_STEPS = 300
 MAX_HALVINGS = 30
@@ -45,13 +44,12 @@ class LiftedObjective:
 
     problem: Problem
     matrix: bsr_matrix
-    precondition: Callable[[Floats], Floats]
+    order: Ints
 
     @classmethod
     def of(cls, problem: Problem) -> LiftedObjective:
         """The lifted F of a problem."""
-        matrix = connection_matrix(problem)
-        return cls(problem, matrix, inverse_of_data_matrix(problem, matrix))
+        return cls(problem, connection_matrix(problem), elimination_order(problem))
 
     def at(self, rotations: Floats, translations: Floats) -> LiftedPoint:
         """The point at these frames (n, d, r); the translations follow from them, whatever was given."""
@@ -63,13 +61,14 @@ class LiftedObjective:
         assert isinstance(point, LiftedPoint)
         frames, multiplier = point.rotations, point.multiplier
         gradient = tangent(frames, point.image).reshape(-1)
+        inverse = definite_inverse(self.problem, self.order, self.matrix, multiplier)
 
         def hessian(x: Floats) -> Floats:
             along = x.reshape(frames.shape)
             return tangent(frames, self._reduced(along)[0] - multiplier @ along).reshape(-1)
 
         def precondition(r: Floats) -> Floats:
-            return tangent(frames, self.precondition(r.reshape(frames.shape))).reshape(-1)
+            return tangent(frames, inverse(r.reshape(frames.shape))).reshape(-1)
 
         found = truncated_cg(hessian, precondition, gradient, tolerance, MAX_CG_STEPS, enough)
         x = found.x

@@ -128,13 +128,25 @@ def negative_pivots(matrix: csc_matrix) -> int:
     """
     if matrix.shape[0] == 0:
         return 0
+    factor = _symmetric(matrix)
+    return -1 if factor is None else int((factor.U.diagonal() < 0).sum())
+
+
+def definite_factor(matrix: csc_matrix) -> Factor | None:
+    """The factor of a symmetric matrix (n, n) whose rows are in elimination order; None unless it is definite."""
+    factor = _symmetric(matrix)
+    if factor is None or (factor.U.diagonal() < 0).any():
+        return None
+    return Factor(int(matrix.shape[0]), factor.solve)
+
+
+def _symmetric(matrix: csc_matrix) -> SuperLU | None:
+    """L D Lᵀ of a symmetric matrix; None where it is singular to working precision."""
     try:
         factor = _decompose(matrix, "NATURAL")
     except GraphError:
-        return -1
-    if not np.array_equal(factor.perm_r, factor.perm_c):
-        return -1
-    return int((factor.U.diagonal() < 0).sum())
+        return None
+    return factor if np.array_equal(factor.perm_r, factor.perm_c) else None
 
 
 def _decompose(csc: csc_matrix, ordering: str) -> SuperLU:
