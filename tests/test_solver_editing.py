@@ -85,6 +85,13 @@ def test_pieces_part_and_join_again():
     same(editor.solve(), solve(graph))
 
 
+def test_an_edge_that_parts_pieces_and_one_that_does_not():
+    graph = ring()
+    editor = GraphEditor(graph)
+    editor.disable([20, 3])
+    same(editor.solve(), solve(scaled(graph, editor.weights)))
+
+
 def test_added_edges_are_solved_and_taken_back():
     graph = ring()
     editor = GraphEditor(graph)
@@ -140,17 +147,34 @@ def test_a_corrected_factor_is_that_of_the_changed_laplacian():
     np.testing.assert_allclose(laplacian(tail, head, new, 9) @ found.solve(rhs), rhs, atol=1e-12)
 
 
-def test_a_change_settles_nearby_first():
-    """On a grid of 90 x 90 the edit is solved in its neighbourhood, then everywhere: the same minimum."""
-    side, rng = 90, np.random.default_rng(1)
+def noisy_grid(side: int) -> ViewGraph:
+    rng = np.random.default_rng(1)
     grid = np.arange(side * side).reshape(side, side)
     edges = np.concatenate(
         [np.stack([a.ravel(), b.ravel()], axis=1) for a, b in ((grid[1:], grid[:-1]), (grid[:, 1:], grid[:, :-1]))]
     )
-    graph = ViewGraph.from_edges(grid.ravel(), edges, se3.exp(0.05 * rng.normal(size=(len(edges), 6))))
+    return ViewGraph.from_edges(grid.ravel(), edges, se3.exp(0.05 * rng.normal(size=(len(edges), 6))))
+
+
+def test_changes_settle_nearby_first():
+    """On a grid of 90 x 90 an edit is solved in its neighbourhood, then everywhere if need be: the same minimum."""
+    graph = noisy_grid(90)
     editor = GraphEditor(graph, objective="isotropic")
-    editor.disable([4000])
-    warm = editor.solve()
-    assert warm.metrics["iterations"] <= 2
-    cold = solve(scaled(graph, editor.weights), objective="isotropic")
+    iterations = []
+    for row in (89, 4000, 15990):
+        editor.disable([row])
+        warm = editor.solve()
+        iterations.append(warm.metrics["iterations"])
+    assert max(iterations) <= 2
+    assert min(iterations) == 0, "no edit was settled in its neighbourhood alone"
+    cold = solve(scaled(graph, editor.weights), objective="isotropic", relative_tolerance=1e-12)
     assert warm.metrics["objective"] == pytest.approx(cold.metrics["objective"], rel=2e-9)
+
+
+def test_a_solution_of_another_objective_is_not_taken_for_the_minimum():
+    graph = noisy_grid(75)
+    editor = GraphEditor(graph, solve(graph, objective="isotropic", relative_tolerance=1e-2), objective="full")
+    editor.disable([4000])
+    found = editor.solve()
+    cold = solve(scaled(graph, editor.weights))
+    assert found.metrics["objective"] == pytest.approx(cold.metrics["objective"], rel=1e-8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,11 +14,11 @@ from hodge_pipeline.complex.components import connected_components, describe_com
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.hodge import ObjectiveName
 from hodge_pipeline.solvers.local import settled_nearby
-from hodge_pipeline.solvers.minimise import metrics_of, minimise
-from hodge_pipeline.solvers.newton import Limits
+from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
+from hodge_pipeline.solvers.newton import Descent, Limits
 from hodge_pipeline.solvers.priors import PER_EDGE
 from hodge_pipeline.solvers.problem import reweighted
-from hodge_pipeline.solvers.setup import InitialName, Setup, prepare
+from hodge_pipeline.solvers.setup import Setup, prepare
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
 LIMITS = Limits(max_iterations=100, relative_tolerance=1e-9)
@@ -25,11 +26,14 @@ LIMITS = Limits(max_iterations=100, relative_tolerance=1e-9)
 
 @dataclass(frozen=True)
 class _State:
-    """What `undo` comes back to: the edges, their weights relative to their information, the latest solution."""
+    """What `undo` comes back to: the edges, their weights relative to their information, the latest solution, and by
+    how much its objective may yet fall where poses far from the edits were left as they are.
+    """
 
     graph: ViewGraph
     weights: Floats
     solution: Solution
+    owed: float
 
 
 @dataclass(frozen=True)
@@ -54,9 +58,9 @@ class GraphEditor:
         better = editor.solve()
         editor.undo()
 
-    Edges are named by their rows. A solve after an edit begins at the present poses, with the factors of the
-    first one corrected for the edges that changed; where pieces part or join, or edges are new, the graph is set up
-    again.
+    Edges are named by their rows. A solve after an edit begins at the present poses, near the edges that changed, and
+    ends there if those farther off have nothing to win; else it goes on with the factors of the first solve, corrected
+    for the edges that changed. Where pieces part or join, or edges are new, the graph is set up again.
     """
 
     def __init__(
@@ -73,8 +77,11 @@ class GraphEditor:
         setup = prepare(graph, None if solution is None else solution.world_from_cam)
         self._base = _Base(graph, np.arange(graph.edge_count), setup)
         if solution is None:
-            solution = self._minimum(self._base, setup, "chordal")
-        self._state = _State(graph, np.asarray(solution.weights, float).copy(), solution)
+            solution = self._solution(self._base, minimise(setup, "chordal", LIMITS, self._full(setup)))
+        own = "chi2" if self._full(setup) else "isotropic"
+        settled = own in solution.metrics and solution.metrics.get("converged") == 1
+        owed = 0.0 if settled else math.inf
+        self._state = _State(graph, np.asarray(solution.weights, float).copy(), solution, owed)
 
     @property
     def graph(self) -> ViewGraph:
@@ -145,24 +152,32 @@ class GraphEditor:
             problem=reweighted(base.setup.problem, scale[base.used]),
             weights=replace(weights, information=information),
         )
-        full = self._objective == "full" and weights.definite
+        full = self._full(setup)
         before = np.zeros_like(scale)
         before[: len(self._state.solution.weights)] = self._state.solution.weights
-        moved = np.flatnonzero(scale[base.used] != before[base.used])
-        solution = self._minimum(base, settled_nearby(setup, moved, LIMITS, full), "given")
+        changed = scale != before
+        moved = np.flatnonzero(changed[base.used])
+        everywhere = len(moved) < np.count_nonzero(changed)
+        near, to_come = (setup, math.inf) if everywhere else settled_nearby(setup, moved, LIMITS, full)
+        owed = self._state.owed + to_come
+        descent = here(near, full)
+        if owed > LIMITS.relative_tolerance * descent.point.cost:
+            descent, owed = minimise(near, "given", LIMITS, full, known=True), 0.0
         used = np.zeros(self.graph.edge_count)
         used[base.used] = scale[base.used]
-        self._state = replace(self._state, solution=replace(solution, weights=used))
-        return self._state.solution
+        solution = replace(self._solution(base, descent), weights=used)
+        self._state = replace(self._state, solution=solution, owed=owed)
+        return solution
 
-    def _minimum(self, base: _Base, setup: Setup, initial: InitialName) -> Solution:
-        full = self._objective == "full" and setup.weights.definite
-        descent = minimise(setup, initial, LIMITS, full, known=initial == "given")
+    def _full(self, setup: Setup) -> bool:
+        return self._objective == "full" and setup.weights.definite
+
+    def _solution(self, base: _Base, descent: Descent) -> Solution:
+        setup = base.setup
         notes = (*setup.weights.notes, *describe_components(setup.component, base.graph.vertex_ids))
         weights = setup.weights.used.astype(float)
-        return Solution(
-            setup.poses(descent.point), setup.component, weights, metrics=metrics_of(descent, full), notes=notes
-        )
+        metrics = metrics_of(descent, self._full(setup))
+        return Solution(setup.poses(descent.point), setup.component, weights, metrics=metrics, notes=notes)
 
     def _remember(self, new: _State) -> None:
         self._history.append(self._state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,25 +11,42 @@ from scipy.sparse.csgraph import breadth_first_order
 
 from hodge_pipeline.solvers.full import FullObjective
 from hodge_pipeline.solvers.minimise import descend_isotropic, full_objective
-from hodge_pipeline.solvers.newton import Limits, descend
-from hodge_pipeline.solvers.problem import Problem, make_problem
+from hodge_pipeline.solvers.newton import Descent, Limits, descend, still_to_come
+from hodge_pipeline.solvers.problem import make_problem
 from hodge_pipeline.solvers.setup import Setup
 from hodge_pipeline.types import Floats, Ints
 
 SHARE = 10
-"""One free vertex in so many moves."""
+"""One free vertex in so many moves at most."""
 FEWEST = 500
 """Below it the whole graph is solved as fast."""
+GROWTH, GROWTHS = 4, 2
+"""The neighbourhood's, from the smallest on."""
+LEAST_SHARE = 0.25
+"""Of what one growth wins, that the next one is expected to win: what is far decays slowly."""
 
 
-def settled_nearby(setup: Setup, changed: Ints, limits: Limits, full: bool) -> Setup:
-    """The set-up with start poses that are at their best near the changed edges (rows of the problem's)."""
-    problem = setup.problem
-    most = problem.free_count // SHARE
-    if not len(changed) or most < FEWEST:
-        return setup
+def settled_nearby(setup: Setup, changed: Ints, limits: Limits, full: bool) -> tuple[Setup, float]:
+    """The set-up with start poses that are at their best near the changed edges (rows of the problem's), and what the
+    poses farther off may still win: foretold from what the neighbourhood won as it grew.
+    """
+    most = setup.problem.free_count // SHARE
+    if not len(changed):
+        return setup, 0.0
+    if most < FEWEST:
+        return setup, math.inf
+    nearest, poses, won = _nearest(setup, changed, most), setup.initial("given"), [0.0]
+    for growth in range(GROWTHS, -1, -1):
+        end = _settled(setup, nearest[: most // GROWTH**growth], poses, limits, full)
+        won.append(end.costs[0] - end.costs[-1])
+    return _with_start(setup, *poses), still_to_come(won[-1], won[-2], LEAST_SHARE)
+
+
+def _settled(setup: Setup, moving: Ints, poses: tuple[Floats, Floats], limits: Limits, full: bool) -> Descent:
+    """The descent of the poses of some vertices, written to where the others are."""
+    problem, (rotations, translations) = setup.problem, poses
     inside = np.zeros(problem.count, bool)
-    inside[_nearest(problem, changed, most)] = True
+    inside[moving] = True
     inside[problem.free_count :] = False
     edges = np.flatnonzero((inside[problem.tail] | inside[problem.head]) & (problem.kappa > 0))
     vertices, ends = np.unique(np.stack([problem.tail[edges], problem.head[edges]]), return_inverse=True)
@@ -40,20 +58,20 @@ def settled_nearby(setup: Setup, changed: Ints, limits: Limits, full: bool) -> S
         problem.tau[edges],
         ~inside[vertices],
     )
-    rotations, translations = setup.initial("given")
     places = vertices[local.order]
     begin = rotations[places], translations[places]
     if full:
         objective = FullObjective.of(local, full_objective(setup).information[edges])
-        end = descend(objective, objective.at(*begin), limits, setup.rounding).point
+        found = descend(objective, objective.at(*begin), limits, setup.rounding)
     else:
-        end = descend_isotropic(local, begin, limits, setup.rounding).point
-    rotations[places], translations[places] = end.rotations, end.translations
-    return _with_start(setup, rotations, translations)
+        found = descend_isotropic(local, begin, limits, setup.rounding)
+    rotations[places], translations[places] = found.point.rotations, found.point.translations
+    return found
 
 
-def _nearest(problem: Problem, changed: Ints, most: int) -> Ints:
+def _nearest(setup: Setup, changed: Ints, most: int) -> Ints:
     """The first vertices that a breadth-first search from the ends of the changed edges reaches."""
+    problem = setup.problem
     ends = np.unique(np.concatenate([problem.tail[changed], problem.head[changed]]))
     root = problem.count
     tail = np.concatenate([problem.tail, np.full(len(ends), root)])

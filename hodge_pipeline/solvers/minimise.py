@@ -87,10 +87,14 @@ def full_objective(setup: Setup) -> FullObjective:
     return FullObjective.of(setup.problem, information if used.all() else information[used])
 
 
-def cost_at_start(setup: Setup, full: bool) -> float:
-    """The objective at the given poses."""
-    given = setup.initial("given")
-    return full_objective(setup).at(*given).cost if full else residuals(setup.problem, *given).cost
+def here(setup: Setup, full: bool) -> Descent:
+    """The descent that stays at the given poses, for their cost."""
+    rotations, translations = setup.initial("given")
+    if full:
+        cost = full_objective(setup).at(rotations, translations).cost
+    else:
+        cost = residuals(setup.problem, rotations, translations).cost
+    return Descent(Point(rotations, translations, cost), (cost,), 0, True, "converged")
 
 
 def metrics_of(descent: Descent, full: bool) -> dict[str, float]:

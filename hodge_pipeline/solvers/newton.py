@@ -105,7 +105,7 @@ def descend(
         costs.append(point.cost)
         if watch is not None:
             watch(point)
-        if _still_to_come(max(step.predicted, decrease), before, tolerance) <= smallest:
+        if still_to_come(max(step.predicted, decrease), before, tolerance**2) <= smallest:
             return Descent(point, tuple(costs), cg_steps, True, "converged")
         if time.monotonic() > limits.deadline_s:
             return Descent(point, tuple(costs), cg_steps, False, "time limit reached")
@@ -116,9 +116,9 @@ def descend(
     return Descent(point, tuple(costs), cg_steps, False, "iteration limit reached")
 
 
-def _still_to_come(decrease: float, before: float, tolerance: float) -> float:
-    """What further steps may win: the decreases go on shrinking as they did, and the CG left its tolerance's share."""
-    share = max(tolerance**2, decrease / before) if before > 0 else 1.0
+def still_to_come(decrease: float, before: float, least_share: float) -> float:
+    """What further steps may win: the decreases go on shrinking as they did, and each leaves a share at the least."""
+    share = max(least_share, decrease / before) if before > 0 else 1.0
     return decrease * share / (1 - share) if share < 1 else math.inf
 
 
