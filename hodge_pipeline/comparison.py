@@ -15,7 +15,7 @@ from hodge_pipeline.evaluation.tables import Table
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.evaluation.verdict import GRAPH_NAMES, length, percent
 from hodge_pipeline.types import Floats
-from hodge_pipeline.workspace import RECIPE_FILE
+from hodge_pipeline.workspace import RECIPE_FILE, is_run_folder
 
 REPORT = "report.json"
 FEWEST_SHARED = 3
@@ -59,7 +59,8 @@ def read_facts(folder: Path, name: str = "") -> RunFacts:
     """The facts of a run folder. Raises `WorkspaceError` where there is no report in it."""
     path = folder / REPORT
     if not path.is_file():
-        raise WorkspaceError(f"{folder}: holds no {REPORT}: finish the run first")
+        remedy = "finish the run first" if is_run_folder(folder) else "give the folder of a run"
+        raise WorkspaceError(f"{folder}: holds no {REPORT}: {remedy}")
     try:
         report = artifacts.read_json(path)
     except ValueError as error:

@@ -25,8 +25,8 @@ from hodge_pipeline.edits import REJECTED, joining, listed_edges, read_history, 
 from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.recipe import Recipe, load_recipe
-from hodge_pipeline.solve_file import read_graph
-from hodge_pipeline.types import Bools, CloudSet, Frame, Ints, Source, Trajectory, ViewGraph
+from hodge_pipeline.solve_file import read_graph, vertex_trajectory
+from hodge_pipeline.types import Bools, CloudSet, Frame, Ints, Source, ViewGraph
 from hodge_pipeline.unordered.pieces import laid_apart
 from hodge_pipeline.workspace import RECIPE_FILE
 
@@ -192,11 +192,8 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) 
 
 
 def _write_poses(path: Path, subject: Subject, found: Diagnosis) -> None:
-    """The robust poses, the stamp of each the number of its vertex, or its row where vertices have names."""
-    ids = subject.graph.vertex_ids
-    numbers = ids.astype(float) if ids.dtype.kind in "iu" else np.arange(len(ids), dtype=float)
-    order = np.argsort(numbers, kind="stable")
-    trajectory = Trajectory(numbers[order], found.world_from_cam[order])
+    """The robust poses by the numbers of their vertices."""
+    trajectory = vertex_trajectory(subject.graph, found.world_from_cam)
     registry.load("writers", "tum")().write(path, Source(subject.name, subject.path, trajectory=trajectory))
 
 

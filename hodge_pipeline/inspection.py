@@ -13,6 +13,7 @@ from hodge_pipeline.inspection_frames import frame_facts, trajectory_facts
 from hodge_pipeline.inspection_graph import graph_facts
 from hodge_pipeline.stages import FrameReader, Sniff
 from hodge_pipeline.unknown_path import unknown
+from hodge_pipeline.workspace import is_run_folder
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,10 @@ def guess_reader(path: Path, known: Sequence[Guess] | None = None) -> FrameReade
         raise SourceError(f"{path}: no such file or folder")
     if not path.is_file() and not path.is_dir():
         raise SourceError(f"{path}: neither a file nor a folder: give one that holds data")
+    if is_run_folder(path):
+        raise SourceError(
+            f"{path}: the folder of a run, no source: give a file of it, such as poses.tum, graph.g2o or mesh.ply"
+        )
     best = guesses(path) if known is None else known
     if not best:
         raise unknown(path)

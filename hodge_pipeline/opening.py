@@ -11,6 +11,7 @@ from hodge_pipeline.inspection import Guess, guess_reader, guesses
 from hodge_pipeline.job import source_key
 from hodge_pipeline.stages import FrameReader
 from hodge_pipeline.types import Source
+from hodge_pipeline.unknown_path import without_frames
 
 SURE = 0.6
 """Confidence of a reader from which a path is said to look like its format."""
@@ -31,11 +32,11 @@ def open_source(path: Path, reader: FrameReader | None) -> tuple[Source, str]:
         likelier = _likelier(path, chosen)
         if likelier is None:
             raise
-        raise SourceError(f"{error}; it looks like {_described(likelier)}: {_remedy(likelier.name)}") from error
+        raise SourceError(f"{error}; it looks like {_described(likelier)}: {_remedy(likelier.name, path)}") from error
     likelier = None if reader is None else _likelier(path, chosen)
     if likelier is not None:
         read_as = f"read as {registry.name_of(chosen)}, but it looks like {_described(likelier)}"
-        source = replace(source, notes=(*source.notes, f"{read_as}: {_remedy(likelier.name)}"))
+        source = replace(source, notes=(*source.notes, f"{read_as}: {_remedy(likelier.name, path)}"))
     return source, source_key(source, chosen)
 
 
@@ -53,8 +54,12 @@ def _described(guess: Guess) -> str:
     return f"{guess.name} ({guess.sniff.reason})"
 
 
-def _remedy(reader: str) -> str:
-    """The recipe that is named as the reader, else the option that takes it."""
+def _remedy(reader: str, path: Path) -> str:
+    """The recipe that is named as the reader, else the option that takes it; the command for what has no frames."""
     if reader in recipe_file.recipe_names():
         return f"try the recipe {reader}"
-    return f"try --set source.reader={reader}"
+    try:
+        source: Source = registry.load("readers", reader)().open(path)
+    except SourceError as error:
+        return f"which does not open it either ({error})"
+    return f"try --set source.reader={reader}" if source.frames else without_frames(source)

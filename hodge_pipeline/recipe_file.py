@@ -33,6 +33,8 @@ def find(name_or_path: str, beside: Path | None = None) -> Path:
             raise RecipeError(f"{path}: no such recipe file")
         return found[0]
     installed = recipe_folder() / f"{name_or_path}.yaml"
+    if path.name != name_or_path and path.exists():
+        raise RecipeError(f"{name_or_path}: is no recipe: give the name of one, and this with --source")
     if not installed.is_file() or path.name != name_or_path:
         raise RecipeError(f"no recipe '{name_or_path}'{registry.suggestion(name_or_path, recipe_names())}")
     return installed

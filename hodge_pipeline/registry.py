@@ -88,10 +88,20 @@ def load(kind: str, name: str) -> Any:
     try:
         return known[name].load()
     except Exception as error:  # a plugin can fail in any way
+        _give_way_to_ctrl_c(error)
         reason = f"{type(error).__name__}: {error}"
         raise RecipeError(
             f"stage '{name}' of kind '{kind}' ({origin(kind, name)}) does not load: {reason}; repair or remove it"
         ) from error
+
+
+def _give_way_to_ctrl_c(error: BaseException) -> None:
+    """Raise the `KeyboardInterrupt` that a compiled module, stopped while it was imported, tells as an ImportError."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause
+        cause = cause.__cause__ or cause.__context__
 
 
 def name_of(stage: object) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from collections.abc import Sequence
@@ -20,8 +19,11 @@ from hodge_pipeline.solvers.hodge import ObjectiveName, solve
 from hodge_pipeline.solvers.robust import solve_robust
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, ViewGraph
+from hodge_pipeline.unknown_path import without_frames
 
 RUN_GRAPH = "graph.g2o"
+GRAPH_WRITERS = ("g2o", "open3d_pose_graph")
+"""Writers that take the poses by the rows of the vertices."""
 SESYNC_UNITS = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 """SE-Sync takes the information of q_vec, half an angle, for that of the angle."""
 
@@ -82,9 +84,12 @@ def read_graph(path: Path) -> Source:
     path = path / RUN_GRAPH if (path / RUN_GRAPH).is_file() else path
     source = guess_reader(path).open(path)
     if source.graph is None:
-        raise SourceError(
-            f"{path}: holds no graph of measured edges: run a recipe on it first, then solve its run folder"
+        rest = (
+            ": run a recipe on it first, then solve its run folder"
+            if source.frames
+            else f" but {without_frames(source)}"
         )
+        raise SourceError(f"{path}: holds no graph of measured edges{rest}")
     return source
 
 
@@ -142,8 +147,21 @@ MOST_POSES_FILMED = 20_000
 """Above it the recording shows the start and the end of the solve only."""
 
 
-def write_solved(path: Path, solved: SolvedFile) -> None:
-    """A g2o file of the solved poses and every edge as it was measured, ignored ones too, in the order read."""
-    poses = solved.solution.world_from_cam
+def write_solved(path: Path, solved: SolvedFile, writer: str = "g2o") -> None:
+    """The solved poses in the format of a writer; where that is of graphs, with every edge as it was measured.
+
+    Ignored edges are written too, all in the order read. Poses without edges are in the order of the vertices' numbers.
+    """
+    poses, graph = solved.solution.world_from_cam, solved.graph
     trajectory = Trajectory(np.arange(len(poses), dtype=float), poses)
-    registry.load("writers", "g2o")().write(path, dataclasses.replace(solved.source, trajectory=trajectory))
+    if writer not in GRAPH_WRITERS:
+        trajectory = vertex_trajectory(graph, poses)
+    registry.load("writers", writer)().write(path, replace(solved.source, trajectory=trajectory))
+
+
+def vertex_trajectory(graph: ViewGraph, world_from_vertex: Floats) -> Trajectory:
+    """Poses (V, 4, 4) in the order of the vertices' numbers, which are the stamps; of names the rows are."""
+    ids = graph.vertex_ids
+    numbers = ids.astype(float) if ids.dtype.kind in "iu" else np.arange(len(ids), dtype=float)
+    order = np.argsort(numbers, kind="stable")
+    return Trajectory(numbers[order], world_from_vertex[order])

@@ -9,6 +9,7 @@ from pathlib import Path
 from hodge_pipeline import registry
 from hodge_pipeline.errors import HodgeError, SourceError
 from hodge_pipeline.stages import FrameReader
+from hodge_pipeline.types import Source
 
 LOOKED_AT = 60
 """Paths inside a folder that the readers are asked about: some hundredths of a second."""
@@ -29,6 +30,13 @@ def unknown(path: Path) -> SourceError:
         return SourceError(f"{path}: is no source itself, but holds some: give {named}{more}")
     remedy = "name one with --reader, in a run with --set source.reader="
     return SourceError(f"{path}: no reader knows this format (readers: {', '.join(readers)}): {remedy}")
+
+
+def without_frames(source: Source) -> str:
+    """What a source without frames, of which no run can be made, is good for."""
+    if source.graph is not None:
+        return "a graph of measured edges, which needs no frames: give it to hodge solve or hodge diagnose"
+    return "poses alone: with the frames they belong to hodge refine trajectory makes them better"
 
 
 def _loadable() -> Iterator[str]:

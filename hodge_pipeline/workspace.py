@@ -27,6 +27,11 @@ def key_of(*parts: Any) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
+def is_run_folder(path: Path) -> bool:
+    """Whether a path is what a run left, finished or not."""
+    return (path / RECIPE_FILE).is_file() and (path / "stages").is_dir()
+
+
 @dataclass(frozen=True)
 class StageFolder:
     """Where one stage's artifacts lie. `finished`: read `path`; else write into `path`, which commits on leaving."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from hodge_pipeline.cli import entry
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 LIGHT = ["--set", "fusion=[]", "--set", "recording.level=off", "--set", "evaluation.tables=false"]
@@ -33,6 +34,17 @@ def test_help_opens_with_examples_and_imports_nothing_heavy() -> None:
     assert done.stdout.index("Examples") < done.stdout.index("Commands")
 
 
+def test_ctrl_c_before_the_command_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "hodge_pipeline.cli.main", raising=False)
+    monkeypatch.setattr("importlib._bootstrap_external.SourceFileLoader.exec_module", stop)
+    with pytest.raises(SystemExit) as ended:
+        entry.main()
+    assert ended.value.code == 130
+
+
 def test_stages_and_recipes_are_listed() -> None:
     stages, recipes = hodge("stages"), hodge("recipes")
     for name in ("tum", "overlap", "gicp", "poisson", "tsdf", "dask"):
@@ -40,6 +52,7 @@ def test_stages_and_recipes_are_listed() -> None:
     assert {line.split()[0] for line in recipes.stdout.splitlines()} >= {"demo", "seven_scenes", "tum"}
     options = hodge("stages", "edges").stdout
     assert "min_iou = 0.5" in options
+    assert "builders must be given: the edge builders" in options
 
 
 @pytest.mark.parametrize(
@@ -55,7 +68,8 @@ def test_stages_and_recipes_are_listed() -> None:
         (["view", "nowhere"], 1, "no recording here"),
         (["run", "demo", "--source", ".", "--set", "solver=hodgee", "--out", "x"], 1, "hodgee: solver: no stage"),
         (["inspect", "{graph}", "--reader", "tmu"], 1, "did you mean 'tum'"),
-        (["solve", "{graph}", "--out", "{tmp}"], 1, "cannot be written (Is a directory)"),
+        (["solve", "{graph}", "--out", "{tmp}"], 1, "is a folder: give the name of a file in it"),
+        (["solve", "{graph}", "--out", "."], 1, "such as solved.g2o"),
         (["solve", "{graph}", "--out", "/proc/x.g2o"], 1, "/proc/x.g2o: cannot be written"),
         (["convert", "{graph}", "{graph}/x.g2o"], 1, "cannot be written (Not a directory): is its folder there?"),
         (["run", "demo"], 2, "--out"),

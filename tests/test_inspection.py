@@ -45,6 +45,14 @@ def oddities_of(frames: list[Frame]) -> list[str]:
     return found
 
 
+def test_a_run_folder_is_no_source(tmp_path: Path) -> None:
+    (tmp_path / "stages").mkdir()
+    for name in ("recipe.yaml", "mesh.ply", "poses.tum"):
+        (tmp_path / name).write_text("")
+    with pytest.raises(SourceError, match="the folder of a run, no source: give a file of it, such as poses.tum"):
+        inspect(tmp_path)
+
+
 def test_a_sound_sequence_has_no_oddities() -> None:
     found: list[str] = []
     facts = frame_facts(walk(10), found)

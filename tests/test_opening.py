@@ -39,6 +39,23 @@ def test_what_can_be_read_all_the_same_is_noted(tum_folder: Path) -> None:
     assert any("read as icl_nuim, but it looks like tum" in note for note in source.notes)
 
 
+@pytest.mark.parametrize(
+    ("text", "remedy"),
+    [
+        (
+            "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n",
+            "a graph of measured edges, which needs no frames: give it to hodge solve",
+        ),
+        ("# stamp\n0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n", "poses alone: with the frames they belong to hodge refine"),
+        ("EDGE_SE2 0 1 1 0 0 nan 0 0 1 0 1\n", "which does not open it either"),
+    ],
+)
+def test_what_has_no_frames_is_sent_elsewhere(tmp_path: Path, text: str, remedy: str) -> None:
+    (tmp_path / "file.txt").write_text(text)
+    with pytest.raises(SourceError, match=remedy):
+        open_source(tmp_path / "file.txt", TumReader())
+
+
 def test_the_right_reader_says_nothing(tum_folder: Path, tmp_path: Path) -> None:
     for reader in (TumReader(), None):
         source, _ = open_source(tum_folder, reader)

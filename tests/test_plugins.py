@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from hodge_pipeline import registry
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 PACKAGE = Path(__file__).parent / "plugin_package"
@@ -64,3 +65,18 @@ def test_its_schema_leaves_the_broken_one_out(environment: dict[str, str]) -> No
     assert schema.returncode == 0
     assert '"ring"' in schema.stdout
     assert '"broken"' not in schema.stdout
+
+
+def test_ctrl_c_while_a_compiled_module_is_imported_is_no_broken_plugin(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Interrupted:
+        dist = None
+
+        def load(self) -> None:
+            try:
+                raise KeyboardInterrupt
+            except KeyboardInterrupt as stop:
+                raise ImportError("initialization failed") from stop
+
+    monkeypatch.setattr(registry, "_entries", lambda group: {"tsdf": Interrupted()})
+    with pytest.raises(KeyboardInterrupt):
+        registry.load("fusion", "tsdf")

@@ -14,6 +14,7 @@ from hodge_adapters.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError
+from hodge_pipeline.inspection import guess_reader
 from hodge_pipeline.solve_file import Choices, disabled_edges, solve_file
 from hodge_pipeline.types import ViewGraph
 
@@ -58,6 +59,31 @@ def test_ids_edges_order_and_held_poses_survive(tmp_path, planar):
     np.testing.assert_allclose(back.trajectory.world_from_cam[1], read.trajectory.world_from_cam[1], rtol=0, atol=1e-14)
     direct = hodge_pipeline.solve(read.graph, start=read.trajectory.world_from_cam)
     np.testing.assert_allclose(back.trajectory.world_from_cam, direct.world_from_cam, atol=1e-12)
+
+
+def test_the_ending_of_the_result_says_its_format(tmp_path):
+    graph_file(tmp_path / "in.g2o")
+    for name in ("out.g2o", "out.tum", "out.kitti", "out.json", "out.txt"):
+        hodge(tmp_path / "in.g2o", "--out", tmp_path / name)
+    back = load_g2o(tmp_path / "out.g2o")
+    poses, ids = back.trajectory.world_from_cam, back.graph.vertex_ids
+    assert (tmp_path / "out.txt").read_text() == (tmp_path / "out.g2o").read_text()
+    open3d = guess_reader(tmp_path / "out.json").open(tmp_path / "out.json")
+    np.testing.assert_allclose(open3d.trajectory.world_from_cam, poses, atol=1e-12)
+    assert open3d.graph.edge_count == back.graph.edge_count
+    tum = guess_reader(tmp_path / "out.tum").open(tmp_path / "out.tum").trajectory
+    assert tum.stamps_s.tolist() == sorted(ids.tolist())
+    np.testing.assert_allclose(tum.world_from_cam, poses[np.argsort(ids)], atol=1e-9)
+    kitti = guess_reader(tmp_path / "out.kitti").open(tmp_path / "out.kitti").trajectory
+    np.testing.assert_allclose(kitti.world_from_cam, poses[np.argsort(ids)], atol=1e-9)
+    with pytest.raises(SourceError, match="PLY holds points"):
+        hodge(tmp_path / "in.g2o", "--out", tmp_path / "out.ply")
+
+
+def test_poses_alone_are_no_graph(tmp_path):
+    (tmp_path / "poses.tum").write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n")
+    with pytest.raises(SourceError, match="no graph of measured edges but poses alone: with the frames they belong to"):
+        hodge(tmp_path / "poses.tum")
 
 
 def test_a_run_folder_is_left_and_solved_again(tmp_path):

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from hodge_adapters.colmap import ColmapReader
+from hodge_adapters.colmap_refining import ColmapModels
 from hodge_adapters.g2o import load_g2o
 from hodge_adapters.toro import load_toro
 from hodge_pipeline.errors import SourceError
@@ -64,6 +66,23 @@ def test_a_file_that_is_nearly_a_source(tmp_path: Path, name: str, advice: str) 
     for part in ("cameras.txt", "images.txt", name):
         (tmp_path / part).write_text("")
     assert advice in complaint(tmp_path / name)
+
+
+@pytest.mark.parametrize("ending", ["bin", "txt"])
+def test_a_model_further_down_is_named(tmp_path: Path, ending: str) -> None:
+    model = tmp_path / "project/export/truth"
+    model.mkdir(parents=True)
+    for part in ("cameras", "images"):
+        (model / f"{part}.{ending}").write_text("")
+    for opened in (ColmapReader().open, ColmapModels().open_models):
+        with pytest.raises(SourceError, match=f"holds some below: give {model}$"):
+            opened(tmp_path)
+        with pytest.raises(SourceError, match=f"one file of a COLMAP model: give its folder {model}$"):
+            opened(model / f"images.{ending}")
+        with pytest.raises(SourceError, match="no such file or folder"):
+            opened(tmp_path / "nowhere")
+        with pytest.raises(SourceError, match="no COLMAP model: give the folder with cameras.bin"):
+            opened(Path(__file__).parent)
 
 
 def test_a_bag_of_sqlite_files(tmp_path: Path) -> None:

@@ -22,7 +22,15 @@ from hodge_adapters.colmap_cameras import (
 from hodge_adapters.colmap_database import database_pairs
 from hodge_adapters.colmap_depth import depth_map_size, sensor_depth, stereo_depth
 from hodge_adapters.colmap_edges import Pair, covisible_pairs, measured_graph
-from hodge_adapters.colmap_files import find_database, find_folder, find_model, load_model, parent_of, part_of_model
+from hodge_adapters.colmap_files import (
+    find_database,
+    find_folder,
+    find_model,
+    load_model,
+    no_model,
+    parent_of,
+    part_of_model,
+)
 from hodge_adapters.colmap_records import CameraRecord, ImageRecord, Model
 from hodge_adapters.colmap_scale import metres_per_unit, scaled_graph, scaled_poses
 from hodge_adapters.text_rows import inside, listed
@@ -86,7 +94,7 @@ class ColmapReader:
         path = Path(path)
         folder = find_model(path)
         if folder is None:
-            raise SourceError(f"{path}: no COLMAP model: give the folder with cameras.bin and images.bin, or .txt")
+            raise no_model(path)
         model = load_model(folder, self.tracks)
         notes = list(model.notes)
         colour_folder = find_folder(folder, self.images, IMAGE_FOLDERS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 
 from hodge_adapters import colmap_binary, colmap_text
@@ -14,6 +15,7 @@ from hodge_pipeline.errors import SourceError
 
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
 PARENTS = 3
+LOOKED_AT = 60
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 _DIGITS = re.compile(r"(\d+)")
 
@@ -30,6 +32,19 @@ def part_of_model(path: Path) -> str:
     if path.stem in MODEL_FILES and path.suffix in (".bin", ".txt") and model_ending(path.parent):
         return f"one file of a COLMAP model: give its folder {path.parent}"
     return ""
+
+
+def no_model(path: Path) -> SourceError:
+    """The error for a path without a model: what to give instead where a part of one is named, or one lies below."""
+    if not path.exists():
+        return SourceError(f"{path}: no such file or folder")
+    advice = part_of_model(path) or "no COLMAP model: give the folder with cameras.bin and images.bin, or .txt"
+    for place in ("*", "*/*", "*/*/*") if path.is_dir() else ():
+        below = sorted({found.parent for found in islice(path.glob(f"{place}/cameras.*"), LOOKED_AT)})
+        models = [folder for folder in below if model_ending(folder)]
+        if models:
+            return SourceError(f"{path}: no COLMAP model itself, but holds some below: give {models[0]}")
+    return SourceError(f"{path}: {advice}")
 
 
 def model_ending(folder: Path) -> str | None:

@@ -15,7 +15,7 @@ from hodge_adapters import images
 from hodge_adapters.colmap import ColmapReader
 from hodge_adapters.colmap_database import database_names
 from hodge_adapters.colmap_depth import sensor_depth
-from hodge_adapters.colmap_files import find_database, find_models, model_ending
+from hodge_adapters.colmap_files import find_database, find_models, model_ending, no_model
 from hodge_adapters.colmap_scale import other_camera_note
 from hodge_adapters.colmap_ties import similarity, tie_points
 from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, read_reconstruction
@@ -54,7 +54,7 @@ class ColmapModels:
             return [self._of_memory(number, model) for number, model in enumerate(source)]
         folders = find_models(Path(source))
         if not folders:
-            raise SourceError(f"{source}: no COLMAP model: give the folder with cameras.bin and images.bin, or .txt")
+            raise no_model(Path(source))
         return [self._open(folder) for folder in folders]
 
     def _of_memory(self, number: int, model: pycolmap.Reconstruction) -> ColmapModel:

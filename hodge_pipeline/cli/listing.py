@@ -65,8 +65,9 @@ def _print_stage(kind: str, name: str, *, with_options: bool) -> None:
     summary = (cls.__doc__ or "").strip().splitlines()[:1]
     print(f"  {name:<16} {summary[0] if summary else ''} [{registry.origin(kind, name)}]")
     if with_options and dataclasses.is_dataclass(cls):
-        for field in cls.__pydantic_fields__.items() if hasattr(cls, "__pydantic_fields__") else ():
-            print(f"      {field[0]} = {field[1].default!r}: {field[1].description or ''}")
+        for option, field in getattr(cls, "__pydantic_fields__", {}).items():
+            default = "must be given" if field.is_required() else f"= {field.get_default(call_default_factory=True)!r}"
+            print(f"      {option} {default}: {field.description or ''}")
 
 
 def recipes(name: str | None, *, schema: bool) -> None:

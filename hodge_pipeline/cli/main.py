@@ -103,7 +103,10 @@ def demo(out: Out, overrides: Overrides = None, overwrite: Overwrite = False, qu
 @app.command()
 def solve(
     graph: Annotated[Path, typer.Argument(help="A pose graph (g2o, TORO, …) or a run folder.")],
-    out: Annotated[Optional[Path], typer.Option("--out", help="g2o file: solved poses, edges as read.")] = None,  # noqa: UP045
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--out", help="The result: .g2o or .json (Open3D) with edges; .tum, .kitti, .csv, .log without."),
+    ] = None,
     objective: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(help="full: g2o's chi2, the default; isotropic: SE-Sync's F, which can be certified."),

@@ -7,13 +7,18 @@ from pathlib import Path
 from typing import Any, get_args
 
 from hodge_pipeline.cli.console import Terminal
-from hodge_pipeline.cli.paths import keep_source
+from hodge_pipeline.cli.converting import writer_name
+from hodge_pipeline.cli.paths import check_result, keep_source
 from hodge_pipeline.edits import read_history
 from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.solve_file import Choices, SolvedFile, solve_file, write_solved
 from hodge_pipeline.solvers.hodge import ObjectiveName
 from hodge_pipeline.solvers.setup import InitialName
+from hodge_pipeline.types import Source
 from hodge_pipeline.workspace import RECIPE_FILE
+
+KNOWN_ENDINGS = (".tum", ".kitti", ".csv", ".log", ".json", ".ply")
+"""Endings that say the format. `.txt` does not: many programs name their g2o files so."""
 
 
 def choices(
@@ -59,12 +64,11 @@ def solve(
             run_folder = run_folder or path
     if out is not None:
         keep_source(path, out)
-    if out is not None and not out.parent.is_dir():
-        raise RecipeError(f"--out {out}: there is no folder {out.parent}: make it first")
+        check_result(out)
     with Terminal(quiet or as_json) as terminal, terminal.stage("solve", 1):
         solved = solve_file(path, options)
     if out is not None:
-        write_solved(out, solved)
+        write_solved(out, solved, _writer(out, solved.source))
     left_out: tuple[str, ...] = ()
     if run_folder is not None:
         from hodge_pipeline.solve_report import write_run_folder
@@ -82,6 +86,11 @@ def solve(
         for label, text in _lines(solved, summary, out, run_folder):
             print(f"{label:<12}{text}")
     _check(summary)
+
+
+def _writer(out: Path, source: Source) -> str:
+    """The writer of a result by its ending: those of poses, and Open3D's; any other name is that of a g2o file."""
+    return writer_name(out, source) if out.suffix.lower() in KNOWN_ENDINGS else "g2o"
 
 
 def _solve_run(folder: Path, *, quiet: bool, as_json: bool) -> None:

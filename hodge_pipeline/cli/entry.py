@@ -1,0 +1,15 @@
+"""What the command `hodge` starts with: nothing is imported before Ctrl-C is provided for."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Run the command; stopped before it has begun, it ends with 130 and without a word, as later."""
+    try:
+        from hodge_pipeline.cli.main import main as command
+
+        command()
+    except KeyboardInterrupt:
+        sys.exit(130)
