@@ -94,6 +94,30 @@ def test_two_scenes_are_two_pieces_and_a_wrong_edge_does_not_glue_them() -> None
     assert (found.verdict[:-2] == CONSISTENT).all() and not (found.verdict[-2:] == CONSISTENT).any()
 
 
+def test_copies_of_edges_tell_nothing_of_how_exact_the_others_are() -> None:
+    once = measured(poses_on_a_ring(40), near_pairs(40, 1))
+    across = measured(poses_on_a_ring(40), np.array([[k, k + 20] for k in range(0, 20, 4)]))
+    twice = [once.i_from_j, once.i_from_j, across.i_from_j]
+    edges = np.concatenate([once.edges, once.edges, across.edges])
+    stated = np.diag(1 / np.repeat([0.005, 0.01], 3) ** 2)
+    graph = ViewGraph.from_edges(np.arange(40), edges, np.concatenate(twice))
+    graph = replace(graph, information=np.tile(stated, (graph.edge_count, 1, 1)))
+    assert diagnose(graph).kept.all()
+
+
+def test_information_that_explains_nearly_all_cycles_is_believed() -> None:
+    """One edge in eight is as exact as the information says, the others a hundred times as exact."""
+    poses, edges = poses_on_a_ring(40), near_pairs(40, 4)
+    loose, tight = measured(poses, edges), measured(poses, edges, 1, noise=0.01)
+    information = np.tile(np.diag(1 / np.repeat([0.005, 0.01], 3) ** 2), (len(edges), 1, 1))
+    motion = np.where((np.arange(len(edges)) < 140)[:, None, None], tight.i_from_j, loose.i_from_j)
+    graph = replace(ViewGraph.from_edges(np.arange(40), edges, motion), information=information)
+    assert diagnose(graph).kept.all()
+    bad, right = spoiled(graph, np.array([7]))
+    found = diagnose(replace(bad, information=information))
+    assert not found.kept[~right].any() and found.kept[right].mean() > 0.85
+
+
 def test_the_same_seed_gives_the_same_answer() -> None:
     graph, _ = spoiled(measured(poses_on_a_ring(16), near_pairs(16, 4)), np.arange(0, 60, 3))
     first, second = diagnose(graph, QUICK), diagnose(graph, QUICK)

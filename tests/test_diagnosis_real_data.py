@@ -12,6 +12,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.diagnosis.solver import DiagnosedSolver
 from hodge_pipeline.evaluation.edges import PairTruth, area_under_roc, pose_recall, precision_and_recall, right_edges
+from hodge_pipeline.solve_file import read_graph
 from hodge_pipeline.types import Bools, ViewGraph
 
 
@@ -51,6 +52,19 @@ def test_few_right_edges_of_a_real_scene_are_blamed_where_all_are_right(data_dir
     found = diagnose(graph.select(right))
     assert found.kept.mean() > 0.9
     assert pose_recall(truth, found.world_from_cam, found.piece) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "most_blamed"),
+    [("slambook_2d/INTEL.g2o", 0.0), ("sesync/cubicle.g2o", 0.03), ("sesync/kitti_00.g2o", 0.005)],
+)
+def test_hardly_an_edge_of_a_sound_pose_graph_is_blamed(data_dir: Path, name: str, most_blamed: float) -> None:
+    """At the optimum nearly all edges are far within what their information states."""
+    graph = read_graph(data_dir / "pose_graphs" / name).graph
+    assert graph is not None
+    found = diagnose(graph)
+    assert (~found.kept).mean() <= most_blamed
+    assert (found.verdict == UNTESTABLE).mean() < 0.03
 
 
 def test_the_robust_solver_finds_the_poses_of_a_real_scene(data_dir: Path) -> None:

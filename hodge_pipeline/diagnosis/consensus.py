@@ -9,13 +9,17 @@ import numpy as np
 from hodge_pipeline.diagnosis.arrangements import best_arrangement
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.pieces import align
+from hodge_pipeline.diagnosis.pieces import Alignment, align
 from hodge_pipeline.diagnosis.robust_poses import GATE, Fit, fit
+from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.types import Floats, ViewGraph
 
 PRIOR_SHARE = 0.3
 EXTREME = 0.01
 UNVOUCHED = 0.9
+STEPS = 3
+NEARLY_ALL = 0.9
+"""Of the cycles close in a graph that may be right as it is."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +37,18 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
     best = fit(evidence, graph, align(evidence, weight, options.cluster_gain, rng), 2)
     if evidence.exhaustive:
         best = best_arrangement(evidence, graph, best, weight, options.cluster_gain, rng)
+    elif evidence.closing >= NEARLY_ALL and not best.used.all():
+        best = max(best, _of_all(evidence, graph), key=lambda found: int(found.used.sum()))
     agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
     return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
+
+
+def _of_all(evidence: Evidence, graph: ViewGraph) -> Fit:
+    """The solution that all edges lead to: where nearly all are right, none of them is left behind by a piece that
+    drifted while it grew.
+    """
+    found = solve(graph, objective="isotropic", max_iterations=STEPS)
+    return fit(evidence, graph, Alignment(found.component, found.world_from_cam), 2)
 
 
 def _unvouched(probability: Floats, fit: Fit, evidence: Evidence) -> Floats:

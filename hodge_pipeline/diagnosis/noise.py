@@ -18,6 +18,12 @@ FIRST_GATE_RAD = 0.35
 FIRST_GATE_SHARE = 0.6
 LONGEST_CYCLE = 4
 FEWEST_CYCLES = 20
+COPIES = 1e-5
+"""Of the gate: cycles that close so exactly join copies of one measurement, and tell nothing."""
+STATED = 3.0
+"""Standard deviations of the graph's own information that explain a cycle."""
+NEARLY_ALL = 0.95
+MAXWELL_NEARLY_ALL = 2.795
 HEAVY_TAILS = 1.9
 """Errors of registration have heavier tails than a Gaussian of the same median."""
 
@@ -34,17 +40,22 @@ class Noise:
 
 
 def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, prior: Floats, reach_m: float) -> Noise:
-    """The noise of each edge: the graph's information gives the proportions, cycles that close give the scale."""
+    """The noise of each edge: the graph's information gives the proportions, cycles that close give the scale.
+
+    Where the information explains nearly all cycles the scale does so too: edges of several kinds make long tails, and
+    such a graph is sound as far as anything shows.
+    """
     rotation, translation, informed = _proportions(graph)
-    sizes = []
-    for relative, error, gate, fallback in (
-        (rotation, angle, FIRST_GATE_RAD, DEFAULT_ANGLE_RAD),
-        (translation, moved, FIRST_GATE_SHARE * reach_m, DEFAULT_SHARE * reach_m),
-    ):
-        sizes.append(_scale(loops, relative, error, gate, prior, 1.0 if informed else fallback))
+    short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
+    loops = loops.select(short)
+    turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, moved[short])
+    turn = turned.scale(FIRST_GATE_RAD, prior, 1.0 if informed else DEFAULT_ANGLE_RAD)
+    shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, 1.0 if informed else DEFAULT_SHARE * reach_m)
+    if informed and _explained(turned, shifted):
+        turn, shift = max(turn, turned.scale_of_nearly_all()), max(shift, shifted.scale_of_nearly_all())
     if not informed:
-        sizes[1] = max(sizes[1], LEVER * sizes[0] * reach_m)
-    return Noise(sizes[0] * rotation, sizes[1] * translation)
+        shift = max(shift, LEVER * turn * reach_m)
+    return Noise(turn * rotation, shift * translation)
 
 
 def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
@@ -63,17 +74,32 @@ def _deviation(precision: Floats) -> Floats:
     return np.asarray(1 / np.sqrt(np.clip(np.where(known, precision, usual), usual / 10, usual * 10)))
 
 
-def _scale(loops: Loops, relative: Floats, error: Floats, gate: float, prior: Floats, fallback: float) -> float:
-    """The scale at which half of the short cycles that close have an error below the median of its distribution."""
-    short = np.flatnonzero((loops.lengths <= LONGEST_CYCLE) & (error < gate))
-    if len(short) < FEWEST_CYCLES:
-        return fallback
-    chosen = loops.select(short)
-    row = np.repeat(np.arange(len(short)), chosen.lengths)
-    spread = np.sqrt(np.bincount(row, relative[chosen.edge] ** 2, len(short)))
-    weight = np.exp(np.bincount(row, np.log(prior[chosen.edge]), len(short)))
-    ratio = error[short] / spread
-    order = np.argsort(ratio)
-    total = np.cumsum(weight[order])
-    median = float(ratio[order][np.searchsorted(total, total[-1] / 2)])
-    return max(HEAVY_TAILS * median / MAXWELL_MEDIAN, 1e-3 * fallback)
+class _Errors:
+    """The `error (L,)` of short cycles, and its `ratio (L,)` to what the proportions of their edges make of it."""
+
+    def __init__(self, loops: Loops, relative: Floats, error: Floats) -> None:
+        self.loops, self.error = loops, error
+        self.row = np.repeat(np.arange(len(loops)), loops.lengths)
+        self.ratio = error / np.sqrt(np.bincount(self.row, relative[loops.edge] ** 2, len(loops)))
+
+    def scale(self, gate: float, prior: Floats, fallback: float) -> float:
+        """The scale at which half of the cycles that close have an error below the median of its distribution."""
+        closes = (self.error > COPIES * gate) & (self.error < gate)
+        if closes.sum() < FEWEST_CYCLES:
+            return fallback
+        weight = np.exp(np.bincount(self.row, np.log(prior[self.loops.edge]), len(closes)))[closes]
+        order = np.argsort(self.ratio[closes])
+        total = np.cumsum(weight[order])
+        median = float(self.ratio[closes][order][np.searchsorted(total, total[-1] / 2)])
+        return max(HEAVY_TAILS * median / MAXWELL_MEDIAN, 1e-3 * fallback)
+
+    def scale_of_nearly_all(self) -> float:
+        """The scale that explains nearly all cycles."""
+        return float(np.quantile(self.ratio, NEARLY_ALL)) / MAXWELL_NEARLY_ALL
+
+
+def _explained(turned: _Errors, shifted: _Errors) -> bool:
+    """Whether the information as it stands explains nearly all cycles."""
+    if len(turned.ratio) < FEWEST_CYCLES:
+        return False
+    return bool(((turned.ratio < STATED) & (shifted.ratio < STATED)).mean() >= NEARLY_ALL)
