@@ -14,8 +14,6 @@ from hodge_pipeline.solvers.elimination import Elimination
 from hodge_pipeline.solvers.linear import Factor
 from hodge_pipeline.types import Floats
 
-CG_FIRST_TO = 15_000
-"""Vertices: on longer chains CG takes too many steps to be worth a try."""
 FEWEST_CG_STEPS = 60
 """Where a factorisation of all unknowns costs no more, it is cheap."""
 CG_STEPS_TRIED = 20
@@ -43,17 +41,21 @@ def steps_worth_a_factor(plan: Elimination, size: int) -> int:
 
 @dataclass
 class DirectSolver:
-    """Solves with one Hessian after another, the latest factor, and how many CG steps went without one."""
+    """Solves with one Hessian after another, the latest factor, and how many CG steps went without one.
+
+    `cg_first`: whether these are tried where a factorisation is cheap.
+    """
 
     plan: Elimination
     backend: Backend
+    cg_first: bool = True
     factor: Factor | None = None
     tried: int = 0
 
     def steps_to_try(self, size: int) -> int:
         """How many CG steps to try before a factorisation with blocks of this size."""
         worth = steps_worth_a_factor(self.plan, size)
-        if self.factor is not None or (worth <= FEWEST_CG_STEPS and self.plan.size > CG_FIRST_TO):
+        if self.factor is not None or (worth <= FEWEST_CG_STEPS and not self.cg_first):
             return 0
         return worth if worth > FEWEST_CG_STEPS else max(min(CG_STEPS_TRIED, worth) - self.tried, 0)
 

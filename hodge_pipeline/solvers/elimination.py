@@ -351,5 +351,10 @@ def _core_matrix(plan: Elimination, diagonal: Floats, rows: Floats) -> csc_matri
     data = np.concatenate([diagonal[begin:], rows[first:], rows[first:].transpose(0, 2, 1)])
     order = np.lexsort((j, i))
     indptr = np.searchsorted(i[order], np.arange(count + 1))
-    whole = bsr_matrix((data[order], j[order], indptr), shape=(count * size, count * size))
-    return whole.tocsc()
+    return by_columns(bsr_matrix((data[order], j[order], indptr), shape=(count * size, count * size)))
+
+
+def by_columns(matrix: bsr_matrix) -> csc_matrix:
+    """A symmetric matrix by its columns, which are its rows."""
+    rows = matrix.tocsr()
+    return csc_matrix((rows.data, rows.indices, rows.indptr), shape=rows.shape)

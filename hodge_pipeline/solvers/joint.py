@@ -24,6 +24,12 @@ from hodge_pipeline.types import Floats
 
 NEWTON_FROM = 0.05
 """Of the tolerance asked for, which says how far the minimum is: from there on the exact Hessian pays."""
+CG_FIRST_TO = 15_000
+"""Vertices: on longer chains CG takes too many steps to be worth a try."""
+LONG_LEVER = 50.0
+"""Of τ‖t_ij‖² / κ, most edges' at the least. What turns move at such levers' ends is more than the Laplacians know: on
+the parking garage, with 75, CG takes 50 steps to solve a system, on graphs with less than 5 from 3 to 17.
+"""
 
 
 def stiffness(kappa: Floats, turn: Floats) -> Floats:
@@ -38,10 +44,17 @@ def stiffness(kappa: Floats, turn: Floats) -> Floats:
     return np.asarray(2 * kappa[:, None, None] * (np.eye(3) - half[:, :, None] * half[:, None, :]))
 
 
+def cg_first(problem: Problem) -> bool:
+    """Whether CG with the two scalar Laplacians is worth a try where a factorisation of all unknowns is cheap."""
+    squared = np.einsum("ei,ei->e", problem.translations, problem.translations)
+    levered = int(np.count_nonzero(problem.tau * squared > LONG_LEVER * problem.kappa))
+    return problem.free_count <= CG_FIRST_TO and levered <= 0.5 * len(squared)
+
+
 def step_solver(problem: Problem) -> DirectSolver | IterativeSolver:
     """What solves for the steps of all unknowns, by the problem's back end."""
     structure = problem.structure
-    return structure.iterative or DirectSolver(structure.elimination, structure.backend)
+    return structure.iterative or DirectSolver(structure.elimination, structure.backend, cg_first(problem))
 
 
 @dataclass(frozen=True)

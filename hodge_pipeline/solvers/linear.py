@@ -10,7 +10,7 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.elimination import Elimination, Ordering, eliminate
+from hodge_pipeline.solvers.elimination import Elimination, Ordering, by_columns, eliminate
 from hodge_pipeline.types import Floats, Ints
 
 MINIMUM_DEGREE_TO = 300_000
@@ -64,9 +64,9 @@ def factorise_blocks(
     where the matrix is singular.
     """
     if not plan.groups and core is not None:
-        return Factor(int(matrix.shape[0]), core(matrix.tocsc()))
+        return Factor(int(matrix.shape[0]), core(by_columns(matrix)))
     if not plan.groups:
-        return factorise(matrix.tocsc(), "NATURAL" if plan.ordered else "auto", single)
+        return factorise(by_columns(matrix), "NATURAL" if plan.ordered else "auto", single)
     try:
         found = eliminate(
             plan,

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 from hodge_pipeline.solvers import direct
 from hodge_pipeline.solvers.full import FullObjective
-from hodge_pipeline.solvers.joint import JointObjective
+from hodge_pipeline.solvers.joint import CG_FIRST_TO, JointObjective, cg_first
 from hodge_pipeline.solvers.newton import CG_LIMIT_REACHED, Descent, Limits, Point, descend
 from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
 from hodge_pipeline.solvers.problem import Problem
@@ -32,7 +32,7 @@ def minimise(
     not tried for the isotropic one.
     """
     begin = setup.initial(initial)
-    if full and (known or (joint_at_once(setup.problem) and not setup.problem.structure.backend.iterative)):
+    if full and (known or full_at_once(setup.problem)):
         objective = full_objective(setup)
         return descend(objective, objective.at(*begin), limits, setup.rounding, watch)
     loose = replace(limits, relative_tolerance=max(limits.relative_tolerance, WARM_START_TOLERANCE))
@@ -78,7 +78,12 @@ def joint_at_once(problem: Problem) -> bool:
     """Whether steps move all unknowns from the first, by such a factorisation or an iterative back end."""
     if problem.structure.backend.iterative:
         return True
-    return problem.free_count > direct.CG_FIRST_TO and steps_are_direct(problem)
+    return problem.free_count > CG_FIRST_TO and steps_are_direct(problem)
+
+
+def full_at_once(problem: Problem) -> bool:
+    """Whether the full objective's steps are by factorisations from the first: then the isotropic one is no help."""
+    return not problem.structure.backend.iterative and not cg_first(problem) and steps_are_direct(problem)
 
 
 def full_objective(setup: Setup) -> FullObjective:
