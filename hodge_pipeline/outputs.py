@@ -174,7 +174,9 @@ def _trajectories(job: Job, source: Source, sets: Mapping[str, Floats], componen
         sets = {name: job.tracked.all_poses(poses) for name, poses in sets.items()}
     if not has_truth(source):
         return ()
-    return trajectory_rows(sets, true_poses(source), component, [frame.sequence for frame in source.frames])
+    sequences = [frame.sequence for frame in source.frames]
+    delta_frames = job.recipe.evaluation.rpe_delta_frames
+    return trajectory_rows(sets, true_poses(source), component, sequences, delta_frames=delta_frames)
 
 
 def _loop_rows(solution: Solution) -> tuple[LoopRow, ...]:

@@ -44,7 +44,11 @@ class EvaluationOptions:
     """What is measured at the end."""
 
     tables: bool = Field(default=True, description="the two score tables, about 40 CPU seconds for 250 frames")
-    rpe_delta_frames: int = Field(default=1, ge=1, description="frames between the two poses of a relative pose error")
+    rpe_delta_frames: int = Field(
+        default=1,
+        ge=1,
+        description="frames from one pose to the other in the relative pose error; 30 are a second of most cameras",
+    )
 
 
 @dataclass(frozen=True, config=OPTIONS)

@@ -250,6 +250,18 @@ def test_parts_are_listed_largest_first_as_the_source_names_them(report: Report)
     assert in_runs(np.zeros(0, np.int64), np.arange(3)) == "none"
 
 
+def test_relative_motions_are_as_long_as_the_recipe_says(report: Report) -> None:
+    truth = circle(6)
+    drifting = np.stack([se3.exp(np.array([0, 0, 0, 0.01 * k, 0, 0])) @ pose for k, pose in enumerate(truth)])
+    for delta_frames in (1, 3):
+        (row,) = trajectory_rows({"result": drifting}, truth, delta_frames=delta_frames)
+        assert row.rpe_translation_m == pytest.approx(0.01 * delta_frames, rel=1e-6)
+        assert row.rpe_delta_frames == delta_frames
+        told = next(t for t in score_tables(replace(report, trajectories=(row,))) if t.title == "Trajectory").caption
+        assert ("from each frame to the one 3 frames on" in told) == (delta_frames == 3)
+        assert ("from each frame to the next" in told) == (delta_frames == 1)
+
+
 def test_relative_motions_stop_at_the_end_of_a_sequence() -> None:
     truth = circle(6)
     jumped = truth.copy()

@@ -35,7 +35,7 @@ class SourceSummary:
 
 @dataclass(frozen=True)
 class TrajectoryRow:
-    """Absolute (ATE) and relative (RPE) error of one set of poses against the truth."""
+    """Absolute (ATE) and relative (RPE, over `rpe_delta_frames`) error of one set of poses against the truth."""
 
     name: str
     frames: int
@@ -46,6 +46,7 @@ class TrajectoryRow:
     rpe_translation_m: float
     rpe_rotation_deg: float
     degenerate: bool = False
+    rpe_delta_frames: int = 1
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.evaluation.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.evaluation.trajectory import absolute_error, relative_error
+from hodge_pipeline.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 CENTIMETRES_PER_DEGREE = 1.0
@@ -26,20 +26,24 @@ def trajectory_rows(
     sequence: Sequence[str] | None = None,
     *,
     with_scale: bool = False,
+    delta_frames: int = 1,
 ) -> tuple[TrajectoryRow, ...]:
     """The errors of each named set of poses (N, 4, 4) against the truth (N, 4, 4), NaN where a frame has none.
 
-    Each component (N,) is aligned apart; relative motions also stop at the end of a sequence (N,).
+    Each component (N,) is aligned apart; relative motions, over `delta_frames`, also stop at the end of a sequence.
     """
     parts = _distinct(component, sequence, len(truth))
-    return tuple(_trajectory_row(name, poses, truth, component, parts, with_scale) for name, poses in pose_sets.items())
+    return tuple(
+        _trajectory_row(
+            name,
+            absolute_error(poses, truth, component, with_scale=with_scale),
+            relative_error(poses, truth, delta_frames, component=parts),
+        )
+        for name, poses in pose_sets.items()
+    )
 
 
-def _trajectory_row(
-    name: str, poses: Floats, truth: Floats, component: Ints | None, parts: Ints, with_scale: bool
-) -> TrajectoryRow:
-    absolute = absolute_error(poses, truth, component, with_scale=with_scale)
-    relative = relative_error(poses, truth, component=parts)
+def _trajectory_row(name: str, absolute: AbsoluteError, relative: RelativeError) -> TrajectoryRow:
     return TrajectoryRow(
         name=name,
         frames=absolute.frames,
@@ -49,6 +53,7 @@ def _trajectory_row(
         ate_max_m=absolute.max_m,
         rpe_translation_m=relative.translation_rmse_m,
         rpe_rotation_deg=relative.rotation_rmse_deg,
+        rpe_delta_frames=relative.delta_frames,
         degenerate=any(alignment.degenerate for alignment in absolute.alignments),
     )
 

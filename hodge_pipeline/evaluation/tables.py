@@ -116,9 +116,11 @@ def _trajectories(report: Report) -> Table:
         )
         for row in report.trajectories
     )
+    delta = report.trajectories[0].rpe_delta_frames if report.trajectories else 1
     caption = (
         "Distance from the true positions after the best rigid alignment (ATE, root mean square), and error of the "
-        "motion from each frame to the next (RPE). The truth of a benchmark has errors of its own."
+        f"motion from each frame to {'the next' if delta == 1 else f'the one {delta} frames on'} (RPE). The truth of a "
+        "benchmark has errors of its own."
     )
     return Table("Trajectory", header, rows, caption)
 

@@ -96,11 +96,6 @@ class Elimination:
         """How many vertices there are."""
         return len(self.order)
 
-    @property
-    def core_share(self) -> float:
-        """The share of the vertices that no round takes."""
-        return 1 - self.core / self.size if self.size else 0.0
-
     @cached_property
     def keys(self) -> Ints:
         """Ascending: row · n + column of each slot."""

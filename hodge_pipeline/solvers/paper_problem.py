@@ -11,12 +11,11 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import orthonormal
-from hodge_pipeline.complex.coboundary import grounded_laplacian
 from hodge_pipeline.complex.components import connected_components, first_of_component
 from hodge_pipeline.complex.edge_weights import edge_weights
 from hodge_pipeline.complex.form import Logarithm, centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.solvers.potential import moved, poisson, residual_metrics
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 LEVER_ARM_M = 1.0  # a rotation counts as the displacement that it causes this far away, in a path's uncertainty
@@ -60,48 +59,16 @@ class PaperProblem:
         return out
 
     def poisson(self, d0: csr_matrix, weights: Floats) -> Callable[[Floats], Floats]:
-        """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω`, of mean zero on each component (Eq. (7)).
-
-        The Laplacian is factorised once; six right-hand sides are solved at a time.
-        """
-        gauge = first_of_component(self.component)
-        factor = factorise(grounded_laplacian(d0, weights, gauge))
-        count = np.bincount(self.component)[:, None]
-
-        def solve(omega: Floats) -> Floats:
-            divergence = d0.T @ (weights[:, None] * omega)
-            f = np.zeros_like(divergence)
-            f[~gauge] = factor.solve(divergence[~gauge])
-            sums = np.stack([np.bincount(self.component, column) for column in f.T], axis=1)
-            return np.asarray(f - (sums / count)[self.component])
-
-        return solve
+        """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω`, of mean zero on each component (Eq. (7))."""
+        return poisson(d0, weights, self.component)
 
     def moved(self, poses: Floats, correction: Floats, log: Logarithm) -> Floats:
         """`exp(f_k) T_k` (V, 4, 4), then each component as one body, so that its first vertex is at its start."""
-        motion = se3.pairing_exp(correction) if log == "pairing" else se3.exp(correction)
-        moved = motion @ poses
-        _, first = np.unique(self.component, return_index=True)
-        back = self.start[first] @ se3.inverse(moved[first])
-        return np.asarray(back[self.component] @ moved)
+        return moved(poses, correction, self.start, self.component, log)
 
     def residual_metrics(self, poses: Floats) -> Mapping[str, float]:
-        """Mean and median disagreement of the edges with the poses, metres and radians.
-
-        The translation is the RMS of those that the two cameras see, so it does not depend on the edge's direction.
-        """
-        i, j = self.edges.T
-        poses_say = se3.inverse(poses[i]) @ poses[j]
-        j_from_i = se3.inverse(self.i_from_j)
-        at_i, at_j = poses_say @ j_from_i, j_from_i @ poses_say
-        translation = np.sqrt(((at_i[:, :3, 3] ** 2).sum(axis=1) + (at_j[:, :3, 3] ** 2).sum(axis=1)) / 2)
-        angle = np.linalg.norm(se3.so3_log(at_j[:, :3, :3]), axis=1)
-        return {
-            "translation_residual_mean_m": float(translation.mean()),
-            "translation_residual_median_m": float(np.median(translation)),
-            "rotation_residual_mean_rad": float(angle.mean()),
-            "rotation_residual_median_rad": float(np.median(angle)),
-        }
+        """Mean and median disagreement of the edges with the poses, metres and radians."""
+        return residual_metrics(self.edges, self.i_from_j, poses)
 
     def notes(self) -> tuple[str, ...]:
         """What was ignored."""

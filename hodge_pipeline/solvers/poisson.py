@@ -12,9 +12,8 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.sparse import csr_matrix
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph, orthonormal
-from hodge_pipeline.complex.coboundary import coboundary_0, grounded_laplacian
+from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.components import connected_components, describe_components, first_of_component
 from hodge_pipeline.complex.cycles import (
     adjusted_edges,
@@ -26,7 +25,7 @@ from hodge_pipeline.complex.cycles import (
 from hodge_pipeline.complex.edge_weights import EdgeWeighting, edge_weights
 from hodge_pipeline.complex.form import Logarithm, centroids, residual_form, shifted
 from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
-from hodge_pipeline.solvers.linear import Factor, factorise
+from hodge_pipeline.solvers.potential import moved, poisson, residual_metrics, residuals
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, SolverIteration, ViewGraph
 
 STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
@@ -172,11 +171,11 @@ class PoissonSolver:
         if len(problem.edges) == 0:
             return ()
         total = problem.base_weights * weights
-        factor = _factorise(problem, total)
+        potential = poisson(problem.d0, total, problem.component)
         poses, history = problem.start, []
         omega = self._form(problem, poses)
         for _ in range(self.inner_iterations):
-            correction = _poisson(problem, factor, total, omega)
+            correction = potential(omega)
             adjusted = adjusted_edges(problem.edges, poses, correction, pairing=self.log == "pairing")
             deviation = loop_deviation(around_loops(adjusted))
             poses = self._moved(problem, poses, correction)
@@ -201,8 +200,8 @@ class PoissonSolver:
         poses, scale = problem.start, float("nan")
         for _ in range(self.reweighting_steps):
             total = problem.base_weights * weights
-            omega = self._form(problem, poses)
-            poses = self._moved(problem, poses, _poisson(problem, _factorise(problem, total), total, omega))
+            correction = poisson(problem.d0, total, problem.component)(self._form(problem, poses))
+            poses = self._moved(problem, poses, correction)
             residual = self._displacement(problem, poses)
             scale = self.scale_m or _robust_scale(residual)
             previous, weights = weights, _kernel(residual / (TUNING[self.robust] * scale), self.robust)
@@ -212,19 +211,14 @@ class PoissonSolver:
 
     def _displacement(self, problem: _Problem, poses: Floats) -> Floats:
         """The residual (E,) of each edge in its own two frames, metres: no matter where the world's origin is."""
-        translation, angle = _residuals(problem, poses)
+        translation, angle = residuals(problem.edges, problem.i_from_j, poses)
         return np.hypot(translation, self.lever_arm_m * angle)
 
     def _form(self, problem: _Problem, poses: Floats) -> Floats:
         return residual_form(problem.edges, problem.i_from_j, poses, self.log)
 
     def _moved(self, problem: _Problem, poses: Floats, correction: Floats) -> Floats:
-        motion = se3.pairing_exp(correction) if self.log == "pairing" else se3.exp(correction)
-        moved = motion @ poses
-        start_from_moved = problem.start[problem.gauge] @ se3.inverse(moved[problem.gauge])
-        out = np.asarray(start_from_moved[problem.component[problem.gauge].argsort()][problem.component] @ moved)
-        out[problem.gauge] = problem.start[problem.gauge]
-        return out
+        return moved(poses, correction, problem.start, problem.component, self.log)
 
     def _convergence_notes(self, problem: _Problem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
         if not history:
@@ -258,39 +252,9 @@ def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam
     )
 
 
-def _factorise(problem: _Problem, weights: Floats) -> Factor:
-    return factorise(grounded_laplacian(problem.d0, weights, problem.gauge))
-
-
-def _poisson(problem: _Problem, factor: Factor, weights: Floats, omega: Floats) -> Floats:
-    """F (V, 6) with `d0ᵀ W d0 f = d0ᵀ W ω` (Eq. (7)) and mean zero on each component."""
-    divergence = problem.d0.T @ (weights[:, None] * omega)
-    f = np.zeros_like(divergence)
-    f[~problem.gauge] = factor.solve(divergence[~problem.gauge])
-    count = np.bincount(problem.component)
-    sums = np.stack([np.bincount(problem.component, column) for column in f.T], axis=1)
-    return np.asarray(f - (sums / count[:, None])[problem.component])
-
-
-def _residuals(problem: _Problem, poses: Floats) -> tuple[Floats, Floats]:
-    """Translation (E,) in metres and angle (E,) in radians of each edge's disagreement with the poses.
-
-    The translation is the RMS of those that the two cameras see, so it does not depend on the edge's direction.
-    """
-    i, j = problem.edges.T
-    poses_say = se3.inverse(poses[i]) @ poses[j]
-    at_i, at_j = poses_say @ se3.inverse(problem.i_from_j), se3.inverse(problem.i_from_j) @ poses_say
-    translation = np.sqrt(((at_i[:, :3, 3] ** 2).sum(axis=1) + (at_j[:, :3, 3] ** 2).sum(axis=1)) / 2)
-    return translation, np.linalg.norm(se3.so3_log(at_j[:, :3, :3]), axis=1)
-
-
 def _metrics(problem: _Problem, poses: Floats, deviation: Floats, step: float) -> Mapping[str, float]:
-    translation, angle = _residuals(problem, poses)
     return {
-        "translation_residual_mean_m": _mean(translation),
-        "translation_residual_median_m": float(np.median(translation)),
-        "rotation_residual_mean_rad": _mean(angle),
-        "rotation_residual_median_rad": float(np.median(angle)),
+        **residual_metrics(problem.edges, problem.i_from_j, poses),
         "step_rms": step,
         "loop_deviation_sum": float(deviation.sum()),
         "loop_deviation_mean": _mean(deviation),
