@@ -11,11 +11,12 @@ from hodge_pipeline import artifacts, given, steps, tracked
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.edges.pairs import labelled, merge
 from hodge_pipeline.job import Job
-from hodge_pipeline.rounds import Round
+from hodge_pipeline.registration.gaps import has_gap
+from hodge_pipeline.rounds import Round, sequences_of
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import Candidates, Source, ViewGraph
 from hodge_pipeline.unordered.graphs import COLUMNS
-from hodge_pipeline.unordered.start import Scene, find_start
+from hodge_pipeline.unordered.start import Scene, Start, find_start
 
 START = "start"
 
@@ -41,6 +42,14 @@ def _apart(first: Round) -> bool:
     return int((np.bincount(component) > 1).sum()) > 1
 
 
+def _stays(source: Source, known: Round, found: Start) -> bool:
+    """Whether no two parts were joined, and none lies behind a hole, over which no motion can be guessed."""
+    parts = connected_components(known.graph.edges, known.graph.vertex_count)
+    stamps_s = np.array([frame.stamp_s for frame in source.frames])
+    holes = has_gap(list(sequences_of(source).values()), stamps_s)
+    return not holes and len(np.unique(found.piece)) >= len(np.unique(parts))
+
+
 def _global_start(job: Job, source: Source, known: Round | None, inputs: tuple[str, ...], workers: Workers) -> Round:
     options, total = job.recipe.global_start, 2 * len(source.frames)
     with job.stage(START, "start without a guess", total, options, inputs) as (folder, advance):
@@ -50,11 +59,15 @@ def _global_start(job: Job, source: Source, known: Round | None, inputs: tuple[s
             scratch = folder.path / "scratch"
             found = find_start(scene, options, scratch, workers, advance)
             shutil.rmtree(scratch, ignore_errors=True)
-            columns = {name: getattr(found.graph, name) for name in ("vertex_ids", *COLUMNS)}
-            artifacts.save_arrays(folder.path / "graph.npz", columns)
-            artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": found.world_from_cam})
             for note in found.notes:
                 job.note(note)
+            first_graph, poses = found.graph, found.world_from_cam
+            if known is not None and _stays(source, known, found):
+                first_graph, poses = known.graph, known.world_from_cam
+                job.note("nothing joins what tracking left apart: it starts where the guessed motion puts it")
+            columns = {name: getattr(first_graph, name) for name in ("vertex_ids", *COLUMNS)}
+            artifacts.save_arrays(folder.path / "graph.npz", columns)
+            artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": poses})
     stored: dict[str, Any] = artifacts.load_arrays(job.path(START) / "graph.npz")
     graph = ViewGraph(**stored)
     poses = artifacts.load_arrays(job.path(START) / "poses.npz")["world_from_cam"]

@@ -117,6 +117,19 @@ def test_rejected_pairs_say_why(folder: Path) -> None:
     assert Acceptance(min_fitness=0.0, max_rmse_m=1e-6).reasons(found)[0] == "points too far apart"
 
 
+def test_pairs_that_see_one_bare_wall_slide_and_are_no_edges(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    flat = np.column_stack([rng.uniform(-1, 1, (4000, 2)), np.full(4000, 2.0)])
+    ahead = np.tile(np.float32([0, 0, -1]), (4000, 1))
+    clouds = [PointCloud((flat + rng.normal(0, 0.002, flat.shape)).astype(np.float32), ahead) for _ in range(3)]
+    with HERE.open() as workers:
+        pairs = np.array([[0, 1], [1, 2], [0, 2]])
+        found = register_pairs(saved(tmp_path, clouds), Gicp(), pairs, np.tile(np.eye(4), (3, 1, 1)), workers)
+    said = Acceptance().reasons(found).tolist()
+    assert said == ["", "", "what they share lets them slide"], "consecutive frames are held all the same"
+    assert Acceptance(min_spread=0.0).reasons(found).tolist() == ["", "", ""]
+
+
 def test_odometry_follows_the_camera(folder: Path) -> None:
     with HERE.open() as workers:
         found = odometry(folder, [np.arange(FRAMES)], np.arange(FRAMES) / 30, OdometryOptions(), workers)

@@ -274,6 +274,17 @@ def test_relative_motions_stop_at_the_end_of_a_sequence() -> None:
     assert split.ate_rmse_m > 0.1
 
 
+def test_frames_that_nothing_joins_do_not_flatter_the_error() -> None:
+    truth = circle(8)
+    poses = truth.copy()
+    poses[::2, :3, 3] += 0.1
+    component = np.array([0, 0, 0, 0, 0, 0, 1, 2])
+    (row,) = trajectory_rows({"result": poses}, truth, component)
+    (joined,) = trajectory_rows({"result": poses[:6]}, truth[:6], component[:6])
+    assert row.ate_rmse_m == pytest.approx(joined.ate_rmse_m)
+    assert (row.frames, row.left_out, row.degenerate) == (6, 2, False)
+
+
 def test_tables_and_terminal_lines(report: Report) -> None:
     scores, trajectory = score_tables(report)
     assert scores.rows[1][:4] == ("odometry", "0.7486", "20.00 mm", "3")

@@ -197,7 +197,7 @@ def test_frames_that_see_through_each_other_are_cut_apart_although_their_edges_a
     graph.correspondences[:] = [900, 900, 100]
     pieces = Pieces(graph, np.zeros(4, np.int64), np.tile(np.eye(4), (4, 1, 1)))
     limits, options = HypothesisLimits(), GlobalStart().diagnosis
-    assert contradictions(clouds, pieces, views.__getitem__, limits).folded == (far_m > 2)
+    assert contradictions(clouds, pieces, np.arange(len(pieces.piece)), views.__getitem__, limits).folded == (far_m > 2)
     found = unfolded(clouds, pieces, 0, views.__getitem__, limits, options)
     if far_m == 2:
         assert found is pieces
@@ -205,6 +205,16 @@ def test_frames_that_see_through_each_other_are_cut_apart_although_their_edges_a
         assert found.graph.edges.tolist() == [[0, 1], [2, 3]]
         assert found.piece[0] == found.piece[1] != found.piece[2] == found.piece[3]
         assert "4 contradict each other" in found.notes[0]
+
+
+def test_what_odometry_holds_is_not_cut_where_it_drifts() -> None:
+    seen = [wall_at(2.0), wall_at(2.0), wall_at(4.0), wall_at(4.0)]
+    clouds, views = CloudSet.from_clouds([cloud for cloud, _ in seen]), [view for _, view in seen]
+    chain = ViewGraph.from_edges(np.arange(4), np.array([[0, 1], [1, 2], [2, 3]]), np.tile(np.eye(4), (3, 1, 1)))
+    pieces = Pieces(chain, np.zeros(4, np.int64), np.tile(np.eye(4), (4, 1, 1)))
+    limits, options = HypothesisLimits(), GlobalStart().diagnosis
+    assert unfolded(clouds, pieces, 3, views.__getitem__, limits, options) is pieces
+    assert unfolded(clouds, pieces, 0, views.__getitem__, limits, options) is not pieces
 
 
 def painted(poster: tuple[int, int, int]) -> PointCloud:

@@ -30,9 +30,13 @@ def trajectory_rows(
 ) -> tuple[TrajectoryRow, ...]:
     """The errors of each named set of poses (N, 4, 4) against the truth (N, 4, 4), NaN where a frame has none.
 
-    Each component (N,) is aligned apart; relative motions, over `delta_frames`, also stop at the end of a sequence.
+    Each component (N,) is aligned apart; a frame that is one by itself is left out, since it would fit its truth
+    exactly. Relative motions, over `delta_frames`, also stop at the end of a sequence.
     """
     parts = _distinct(component, sequence, len(truth))
+    if component is not None:
+        alone = np.bincount(component)[component] == 1
+        truth = truth if alone.all() else np.where(alone[:, None, None], np.nan, truth)
     return tuple(
         _trajectory_row(
             name,

@@ -196,7 +196,7 @@ def _unmatched(report: Report) -> Iterator[str]:
 
 def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[str]:
     if row.left_out:
-        yield f"{row.name}: {row.left_out} frames without a true pose are not in the error of the trajectory."
+        yield f"{row.name}: {row.left_out} frames without a true pose, or joined to no other, are not in its error."
     if row.degenerate:
         yield f"{row.name}: its positions lie on a line (or are fewer than three): its orientations aligned it."
 

@@ -29,7 +29,7 @@ class ModelRefinement:
     description: str = Field(default="", description="one sentence for `hodge recipes`")
     seed: int = Field(default=0, ge=0, description="of everything random")
     clouds: CloudOptions = CloudOptions()
-    acceptance: Acceptance = Acceptance()
+    acceptance: Acceptance = Acceptance(min_spread=0.0)
     held_out_share: float = Field(
         default=0.2,
         ge=0,

@@ -94,14 +94,32 @@ class Acceptance:
         gt=0,
         description="metres: RMS distance of those points; two 3 cm grids of one surface differ by 2 to 4 cm",
     )
+    min_spread: float = Field(
+        default=0.02,
+        ge=0,
+        le=0.3,
+        description="share of a pair's information on translation that its weakest direction has, at most a third; "
+        "below it what both see, such as a bare floor or wall, lets them slide on each other wherever the guess is "
+        "wrong. 0.02: normals within 8° of each other. Consecutive frames, whose guess is near, are held all the same",
+    )
 
     def reasons(self, registered: Registered) -> NDArray[np.str_]:
         """Why each pair (P,) is rejected, an empty word where it is accepted."""
-        out = np.full(len(registered.pairs), "", "U32")
+        out = np.full(len(registered.pairs), "", "U64")
+        out[_slides(registered, self.min_spread)] = "what they share lets them slide"
         out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
         out[~(registered.fitness >= self.min_fitness)] = "too little overlap"
         out[registered.correspondences == 0] = "nothing in common"
         return out
+
+
+def _slides(registered: Registered, min_spread: float) -> Bools:
+    """Where (P,) translation is hardly known in some direction, for pairs that are not next to each other."""
+    values = np.linalg.eigvalsh(np.nan_to_num(registered.information[:, 3:, 3:]))
+    rank = np.searchsorted(np.unique(registered.pairs), registered.pairs)
+    is_next = np.abs(rank[:, 0] - rank[:, 1]) == 1
+    weakest = np.maximum(values[:, 0], 0.0)  # rounding may make it negative
+    return np.asarray((weakest < min_spread * values.sum(axis=1)) & ~is_next)
 
 
 def register_pairs(

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.evaluation.scores import evenly
@@ -52,12 +53,19 @@ class Contradictions:
         return len(self.pairs) > max(1.0, FOLDED_SHARE * self.looked_at)
 
 
-def contradictions(clouds: CloudSet, pieces: Pieces, view_of: ViewOf, limits: HypothesisLimits) -> Contradictions:
-    """What free space says of frames that the poses bring together, whether an edge joins them or not."""
+def contradictions(
+    clouds: CloudSet, pieces: Pieces, held: Ints, view_of: ViewOf, limits: HypothesisLimits
+) -> Contradictions:
+    """What free space says of frames that the poses bring together, whether an edge joins them or not.
+
+    Frames of one part `held (N,)` by odometry are left out: what contradicts there has drifted, and looks like nothing.
+    """
     rows = np.flatnonzero(clouds.sizes > 0)
     i, j = np.triu_indices(len(rows), 1)
     every = np.stack([rows[i], rows[j]], axis=1)
-    pairs = evenly(every[pieces.piece[every[:, 0]] == pieces.piece[every[:, 1]]], MOST_PAIRS)
+    first, second = every.T
+    chosen = (pieces.piece[first] == pieces.piece[second]) & (held[first] != held[second])
+    pairs = evenly(every[chosen], MOST_PAIRS)
     motions = se3.inverse(pieces.poses[pairs[:, 0]]) @ pieces.poses[pairs[:, 1]]
     seen_through = violations(clouds, pairs, motions, view_of)
     certain = seen_through > CERTAIN * limits.max_violation  # false for NaN
@@ -73,7 +81,8 @@ def unfolded(
     options: DiagnosisOptions,
 ) -> Pieces:
     """The pieces, cut where they hold frames that contradict each other; the first `given` edges are cut last."""
-    found = contradictions(clouds, pieces, view_of, limits)
+    held = connected_components(pieces.graph.edges[:given], len(pieces.piece))
+    found = contradictions(clouds, pieces, held, view_of, limits)
     if not found.folded:
         return pieces
     first, before = found, len(pieces.graph.edges)
@@ -87,7 +96,7 @@ def unfolded(
         judged = diagnose(graph, options)
         strength = strength[judged.kept]
         pieces = Pieces(*without_wrong(graph, judged))
-        found = contradictions(clouds, pieces, view_of, limits)
+        found = contradictions(clouds, pieces, held, view_of, limits)
         if not found.folded:
             break
         forbidden = np.unique(np.concatenate([forbidden, found.pairs]), axis=0)
