@@ -8,6 +8,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.cuts import interval_sums, sums_of
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.joining import Joining, learn_joining
+from hodge_pipeline.diagnosis.order import order_prior
 from hodge_pipeline.evaluation.edges import precision_and_recall
 from hodge_pipeline.types import Floats
 
@@ -31,6 +32,19 @@ def test_interval_sums_are_the_sums_of_each_run() -> None:
     for row in range(len(low)):
         inside = (np.arange(7) >= low[row]) & (np.arange(7) < high[row])
         np.testing.assert_allclose(sums[:, row], sums_of(layers, inside), atol=1e-12)
+
+
+@pytest.mark.parametrize("joined", [0.05, 0.3, 0.6, 0.8])
+def test_the_order_counts_also_where_most_pairs_are_joined_and_not_where_it_tells_nothing(joined: float) -> None:
+    rng = np.random.default_rng(0)
+    pairs = np.stack(np.triu_indices(40, 1), 1)
+    near = pairs[:, 1] - pairs[:, 0] <= 2
+    by_chance = rng.random(len(pairs)) < joined
+    edges = pairs[near | by_chance]
+    prior = order_prior(edges, 40)
+    gap = edges[:, 1] - edges[:, 0]
+    assert prior[gap == 1].min() > 0.9 and prior[gap > 20].mean() < 0.3
+    assert np.ptp(order_prior(pairs[by_chance], 40)) == 0 and np.ptp(order_prior(pairs, 40)) == 0
 
 
 @pytest.mark.parametrize("seed", [1, 3])

@@ -14,6 +14,9 @@ from hodge_pipeline.types import Floats, Ints
 FLOOR, CEILING = 0.05, 0.98
 FAR_SHARE = 0.25
 """Pairs further apart than this share of the vertices tell how often any two views are joined."""
+LEAST_ODDS = 2.0
+"""Of neighbours in order to be joined, in units of those of far pairs, for the order to count."""
+DOUBTED = 2
 TRIED_FROM = 0.1
 """Share of the far pairs that are joined."""
 
@@ -21,7 +24,7 @@ TRIED_FROM = 0.1
 def order_prior(edges: Ints, vertex_count: int) -> Floats:
     """The probability (E,) that an edge is right, from its gap |i − j| alone.
 
-    All are equal where near pairs are joined no more often than far ones. Vertex rows are the order.
+    All are equal where neighbours are hardly more often joined than far pairs. Vertex rows are the order.
     """
     gap = np.abs(edges[:, 1] - edges[:, 0])
     bounds = _bounds(vertex_count)
@@ -30,7 +33,9 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
     pairs = np.array([_pairs(low, high, vertex_count) for low, high in zip(bounds[:-1], bounds[1:], strict=True)])
     rate = np.minimum(joined / np.maximum(pairs, 1), 1.0)
     far = _far_rate(gap, vertex_count)
-    if rate[0] < 2 * far or not joined.any():
+    # by odds, which tell also where most pairs are joined, and with some neighbours more that are not: it may be chance
+    missed = 1 - rate[0] + DOUBTED / max(pairs[0], 1)
+    if rate[0] * (1 - far) < LEAST_ODDS * far * missed or not joined.any():
         return np.full(len(edges), 0.5)
     right = np.maximum(rate - far, 0) / (1 - far)
     share = np.clip(right / np.maximum(rate, 1e-12), FLOOR, CEILING)
