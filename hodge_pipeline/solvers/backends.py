@@ -10,6 +10,7 @@ import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -84,8 +85,11 @@ def backend(name: BackendName) -> Backend:
     return Backend("superlu")
 
 
+@cache
 def installed(name: BackendName) -> bool:
-    """Whether the library of a back end can be imported."""
+    """Whether the library of a back end can be imported: looked up once, since a search of the path takes as long as a
+    twentieth of a solve for a thousand poses.
+    """
     module = MODULES.get(name, ("scipy", ""))[0]
     try:
         return importlib.util.find_spec(module) is not None

@@ -207,12 +207,11 @@ def _ordered_core(
     """The vertices of the core in elimination order."""
     place = np.zeros(count, np.int64)
     place[rest] = np.arange(len(rest))
-    rows, columns = place[low], place[high]
-    ones = np.ones(len(rows))
-    pattern = csc_matrix((np.r_[-ones, -ones], (np.r_[rows, columns], np.r_[columns, rows])), (len(rest), len(rest)))
-    degree = np.bincount(np.r_[rows, columns], minlength=len(rest)) + 1.0
-    pattern = pattern + csc_matrix((degree, (np.arange(len(rest)), np.arange(len(rest)))), pattern.shape)
-    found = core_order(pattern)
+    rows, columns, own = place[low], place[high], np.arange(len(rest))
+    i, j = np.concatenate([rows, columns, own]), np.concatenate([columns, rows, own])
+    weights = np.full(len(i), -1.0)
+    weights[2 * len(rows) :] = np.bincount(i)
+    found = core_order(csc_matrix((weights, (i, j)), (len(rest), len(rest))))
     return replace(found, order=rest[found.order])
 
 
