@@ -3,12 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagnosis_graphs import every_pair_tried
+from diagnosis_graphs import every_pair_tried, measured, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.cuts import interval_sums, sums_of
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.joining import Joining, learn_joining
-from hodge_pipeline.diagnosis.order import order_prior
+from hodge_pipeline.diagnosis.order import order_prior, prior_by_cycles
 from hodge_pipeline.evaluation.edges import precision_and_recall
 from hodge_pipeline.types import Floats
 
@@ -45,6 +45,21 @@ def test_the_order_counts_also_where_most_pairs_are_joined_and_not_where_it_tell
     gap = edges[:, 1] - edges[:, 0]
     assert prior[gap == 1].min() > 0.9 and prior[gap > 20].mean() < 0.3
     assert np.ptp(order_prior(pairs[by_chance], 40)) == 0 and np.ptp(order_prior(pairs, 40)) == 0
+
+
+def test_the_order_counts_where_every_pair_is_joined() -> None:
+    """Each view is right with the next five, and any other pair has an edge all the same."""
+    pairs = np.stack(np.triu_indices(24, 1), 1)
+    clean = measured(poses_on_a_ring(24), pairs)
+    graph, right = spoiled(clean, np.flatnonzero(pairs[:, 1] - pairs[:, 0] > 5))
+    found = diagnose(graph)
+    precision, recall = precision_and_recall(found.kept, right)
+    assert precision > 0.95 and recall > 0.95
+    prior = prior_by_cycles(pairs, 24, found.cycles)
+    gap = pairs[:, 1] - pairs[:, 0]
+    assert prior[gap == 1].min() > 0.9 and prior[gap > 8].max() < 0.2
+    shuffled = np.random.default_rng(0).permutation(24)[pairs]
+    assert np.ptp(prior_by_cycles(shuffled, 24, found.cycles)) == 0
 
 
 @pytest.mark.parametrize("seed", [1, 3])

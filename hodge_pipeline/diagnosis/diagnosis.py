@@ -13,7 +13,7 @@ from hodge_pipeline.diagnosis.consensus import find_consensus
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.noise import Noise, edge_noise
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior
+from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior, prior_by_cycles
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
 from hodge_pipeline.diagnosis.robust_poses import left_over
 from hodge_pipeline.diagnosis.shared_blame import share_blame
@@ -51,6 +51,10 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     noise = edge_noise(graph, loops, angle, moved, prior, reach_m)
     cycles = judge_cycles(loops, angle, moved, noise, reach_m)
     exhaustive = every_pair_tried(graph.edges, graph.vertex_count)
+    if exhaustive and options.order_prior and np.ptp(prior) == 0:
+        prior = prior_by_cycles(graph.edges, graph.vertex_count, cycles)
+        noise = edge_noise(graph, loops, angle, moved, prior, reach_m)
+        cycles = judge_cycles(loops, angle, moved, noise, reach_m)
     if not exhaustive:
         # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
         prior = np.minimum(prior, usual_share(cycles))

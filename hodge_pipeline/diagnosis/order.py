@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hodge_pipeline.diagnosis.result import Cycles
 from hodge_pipeline.types import Floats, Ints
 
 FLOOR, CEILING = 0.05, 0.98
@@ -17,6 +18,7 @@ FAR_SHARE = 0.25
 LEAST_ODDS = 2.0
 """Of neighbours in order to be joined, in units of those of far pairs, for the order to count."""
 DOUBTED = 2
+SHARE_ROUNDS = 30
 TRIED_FROM = 0.1
 """Share of the far pairs that are joined."""
 
@@ -40,6 +42,29 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
     right = np.maximum(rate - far, 0) / (1 - far)
     share = np.clip(right / np.maximum(rate, 1e-12), FLOOR, CEILING)
     return np.asarray(share[np.maximum(place, 0)])
+
+
+def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
+    """The probability (E,) that an edge is right, from its gap and from the triangles that close: where all pairs are
+    joined, how often they are says nothing.
+
+    A triangle closes where its three edges are right, so that each gap's share is that of its triangles that close
+    over what the other two edges let expect. All are equal where neighbours are hardly more often right.
+    """
+    bounds = _bounds(vertex_count)
+    place = np.maximum(np.searchsorted(bounds, np.abs(edges[:, 1] - edges[:, 0]), side="right") - 1, 0)
+    triangles = np.flatnonzero(cycles.loops.lengths == 3)
+    sides = place[cycles.loops.select(triangles).edge.reshape(-1, 3)]
+    closing = np.bincount(sides.ravel(), np.repeat(cycles.closes[triangles], 3), len(bounds))
+    share = np.full(len(bounds), 0.5)
+    for _ in range(SHARE_ROUNDS):
+        others = share[sides[:, [1, 0, 0]]] * share[sides[:, [2, 2, 1]]]
+        expected = np.bincount(sides.ravel(), others.ravel(), len(bounds))
+        told = np.clip(closing / np.maximum(expected, 1e-9), FLOOR, CEILING)
+        share = np.sqrt(share * told)  # half a step, since whole ones swing
+    odds = share / (1 - share)
+    known = bool(len(triangles)) and odds[0] >= LEAST_ODDS * odds[place].mean()
+    return share[place] if known else np.full(len(edges), 0.5)
 
 
 def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
