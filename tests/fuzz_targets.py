@@ -33,6 +33,7 @@ from mcap_data import some_images, write_depth_log
 from mcap_encoding import CDR, JSON, PROTOBUF
 from mcap_scene import everything
 from readers_data import seven_scenes_sequence, some_poses, tum_folder, tum_line, write_colour, write_depth
+from scan_data import FAR, ROOM, write_e57, write_las
 
 
 @dataclass(frozen=True)
@@ -216,6 +217,39 @@ def ply(ascii: bool) -> Callable[[Path], Path]:
     return make
 
 
+def las(folder: Path) -> Path:
+    write_las(folder / "a.las", FAR + ROOM)
+    return folder
+
+
+def planar(folder: Path) -> Path:
+    """A graph in the plane with a vertex that is held and what is known of another."""
+    path = folder / "planar.g2o"
+    path.write_text(
+        "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0.5\nVERTEX_SE2 2 1 1 1.5\nFIX 0\nEDGE_SE2 0 1 1 0 0.5 4 0 0 4 0 9\n"
+        "EDGE_SE2 1 2 0.5 0.9 1 4 0 0 4 0 9\nEDGE_PRIOR_SE2 1 1 0 0.5 4 0 0 4 0 9\nEDGE_PRIOR_SE2_XY 2 1 1 4 0 4\n"
+    )
+    return path
+
+
+def priors(folder: Path) -> Path:
+    """A graph in space whose vertices are known in part, one by a sensor with an offset."""
+    path = folder / "priors.g2o"
+    information = " ".join(map(str, np.eye(6)[np.triu_indices(6)]))
+    G2oWriter().write(path, poses_source())
+    known = f"0 0 0 0 0 0 1 {information}\n"
+    path.write_text(
+        f"{path.read_text()}PARAMS_SE3OFFSET 0 0.1 0 0 0 0 0 1\nEDGE_SE3_PRIOR 1 0 {known}EDGE_SE3_PRIOR 2 0 {known}"
+    )
+    return path
+
+
+def isam(folder: Path) -> Path:
+    path = folder / "isam.txt"
+    path.write_text("ODOMETRY 0 1 1 0 0.1 4 0 0 9 0 1\nLANDMARK 0 5 2 3 0.4 0 0.4\nODOMETRY 1 2 1 0 0.1 4 0 0 9 0 1\n")
+    return path
+
+
 def pcd(kind: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         points = np.arange(24, dtype="<f4").reshape(8, 3)
@@ -269,5 +303,10 @@ TARGETS: dict[str, Target] = {
     "tum_poses": Target(TumPosesReader(), written(TumWriter(), "a.tum")),
     "kitti_poses": Target(KittiPosesReader(), written(KittiWriter(), "a.txt")),
     "g2o": Target(G2oReader(), written(G2oWriter(), "a.g2o")),
+    "g2o_planar": Target(G2oReader(), planar),
+    "g2o_priors": Target(G2oReader(), priors),
+    "isam": Target(ToroReader(), isam),
+    "las": Target(CloudFolderReader(), las),
+    "e57": Target(CloudFolderReader(), lambda folder: write_e57(folder / "a.e57", some_poses(2))),
     "toro": Target(ToroReader(), toro),
 }

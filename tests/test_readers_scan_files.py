@@ -13,35 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
 from readers_data import some_poses
-
-ROOM = np.random.default_rng(0).uniform(0, 3, (50, 3))
-FAR = np.array([431_000.0, 5_401_000.0, 120.0])
-"""Where a map's coordinates are: float32 would round them to half a metre."""
-
-
-def write_las(path: Path, points: np.ndarray, bits: int = 16) -> Path:
-    laspy = pytest.importorskip("laspy", reason="laspy is not installed: pip install 'hodge-pipeline[scans]'")
-    header = laspy.LasHeader(point_format=3, version="1.2")
-    header.scales, header.offsets = np.full(3, 1e-4), points.min(axis=0)
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = points.T
-    las.red = las.green = np.full(len(points), 200 * (257 if bits == 16 else 1))
-    las.blue = np.zeros(len(points))
-    las.write(str(path))
-    return path
-
-
-def write_e57(path: Path, poses: np.ndarray) -> Path:
-    pye57 = pytest.importorskip("pye57", reason="pye57 is not installed: pip install 'hodge-pipeline[scans]'")
-    file = pye57.E57(str(path), mode="w")
-    for pose in poses:
-        local = se3.transform(se3.inverse(pose), ROOM)
-        columns = {f"cartesian{axis}": local[:, row].copy() for row, axis in enumerate("XYZ")}
-        columns.update({f"color{name}": np.full(len(ROOM), 7, np.uint8) for name in ("Red", "Green", "Blue")})
-        quat_wxyz = se3.to_quat_xyzw(pose)[[3, 0, 1, 2]]
-        file.write_scan_raw(columns, rotation=quat_wxyz, translation=pose[:3, 3].copy())
-    file.close()
-    return path
+from scan_data import FAR, ROOM, write_e57, write_las
 
 
 def test_las_files_count_from_one_corner(tmp_path: Path) -> None:
@@ -86,4 +58,14 @@ def test_the_package_that_is_needed_is_named(
     monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / name).write_bytes(b"LASF")
     with pytest.raises(SourceError, match=f"pip install {package}"):
+        CloudFolderReader().open(tmp_path)
+
+
+@pytest.mark.parametrize(("at", "value"), [(96, 2**31), (100, 2**32 - 1)])
+def test_a_las_header_that_counts_too_much_is_refused_at_once(tmp_path: Path, at: int, value: int) -> None:
+    path = write_las(tmp_path / "a.las", ROOM)
+    contents = bytearray(path.read_bytes())
+    contents[at : at + 4] = value.to_bytes(4, "little")
+    path.write_bytes(contents)
+    with pytest.raises(SourceError, match=r"a.las: laspy cannot read it \(counts .* of \d+ on\): convert it to PLY"):
         CloudFolderReader().open(tmp_path)

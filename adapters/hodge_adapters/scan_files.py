@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,10 @@ LIBRARIES = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
 MAX_POINTS = 1 << 28
 """A file that says more would fill 3 GB with one cloud."""
 
+LAS_HEADER, LAS_14_HEADER = 227, 375
+"""Bytes of the public header of LAS 1.2 and 1.4 (ASPRS LAS 1.4 R15, tables 3 and 20)."""
+RECORD_HEADER, EXTENDED_RECORD_HEADER = 54, 60
+
 
 @dataclass(frozen=True)
 class Scan:
@@ -32,6 +37,8 @@ def las_corner(paths: Sequence[Path]) -> tuple[float, float, float]:
     """The lower corner (x, y, z) of all these files, from their headers."""
     corners = []
     for path in paths:
+        with _named(path, "laspy"):
+            _check_counts(path)
         with _named(path, "laspy"), library("laspy", path).open(path) as file:
             if not 0 <= file.header.point_count <= MAX_POINTS:
                 raise ValueError(f"says {file.header.point_count} points")
@@ -40,6 +47,22 @@ def las_corner(paths: Sequence[Path]) -> tuple[float, float, float]:
     if not np.isfinite(low).all():
         raise SourceError(f"{paths[0]}: the header's corner is not finite: mend it, or convert the file to PLY")
     return float(low[0]), float(low[1]), float(low[2])
+
+
+def _check_counts(path: Path) -> None:
+    """Raise `ValueError` where the header of a LAS file counts more records than the file has bytes for.
+
+    laspy would go on looking for billions of them.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        header = file.read(LAS_14_HEADER)
+    if len(header) < LAS_HEADER or header[:4] != b"LASF":
+        return  # laspy has the words for it
+    points_at, records = struct.unpack_from("<II", header, 96)
+    extended = struct.unpack_from("<I", header, 243)[0] if header[25] >= 4 and len(header) == LAS_14_HEADER else 0
+    if points_at > size or RECORD_HEADER * records > points_at or EXTENDED_RECORD_HEADER * extended > size:
+        raise ValueError(f"counts {records} and {extended} records, points from byte {points_at} of {size} on")
 
 
 def read_las(path: Path, corner: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PointCloud:
