@@ -44,6 +44,8 @@ def test_a_good_loop_vouches_for_its_own_edges_alone(
         else:
             assert found.verdict[row] == CONSISTENT
     assert sorted(set(found.verdict.tolist())) == [CONSISTENT, SUSPECT, UNTESTABLE]
+    left_out = found.verdict == SUSPECT
+    assert ((found.probability[left_out] > 0.5) & (found.probability[left_out] < 1)).all(), "one of several is wrong"
 
 
 def test_a_second_loop_through_the_wrong_edge_clears_the_others() -> None:

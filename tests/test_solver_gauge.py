@@ -76,8 +76,10 @@ def test_priors_are_edges_from_the_world():
     np.testing.assert_allclose(solution.world_from_cam[:, 0, 3], [force, 1 + 2 * force, 2 + 3 * force], atol=1e-7)
     assert solution.metrics["objective"] == pytest.approx(force**2 * 3.5, rel=1e-6)
     assert len(solution.weights) == 2
-    with pytest.raises(GraphError, match="prior 1 names vertex row 7"):
-        solve(graph, priors=Priors(np.array([0, 7]), known, priors.information))
+    assert all(len(step.world_from_cam) == 3 for step in solve(graph, priors=priors, keep_history=True).history)
+    for outside in (3, 7, -1):
+        with pytest.raises(GraphError, match=f"prior 1 names vertex row {outside} of 3"):
+            solve(graph, priors=Priors(np.array([0, outside]), known, priors.information))
 
 
 def test_priors_join_pieces_and_can_be_certified():
