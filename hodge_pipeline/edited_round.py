@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import artifacts
+from hodge_pipeline.accepted import rejections
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.edits import DISABLED, ENABLED, REGISTERED, History, joining, read_history, vertex_rows
@@ -108,7 +109,7 @@ def _start(job: Job, graph: ViewGraph, rounds: Sequence[Round]) -> Floats:
 
 def _edited(job: Job, candidates: Candidates, registered: Registered, measured: ViewGraph, history: History) -> _Edges:
     graph = joined([registered.as_graph(measured.vertex_ids, candidates.source), measured])
-    reasons = job.recipe.acceptance.reasons(registered)
+    reasons = rejections(job, registered)
     reasons = np.concatenate([reasons, np.full(measured.edge_count, "", reasons.dtype)])
     chosen = (reasons == "") | _any_joining(graph, history.enabled)
     return _Edges(graph, reasons, chosen, _any_joining(graph, history.disabled))

@@ -10,6 +10,7 @@ from types import TracebackType
 import numpy as np
 
 from hodge_pipeline import artifacts, binding, se3, yaml_file
+from hodge_pipeline.accepted import rejections
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.fusion.ply import read_ply
@@ -71,7 +72,7 @@ class Recording:
         """What registration found in outer round `number`, from the poses before it."""
         i, j = registered.pairs.T
         guesses = se3.inverse(before[i]) @ before[j]
-        reasons = self._job.recipe.acceptance.reasons(registered)
+        reasons = rejections(self._job, registered)
         self._part(
             f"registration-{number}",
             (f"register-{number}",),

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import artifacts, given, se3
+from hodge_pipeline.accepted import rejections
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.edges.pairs import select
 from hodge_pipeline.errors import RecipeError, SourceError
@@ -160,7 +161,7 @@ def solve(
 ) -> Round:
     """Round `number`: the accepted and the measured edges, and the poses consistent with them from `start`."""
     name, options = f"solve-{number}", (job.recipe.acceptance, job.recipe.solver)
-    reasons = job.recipe.acceptance.reasons(registered)
+    reasons = rejections(job, registered)
     accepted = reasons == ""
     graph = joined([registered.select(accepted).as_graph(vertex_ids(source), candidates.source[accepted]), measured])
     with job.stage(name, f"solve, round {number}", 1, options, (f"register-{number}",)) as (folder, advance):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import artifacts, steps
+from hodge_pipeline.accepted import rejections
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
@@ -54,7 +55,7 @@ def suggested_rounds(
         registered = Registered.joined([last.registered, new])
         candidates = with_more(last.candidates, new.pairs, SUGGESTED)
         found = steps.solve(job, number, source, candidates, registered, start, measured)
-        accepted = int((job.recipe.acceptance.reasons(new) == "").sum())
+        accepted = int((rejections(job, new) == "").sum())
         job.note(
             f"round {number}: of {len(proposal.pairs)} suggested pairs {accepted} became edges; before it "
             f"{proposal.untestable} of {last.graph.edge_count} edges could not be tested"
@@ -99,7 +100,7 @@ def _judged(job: Job, last: Round, new: Registered, proposal: _Proposal, clouds:
     across = proposal.placed.across(new.pairs)
     if not across.any():
         return new, last.world_from_cam
-    accepted = job.recipe.acceptance.reasons(new) == ""
+    accepted = rejections(job, new) == ""
     graph = joined([last.graph, new.as_graph(last.graph.vertex_ids, np.full(len(new.pairs), SUGGESTED))])
     weighed = np.append(np.ones(last.graph.edge_count, bool), accepted)
     found = diagnose(graph.select(weighed), job.recipe.diagnosis)

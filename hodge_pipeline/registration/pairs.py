@@ -104,7 +104,7 @@ class Acceptance:
     )
 
     def reasons(self, registered: Registered) -> NDArray[np.str_]:
-        """Why each pair (P,) is rejected, an empty word where it is accepted."""
+        """Why each pair (P,) is rejected by itself, an empty word where it is accepted."""
         out = np.full(len(registered.pairs), "", "U64")
         out[_slides(registered, self.min_spread)] = "what they share lets them slide"
         out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
