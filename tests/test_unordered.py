@@ -207,6 +207,20 @@ def test_frames_that_see_through_each_other_are_cut_apart_although_their_edges_a
         assert "4 contradict each other" in found.notes[0]
 
 
+def test_a_wall_seen_from_farther_off_contradicts_nothing() -> None:
+    seen = [wall_at(2.0), wall_at(2.0), wall_at(4.0), wall_at(4.0)]
+    clouds, views = CloudSet.from_clouds([cloud for cloud, _ in seen]), [view for _, view in seen]
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    graph = ViewGraph.from_edges(np.arange(4), np.zeros((0, 2), int), np.zeros((0, 4, 4)))
+    rows, limits = np.arange(4), HypothesisLimits()
+    together = Pieces(graph, np.zeros(4, np.int64), poses)
+    assert len(contradictions(clouds, together, rows, views.__getitem__, limits).pairs) == 4
+    poses = poses.copy()
+    poses[2:, 2, 3] = -2.0
+    apart = contradictions(clouds, Pieces(graph, np.zeros(4, np.int64), poses), rows, views.__getitem__, limits)
+    assert apart.looked_at == 6 and not len(apart.pairs)
+
+
 def test_what_odometry_holds_is_not_cut_where_it_drifts() -> None:
     seen = [wall_at(2.0), wall_at(2.0), wall_at(4.0), wall_at(4.0)]
     clouds, views = CloudSet.from_clouds([cloud for cloud, _ in seen]), [view for _, view in seen]
