@@ -28,7 +28,7 @@ from hodge_pipeline.recipe import Recipe, load_recipe
 from hodge_pipeline.solve_file import read_graph, vertex_trajectory
 from hodge_pipeline.types import Bools, CloudSet, Frame, Ints, Source, ViewGraph
 from hodge_pipeline.unordered.pieces import laid_apart
-from hodge_pipeline.workspace import RECIPE_FILE
+from hodge_pipeline.workspace import RECIPE_FILE, is_run_folder
 
 PICTURED, LEAST_PICTURED = 6, 2
 SUGGESTED, REGISTERED = 12, 6
@@ -61,7 +61,7 @@ def open_subject(path: Path) -> Subject:
     stage = path / "stages" / "diagnose"
     if (stage / "graph.npz").is_file():
         return _run_subject(path, artifacts.load(stage / "graph.npz", ViewGraph))
-    if (path / RECIPE_FILE).is_file():
+    if is_run_folder(path):
         raise WorkspaceError(
             f"{path}: this run is not finished: run the same command again, it goes on where it stopped"
         )

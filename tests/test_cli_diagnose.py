@@ -19,6 +19,7 @@ from hodge_pipeline.complex.betti import betti_numbers
 from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
+from hodge_pipeline.diagnose_path import open_subject
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.energy import energy_rows
 from hodge_pipeline.diagnosis.matches import side_by_side
@@ -251,8 +252,15 @@ def test_a_run_is_diagnosed_with_pictures(tiny_sequence: Path, tmp_path: Path) -
 
 def test_mistakes_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
-    (tmp_path / "half").mkdir()
+    (tmp_path / "half/stages").mkdir(parents=True)
     (tmp_path / "half/recipe.yaml").write_text("x: 1\n")
     for path, message in (("poses.tum", "no graph"), ("half", "not finished"), ("nothing.g2o", "no such file")):
         with pytest.raises(HodgeError, match=message):
             hodge(tmp_path / path)
+
+
+def test_the_folder_of_a_refined_model_is_diagnosed_as_what_it_holds(tmp_path: Path) -> None:
+    (tmp_path / "recipe.yaml").write_text("model: colmap\n")
+    graph = ViewGraph.from_edges(np.arange(3), np.array([[0, 1], [1, 2], [0, 2]]), np.tile(np.eye(4), (3, 1, 1)))
+    write_g2o(tmp_path / "graph.g2o", graph)
+    assert open_subject(tmp_path).graph.edge_count == 3
