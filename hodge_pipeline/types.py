@@ -10,6 +10,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.errors import GraphError
+
 Floats: TypeAlias = NDArray[np.float64]
 Floats32: TypeAlias = NDArray[np.float32]
 Ints: TypeAlias = NDArray[np.int64]
@@ -177,13 +179,21 @@ class ViewGraph:
         dimension: int = 3,
         fixed: Ints | None = None,
     ) -> ViewGraph:
-        """A graph of measured edges; the information defaults to the identity, what was not seen to NaN or 0."""
+        """A graph of measured edges; the information defaults to the identity, what was not seen to NaN or 0.
+
+        Raises `GraphError` where there is not one motion (4, 4) and one information (6, 6) for each edge.
+        """
         count = len(edges)
+        for name, given, side in (("i_from_j", i_from_j, 4), ("information", information, 6)):
+            if count and given is not None and np.shape(given) != (count, side, side):
+                raise GraphError(f"{name} has the shape {np.shape(given)}: expected ({count}, {side}, {side})")
         return cls(
             vertex_ids=np.asarray(vertex_ids),
             edges=np.asarray(edges, np.int64).reshape(-1, 2),
             i_from_j=np.asarray(i_from_j, float).reshape(-1, 4, 4),
-            information=np.broadcast_to(np.eye(6), (count, 6, 6)).copy() if information is None else information,
+            information=np.broadcast_to(np.eye(6), (count, 6, 6)).copy()
+            if information is None
+            else np.asarray(information, float),
             fitness=np.full(count, np.nan),
             rmse_m=np.full(count, np.nan),
             source=np.full(count, source),

@@ -149,3 +149,17 @@ def test_contradictory_edges_still_have_a_minimum():
     solution = solve(ViewGraph.from_edges(np.arange(6), edges, motions))
     assert np.isfinite(solution.world_from_cam).all()
     assert se3.is_motion(solution.world_from_cam, 1e-9).all()
+
+
+def test_shapes_that_are_no_motions_are_one_line() -> None:
+    edges, motions = [[0, 1], [1, 2], [2, 0], [2, 0]], np.tile(np.eye(4), (4, 1, 1))
+    with pytest.raises(GraphError, match=r"i_from_j has the shape \(4, 3, 4\): expected \(4, 4, 4\)"):
+        ViewGraph.from_edges(np.arange(3), edges, motions[:, :3])
+    with pytest.raises(GraphError, match=r"information has the shape \(4,\): expected \(4, 6, 6\)"):
+        ViewGraph.from_edges(np.arange(3), edges, motions, np.ones(4))
+
+
+def test_plain_lists_are_taken() -> None:
+    graph = ViewGraph.from_edges([5, 6, 9], [[0, 1], [1, 2]], np.tile(np.eye(4), (2, 1, 1)).tolist())
+    start = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1)).tolist()
+    np.testing.assert_allclose(solve(graph, start=start).world_from_cam, start, atol=1e-12)

@@ -62,6 +62,7 @@ def solve(
 
     Raises `GraphError` for numbers that are not finite, edges that name no vertex, and a back end not installed.
     """
+    start = None if start is None else np.asarray(start, float)
     if start is None and (initial == "given" or (fixed is not None and len(fixed))):
         raise GraphError("fixed vertices and a given initial guess need start poses: pass start")
     priors = graph.priors if priors is None else priors
