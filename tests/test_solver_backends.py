@@ -118,6 +118,13 @@ def test_a_cycle_is_symmetric_and_positive_definite() -> None:
     assert x @ first > 0
 
 
+def test_multigrid_takes_a_graph_with_vertices_that_nothing_joins() -> None:
+    count = 400
+    matrix = bsr_matrix((np.full((count, 1, 1), 2.0), np.arange(count), np.arange(count + 1)))
+    hierarchy = multigrid(matrix, Modes(), lambda coarse: factorise(coarse).solve, Coarsening())
+    np.testing.assert_allclose(hierarchy.cycle(matrix, np.ones(count)), 0.5)
+
+
 def test_a_rigid_body_s_motion_costs_few_steps_however_long_the_levers() -> None:
     """What multigrid for a scalar Laplacian cannot see."""
     count, width = 8000, 4

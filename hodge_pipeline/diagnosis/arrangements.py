@@ -17,7 +17,7 @@ from hodge_pipeline.diagnosis.joining import Joining
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.pieces import Alignment, align
 from hodge_pipeline.diagnosis.rearrange import learned, rearrange, scene_of
-from hodge_pipeline.diagnosis.robust_poses import Fit, fit
+from hodge_pipeline.diagnosis.robust_poses import ONCE, TWICE, Fit, fit
 from hodge_pipeline.types import Floats, ViewGraph
 
 FAIR_SHARES = (0.75, 0.5)
@@ -58,8 +58,8 @@ def _in_order(
         support=evidence.support[rows],
         alone=evidence.alone[rows],
     )
-    chained = fit(chain, graph.select(rows), align(chain, weight[rows], cluster_gain, rng), 1)
-    return fit(evidence, graph, Alignment(chained.component, chained.poses), 2)
+    chained = fit(chain, graph.select(rows), align(chain, weight[rows], cluster_gain, rng), ONCE)
+    return fit(evidence, graph, Alignment(chained.component, chained.poses), TWICE)
 
 
 def _total(evidence: Evidence, found: Fit, joining: Joining) -> float:

@@ -10,7 +10,7 @@ from hodge_pipeline.diagnosis.arrangements import best_arrangement
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.pieces import Alignment, align
-from hodge_pipeline.diagnosis.robust_poses import GATE, Fit, fit
+from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, TWICE, Fit, fit
 from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.types import Floats, ViewGraph
 
@@ -18,8 +18,10 @@ PRIOR_SHARE = 0.3
 EXTREME = 0.01
 UNVOUCHED = 0.9
 STEPS = 3
-NEARLY_ALL = 0.9
-"""Of the cycles close in a graph that may be right as it is."""
+MOST_GROWTHS, WORTH = 3, 1e-3
+"""Times that pieces grow again, while more than this share of the edges is to be won by it."""
+FEW = 0.01
+"""With no more than this share of its edges left out, a graph may be right as it is."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +36,33 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
     """The alignment that the edges speak for; `graph` holds the recentred edges with the information of their noise."""
     rng = np.random.default_rng(options.seed)
     weight = edge_weight(evidence)
-    best = fit(evidence, graph, align(evidence, weight, options.cluster_gain, rng), 2)
+    grown = align(evidence, weight, options.cluster_gain, rng)
     if evidence.exhaustive:
-        best = best_arrangement(evidence, graph, best, weight, options.cluster_gain, rng)
-    elif evidence.closing >= NEARLY_ALL and not best.used.all():
-        best = max(best, _of_all(evidence, graph), key=lambda found: int(found.used.sum()))
+        best = best_arrangement(evidence, graph, fit(evidence, graph, grown, TWICE), weight, options.cluster_gain, rng)
+    else:
+        best = _regrown(evidence, graph, fit(evidence, graph, grown, ANNEALED), weight, options.cluster_gain, rng)
+        if 0 < (~best.used).sum() <= FEW * len(best.used):
+            best = max(best, _of_all(evidence, graph), key=lambda found: int(found.used.sum()))
     agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
     return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
+
+
+def _regrown(
+    evidence: Evidence, graph: ViewGraph, best: Fit, weight: Floats, cluster_gain: float, rng: np.random.Generator
+) -> Fit:
+    """The solution whose pieces, as the edges hold them, no longer grow into any that more edges agree on."""
+    worth = WORTH * len(evidence.edges)
+    for _ in range(MOST_GROWTHS):
+        ends = best.component[evidence.edges]
+        if (ends[:, 0] != ends[:, 1]).sum() < worth:
+            break
+        grown = align(evidence, weight, cluster_gain, rng, Alignment(best.component, best.poses))
+        found = fit(evidence, graph, grown, ANNEALED)
+        won = found.used.sum() - best.used.sum()
+        best = found if won > 0 else best
+        if won < worth:
+            break
+    return best
 
 
 def _of_all(evidence: Evidence, graph: ViewGraph) -> Fit:
@@ -48,7 +70,7 @@ def _of_all(evidence: Evidence, graph: ViewGraph) -> Fit:
     drifted while it grew.
     """
     found = solve(graph, objective="isotropic", max_iterations=STEPS)
-    return fit(evidence, graph, Alignment(found.component, found.world_from_cam), 2)
+    return fit(evidence, graph, Alignment(found.component, found.world_from_cam), TWICE)
 
 
 def _unvouched(probability: Floats, fit: Fit, evidence: Evidence) -> Floats:

@@ -67,7 +67,6 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
         support=closing_support(cycles, prior),
         alone=in_no_cycle(graph.edges, graph.vertex_count, cycles),
         exhaustive=exhaustive,
-        closing=float(cycles.closes.mean()) if len(cycles.loops) else 0.0,
         reach_m=reach_m,
     )
     consensus = find_consensus(evidence, _with_noise(graph, motions, noise), options)

@@ -16,7 +16,6 @@ class Evidence:
     - `support (E,)`: how many cycles close over the edge, whose edges are likely right.
     - `alone (E,)`: edges in no cycle.
     - `exhaustive`: whether registration seems to have been tried on all pairs.
-    - `closing`: the share of all cycles that close.
     - `reach_m`: how far overlapping views lie apart.
     """
 
@@ -28,5 +27,4 @@ class Evidence:
     support: Floats
     alone: Bools
     exhaustive: bool
-    closing: float
     reach_m: float

@@ -8,7 +8,7 @@ import numpy as np
 
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.solvers.weights import edge_weights
-from hodge_pipeline.types import Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 MAXWELL_MEDIAN = 1.538
 DEFAULT_ANGLE_RAD = 0.03
@@ -42,8 +42,8 @@ class Noise:
 def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, prior: Floats, reach_m: float) -> Noise:
     """The noise of each edge: the graph's information gives the proportions, cycles that close give the scale.
 
-    Where the information explains nearly all cycles the scale does so too: edges of several kinds make long tails, and
-    such a graph is sound as far as anything shows.
+    Where the information explains nearly all of these, the scale does so too: edges of several kinds make long tails,
+    and what they say of themselves is sound as far as anything shows.
     """
     rotation, translation, informed = _proportions(graph)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
@@ -51,8 +51,10 @@ def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, pri
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, moved[short])
     turn = turned.scale(FIRST_GATE_RAD, prior, 1.0 if informed else DEFAULT_ANGLE_RAD)
     shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, 1.0 if informed else DEFAULT_SHARE * reach_m)
-    if informed and _explained(turned, shifted):
-        turn, shift = max(turn, turned.scale_of_nearly_all()), max(shift, shifted.scale_of_nearly_all())
+    closes = (turned.error < FIRST_GATE_RAD) & (shifted.error < FIRST_GATE_SHARE * reach_m)
+    sound = (turned.ratio < STATED) & (shifted.ratio < STATED)
+    if informed and closes.sum() >= FEWEST_CYCLES and sound[closes].mean() >= NEARLY_ALL:
+        turn, shift = max(turn, turned.scale_of_nearly(sound)), max(shift, shifted.scale_of_nearly(sound))
     if not informed:
         shift = max(shift, LEVER * turn * reach_m)
     return Noise(turn * rotation, shift * translation)
@@ -93,13 +95,6 @@ class _Errors:
         median = float(self.ratio[closes][order][np.searchsorted(total, total[-1] / 2)])
         return max(HEAVY_TAILS * median / MAXWELL_MEDIAN, 1e-3 * fallback)
 
-    def scale_of_nearly_all(self) -> float:
-        """The scale that explains nearly all cycles."""
-        return float(np.quantile(self.ratio, NEARLY_ALL)) / MAXWELL_NEARLY_ALL
-
-
-def _explained(turned: _Errors, shifted: _Errors) -> bool:
-    """Whether the information as it stands explains nearly all cycles."""
-    if len(turned.ratio) < FEWEST_CYCLES:
-        return False
-    return bool(((turned.ratio < STATED) & (shifted.ratio < STATED)).mean() >= NEARLY_ALL)
+    def scale_of_nearly(self, chosen: Bools) -> float:
+        """The scale that explains nearly all of the cycles that are chosen (L,)."""
+        return float(np.quantile(self.ratio[chosen], NEARLY_ALL)) / MAXWELL_NEARLY_ALL

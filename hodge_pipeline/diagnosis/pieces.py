@@ -32,10 +32,14 @@ class Alignment:
     piece_from: Floats
 
 
-def align(evidence: Evidence, weight: Floats, cluster_gain: float, rng: np.random.Generator) -> Alignment:
-    """The alignment that these edge weights (E,) lead to."""
+def align(
+    evidence: Evidence, weight: Floats, cluster_gain: float, rng: np.random.Generator, start: Alignment | None = None
+) -> Alignment:
+    """The alignment that these edge weights (E,) lead to, from vertices on their own or from the pieces of a start."""
     count = evidence.vertex_count
     piece, piece_from = np.arange(count), np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+    if start is not None:
+        piece, piece_from = start.piece.copy(), start.piece_from.copy()
     # without this, equal weights would join a chain one edge a round
     weight = weight * (1 + TIE_BREAK * rng.random(len(weight)))
     while (votes := collect_votes(evidence, piece, piece_from, weight)) is not None:

@@ -17,7 +17,7 @@ from hodge_pipeline.diagnosis.cuts import GATE, Scene, consecutive_nats, interva
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.joining import Joining, learn_joining
 from hodge_pipeline.diagnosis.pieces import Alignment
-from hodge_pipeline.diagnosis.robust_poses import Fit, fit
+from hodge_pipeline.diagnosis.robust_poses import ONCE, TWICE, Fit, fit
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 ROUNDS = 10
@@ -59,8 +59,8 @@ def rearrange(evidence: Evidence, graph: ViewGraph, start: Fit, fair_share: floa
             break
         poses, piece = found.poses.copy(), found.component.copy()
         poses[move.inside], piece[move.inside] = move.motion @ poses[move.inside], move.piece
-        found = fit(evidence, graph, Alignment(piece, poses), 1)
-    return start if found is start else fit(evidence, graph, Alignment(found.component, found.poses), 2)
+        found = fit(evidence, graph, Alignment(piece, poses), ONCE)
+    return start if found is start else fit(evidence, graph, Alignment(found.component, found.poses), TWICE)
 
 
 def learned(evidence: Evidence, found: Fit, known: Joining | None = None) -> Joining:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,13 @@ from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 FREEDOM = 4.0
 """Degrees of freedom of Student's t: the tails of real registration errors."""
-FIRST_GATE, GATE = 60.0, 90.0
+GATE = 90.0
+"""An edge of a larger χ² has no part in the poses."""
+ONCE, TWICE = (60.0,), (60.0, GATE)
+ANNEALED = (1e4, 1e3, GATE)
+"""Gates for poses that drifted while they grew: edges that they miss by far pull them into place (graduated
+non-convexity, Yang et al. 2020), and what does not follow falls out.
+"""
 DIMENSION = 6
 LARGE = 20_000
 """From so many edges on, a solve is stopped early: verdicts need millimetres less than seconds."""
@@ -37,38 +44,48 @@ class Fit:
     resistance: Floats
 
 
-def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, rounds: int) -> Fit:
-    """The robust solution that an alignment leads to; `graph` holds the recentred edges."""
+def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple[float, ...]) -> Fit:
+    """The robust solution that an alignment leads to; `graph` holds the recentred edges.
+
+    For one gate after the other, the edges of a smaller χ² are solved, with errors as large as the gate allows.
+    """
     poses, component = alignment.piece_from, alignment.piece
     used = component[evidence.edges[:, 0]] == component[evidence.edges[:, 1]]
     resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
     chi2 = _chi2(evidence, graph, poses, component, resistance, np.zeros(graph.edge_count))
-    used = chi2 < FIRST_GATE
-    for _ in range(rounds):
+    for gate, following in zip(gates, (*gates[1:], math.inf), strict=True):
+        used = chi2 < gate
+        if following < gate and np.array_equal(used, chi2 < following):
+            continue
         component = connected_components(evidence.edges[used], evidence.vertex_count)
-        poses, say = _solve(evidence, graph, poses, used)
+        poses, say = _solve(evidence, graph, poses, used, chi2, max(1.0, gate / GATE))
         resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
         chi2 = _chi2(evidence, graph, poses, component, resistance, say)
-        used = chi2 < GATE
-    return Fit(poses, component, chi2, used, resistance)
+    return Fit(poses, component, chi2, chi2 < GATE, resistance)
 
 
-def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> tuple[Floats, Floats]:
-    """Poses, and what each edge (E,) weighed, 1 for one that fits and 0 for one that is not used."""
+def _solve(
+    evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools, chi2: Floats, widened: float
+) -> tuple[Floats, Floats]:
+    """Poses, and what each edge (E,) weighed, 1 for one that fits and 0 for one that is not used.
+
+    `widened` is the factor by which squared errors may be larger than the noise. Where they may, poses that are far
+    off are given: then `chi2 (E,)` there says what an edge weighs at first.
+    """
     chosen = graph.select(np.flatnonzero(used))
-    large = graph.edge_count > LARGE
-    limits = Limits(3 if large else 20, 1e-3 if large else 1e-6)
+    rough = widened > 1 or graph.edge_count > LARGE
+    limits = Limits(3 if rough else 20, 1e-3 if rough else 1e-6)
     setup = prepare(chosen, poses, dimension=3)
     rotations, translations = setup.initial("given")
-    weight = np.ones(chosen.edge_count)
-    for _ in range(2 if large else 4):
-        share = weight[setup.weights.used]
+    squares = chi2[used] / widened if widened > 1 else np.full(chosen.edge_count, float(DIMENSION))
+    for _ in range(2 if rough else 4):
+        share = ((FREEDOM + DIMENSION) / (FREEDOM + squares))[setup.weights.used]
         problem = replace(setup.problem, kappa=share * setup.problem.kappa, tau=share * setup.problem.tau)
         point = descend_isotropic(problem, (rotations, translations), limits, setup.rounding).point
         rotations, translations, poses = point.rotations, point.translations, setup.poses(point)
         angle, moved = left_over(chosen, poses)
         squares = (angle / evidence.noise.rotation_rad[used]) ** 2 + (moved / evidence.noise.translation_m[used]) ** 2
-        weight = (FREEDOM + DIMENSION) / (FREEDOM + squares)
+        squares /= widened
     say = np.zeros(graph.edge_count)
     say[used] = FREEDOM / (FREEDOM + squares)
     return poses, say

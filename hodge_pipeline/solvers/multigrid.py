@@ -146,8 +146,8 @@ def _worth_a_factor(matrix: bsr_matrix, finest: int) -> bool:
         return False
     pattern = _pattern(matrix)
     pattern.data[:] = -1.0
-    laplacian = pattern + diags_array(np.diff(pattern.indptr).astype(np.float32))
-    return fill_reducing_order(laplacian).work < FACTOR_WORTH * finest
+    definite = pattern + diags_array(np.diff(pattern.indptr) + 1.0)  # also where nothing is pinned
+    return fill_reducing_order(definite).work < FACTOR_WORTH * finest
 
 
 def _pattern(matrix: bsr_matrix) -> csr_matrix:
