@@ -18,6 +18,7 @@ PRIOR_SHARE = 0.3
 EXTREME = 0.01
 UNVOUCHED = 0.9
 STEPS = 3
+"""Of Newton's, where the robust solution goes on from there."""
 MOST_GROWTHS, WORTH = 3, 1e-3
 """Times that pieces grow again, while more than this share of the edges is to be won by it."""
 FEW = 0.01
@@ -77,7 +78,7 @@ def _unvouched(probability: Floats, fit: Fit, evidence: Evidence) -> Floats:
     """An edge that alone holds two parts together, against edges that would hold them otherwise, is no more likely
     than its order makes it: no cycle of edges that agree vouches for it.
     """
-    bridge = fit.used & np.isinf(fit.resistance) & ~evidence.alone
+    bridge = fit.bridge & ~evidence.alone
     return np.where(bridge, np.minimum(probability, UNVOUCHED * evidence.prior), probability)
 
 

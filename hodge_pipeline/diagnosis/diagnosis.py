@@ -15,7 +15,7 @@ from hodge_pipeline.diagnosis.noise import Noise, edge_noise
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior, prior_by_cycles
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
-from hodge_pipeline.diagnosis.robust_poses import left_over
+from hodge_pipeline.diagnosis.robust_poses import Fit, left_over
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors, short_cycles
 from hodge_pipeline.diagnosis.testing_cycles import (
@@ -77,12 +77,9 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     probability = np.where(untestable, np.nan, np.maximum(consensus.probability, blame.probability))
     undecided = np.where(undecided >= 0, undecided, np.where(unvouched | (blame.probability > 0), blame.cycle, -1))
     verdict = _verdicts(probability, untestable, consensus.fit.used, options)
-    bridge = consensus.fit.used & np.isinf(consensus.fit.resistance)
     kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
     world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
-    return _report(
-        graph, cycles, probability, verdict, kept, undecided, bridge, world_from_cam, consensus.fit.resistance
-    )
+    return _report(graph, cycles, probability, verdict, kept, undecided, consensus.fit, world_from_cam)
 
 
 def _with_noise(graph: ViewGraph, motions: Floats, noise: Noise) -> ViewGraph:
@@ -105,22 +102,21 @@ def _report(
     verdict: NDArray[np.str_],
     kept: Bools,
     undecided: Ints,
-    bridge: Bools,
+    fit: Fit,
     world_from_cam: Floats,
-    resistance: Floats,
 ) -> Diagnosis:
     piece = connected_components(graph.edges[kept], graph.vertex_count)
     same = piece[graph.edges[:, 0]] == piece[graph.edges[:, 1]]
     angle, moved = left_over(graph, world_from_cam)
     residual = np.where(same, moved, np.nan), np.where(same, np.degrees(angle), np.nan)
     telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
-    share = 1 - 1 / (1 + resistance)
+    share = 1 - 1 / (1 + fit.resistance)
     counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
     tested = f"{len(cycles.loops)} cycles, {int(cycles.closes.sum())} of them close"
     return Diagnosis(
         verdict=verdict,
         probability=probability,
-        reason=reasons(graph, cycles, verdict, residual, telling, undecided, bridge),
+        reason=reasons(graph, cycles, verdict, residual, telling, undecided, fit.bridge),
         kept=kept,
         residual_m=residual[0],
         residual_deg=residual[1],

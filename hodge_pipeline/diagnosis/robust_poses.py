@@ -43,6 +43,11 @@ class Fit:
     used: Bools
     resistance: Floats
 
+    @property
+    def bridge(self) -> Bools:
+        """Edges (E,) in use that alone hold two parts together."""
+        return self.used & np.isinf(self.resistance)
+
 
 def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple[float, ...]) -> Fit:
     """The robust solution that an alignment leads to; `graph` holds the recentred edges.
@@ -105,10 +110,9 @@ def _chi2(
     Of an edge that has its say in the poses, what it would be without that.
     """
     angle, moved = left_over(graph, poses)
-    pulled = 1 + say * np.where(np.isfinite(resistance), resistance, 0.0)
-    angle, moved = pulled * angle, pulled * moved
-    turn, shift = evidence.noise.rotation_rad**2, evidence.noise.translation_m**2
     known = np.where(np.isfinite(resistance), resistance, 0.0)
+    angle, moved = (1 + say * known) * angle, (1 + say * known) * moved
+    turn, shift = evidence.noise.rotation_rad**2, evidence.noise.translation_m**2
     swing = turn * evidence.reach_m**2 * known**3 / 3
     chi2 = angle**2 / (turn * (1 + known)) + moved**2 / (shift * (1 + known) + swing)
     apart = component[graph.edges[:, 0]] != component[graph.edges[:, 1]]
