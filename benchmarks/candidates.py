@@ -7,7 +7,7 @@ reach" counts a pair as found where one within 5 frames of it is, since the roun
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -57,7 +57,11 @@ def matching_s(folder: Path, registrar: GlobalRegistrar, pairs: Ints, workers: W
 
 
 def main() -> None:
-    frames = SevenScenesReader().open(Path(sys.argv[1])).frames[:: int(sys.argv[2]) if len(sys.argv) > 2 else 1]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sequence", type=Path, help="a 7-Scenes folder")
+    parser.add_argument("every", type=int, nargs="?", default=1, help="take every n-th frame")
+    given = parser.parse_args()
+    frames = SevenScenesReader().open(given.sequence).frames[:: given.every]
     options, rows = GlobalStart(), np.arange(len(frames))
     truth = np.array([frame.world_from_cam for frame in frames])
     with tempfile.TemporaryDirectory() as name, LocalExecutor(workers=0).open() as workers:

@@ -7,7 +7,7 @@ reads the registered edges of a finished run (its first round, unless another is
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -72,8 +72,11 @@ def spread(values: list[float], digits: int) -> str:
 
 def main() -> None:
     """Print the table."""
-    run, round_number = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 1
-    problem = read_problem(run, round_number)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="a finished run")
+    parser.add_argument("round", type=int, nargs="?", default=1)
+    given = parser.parse_args()
+    problem = read_problem(given.run, given.round)
     makers: dict[str, tuple[Callable[[int], ConsistencySolver], int]] = {
         "graph, pairing": (lambda seed: PoissonSolver(robust="none", log="pairing"), 1),
         "graph, se(3)": (lambda seed: PoissonSolver(robust="none"), 1),

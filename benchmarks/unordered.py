@@ -7,8 +7,8 @@ that are not listed and would be accepted, and the CPU seconds with the features
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
-import sys
 import time
 from itertools import combinations
 from pathlib import Path
@@ -57,11 +57,14 @@ def row(registrar: GlobalRegistrar, clouds: list[PointCloud], truth: dict[tuple[
 
 
 def main() -> None:
-    folder, log = map(Path, sys.argv[1:3])
-    frames = CloudFolderReader(log="").open(folder).frames
-    options = CloudOptions(voxel_m=0.03, min_range_m=0.0, max_range_m=200.0)
-    clouds = [make_cloud(frame, options)[0] for frame in frames]
-    listed = read_log_file(log)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("fragments", type=Path)
+    parser.add_argument("gt_log", type=Path)
+    options = parser.parse_args()
+    frames = CloudFolderReader(log="").open(options.fragments).frames
+    clouds_of = CloudOptions(voxel_m=0.03, min_range_m=0.0, max_range_m=200.0)
+    clouds = [make_cloud(frame, clouds_of)[0] for frame in frames]
+    listed = read_log_file(options.gt_log)
     row_of = {frame.frame_id: at for at, frame in enumerate(frames)}
     truth = {
         (row_of[i], row_of[j]): motion
