@@ -19,6 +19,7 @@ from hodge_pipeline.yaml_file import Keys
 T = TypeVar("T")
 Where = Callable[[Keys], str]
 """Gives `file:line` of a key path."""
+WORDS = {float: "number", int: "whole number", bool: "true or false", str: "text", type(None): "nothing"}
 
 
 def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | None = None) -> T:
@@ -45,7 +46,7 @@ def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | 
     try:
         return cls(**values)
     except ValidationError as error:
-        raise _first_error(error, where, keys) from error
+        raise _first_error(error, where, keys, known) from error
 
 
 def _value(annotation: Any, value: Any, where: Where, keys: Keys, seed: int | None) -> Any:
@@ -102,6 +103,18 @@ def _is_stage(value: Any) -> bool:
     )
 
 
+def _spelled(annotation: Any) -> str:
+    """A type in the words of a recipe."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_spelled(part) for part in parts)
+    if origin is typing.Literal:
+        return " or ".join(map(repr, parts))
+    if origin is tuple:
+        return f"[{', '.join('…' if part is ... else _spelled(part) for part in parts)}]"
+    return WORDS.get(annotation, str(annotation))
+
+
 def _is_section(annotation: Any) -> bool:
     return isinstance(annotation, type) and dataclasses.is_dataclass(annotation)
 
@@ -110,9 +123,13 @@ def _dotted(keys: Keys) -> str:
     return ".".join(map(str, keys)) or "recipe"
 
 
-def _first_error(error: ValidationError, where: Where, keys: Keys) -> RecipeError:
-    """The first of pydantic's complaints as one line at its own key."""
+def _first_error(error: ValidationError, where: Where, keys: Keys, known: Mapping[str, Any]) -> RecipeError:
+    """The first of pydantic's complaints as one line at its own key; of an option of several types, what they are."""
     first = error.errors()[0]
+    field = first["loc"][0] if first["loc"] else None
+    if isinstance(field, str) and len({other["loc"][1:2] for other in error.errors() if other["loc"][0] == field}) > 1:
+        given, here = error.errors()[0]["input"], (*keys, field)
+        return RecipeError(f"{where(here)}: {_dotted(here)}: expected {_spelled(known[field])}, got {given!r}")
     here = (*keys, *(key for key in first["loc"] if isinstance(key, (str, int))))
     while len(here) > len(keys) and isinstance(here[-1], str) and "-" in here[-1]:
         here = here[:-1]

@@ -119,7 +119,7 @@ def _note_ids(frames: Sequence[Frame], oddities: list[str]) -> None:
 
 
 def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
-    """Depth range and invalid share of a few frames, evenly over the sequence, and those that cannot be read."""
+    """Depth range and invalid share of a few frames, evenly over the sequence, and their images that cannot be read."""
     with_depth = [frame for frame in frames if frame.read_depth is not None or frame.read_points is not None]
     picked = np.unique(np.linspace(0, len(with_depth) - 1, SAMPLED_FRAMES).round().astype(int)) if with_depth else ()
     depths, faults = [], []
@@ -130,6 +130,7 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
         except SourceError as error:
             faults.append(str(error))
             continue
+        faults += _colour_fault(frame)
         share = float((depths[-1] <= 0).mean()) if depths[-1].size else 1.0
         if share > MOSTLY_EMPTY and frame.read_depth is not None:
             oddities.append(f"frame {frame.frame_id}: {share:.0%} of its pixels have no depth")
@@ -153,6 +154,15 @@ def _depth(frame: Frame) -> Floats32:
         return frame.read_depth()
     assert frame.read_points is not None
     return np.asarray(np.linalg.norm(frame.read_points().points_in_cam, axis=1), np.float32)
+
+
+def _colour_fault(frame: Frame) -> list[str]:
+    try:
+        if frame.read_colour is not None:
+            frame.read_colour()
+    except SourceError as error:
+        return [str(error)]
+    return []
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -87,7 +87,7 @@ def _overridden(document: Document, override: str) -> Document:
     typed, change = _typed(keys), _nested(document.data, keys, value, name)
     merges = isinstance(value, dict)
     kept = {key: line for key, line in document.origins.items() if merges or key[: len(typed)] != typed}
-    return Document(change, {**kept, typed: name})
+    return Document(change, {**{typed[:end]: name for end in range(1, len(typed))}, **kept, typed: name})
 
 
 def _typed(keys: list[str]) -> Keys:

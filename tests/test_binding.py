@@ -62,6 +62,11 @@ def test_a_stage_by_name_has_its_defaults(tmp_path: Path) -> None:
             "r.yaml:8: fusion.0.voxle_m: unknown option (did you mean 'voxel_m'",
         ),
         ("odometry: {registration: {stage: gicp, distances_m: []}}\n", "r.yaml:6: odometry.registration.distances_m:"),
+        ("scale: big\n", "r.yaml:6: scale: expected number or 'auto', got 'big'"),
+        (
+            "source: {reader: {stage: tum, camera: [525, 525]}}\n",
+            "r.yaml:6: source.reader.camera: expected text or [number, number, number, number], got [525, 525]",
+        ),
         (
             "recording: {level: loud}\n",
             "r.yaml:6: recording.level: input should be 'off', 'summary', 'normal' or 'full'",
@@ -73,6 +78,11 @@ def test_errors_name_file_line_key_and_what_was_expected(tmp_path: Path, change:
         load(tmp_path, SMALL + change)
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_misspelt_section_of_an_override_is_where_it_was_given() -> None:
+    with pytest.raises(RecipeError, match=r"^--set sorce.path=x: sorce: unknown option \(did you mean 'source'"):
+        load_recipe("demo", ["sorce.path=x"])
 
 
 def test_a_missing_stage_is_named(tmp_path: Path) -> None:

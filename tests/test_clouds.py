@@ -119,6 +119,14 @@ def test_clouds_come_in_the_order_of_the_frames_and_bad_frames_are_said() -> Non
     assert sum(done) == 40
 
 
+def test_of_many_frames_with_the_same_fault_the_first_are_named_and_the_others_counted() -> None:
+    frames = [frame(wall(WALL_M), k, read_colour=unreadable) for k in range(40)]
+    frames[30] = frame(wall(0.0), 30)
+    _, notes = prepare_clouds(frames, CloudOptions(), InProcess())
+    assert [note.split(":")[0] for note in notes[:6]] == [*(f"frame {k}" for k in range(5)), "frame 30"]
+    assert notes[6:] == ("34 more frames: its cloud has no colours, as of those before",)
+
+
 def test_no_cloud_at_all_is_an_error_with_the_first_reason() -> None:
     for frames, reason in (
         ([Frame(k, 0.0, CAMERA, read_depth=unreadable) for k in range(3)], "none of the 3 frames.*truncated"),
@@ -172,4 +180,4 @@ def test_a_scan_of_many_points_is_said_to_be_down_sampled(monkeypatch: pytest.Mo
     points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)).astype(np.float32)
     frame = Frame(7, 0.0, read_points=lambda: PointCloud(points))
     _, counts = make_cloud(frame, CloudOptions(voxel_m=0.5, min_range_m=0.0))
-    assert counts.note == f"frame 7: 2000 points, down-sampled to {counts.points}, one a voxel of 0.5 m"
+    assert counts.note == f"frame 7: down-sampled in parts: 2000 points to {counts.points}, one a voxel of 0.5 m"

@@ -124,7 +124,7 @@ def test_frames_that_cannot_be_used_are_counted(fuser: TsdfFuser | CloudFuser) -
     done: list[int] = []
     model = fuser.fuse(frames, poses, done.append)
     assert sum(done) == 8
-    assert model.notes[0] == "1 frame skipped: no finite pose (the first: 2)"
+    assert model.notes[0] == "1 frame skipped: nothing says where it is (the first: 2)"
     assert model.notes[1] == "2 frames skipped: cannot be read (the first: 4: x.png: cut short)"
     assert "bare" in model.notes[2] and len(model.notes) == 3
     kept = [0, 1, 3, 7]
@@ -186,10 +186,43 @@ def test_the_mesh_without_colour_has_the_same_surface() -> None:
 
 
 def test_a_surface_seen_too_rarely_is_left_out_and_said() -> None:
-    model = TsdfFuser(voxel_m=0.04, min_weight=3).fuse(*box_frames(2))
+    frames, poses = box_frames(4)
+    poses[2:, 0, 3] += 100.0
+    model = TsdfFuser(voxel_m=0.04, min_weight=2).fuse(frames, poses)
     assert model.triangles is not None and len(model.triangles) == 0
-    assert model.notes == ("the mesh is empty: no surface was seen by min_weight = 3 frames",)
-    assert len(TsdfFuser(voxel_m=0.04, min_weight=1).fuse(*box_frames(2)).points_in_world) > 1000
+    assert model.notes == ("the mesh is empty: no surface was seen by more than min_weight = 2 frames",)
+    assert len(TsdfFuser(voxel_m=0.04, min_weight=1).fuse(frames, poses).points_in_world) > 1000
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_of_no_more_frames_than_min_weight_a_surface_needs_all(count: int) -> None:
+    frames, poses = box_frames(count)
+    model = TsdfFuser(voxel_m=0.04, min_weight=3).fuse(frames, poses)
+    assert len(model.points_in_world) > 1000 and model.notes == ()
+    assert_same(model, TsdfFuser(voxel_m=0.04, min_weight=count - 1).fuse(frames, poses))
+
+
+@BOTH
+def test_a_frame_whose_image_is_damaged_is_fused_without_its_colour(fuser: TsdfFuser | CloudFuser) -> None:
+    frames, poses = box_frames(4)
+    whole = fuser.fuse(frames, poses)
+    damaged = partial(fail, SourceError("x.jpg: cut short"))
+    frames[1] = Frame(1, 0.0, CAMERA, frames[1].read_depth, damaged)
+    model = fuser.fuse(frames, poses)
+    assert model.notes == ("1 frame fused without colour: its image cannot be read (the first: 1: x.jpg: cut short)",)
+    np.testing.assert_array_equal(model.points_in_world, whole.points_in_world)
+    assert model.colours is not None
+    blind = [Frame(f.frame_id, 0.0, CAMERA, f.read_depth, damaged) for f in frames]
+    bare = fuser.fuse(blind, poses)
+    assert bare.colours is None and bare.notes[0].startswith("4 frames fused without colour: ")
+    np.testing.assert_array_equal(bare.points_in_world, whole.points_in_world)
+
+
+def test_an_empty_grid_is_not_fused_again_with_coarser_voxels() -> None:
+    frames = [Frame("bare", 0.0), box_frames(1)[0][0]]
+    model = TsdfFuser(voxel_m=0.04).fuse(frames, np.full((2, 4, 4), np.nan))
+    assert len(model.points_in_world) == 0
+    assert not any("instead of" in note for note in model.notes)
 
 
 def test_a_voxel_holds_the_mean() -> None:

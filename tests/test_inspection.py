@@ -94,6 +94,12 @@ def test_frames_that_cannot_be_read_are_told() -> None:
     assert facts["unreadable among them"] == ["frame.png: is no PNG"] and facts["frames looked into"] == 2
 
 
+def test_images_without_readable_colours_are_told() -> None:
+    frames = [replace(frame, read_colour=unreadable) for frame in walk(2)]
+    facts = frame_facts(frames, [])
+    assert facts["unreadable among them"] == ["frame.png: is no PNG"] * 2 and facts["frames looked into"] == 2
+
+
 def test_sequences_are_not_compared_with_each_other() -> None:
     second = [replace(frame, sequence="b", frame_id=f"b{frame.frame_id}") for frame in walk(5)]
 
@@ -184,5 +190,5 @@ def test_of_a_long_folder_a_few_images_are_decoded(data_dir: Path, monkeypatch: 
     decode, decoded = cv2.imdecode, []
     monkeypatch.setattr(cv2, "imdecode", lambda *given: decoded.append(1) or decode(*given))
     facts = inspect(data_dir / "seven_scenes/redkitchen")
-    assert len(decoded) == 8
+    assert len(decoded) == 8 + 8  # of each frame looked into depth and colour
     assert facts["frames"] == 250 and facts["frames looked into"] == 8 and facts["oddities"] == []

@@ -155,10 +155,15 @@ class TumReader:
         if file:
             return self._from_file(file, notes)
         match = _FREIBURG.search(path.resolve().name)
-        name = f"fr{match[1] or match[2]}" if match else "default"
-        why = "by the folder's name" if match else "no camera file, and no freiburg1, 2 or 3 in the folder's name"
-        notes.append(f"intrinsics of {name} taken: {why}")
-        return CAMERAS[name], ()
+        if match:
+            name = f"fr{match[1] or match[2]}"
+            notes.append(f"intrinsics of {name} taken: by the folder's name")
+            return CAMERAS[name], ()
+        notes.append(
+            "default intrinsics taken (525 525 319.5 239.5), since there is no camera file, and no freiburg1, 2 or 3 in "
+            "the folder's name: give those of your camera with camera=[fx,fy,cx,cy]"
+        )
+        return CAMERAS["default"], ()
 
     def _from_file(self, file: Path, notes: list[str]) -> tuple[Intrinsics, tuple[Path, ...]]:
         found = read_intrinsics(file)

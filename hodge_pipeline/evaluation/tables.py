@@ -30,7 +30,8 @@ def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
     lines.append(("source", f"{source.name}, {source.counted}, {source.frames_with_truth} with a true pose"))
     if graph is not None:
         by_source = ", ".join(f"{count} {name}" for name, count in graph.edges_by_source.items())
-        lines.append(("graph", f"{graph.edges} edges ({by_source}), {len(graph.components)} connected part(s)"))
+        sources = f" ({by_source})" if by_source else ""
+        lines.append(("graph", f"{graph.edges} edges{sources}, {len(graph.components)} connected part(s)"))
     if report.stages:
         wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
         lines.append(("time", f"{wall:.1f} s, {cpu:.1f} CPU s, at most {_peak(report):.0f} MB"))

@@ -16,6 +16,7 @@ BYTES_A_VOXEL = 4 + 4 + 12 + 16
 GROWTH_COPIES = 3
 """The old blocks are alive while the twice as many new ones are filled."""
 FIRST_BLOCKS = 1000
+GREY = 128
 TOUCH_STRIDE = 4
 """Of a depth image open3d takes each fourth row and column to find the blocks that it touches."""
 
@@ -30,10 +31,16 @@ def blocks_within(memory_limit_mb: float) -> int:
 
 
 class BlockGrid:
-    """Integrates depth images; `max_blocks` bounds it, `GridFull` is raised before it is passed."""
+    """Integrates depth images; `max_blocks` bounds it, `GridFull` is raised before it is passed.
 
-    def __init__(self, voxel_m: float, truncation_voxels: float, max_depth_m: float, max_blocks: int) -> None:
+    It holds colours for all views or, without `colour`, for none; `views` of them were added, `coloured` with an image.
+    """
+
+    def __init__(
+        self, voxel_m: float, truncation_voxels: float, max_depth_m: float, max_blocks: int, colour: bool
+    ) -> None:
         self.truncation_voxels, self.max_depth_m, self.max_blocks = truncation_voxels, max_depth_m, max_blocks
+        self.colour, self.views, self.coloured = colour, 0, 0
         float32 = o3d.core.float32
         self._grid = o3d.t.geometry.VoxelBlockGrid(
             attr_names=("tsdf", "weight", "color"),
@@ -48,7 +55,7 @@ class BlockGrid:
         return int(self._grid.hashmap().size())
 
     def integrate(self, depth_m: Floats32, colour: Bytes | None, camera: Camera, world_from_cam: Floats) -> bool:
-        """Add one view: depth (H, W), 0 where there is none; colour (h, w, 3) of the same field of view.
+        """Add one view: depth (H, W), 0 where there is none; colour (h, w, 3) of the same field of view, or none: grey.
 
         False where no depth is within reach: there was nothing to add.
         """
@@ -66,9 +73,11 @@ class BlockGrid:
         )
         self._make_room(len(blocks))
         matrix = _floor_matrix(camera, depth_m.shape, depth_m.shape)
-        if colour is None:
+        self.views, self.coloured = self.views + 1, self.coloured + (colour is not None)
+        if not self.colour:
             self._grid.integrate(blocks, depth, matrix, pose, 1.0, *reach)
         else:
+            colour = np.full((*depth_m.shape, 3), GREY, np.uint8) if colour is None else colour
             image = o3d.t.geometry.Image(_tensor(colour, np.float32))
             colour_matrix = _floor_matrix(camera, depth_m.shape, colour.shape)
             self._grid.integrate(blocks, depth, image, matrix, colour_matrix, pose, 1.0, *reach)
@@ -89,7 +98,7 @@ class BlockGrid:
             self._grid.hashmap().reserve(min(max(needed, 2 * capacity), self.max_blocks))
 
     def mesh(self, min_weight: float) -> tuple[Floats32, Floats32, Bytes, Any]:
-        """Vertices (V, 3), normals, colours and triangles (T, 3) of the surface seen `min_weight` times, in an order
+        """Vertices (V, 3), normals, colours and triangles (T, 3) of the surface seen more than `min_weight` times, in an order
         of their own: by x, y, z, since the order in which the grid gives them changes from run to run.
         """
         if len(self) == 0:

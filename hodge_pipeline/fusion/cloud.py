@@ -62,7 +62,7 @@ class CloudFuser:
         )
 
     def _add(self, cloud: VoxelCloud, frame: Frame, world_from_cam: Floats, skipped: Skipped) -> int:
-        view = self._view(frame)
+        view = self._view(frame, skipped)
         if view is None:
             skipped.add("neither depth image nor points", frame)
             return 0
@@ -79,12 +79,11 @@ class CloudFuser:
             far += cloud.add(points, None if view.colours is None else view.colours[part][good], turned)
         return far
 
-    def _view(self, frame: Frame) -> PointCloud | None:
+    def _view(self, frame: Frame, skipped: Skipped) -> PointCloud | None:
         if frame.read_depth and frame.camera:
-            colour = frame.read_colour() if frame.read_colour else None
-            return depth_points(
-                frame.read_depth(), colour, frame.camera, self.stride, self.min_depth_m, self.max_depth_m
-            )
+            depth_m = frame.read_depth()
+            colour = skipped.colour(frame)
+            return depth_points(depth_m, colour, frame.camera, self.stride, self.min_depth_m, self.max_depth_m)
         return frame.read_points() if frame.read_points else None
 
     def _notes(self, cloud: VoxelCloud, far: int) -> list[str]:

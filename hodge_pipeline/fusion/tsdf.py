@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
@@ -27,7 +26,10 @@ class TsdfFuser:
     )
     max_depth_m: float = Field(6.0, gt=0, description="metres: measurements beyond are ignored as too noisy")
     min_weight: float = Field(
-        3.0, ge=0, description="frames: a surface that fewer have seen is left out, as flying pixels are"
+        3.0,
+        ge=0,
+        description="frames: a surface that no more than so many have seen is left out, as flying pixels are; where no more are "
+        "fused, all of them must have seen it",
     )
     every: int = Field(1, ge=1, description="frames: only each such frame is fused; a long sequence needs fewer")
     colour: bool = Field(True, description="colour the mesh; without it fusion is a third faster")
@@ -52,16 +54,17 @@ class TsdfFuser:
             skipped = Skipped()
             views = posed(frames, world_from_cam, self.every, skipped)
             grid, reported = self._integrated(views, voxel_m, skipped, reported, advance)
-            voxel_m *= 1 if grid else 2
+            voxel_m *= 2 if grid is None else 1
         advance(len(frames) - len(views))
-        points, normals, colours, triangles = grid.mesh(self.min_weight)
+        min_weight = min(self.min_weight, max(grid.views - 1.0, 0.0))
+        points, normals, colours, triangles = grid.mesh(min_weight)
         return Model(
             name="mesh",
             points_in_world=points,
             normals_in_world=normals,
-            colours=colours if self.colour and any(frame.read_colour for frame in frames) else None,
+            colours=colours if grid.coloured else None,
             triangles=triangles,
-            notes=(*skipped.notes(), *self._notes(voxel_m, len(triangles))),
+            notes=(*skipped.notes(), *self._notes(voxel_m, len(triangles), min_weight)),
         )
 
     def _integrated(
@@ -69,7 +72,8 @@ class TsdfFuser:
     ) -> tuple[BlockGrid | None, int]:
         """The grid, or None where it would pass the limit; and how many views `advance` has heard of."""
         limit = blocks_within(self.memory_limit_mb)
-        grid = BlockGrid(voxel_m, self.truncation_voxels, self.max_depth_m, limit)
+        colour = self.colour and any(frame.read_colour for frame, _ in views)
+        grid = BlockGrid(voxel_m, self.truncation_voxels, self.max_depth_m, limit, colour)
         for row, (frame, pose) in enumerate(views):
             try:
                 self._integrate(grid, frame, pose, skipped)
@@ -86,14 +90,11 @@ class TsdfFuser:
             return
         with skipped.unreadable(frame):
             depth_m = frame.read_depth()
-            colour = frame.read_colour() if self.colour and frame.read_colour else None
-            if self.colour and colour is None:
-                # The grid holds colours for all views or for none.
-                colour = np.full((*depth_m.shape, 3), 128, np.uint8)
+            colour = skipped.colour(frame) if grid.colour else None
             if not grid.integrate(depth_m, colour, frame.camera, world_from_cam):
                 skipped.add(f"no depth within max_depth_m = {self.max_depth_m:g}", frame)
 
-    def _notes(self, voxel_m: float, triangles: int) -> list[str]:
+    def _notes(self, voxel_m: float, triangles: int, min_weight: float) -> list[str]:
         notes = []
         if voxel_m > self.voxel_m:
             notes.append(
@@ -101,5 +102,5 @@ class TsdfFuser:
                 f"memory_limit_mb = {self.memory_limit_mb:g}"
             )
         if triangles == 0:
-            notes.append(f"the mesh is empty: no surface was seen by min_weight = {self.min_weight:g} frames")
+            notes.append(f"the mesh is empty: no surface was seen by more than min_weight = {min_weight:g} frames")
         return notes

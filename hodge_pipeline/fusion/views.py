@@ -1,4 +1,4 @@
-"""What every fuser shares: which frames it takes, and what it says about those that it leaves out."""
+"""What every fuser shares: which frames it takes, and what it says about those that it leaves out, or their colours."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from contextlib import contextmanager
 import numpy as np
 
 from hodge_pipeline.errors import HodgeError
-from hodge_pipeline.types import Floats, Frame
+from hodge_pipeline.types import Bytes, Floats, Frame
 
 
 class Skipped:
-    """A tally of the frames left out: how many for each reason, and the first of them."""
+    """A tally of the frames left out, or fused without colour: how many for each reason, and the first of them."""
 
     def __init__(self) -> None:
         self._frames: dict[str, list[str]] = {}
 
-    def add(self, reason: str, frame: Frame, detail: str = "") -> None:
+    def add(self, reason: str, frame: Frame, detail: str = "", fate: str = "skipped") -> None:
         """Count one frame."""
-        self._frames.setdefault(reason, []).append(f"{frame.frame_id}: {detail}" if detail else f"{frame.frame_id}")
+        named = f"{frame.frame_id}: {detail}" if detail else f"{frame.frame_id}"
+        self._frames.setdefault(f"{fate}: {reason}", []).append(named)
 
     @contextmanager
     def unreadable(self, frame: Frame) -> Iterator[None]:
@@ -29,11 +30,19 @@ class Skipped:
         except (HodgeError, OSError) as error:
             self.add("cannot be read", frame, str(error))
 
+    def colour(self, frame: Frame) -> Bytes | None:
+        """The frame's colour image (h, w, 3); None where it has none, or none that can be read, which is counted."""
+        try:
+            return frame.read_colour() if frame.read_colour else None
+        except (HodgeError, OSError) as error:
+            self.add("its image cannot be read", frame, str(error), fate="fused without colour")
+            return None
+
     def notes(self) -> tuple[str, ...]:
         """One line for each reason."""
         return tuple(
-            f"{len(names)} frame{'s' if len(names) > 1 else ''} skipped: {reason} (the first: {names[0]})"
-            for reason, names in self._frames.items()
+            f"{len(names)} frame{'s' if len(names) > 1 else ''} {why} (the first: {names[0]})"
+            for why, names in self._frames.items()
         )
 
 
@@ -44,5 +53,5 @@ def posed(frames: Sequence[Frame], world_from_cam: Floats, every: int, skipped: 
         if np.isfinite(pose).all():
             taken.append((frame, pose))
         else:
-            skipped.add("no finite pose", frame)
+            skipped.add("nothing says where it is", frame)
     return taken

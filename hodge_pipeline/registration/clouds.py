@@ -20,6 +20,7 @@ from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats32, Frame, Landm
 FRAMES_IN_BLOCK = 16
 MIN_POINTS_FOR_NORMALS = 5
 MANY_POINTS = 5_000_000
+LISTED_NOTES = 5
 MAX_VOXELS_ALONG_AXIS = 2_000_000  # its cube still fits the 64-bit voxel key
 
 
@@ -96,8 +97,8 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
         empty += f": {samples.note}"
     note = samples.note if len(points) else empty
     if len(points) and samples.looked_at > MANY_POINTS:
-        note = f"frame {frame.frame_id}: {samples.looked_at} points, down-sampled to {len(points)}, one a voxel of "
-        note += f"{options.voxel_m:.3g} m"
+        note = f"frame {frame.frame_id}: down-sampled in parts: {samples.looked_at} points to {len(points)}, one a "
+        note += f"voxel of {options.voxel_m:.3g} m"
     return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), note)
 
 
@@ -118,7 +119,7 @@ def _landmarks(frame: Frame, options: CloudOptions) -> Landmarks:
 def prepare_clouds(
     frames: Sequence[Frame], options: CloudOptions, workers: Workers, advance: Advance = no_progress
 ) -> tuple[CloudSet, tuple[str, ...]]:
-    """The clouds of all frames, in their order, and a note for each frame that gave none.
+    """The clouds of all frames, in their order, and notes on the frames that gave none, or a cloud that is odd.
 
     A frame that cannot be read gets an empty cloud. Raises `SourceError` where no frame gave a single point.
     """
@@ -132,7 +133,20 @@ def prepare_clouds(
     if not any(counts.points for _, counts in results):
         reason = notes[0] if notes else "the source has no frames"
         raise SourceError(f"none of the {len(frames)} frames gave a point cloud; the first: {reason}")
-    return CloudSet.from_clouds([cloud for cloud, _ in results]), notes
+    return CloudSet.from_clouds([cloud for cloud, _ in results]), _shortened(notes)
+
+
+def _shortened(notes: Sequence[str]) -> tuple[str, ...]:
+    """Notes `frame 7: what: why`: of many with the same `what` the first ones, and how many more there are."""
+    alike: dict[str, list[str]] = {}
+    for note in notes:
+        alike.setdefault(note.split(": ")[1], []).append(note)
+    more = tuple(
+        f"{len(same) - LISTED_NOTES} more frames: {what}, as of those before"
+        for what, same in alike.items()
+        if len(same) > LISTED_NOTES
+    )
+    return tuple(note for same in alike.values() for note in same[:LISTED_NOTES]) + more
 
 
 def _make_block(frames: Sequence[Frame], options: CloudOptions) -> list[tuple[PointCloud, CloudCounts]]:
