@@ -160,8 +160,8 @@ class TumReader:
             notes.append(f"intrinsics of {name} taken: by the folder's name")
             return CAMERAS[name], ()
         notes.append(
-            "default intrinsics taken (525 525 319.5 239.5), since there is no camera file, and no freiburg1, 2 or 3 in "
-            "the folder's name: give those of your camera with camera=[fx,fy,cx,cy]"
+            "default intrinsics taken (525 525 319.5 239.5), since there is no camera file, and no freiburg1, 2 or 3 "
+            "in the folder's name: give those of your camera with camera=[fx,fy,cx,cy]"
         )
         return CAMERAS["default"], ()
 

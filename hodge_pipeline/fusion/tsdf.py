@@ -28,8 +28,8 @@ class TsdfFuser:
     min_weight: float = Field(
         3.0,
         ge=0,
-        description="frames: a surface that no more than so many have seen is left out, as flying pixels are; where no more are "
-        "fused, all of them must have seen it",
+        description="frames: a surface that no more than so many have seen is left out, as flying pixels are; where no "
+        "more are fused, all of them must have seen it",
     )
     every: int = Field(1, ge=1, description="frames: only each such frame is fused; a long sequence needs fewer")
     colour: bool = Field(True, description="colour the mesh; without it fusion is a third faster")
