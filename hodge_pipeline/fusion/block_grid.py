@@ -100,7 +100,7 @@ class BlockGrid:
     def mesh(self, min_weight: float) -> tuple[Floats32, Floats32, Bytes, Any]:
         """Vertices (V, 3), normals, colours and triangles (T, 3) of the surface seen more than `min_weight` times.
 
-        They are in an order of their own, by x, y, z, since the order in which the grid gives them changes from run to run.
+        They are in an order of their own, by x, y, z: the one in which the grid gives them changes from run to run.
         """
         if len(self) == 0:
             nothing = np.zeros((0, 3), np.float32)
