@@ -8,6 +8,7 @@ import numpy as np
 
 from hodge_pipeline.diagnosis.arrangements import best_arrangement
 from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.mending import mend
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.pieces import Alignment, align
 from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, TWICE, Fit, fit
@@ -44,6 +45,7 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
         best = _regrown(evidence, graph, fit(evidence, graph, grown, ANNEALED), weight, options.cluster_gain, rng)
         if 0 < (~best.used).sum() <= FEW * len(best.used):
             best = max(best, _of_all(evidence, graph), key=lambda found: int(found.used.sum()))
+        best = mend(evidence, graph, best)
     agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
     return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
 

@@ -13,7 +13,7 @@ from hodge_pipeline.diagnosis.consensus import find_consensus
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.noise import Noise, edge_noise
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior, prior_by_cycles
+from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior, prior_by_cycles, right_by_gap
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
 from hodge_pipeline.diagnosis.robust_poses import Fit, left_over
 from hodge_pipeline.diagnosis.shared_blame import share_blame
@@ -57,7 +57,10 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
         cycles = judge_cycles(loops, angle, moved, noise, reach_m)
     if not exhaustive:
         # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
-        prior = np.minimum(prior, usual_share(cycles))
+        usual = usual_share(cycles)
+        prior = np.minimum(prior, usual)
+        if options.order_prior:
+            prior = right_by_gap(graph.edges, graph.vertex_count, cycles, usual)
     evidence = Evidence(
         edges=graph.edges,
         vertex_count=graph.vertex_count,

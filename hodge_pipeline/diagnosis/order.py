@@ -67,6 +67,29 @@ def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
     return share[place] if known else np.full(len(edges), 0.5)
 
 
+def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -> Floats:
+    """The probability (E,) that an edge is right, from the cycles that close over edges of its gap |i − j|.
+
+    For graphs of which registration has left out bad edges already, so that how often pairs are joined says nothing of
+    how many are right. `usual` holds where no cycle tells. Nothing is surer than as many edges of a gap can show: of n
+    edges none of which fails the next one is right with (n + 1) / (n + 2) (Laplace's rule of succession).
+    """
+    bounds = _bounds(vertex_count)
+    place = np.maximum(np.searchsorted(bounds, np.abs(edges[:, 1] - edges[:, 0]), side="right") - 1, 0)
+    loops = cycles.loops
+    row, entry = np.repeat(np.arange(len(loops)), loops.lengths), place[loops.edge]
+    closing = np.bincount(entry, cycles.closes[row], len(bounds))
+    number = np.bincount(place, minlength=len(bounds))
+    share = np.full(len(bounds), usual)
+    for _ in range(SHARE_ROUNDS):
+        logs = np.log(share)[entry]
+        others = np.exp(np.bincount(row, logs, len(loops))[row] - logs)
+        expected = np.bincount(entry, others, len(bounds))
+        told = np.clip((closing + usual) / (expected + 1), FLOOR, (number + 1) / (number + 2))
+        share = np.sqrt(share * told)
+    return np.asarray(share[place])
+
+
 def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
     """Whether far pairs are joined so often that registration seems to have been tried on all pairs."""
     return _far_rate(np.abs(edges[:, 1] - edges[:, 0]), vertex_count) >= TRIED_FROM

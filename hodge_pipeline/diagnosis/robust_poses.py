@@ -102,6 +102,11 @@ def left_over(graph: ViewGraph, poses: Floats) -> tuple[Floats, Floats]:
     return np.linalg.norm(se3.so3_log(motion[:, :3, :3]), axis=1), np.linalg.norm(motion[:, :3, 3], axis=1)
 
 
+def chi2_at(evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats) -> Floats:
+    """χ² (E,) of each edge at poses in which none of them had a say, held as loosely as `resistance (E,)` says."""
+    return _chi2(evidence, graph, poses, component, resistance, np.zeros(graph.edge_count))
+
+
 def _chi2(
     evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats, say: Floats
 ) -> Floats:

@@ -58,7 +58,7 @@ def collect_votes(evidence: Evidence, piece: Ints, piece_from: Floats, weight: F
     edge, motion, point, key = edge[order], motion[order], point[order], key[order]
     names, start, pair, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
     hypothesis, vote = _compared(pair.reshape(-1), start, count)
-    agreement = _agreement(evidence, edge, motion, point, hypothesis, vote)
+    agreement = agreement_of(evidence, edge, motion, point, hypothesis, vote)
     low, high = names // evidence.vertex_count, names % evidence.vertex_count
     return Votes(edge, motion, point, pair.reshape(-1), low, high, start, count, hypothesis, vote, agreement)
 
@@ -74,7 +74,10 @@ def _compared(pair: Ints, start: Ints, count: Ints) -> tuple[Ints, Ints]:
     return hypothesis[row], start[pair[hypothesis]][row] + number * total[row] // taken[row]
 
 
-def _agreement(evidence: Evidence, edge: Ints, motion: Floats, point: Floats, first: Ints, second: Ints) -> Floats:
+def agreement_of(evidence: Evidence, edge: Ints, motion: Floats, point: Floats, first: Ints, second: Ints) -> Floats:
+    """How well pairs (M,) of votes (N,) agree, from 1 down to 0 at the gate: rows `first` and `second` of the edges,
+    their motions (N, 4, 4) and the points (N, 3) that these move.
+    """
     quat = se3.to_quat_xyzw(motion)
     angle = 2 * np.arccos(np.minimum(1.0, np.abs(np.einsum("ni,ni->n", quat[first], quat[second]))))
     at = point[second]

@@ -1,0 +1,154 @@
+"""A solution mended where edges that it leaves out agree with each other and outweigh those that hold it together.
+
+Pieces that grew together are never parted again, and where several wrong edges that agree came first, the right ones
+stay outside. Each edge that is left out says by which motion of the world its second end should move. Those that say
+the same are held against the lightest set of used edges that separates their ends, a minimum cut (Ford and Fulkerson
+1956): where that is lighter, the side of the cut moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.pieces import Alignment
+from hodge_pipeline.diagnosis.robust_poses import GATE, TWICE, Fit, chi2_at, fit
+from hodge_pipeline.diagnosis.votes import agreement_of
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+
+ROUNDS, MOVES = 4, 40
+"""Solves at most, and sets of views that move before each."""
+MOST_PROPOSALS = 1200
+"""Edges left out that are compared with each other; of more, evenly spread ones."""
+TRIED = 40
+"""Groups of them, the weightiest, for each move."""
+DRIFTED_RAD, ALIKE = 0.1, 12.0
+"""Motions are compared where they turn alike but for this, and for so many standard deviations."""
+LEAST_GAIN = 1.0
+"""Nats."""
+UNIT = 1000
+"""Of a nat, since flows are whole numbers."""
+
+
+@dataclass(frozen=True)
+class _Proposals:
+    """Edges left out, each in both directions: view `mover (P,)` should move by `motion (P, 4, 4)` of the world,
+    `stayer (P,)` not; `alike (P, P)` from 1 down to 0 how well the second agrees with the motion of the first.
+    """
+
+    edge: Ints
+    mover: Ints
+    stayer: Ints
+    motion: Floats
+    alike: csr_matrix
+
+
+def mend(evidence: Evidence, graph: ViewGraph, start: Fit) -> Fit:
+    """The solution after the moves; `graph` has the recentred edges. An edge counts −log of how likely it is wrong."""
+    nats = -np.log1p(-evidence.prior)
+    found = start
+    for _ in range(ROUNDS):
+        poses = _moved(evidence, graph, found, nats)
+        if poses is None:
+            break
+        tried = fit(evidence, graph, Alignment(found.component, poses), TWICE)
+        if nats[tried.used].sum() <= nats[found.used].sum():
+            break
+        found = tried
+    return found
+
+
+def _moved(evidence: Evidence, graph: ViewGraph, found: Fit, nats: Floats) -> Floats | None:
+    """Poses (V, 4, 4) after all moves that are worth it; None where none is."""
+    poses, moves = found.poses, 0
+    for _ in range(MOVES):
+        agreeing = np.maximum(0.0, 1 - chi2_at(evidence, graph, poses, found.component, found.resistance) / GATE)
+        proposals = _proposals(evidence, poses, found.component, agreeing, nats)
+        move = _best_move(evidence, poses, agreeing, nats, proposals)
+        if move is None:
+            break
+        inside, motion = move
+        poses, moves = poses.copy(), moves + 1
+        poses[inside] = motion @ poses[inside]
+    return poses if moves else None
+
+
+def _proposals(evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, nats: Floats) -> _Proposals:
+    i, j = evidence.edges.T
+    rows = np.flatnonzero((agreeing == 0) & (component[i] == component[j]) & (i != j))
+    rows = rows[:: max(-(-len(rows) // MOST_PROPOSALS), 1)]
+    motion = poses[i[rows]] @ evidence.i_from_j[rows] @ se3.inverse(poses[j[rows]])
+    motion = np.concatenate([motion, se3.inverse(motion)])
+    edge, mover, stayer = np.tile(rows, 2), np.concatenate([j[rows], i[rows]]), np.concatenate([i[rows], j[rows]])
+    point = poses[mover, :3, 3]
+    first, second = _near_in_angle(evidence, edge, motion)
+    alike = agreement_of(evidence, edge, motion, point, first, second)
+    matrix = csr_matrix((alike, (first, second)), shape=(len(edge), len(edge)))
+    matrix.eliminate_zeros()
+    return _Proposals(edge, mover, stayer, motion, matrix)
+
+
+def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints, Ints]:
+    """Pairs of motions whose rotations may agree."""
+    quat = se3.to_quat_xyzw(motion).astype(np.float32)
+    likeness = np.abs(quat @ quat.T)
+    widest = min(DRIFTED_RAD + ALIKE * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
+    first, second = np.nonzero(likeness >= np.cos(widest / 2))
+    return first, second
+
+
+def _best_move(
+    evidence: Evidence, poses: Floats, agreeing: Floats, nats: Floats, proposals: _Proposals
+) -> tuple[Bools, Floats] | None:
+    """The weightiest group that outweighs its cut: the views (V,) that move, and how."""
+    weight = proposals.alike @ nats[proposals.edge]
+    left = np.diff(proposals.alike.indptr) > 1
+    for _ in range(TRIED):
+        if not left.any():
+            return None
+        row = int(np.argmax(np.where(left, weight, -1.0)))
+        entry = slice(proposals.alike.indptr[row], proposals.alike.indptr[row + 1])
+        group, alike = proposals.alike.indices[entry], proposals.alike.data[entry]
+        left[group[alike > 0.5]] = False
+        left[row] = False
+        share = alike * nats[proposals.edge[group]]
+        inside = _cut(evidence, agreeing * nats, proposals, group, share)
+        if inside is not None:
+            return inside, _mean_motion(proposals, group, share, poses)
+    return None
+
+
+def _cut(evidence: Evidence, held: Floats, proposals: _Proposals, group: Ints, share: Floats) -> Bools | None:
+    """The views (V,) on the movers' side of the lightest cut; None where it is not lighter than the group.
+
+    An edge of the group whose ends are not parted counts as lost, as does each used edge that is.
+    """
+    count = evidence.vertex_count
+    source, sink = count, count + 1
+    used = np.flatnonzero(held > 0)
+    i, j = evidence.edges[used].T
+    mover, stayer = proposals.mover[group], proposals.stayer[group]
+    tail = np.concatenate([i, j, np.full(len(group), source), mover])
+    head = np.concatenate([j, i, stayer, np.full(len(group), sink)])
+    nats = np.concatenate([held[used], held[used], share, share])
+    capacity = csr_matrix((np.ceil(UNIT * nats).astype(np.int32), (tail, head)), shape=(count + 2, count + 2))
+    left = capacity - maximum_flow(capacity, source, sink).flow
+    left.eliminate_zeros()
+    inside = np.ones(count + 2, bool)
+    inside[breadth_first_order(left, source, return_predecessors=False)] = False
+    won = share[inside[mover] & ~inside[stayer]].sum()
+    lost = held[used][inside[i] != inside[j]].sum()
+    return inside[:count] if won - lost > LEAST_GAIN else None
+
+
+def _mean_motion(proposals: _Proposals, group: Ints, share: Floats, poses: Floats) -> Floats:
+    share = share / share.sum()
+    motion, point = proposals.motion[group], poses[proposals.mover[group], :3, 3]
+    rotation = se3.project_to_so3(np.einsum("n,nab->ab", share, motion[:, :3, :3])[None])[0]
+    landed = share @ (np.einsum("nab,nb->na", motion[:, :3, :3], point) + motion[:, :3, 3])
+    return np.asarray(se3.from_parts(rotation, landed - rotation @ (share @ point)))
