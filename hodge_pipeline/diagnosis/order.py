@@ -19,6 +19,8 @@ LEAST_ODDS = 2.0
 """Of neighbours in order to be joined, in units of those of far pairs, for the order to count."""
 DOUBTED = 2
 SHARE_ROUNDS = 30
+FEW = 10
+"""Edges of a gap, for which the usual share of right edges says as much as their own."""
 TRIED_FROM = 0.1
 """Share of the far pairs that are joined."""
 
@@ -87,7 +89,11 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
         expected = np.bincount(entry, others, len(bounds))
         told = np.clip((closing + usual) / (expected + 1), FLOOR, (number + 1) / (number + 2))
         share = np.sqrt(share * told)
-    return np.asarray(share[place])
+    # few edges say little of their gap: one that is in doubt would tell against itself
+    trust = number / (number + FEW)
+    usual = float(np.clip(usual, FLOOR, CEILING))
+    logit = trust * np.log(share / (1 - share)) + (1 - trust) * np.log(usual / (1 - usual))
+    return np.asarray(1 / (1 + np.exp(-logit[place])))
 
 
 def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
