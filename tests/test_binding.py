@@ -109,7 +109,8 @@ def test_the_schema_offers_every_stage_and_refuses_unknown_keys() -> None:
 
 
 def test_the_schema_agrees_with_the_recipes() -> None:
-    jsonschema = pytest.importorskip("jsonschema")
+    import jsonschema
+
     schemas = {cls: binding.json_schema(cls) for cls in (Recipe, ModelRefinement)}
     for name in recipe_names():
         recipe = load_any(name)

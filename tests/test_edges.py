@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_pipeline import se3
 from hodge_pipeline.edges.centroid import CentroidEdges
 from hodge_pipeline.edges.combined import CombinedEdges
@@ -187,7 +188,7 @@ def test_merge_of_a_union_keeps_the_best_overlap() -> None:
 
 def test_red_kitchen_pairs(data_dir) -> None:  # type: ignore[no-untyped-def]
     """Every tenth frame under the reference poses, against the sets of their voxels."""
-    reader = pytest.importorskip("hodge_adapters.seven_scenes").SevenScenesReader()
+    reader = SevenScenesReader()
     folder = data_dir / "seven_scenes" / "redkitchen"
     if not folder.is_dir():
         pytest.skip(f"{folder} is absent")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.fusion.cloud import CloudFuser
@@ -293,7 +294,7 @@ def test_images_of_two_sizes_share_the_field_of_view() -> None:
 
 
 def test_red_kitchen_is_a_room(data_dir: Path) -> None:
-    reader = pytest.importorskip("hodge_adapters.seven_scenes").SevenScenesReader()
+    reader = SevenScenesReader()
     folder = data_dir / "seven_scenes" / "redkitchen"
     if not folder.is_dir():
         pytest.skip(f"{folder} is absent")

@@ -72,7 +72,10 @@ def colmap(
         Optional[Path],  # noqa: UP045
         typer.Option("--depth", help="Folder of sensor depth, PNGs named as the images (or depth for color)."),
     ] = None,
-    depth_scale: Annotated[float, typer.Option("--depth-scale", help="Stored units of depth to the metre.")] = 1000.0,
+    depth_scale: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option("--depth-scale", help="Stored units of depth to the metre; default: the recipe's, 1000."),
+    ] = None,
     depth_camera: Annotated[
         Optional[tuple[float, float, float, float]],  # noqa: UP045
         typer.Option("--depth-camera", help="FX FY CX CY of depth that is not on the pixels of the colour images."),

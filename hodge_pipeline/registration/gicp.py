@@ -19,35 +19,77 @@ ROTATION_EPSILON_RAD = 1e-3
 EPSILON_SHARE = 0.02
 """Of the finest distance: 1 mm of the usual 5 cm."""
 
-_DISTANCES = "Metres, coarse to fine: how far apart corresponding points may be. 0.3 forgives a start 10 cm and 5° off."
-_SOURCE_POINTS = (
-    "Points of cloud j used at each level, evenly strided. 4000 lose no accuracy against all 7500 of a room's cloud."
-)
-_SEED = "Of the sample of source points: which point it begins with. The recipe's seed, where none is given."
-_ITERATIONS = "Steps at each level; a level stops earlier once a step is below 1 mrad and 1/50 of the finest distance."
-_POINTS_PER_SAMPLE = (
-    "Source points (one a voxel) that count as one independent measurement in the information, since neighbours share "
-    "their error. Calibrated on real pairs so that their errors have the size that the information says."
-)
-
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Gicp:
-    """Plane-to-plane ICP. It needs a guess within about 10 cm and 5°."""
+class _SmallGicp:
+    """What both forms can be told."""
 
-    distances_m: tuple[float, ...] = Field(default=(0.3, 0.1, 0.05), min_length=1, description=_DISTANCES)
-    source_points: tuple[int, ...] = Field(default=(1000, 2000, 4000), min_length=1, description=_SOURCE_POINTS)
-    max_iterations: int = Field(default=20, ge=1, description=_ITERATIONS)
+    distances_m: tuple[float, ...] = Field(
+        default=(0.3, 0.1, 0.05),
+        min_length=1,
+        description="Metres, coarse to fine: how far apart corresponding points may be. 0.3 forgives a start 10 cm and "
+        "5° off.",
+    )
+    source_points: tuple[int, ...] = Field(
+        default=(1000, 2000, 4000),
+        min_length=1,
+        description="Points of cloud j used at each level, evenly strided. 4000 lose no accuracy against all 7500 of a "
+        "room's cloud.",
+    )
+    max_iterations: int = Field(
+        default=20,
+        ge=1,
+        description="Steps at each level; a level stops earlier once a step is below 1 mrad and 1/50 of the finest "
+        "distance.",
+    )
     neighbours: int = Field(
         default=10, ge=5, description="Points in the covariance of a point. 10: enough for a plane."
     )
-    points_per_sample: float = Field(default=100.0, gt=0, description=_POINTS_PER_SAMPLE)
-    seed: int = Field(default=0, ge=0, description=_SEED)
+    points_per_sample: float = Field(
+        default=100.0,
+        gt=0,
+        description="Source points (one a voxel) that count as one independent measurement in the information, since "
+        "neighbours share their error. Calibrated on real pairs so that their errors have the size that the "
+        "information says.",
+    )
+    seed: int = Field(
+        default=0,
+        ge=0,
+        description="Of the sample of source points: which point it begins with. The recipe's seed, where none is "
+        "given.",
+    )
 
     @model_validator(mode="after")
-    def _check_levels(self) -> Gicp:
-        _check_levels(self.distances_m, self.source_points)
+    def _check_levels(self) -> _SmallGicp:
+        levels, samples = len(self.distances_m), len(self.source_points)
+        if levels != samples:
+            raise ValueError(f"{levels} distances_m but {samples} source_points: one of each a level")
+        if min(self.distances_m) <= 0 or min(self.source_points) < MIN_POINTS:
+            raise ValueError(f"distances_m must be positive, source_points at least {MIN_POINTS}")
         return self
+
+    def _registered(
+        self, align: Callable[..., Any], target: PreparedCloud, source: PreparedCloud, guess: Floats
+    ) -> Registration:
+        """Level by level; `align` has small_gicp align a sample of the source with the target."""
+
+        def at(level: _Level, guess: Floats) -> Any:
+            return align(
+                source.sample(level.source_points),
+                guess,
+                max_correspondence_distance=level.distance_m,
+                max_iterations=self.max_iterations,
+                rotation_epsilon=ROTATION_EPSILON_RAD,
+                translation_epsilon=EPSILON_SHARE * self.distances_m[-1],
+            )
+
+        levels = [_Level(*level) for level in zip(self.distances_m, self.source_points, strict=True)]
+        return _register(at, levels, target, source, guess, self.points_per_sample)
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Gicp(_SmallGicp):
+    """Plane-to-plane ICP. It needs a guess within about 10 cm and 5°."""
 
     def prepare(self, cloud: PointCloud) -> PreparedCloud:
         """Trees and covariances of a cloud, each made when it is first needed."""
@@ -56,40 +98,17 @@ class Gicp:
     def register(self, target: PreparedCloud, source: PreparedCloud, i_from_j: Floats) -> Registration:
         """Cloud j (source) moved onto cloud i (target) from the guess."""
 
-        def align(level: _Level, guess: Floats) -> Any:
-            return small_gicp.align(
-                target.cloud,
-                source.sample(level.source_points),
-                target.tree,
-                guess,
-                max_correspondence_distance=level.distance_m,
-                max_iterations=self.max_iterations,
-                rotation_epsilon=ROTATION_EPSILON_RAD,
-                translation_epsilon=EPSILON_SHARE * self.distances_m[-1],
-            )
+        def align(sample: Any, guess: Floats, **criteria: float) -> Any:
+            return small_gicp.align(target.cloud, sample, target.tree, guess, **criteria)
 
-        levels = _levels(self.distances_m, self.source_points)
-        return _register(align, levels, target, source, i_from_j, self.points_per_sample)
+        return self._registered(align, target, source, i_from_j)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Vgicp:
+class Vgicp(_SmallGicp):
     """Plane-to-plane ICP against voxel Gaussians of the target: wider steps, slightly less accurate."""
 
     voxel_m: float = Field(default=0.1, gt=0, description="Metres; side of the target's Gaussian voxels.")
-    distances_m: tuple[float, ...] = Field(default=(0.3, 0.1, 0.05), min_length=1, description=_DISTANCES)
-    source_points: tuple[int, ...] = Field(default=(1000, 2000, 4000), min_length=1, description=_SOURCE_POINTS)
-    max_iterations: int = Field(default=20, ge=1, description=_ITERATIONS)
-    neighbours: int = Field(
-        default=10, ge=5, description="Points in the covariance of a point. 10: enough for a plane."
-    )
-    points_per_sample: float = Field(default=100.0, gt=0, description=_POINTS_PER_SAMPLE)
-    seed: int = Field(default=0, ge=0, description=_SEED)
-
-    @model_validator(mode="after")
-    def _check_levels(self) -> Vgicp:
-        _check_levels(self.distances_m, self.source_points)
-        return self
 
     def prepare(self, cloud: PointCloud) -> PreparedCloud:
         """Trees, covariances and voxels of a cloud, each made when it is first needed."""
@@ -98,19 +117,10 @@ class Vgicp:
     def register(self, target: PreparedCloud, source: PreparedCloud, i_from_j: Floats) -> Registration:
         """Cloud j (source) moved onto cloud i (target) from the guess."""
 
-        def align(level: _Level, guess: Floats) -> Any:
-            return small_gicp.align(
-                target.voxels,
-                source.sample(level.source_points),
-                guess,
-                max_correspondence_distance=level.distance_m,
-                max_iterations=self.max_iterations,
-                rotation_epsilon=ROTATION_EPSILON_RAD,
-                translation_epsilon=EPSILON_SHARE * self.distances_m[-1],
-            )
+        def align(sample: Any, guess: Floats, **criteria: float) -> Any:
+            return small_gicp.align(target.voxels, sample, guess, **criteria)
 
-        levels = _levels(self.distances_m, self.source_points)
-        return _register(align, levels, target, source, i_from_j, self.points_per_sample)
+        return self._registered(align, target, source, i_from_j)
 
 
 class PreparedCloud:
@@ -186,17 +196,6 @@ class PreparedCloud:
 class _Level(NamedTuple):
     distance_m: float
     source_points: int
-
-
-def _levels(distances_m: tuple[float, ...], source_points: tuple[int, ...]) -> list[_Level]:
-    return [_Level(*level) for level in zip(distances_m, source_points, strict=True)]
-
-
-def _check_levels(distances_m: tuple[float, ...], source_points: tuple[int, ...]) -> None:
-    if len(distances_m) != len(source_points):
-        raise ValueError(f"{len(distances_m)} distances_m but {len(source_points)} source_points: one of each a level")
-    if min(distances_m) <= 0 or min(source_points) < MIN_POINTS:
-        raise ValueError(f"distances_m must be positive, source_points at least {MIN_POINTS}")
 
 
 def _register(

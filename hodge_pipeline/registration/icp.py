@@ -13,49 +13,23 @@ from hodge_pipeline.types import Floats, PointCloud, Registration
 
 o3d_registration = o3d.pipelines.registration
 
-_DISTANCES = "Metres, coarse to fine: how far apart corresponding points may be. 0.3 forgives a start 10 cm and 5° off."
-_ITERATIONS = "Steps at each level, at most."
-_POINTS_PER_SAMPLE = "Points that count as one independent measurement in the information; as for gicp."
-
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class PointToPlaneIcp:
     """Point-to-plane ICP: the least that works, three times the cost of gicp."""
 
-    distances_m: tuple[float, ...] = Field(default=(0.3, 0.1, 0.05), min_length=1, description=_DISTANCES)
-    max_iterations: int = Field(default=30, ge=1, description=_ITERATIONS)
-    points_per_sample: float = Field(default=100.0, gt=0, description=_POINTS_PER_SAMPLE)
-
-    def prepare(self, cloud: PointCloud) -> Open3dCloud:
-        """The cloud with normals and a tree, each made when it is first needed."""
-        return Open3dCloud(cloud, neighbours=10)
-
-    def register(self, target: Open3dCloud, source: Open3dCloud, i_from_j: Floats) -> Registration:
-        """Cloud j (source) moved onto cloud i (target) from the guess."""
-        return register_levels(
-            self._align,
-            self.distances_m,
-            target,
-            source,
-            i_from_j,
-            max_distance_m=min(self.distances_m),
-            points_per_sample=self.points_per_sample,
-        )
-
-    def _align(self, target: Open3dCloud, source: Open3dCloud, distance_m: float, guess: Floats) -> Any:
-        return _point_to_plane(target, source, distance_m, guess, self.max_iterations)
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class ColouredIcp:
-    """Coloured ICP: holds on to texture where the surfaces alone would slide; geometry alone without colours."""
-
-    distances_m: tuple[float, ...] = Field(default=(0.3, 0.1, 0.05), min_length=1, description=_DISTANCES)
-    max_iterations: int = Field(default=30, ge=1, description=_ITERATIONS)
-    geometric_share: float = Field(
-        default=0.968, ge=0, le=1, description="Weight of geometry against colour; open3d's and the authors' own value."
+    distances_m: tuple[float, ...] = Field(
+        default=(0.3, 0.1, 0.05),
+        min_length=1,
+        description="Metres, coarse to fine: how far apart corresponding points may be. 0.3 forgives a start 10 cm and "
+        "5° off.",
     )
-    points_per_sample: float = Field(default=100.0, gt=0, description=_POINTS_PER_SAMPLE)
+    max_iterations: int = Field(default=30, ge=1, description="Steps at each level, at most.")
+    points_per_sample: float = Field(
+        default=100.0,
+        gt=0,
+        description="Points that count as one independent measurement in the information; as for gicp.",
+    )
 
     def prepare(self, cloud: PointCloud) -> Open3dCloud:
         """The cloud with normals, colours and a tree, each made when it is first needed."""
@@ -74,8 +48,27 @@ class ColouredIcp:
         )
 
     def _align(self, target: Open3dCloud, source: Open3dCloud, distance_m: float, guess: Floats) -> Any:
+        return o3d_registration.registration_icp(
+            source.geometry,
+            target.geometry,
+            distance_m,
+            guess,
+            o3d_registration.TransformationEstimationPointToPlane(),
+            o3d_registration.ICPConvergenceCriteria(max_iteration=self.max_iterations),
+        )
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class ColouredIcp(PointToPlaneIcp):
+    """Coloured ICP: holds on to texture where the surfaces alone would slide; geometry alone without colours."""
+
+    geometric_share: float = Field(
+        default=0.968, ge=0, le=1, description="Weight of geometry against colour; open3d's and the authors' own value."
+    )
+
+    def _align(self, target: Open3dCloud, source: Open3dCloud, distance_m: float, guess: Floats) -> Any:
         if not (target.has_colours and source.has_colours):
-            return _point_to_plane(target, source, distance_m, guess, self.max_iterations)
+            return super()._align(target, source, distance_m, guess)
         return o3d_registration.registration_colored_icp(
             source.geometry,
             target.geometry,
@@ -84,16 +77,3 @@ class ColouredIcp:
             o3d_registration.TransformationEstimationForColoredICP(lambda_geometric=self.geometric_share),
             o3d_registration.ICPConvergenceCriteria(max_iteration=self.max_iterations),
         )
-
-
-def _point_to_plane(
-    target: Open3dCloud, source: Open3dCloud, distance_m: float, guess: Floats, max_iterations: int
-) -> Any:
-    return o3d_registration.registration_icp(
-        source.geometry,
-        target.geometry,
-        distance_m,
-        guess,
-        o3d_registration.TransformationEstimationPointToPlane(),
-        o3d_registration.ICPConvergenceCriteria(max_iteration=max_iterations),
-    )
