@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hodge_pipeline import artifacts
 from hodge_pipeline.errors import GraphError, WorkspaceError
 from hodge_pipeline.types import Bools, Ints, ViewGraph
+from hodge_pipeline.workspace import REFINEMENT
 
 FILE = "edits.json"
 EDGES = "edges.csv"
@@ -136,6 +137,11 @@ class ListedEdge:
 def listed_edges(folder: Path) -> list[ListedEdge]:
     """Every edge and rejected pair of a run. Raises `WorkspaceError` where the folder holds no finished run."""
     path = folder / EDGES
+    if (folder / REFINEMENT).is_dir():
+        raise WorkspaceError(
+            f"{folder}: holds a refined model, of which no edge is switched: hodge diagnose {folder} judges its edges, "
+            "hodge refine colmap takes other options"
+        )
     if not path.is_file():
         raise WorkspaceError(f"{folder}: holds no finished run ({EDGES} is missing): run the recipe to its end first")
     with path.open(newline="", encoding="utf-8") as file:

@@ -25,7 +25,7 @@ from hodge_pipeline.workspace import KEY_FILE, StageFolder, Workspace, key_of
 if TYPE_CHECKING:
     from hodge_pipeline.tracked import Tracked
 
-LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless")
+LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless", "pycolmap")
 RECORDING = "recording"
 """The title of every stage that only records: such a stage is written whether a job computes or not."""
 log = logging.getLogger("hodge_pipeline")
@@ -77,7 +77,7 @@ class Job:
 
     def path(self, stage: str) -> Path:
         """Where a stage's artifacts lie."""
-        return self.workspace.folder / "stages" / stage
+        return self.workspace.path(stage)
 
     def note(self, message: str) -> None:
         """Tell the user, the log and the report; a finished stage tells its notes again in every later run."""

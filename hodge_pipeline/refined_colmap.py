@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from hodge_pipeline import binding
+from hodge_pipeline.job import versions
 from hodge_pipeline.monitor import Monitor
 from hodge_pipeline.refine.model import RefinedModel, refine_models
 from hodge_pipeline.refine.model_options import RECIPE, ModelRefinement, load_model_refinement
-from hodge_pipeline.refined_folder import check_out, write_run_folder
+from hodge_pipeline.refine.model_stages import ModelStages, models_key
+from hodge_pipeline.refined_folder import model_workspace, write_run_folder
 from hodge_pipeline.watch import Nobody, Watcher
 
 
@@ -44,6 +47,7 @@ def refine_colmap(
     depth_scale: float | None = None,
     out: Path | str | None = None,
     force: bool = False,
+    overwrite: bool = False,
     recipe: str = RECIPE,
     overrides: Sequence[str] = (),
     watcher: Watcher | None = None,
@@ -51,25 +55,35 @@ def refine_colmap(
     """A COLMAP model with better poses: `model` is its folder, a `pycolmap.Reconstruction`, or a list of those.
 
     `depth`: folder of sensor depth images named as the colour images, `depth_scale` stored units to the metre. Without
-    `out` nothing is written. Raises `HodgeError` (see `errors`) for whatever the user can mend.
+    `out` nothing is written; with it a refinement that was stopped goes on (that of models in memory begins anew), and
+    another one is replaced where it may `overwrite`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     given = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale}
     sets = [f"model.{name}={value}" for name, value in given.items() if value is not None]
     options = load_model_refinement(recipe, [*sets, *overrides])
-    return run_refinement(model, options, out=None if out is None else Path(out), force=force, watcher=watcher)
+    folder = None if out is None else Path(out)
+    return run_refinement(model, options, out=folder, force=force, overwrite=overwrite, watcher=watcher)
 
 
 def run_refinement(
-    model: Any, options: ModelRefinement, *, out: Path | None, force: bool, watcher: Watcher | None = None
+    model: Any,
+    options: ModelRefinement,
+    *,
+    out: Path | None,
+    force: bool,
+    overwrite: bool,
+    watcher: Watcher | None = None,
 ) -> RefinedColmap:
     """The same with the options bound already."""
     watcher = watcher or Nobody()
     is_path = isinstance(model, (str, Path))
-    if out is not None:
-        check_out(out, Path(model) if is_path else None)
-    models = Path(model) if is_path else model if isinstance(model, (list, tuple)) else [model]
-    with Monitor().measure() as cost, watcher.stage("refine", 1):
-        results = refine_models(options.model.open_models(models), options, force=force)
-    if out is not None:
-        write_run_folder(out, results, options, str(model) if is_path else "pycolmap", cost)
+    options = replace(options, source=str(model) if is_path else None)
+    given = Path(model) if is_path else model if isinstance(model, (list, tuple)) else [model]
+    with model_workspace(out, options, overwrite=overwrite) as workspace:
+        with Monitor().measure() as cost, watcher.stage("refine", 1):
+            models = options.model.open_models(given)
+            stages = ModelStages(workspace, models_key(models, binding.unbind(options), versions()))
+            results = refine_models(models, options, stages, force=force)
+        if out is not None:
+            write_run_folder(out, results, options, cost)
     return RefinedColmap(results, out)

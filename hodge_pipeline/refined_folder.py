@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline import artifacts, binding, registry, yaml_file
+from hodge_pipeline import artifacts, binding, registry
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.report import write_report
 from hodge_pipeline.monitor import Cost
@@ -22,34 +23,40 @@ from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refined_report import model_report
 from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.types import Source, Trajectory
+from hodge_pipeline.workspace import REFINEMENT, Workspace
 
 MODELS = "sparse"
-RECIPE_FILE = "recipe.yaml"
+REFUSAL = "holds another refined model ({change}): --overwrite replaces it"
 
 
-def check_out(out: Path, model: Path | None) -> None:
-    """Raise `WorkspaceError` where the folder holds anything but an earlier refinement, or is the input itself."""
-    if model is not None and out.resolve() in (model.resolve(), *model.resolve().parents):
+@contextmanager
+def model_workspace(out: Path | None, options: ModelRefinement, *, overwrite: bool) -> Iterator[Workspace]:
+    """The folder of a refinement with its stages; for the time of the body alone, where there is no `out`.
+
+    Raises `WorkspaceError` where the folder holds something else, or is the input itself.
+    """
+    model = None if options.source is None else Path(options.source).resolve()
+    if out is not None and model is not None and out.resolve() in (model, *model.parents):
         raise WorkspaceError(f"--out {out}: holds the model to be refined: give another folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / RECIPE_FILE).is_file():
-        raise WorkspaceError(f"--out {out}: is not empty and not a run folder: give another one")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) if out is None else out
+        recipe = binding.unbind(options)
+        with Workspace.open(folder, recipe, overwrite=overwrite, refusal=REFUSAL, kind=REFINEMENT) as workspace:
+            yield workspace
 
 
 def write_run_folder(
     out: Path,
     results: Sequence[RefinedModel],
     options: ModelRefinement,
-    source: str,
     cost: Cost,
 ) -> None:
     """Write it all; the models in one step, so that the folder holds those of one run."""
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        artifacts.write_text(out / RECIPE_FILE, yaml_file.dump(binding.unbind(options)))
         models = [model for result in results if _is_result(result) for model in result.kept]
         _write_models(out, models)
         _write_tables(out, results)
-        write_report(out, model_report(results, options, source, cost))
+        write_report(out, model_report(results, options, options.source or "pycolmap", cost))
         _record(out, results[0])
     except OSError as error:
         raise WorkspaceError(f"{out}: cannot be written ({error.strerror}): give another --out") from error

@@ -183,6 +183,11 @@ class TrackedModel(Protocol):
         ...
 
     @property
+    def measurements(self) -> tuple[Path, ...]:
+        """The files beside the model that its edges come from: matches, depth."""
+        ...
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What was skipped or repaired so far, one line each."""
         ...
@@ -245,6 +250,10 @@ class TrackedModel(Protocol):
 
     def write(self, folder: Path) -> None:
         """Write it in its own format into a folder that exists."""
+        ...
+
+    def read_back(self, folder: Path, notes: tuple[str, ...]) -> TrackedModel:
+        """What a model made from this one has written to a folder, with its notes."""
         ...
 
 

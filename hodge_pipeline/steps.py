@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from hodge_pipeline.refine.held_out import is_held_out
 from hodge_pipeline.registration import clouds as cloud_stage
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
+from hodge_pipeline.registration.block_store import BlockStore
 from hodge_pipeline.registration.gaps import has_gap
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
@@ -191,26 +191,6 @@ def judge_edges(job: Job, last: Round, number: int) -> Round:
             artifacts.save(folder.path / "verdicts.npz", verdicts)
             advance(1)
     return replace(last, verdicts=artifacts.load(job.path("diagnose") / "verdicts.npz", Verdicts))
-
-
-@dataclass(frozen=True)
-class BlockStore:
-    """Registered blocks on disk, so that a killed registration goes on with the next one."""
-
-    folder: Path
-
-    def read(self) -> dict[int, Registered]:
-        """The blocks that are there, by number."""
-        return {int(path.stem): artifacts.load(path, Registered) for path in sorted(self.folder.glob("[0-9]*.npz"))}
-
-    def write(self, block: int, result: Registered) -> None:
-        """Keep one block."""
-        self.folder.mkdir(exist_ok=True)
-        artifacts.save(self.folder / f"{block:06d}.npz", result)
-
-    def remove(self) -> None:
-        """Forget the blocks: the whole is written."""
-        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def fuse(job: Job, frames: Sequence[Frame], world_from_cam: Floats, number: int) -> dict[str, Path]:

@@ -18,6 +18,8 @@ from hodge_pipeline.errors import WorkspaceError
 
 KEY_FILE = "key.json"
 RECIPE_FILE = "recipe.yaml"
+RUN, REFINEMENT = "stages", "refinement"
+"""The folder of the stages of a run, and of the refinement of a model."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, None)
 """What the system says when a file cannot be written; None is numpy's own short write."""
 
@@ -29,7 +31,7 @@ def key_of(*parts: Any) -> str:
 
 def is_run_folder(path: Path) -> bool:
     """Whether a path is what a run left, finished or not."""
-    return (path / RECIPE_FILE).is_file() and (path / "stages").is_dir()
+    return (path / RECIPE_FILE).is_file() and (path / RUN).is_dir()
 
 
 @dataclass(frozen=True)
@@ -50,11 +52,12 @@ class Workspace:
     """One run folder, held by one process at a time.
 
     `stages/<name>` holds a finished stage, `stages/<name>.part` one that was begun; a part is continued when its key
-    is still the same. Everything else in the folder is for people.
+    is still the same. Everything else in the folder is for people. `kind` is what `stages` is called: what runs and
+    what refines a model never share a folder.
     """
 
-    def __init__(self, folder: Path, lock: IO[str]) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, lock: IO[str], kind: str = RUN) -> None:
+        self.folder, self.kind = folder, kind
         self._lock = lock
 
     @classmethod
@@ -65,6 +68,7 @@ class Workspace:
         *,
         overwrite: bool = False,
         refusal: str = "holds a run of another recipe ({change}): --overwrite replaces it",
+        kind: str = RUN,
     ) -> Workspace:
         """The run folder for this recipe, made if it is not there.
 
@@ -78,12 +82,13 @@ class Workspace:
             raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
         _hold(lock, folder)
         try:
-            _check_recipe(folder, recipe, overwrite, refusal)
-            (folder / "stages").mkdir(exist_ok=True)
+            _check_kind(folder, kind)
+            _check_recipe(folder, recipe, overwrite, refusal, kind)
+            (folder / kind).mkdir(exist_ok=True)
         except BaseException:
             lock.close()
             raise
-        return cls(folder, lock)
+        return cls(folder, lock, kind)
 
     @classmethod
     def reopen(cls, folder: Path, recipe: dict[str, Any]) -> Workspace:
@@ -112,7 +117,11 @@ class Workspace:
 
     def is_finished(self, name: str, key: str) -> bool:
         """Whether the stage is there under its key."""
-        return _key_at(self.folder / "stages" / name) == key
+        return _key_at(self.path(name)) == key
+
+    def path(self, name: str) -> Path:
+        """Where the artifacts of a finished stage lie."""
+        return self.folder / self.kind / name
 
     @contextmanager
     def stage(self, name: str, key: str) -> Iterator[StageFolder]:
@@ -120,7 +129,7 @@ class Workspace:
 
         A full disk raises `WorkspaceError`; what other stages finished stays.
         """
-        path = self.folder / "stages" / name
+        path = self.path(name)
         if _key_at(path) == key:
             yield StageFolder(path, key, finished=True)
             return
@@ -136,7 +145,7 @@ class Workspace:
 
     def note(self, name: str, info: dict[str, Any]) -> None:
         """Add facts (cost, versions) to a finished stage."""
-        path = self.folder / "stages" / name / KEY_FILE
+        path = self.path(name) / KEY_FILE
         artifacts.write_json(path, {**artifacts.read_json(path), **info})
 
 
@@ -165,14 +174,20 @@ def _hold(lock: IO[str], folder: Path) -> None:
         raise WorkspaceError(f"{folder}: another run uses this folder: wait for it, or name another folder") from error
 
 
-def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal: str) -> None:
+def _check_kind(folder: Path, kind: str) -> None:
+    for other, content in ((RUN, "a run"), (REFINEMENT, "a refined model")):
+        if kind != other and (folder / other).is_dir():
+            raise WorkspaceError(f"{folder}: holds {content}: give another --out")
+
+
+def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal: str, kind: str) -> None:
     """Write the resolved recipe, or refuse a folder that is not this recipe's."""
     path = folder / RECIPE_FILE
     text = yaml_file.dump(recipe)
     if path.exists():
         if path.read_text("utf-8") == text:
             return
-        if not overwrite and _has_stages(folder):
+        if not overwrite and _has_stages(folder / kind):
             change = _first_change(yaml_file.read(path).data, recipe)
             raise WorkspaceError(f"{folder}: {refusal.replace('{change}', change)}")
     elif any(entry.name != ".lock" for entry in folder.iterdir()):
@@ -183,9 +198,8 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal
         artifacts.write_text(path, text)
 
 
-def _has_stages(folder: Path) -> bool:
+def _has_stages(stages: Path) -> bool:
     """Whether a stage was begun: a run that failed before, by a source that is not there, is nobody's work."""
-    stages = folder / "stages"
     return stages.is_dir() and any(stages.iterdir())
 
 

@@ -10,8 +10,10 @@ from typer.testing import CliRunner
 
 import hodge_pipeline
 from hodge_adapters.colmap_refining import ColmapModels
+from hodge_adapters.colmap_tracked import ColmapModel
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
+from hodge_pipeline.edits import listed_edges
 from hodge_pipeline.errors import CheckError, SourceError, WorkspaceError
 from hodge_pipeline.refine.scale import metric_scale
 from test_readers_colmap import synthetic
@@ -153,7 +155,70 @@ def test_without_one_edge_nothing_is_written_but_the_report(tmp_path: Path) -> N
     command = ["refine", "colmap", str(model), "--out", str(out), "--set", "model.min_shared=100000", "--set", FREE[0]]
     result = CliRunner().invoke(app, command)
     assert isinstance(result.exception, CheckError) and "nothing was written" in str(result.exception)
-    assert sorted(path.name for path in out.iterdir()) == ["recipe.yaml", "report.html", "report.json"]
+    written = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
+    assert written == ["recipe.yaml", "refinement", "report.html", "report.json"]
+
+
+def refuse(*_: object) -> None:
+    raise AssertionError("this was done before")
+
+
+def stop(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_refinement_that_was_stopped_goes_on_and_ends_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: bool
+) -> None:
+    start = disturbed(noisy(tmp_path), tmp_path / "start")
+    if not text:
+        as_text, start = start, tmp_path / "as_binary"
+        start.mkdir()
+        pycolmap.Reconstruction(as_text).write_binary(start)
+    whole, out = tmp_path / "whole", tmp_path / "stopped"
+    hodge_pipeline.refine_colmap(start, overrides=FREE, out=whole)
+    with monkeypatch.context() as patch:
+        patch.setattr(ColmapModel, "adjusted", stop)
+        with pytest.raises(KeyboardInterrupt):
+            hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
+    monkeypatch.setattr(ColmapModel, "measured", refuse)
+    hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
+    monkeypatch.setattr(ColmapModel, "adjusted", refuse)
+    again = hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
+    assert again.results[0].decision.outcome == "refined"
+    ending = "txt" if text else "bin"
+    for name in ("poses.tum", "edges.csv", f"sparse/0/images.{ending}", f"sparse/0/points3D.{ending}"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_a_model_that_changed_is_computed_anew_and_another_option_replaces_only_when_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, out = disturbed(noisy(tmp_path), tmp_path / "start"), tmp_path / "out"
+    hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
+    other = [*FREE, "model.min_shared=20"]
+    with pytest.raises(WorkspaceError, match="another refined model .model.min_shared was 30, is 20.: --overwrite"):
+        hodge_pipeline.refine_colmap(start, overrides=other, out=out)
+    pycolmap.Reconstruction(start).write_text(start)
+    monkeypatch.setattr(ColmapModel, "measured", refuse)
+    with pytest.raises(AssertionError, match="done before"):
+        hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
+    with pytest.raises(AssertionError, match="done before"):
+        hodge_pipeline.refine_colmap(start, overrides=other, out=out, overwrite=True)
+
+
+def test_a_refined_model_and_a_run_never_share_a_folder(tmp_path: Path) -> None:
+    model, out = noisy(tmp_path), tmp_path / "out"
+    hodge_pipeline.refine_colmap(model, overrides=FREE, out=out)
+    with pytest.raises(WorkspaceError, match="holds a refined model: give another --out"):
+        hodge_pipeline.run("demo", out, source=tmp_path)
+    with pytest.raises(WorkspaceError, match="hodge diagnose .* judges its edges"):
+        listed_edges(out)
+    run = tmp_path / "run"
+    (run / "stages").mkdir(parents=True)
+    with pytest.raises(WorkspaceError, match="holds a run: give another --out"):
+        hodge_pipeline.refine_colmap(model, overrides=FREE, out=run)
 
 
 def test_points_that_one_image_saw_are_kept(tmp_path: Path) -> None:

@@ -68,6 +68,12 @@ class ColmapModel:
         """The reconstruction itself."""
         return self.reconstruction
 
+    @property
+    def measurements(self) -> tuple[Path, ...]:
+        """The database and the depth images."""
+        database = () if self.edges.database is None else (self.edges.database,)
+        return (*database, *self.depth.files.values())
+
     @cached_property
     def records(self) -> Model:
         """The model as plain arrays, images in natural order of their names."""
@@ -170,6 +176,10 @@ class ColmapModel:
     def write(self, folder: Path) -> None:
         """Five files, binary or text as the model was."""
         (self.reconstruction.write_text if self.text else self.reconstruction.write_binary)(folder)
+
+    def read_back(self, folder: Path, notes: tuple[str, ...]) -> ColmapModel:
+        """The model of that folder with the frames, depth and database of this one."""
+        return replace(self, reconstruction=read_reconstruction(folder), files=(), notes=notes)
 
     def _copy(self) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(self.reconstruction)

@@ -59,7 +59,9 @@ def trajectory(
 @group.command()
 def colmap(
     model: Annotated[Path, typer.Argument(help="A COLMAP model, .bin or .txt; or the folder of several: 0, 1, …")],
-    out: Annotated[Path, typer.Option("--out", help="The run folder: sparse/0 (the model), report, poses.")],
+    out: Annotated[
+        Path, typer.Option("--out", help="The run folder: sparse/0 (the model), report; it goes on where it stopped.")
+    ],
     database: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--database", help="COLMAP's database.db; default: the one beside or above the model."),
@@ -86,6 +88,7 @@ def colmap(
         Optional[list[str]],  # noqa: UP045
         typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe colmap-refine."),
     ] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
@@ -97,5 +100,12 @@ def colmap(
     if depth_camera is not None:
         sets.append(f"model.depth_camera=[{', '.join(map(str, depth_camera))}]")
     refining_colmap.refine(
-        model, out, [*sets, *(overrides or [])], recipe=recipe, force=force, quiet=quiet, as_json=json
+        model,
+        out,
+        [*sets, *(overrides or [])],
+        recipe=recipe,
+        force=force,
+        overwrite=overwrite,
+        quiet=quiet,
+        as_json=json,
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hodge_pipeline.cli.console import Terminal, print_table
+from hodge_pipeline.cli.running import resumable
 from hodge_pipeline.errors import CheckError
 from hodge_pipeline.refine.model_options import RECIPE, load_model_refinement
 
@@ -15,14 +16,22 @@ if TYPE_CHECKING:
 
 
 def refine(
-    model: Path, out: Path, overrides: Sequence[str], *, recipe: str, force: bool, quiet: bool, as_json: bool
+    model: Path,
+    out: Path,
+    overrides: Sequence[str],
+    *,
+    recipe: str,
+    force: bool,
+    overwrite: bool,
+    quiet: bool,
+    as_json: bool,
 ) -> None:
     """Refine a model into a run folder. Raises `CheckError` (exit code 3) where the guard kept the input as worse."""
     options = load_model_refinement(recipe or RECIPE, overrides)
     from hodge_pipeline.refined_colmap import run_refinement
 
-    with Terminal(quiet or as_json) as terminal:
-        done = run_refinement(model, options, out=out, force=force, watcher=terminal)
+    with resumable(out), Terminal(quiet or as_json) as terminal:
+        done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal)
     if as_json:
         print((out / "report.json").read_text("utf-8"), end="")
     elif not quiet:

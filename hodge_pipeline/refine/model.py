@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline import se3
+from hodge_pipeline import artifacts, se3
 from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.refine.guard import Change, Decision, Measure, decide
 from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, joined_graphs, no_depth_edges
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
+from hodge_pipeline.refine.model_stages import NOTES, ModelStages, measured_edges
 from hodge_pipeline.refine.scale import Scale, metric_scale
 from hodge_pipeline.refine.uncertainty import SIGMAS
 from hodge_pipeline.stages import TrackedModel, Workers
@@ -26,6 +25,7 @@ ADJUSTMENTS = 2
 NO_EDGE = "no edge was found: no two images share enough points, matches or depth (model.min_shared)"
 NO_EDGE_LEFT = "every edge was rejected: no two of them agree"
 CHI2_TOLERANCE = 0.05
+MODEL = "model"
 SCORE_TOLERANCE = 0.002
 NO_BASELINE = 1e-9
 """Of the size of the model: a sensor nearer than this to its rig's origin is off it by rounding alone."""
@@ -55,17 +55,17 @@ class RefinedModel:
 
 
 def refine_models(
-    models: Sequence[TrackedModel], options: ModelRefinement, *, force: bool = False
+    models: Sequence[TrackedModel], options: ModelRefinement, stages: ModelStages, *, force: bool = False
 ) -> tuple[RefinedModel, ...]:
-    """Every model refined, those that measurements tie together as one. Nothing is written."""
+    """Every model refined, those that measurements tie together as one. Nothing is written but the stages."""
     scales = [metric_scale(model.depth_ratios()) for model in models]
     metric = [in_metres(model, scale) for model, scale in zip(models, scales, strict=True)]
     out = []
     with options.executor.open() as workers:
-        for joined in options.model.join(metric):
+        for number, joined in enumerate(options.model.join(metric)):
             parts = [row for row, model in enumerate(metric) if set(model.body_names) & set(joined.body_names)]
             is_metric = all(scales[row].is_observable for row in parts)
-            found = _refine(joined, options, workers, is_metric)
+            found = _refine(joined, options, replace(stages, number=number), workers, is_metric)
             inputs = tuple(models[row] for row in parts)
             out.append(_judged(inputs, tuple(scales[row] for row in parts), found, options, force))
     return tuple(out)
@@ -88,32 +88,45 @@ class _Found:
     notes: tuple[str, ...]
 
 
-def _refine(start: TrackedModel, options: ModelRefinement, workers: Workers, is_metric: bool) -> _Found:
+def _refine(
+    start: TrackedModel, options: ModelRefinement, stages: ModelStages, workers: Workers, is_metric: bool
+) -> _Found:
     """Depth takes part where the model is in metres: else its clouds are in another unit, or not of these images."""
     nothing = np.zeros((2, 0))
-    with tempfile.TemporaryDirectory() as folder:
-        measured, left_out = start.measured()
-        depth = depth_edges(start, options, Path(folder), workers) if is_metric else no_depth_edges(start)
-        graph = joined_graphs(measured, depth.graph)
-        notes = (*left_out, *depth.notes)
-        if not graph.edge_count:
-            return _Found(start, start, None, np.full((1, 2), np.nan), nothing, (*notes, NO_EDGE))
-        solved = solve_bodies(graph, start.world_from_body, options.solver)
-        notes = (*notes, *solved.solution.notes)
-        if not solved.kept.any():
-            return _Found(start, start, solved, np.full((1, 2), np.nan), nothing, (*notes, NO_EDGE_LEFT))
-        with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
-        model, errors = _adjusted(start, solved, options.depth_weight if with_depth else 0.0)
-        if not is_metric:
-            model, errors = _in_the_scale_of(start, model, errors)
-        distances = nothing
-        if len(depth.held_out):
-            poses = np.array([_image_poses(start), _image_poses(model)])
-            distances = held_out_distances(depth, Path(folder), poses, workers)
+    measured, left_out = measured_edges(start, stages)
+    depth = depth_edges(start, options, stages, workers) if is_metric else no_depth_edges(start)
+    graph = joined_graphs(measured, depth.graph)
+    notes = (*left_out, *depth.notes)
+    if not graph.edge_count:
+        return _Found(start, start, None, np.full((1, 2), np.nan), nothing, (*notes, NO_EDGE))
+    solved = solve_bodies(graph, start.world_from_body, options.solver)
+    notes = (*notes, *solved.solution.notes)
+    if not solved.kept.any():
+        return _Found(start, start, solved, np.full((1, 2), np.nan), nothing, (*notes, NO_EDGE_LEFT))
+    model, errors = _adjusted(start, solved, options, stages)
+    if not is_metric:
+        model, errors = _in_the_scale_of(start, model, errors)
+    distances = held_out_distances(depth, np.array([_image_poses(start), _image_poses(model)]), workers)
     return _Found(start, model, solved, errors, distances, notes)
 
 
-def _adjusted(start: TrackedModel, solved: Solved, weight: float) -> tuple[TrackedModel, Floats]:
+def _adjusted(
+    start: TrackedModel, solved: Solved, options: ModelRefinement, stages: ModelStages
+) -> tuple[TrackedModel, Floats]:
+    """The bundle adjustment, read back where it was done before."""
+    with stages.stage("adjusted") as folder:
+        if not folder.finished:
+            with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
+            model, errors = _adjust(start, solved, options.depth_weight if with_depth else 0.0)
+            (folder.path / MODEL).mkdir(exist_ok=True)
+            model.write(folder.path / MODEL)
+            artifacts.save_arrays(folder.path / "errors.npz", {"errors": errors})
+            artifacts.write_json(folder.path / NOTES, model.notes)
+    path = stages.path("adjusted")
+    return start.read_back(path / MODEL, stages.notes("adjusted")), artifacts.load_arrays(path / "errors.npz")["errors"]
+
+
+def _adjust(start: TrackedModel, solved: Solved, weight: float) -> tuple[TrackedModel, Floats]:
     """Points where rays meet at the solved poses, and bundle adjustment, with the solved positions as priors."""
     priors = position_priors(solved, weight)
     model = start.moved(solved.solution.world_from_cam)

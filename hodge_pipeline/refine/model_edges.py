@@ -2,34 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline import se3
+from hodge_pipeline import artifacts, se3
 from hodge_pipeline.evaluation.scores import edge_distances
 from hodge_pipeline.refine.model_options import ModelRefinement
+from hodge_pipeline.refine.model_stages import NOTES, ModelStages
+from hodge_pipeline.registration.block_store import BlockStore
 from hodge_pipeline.registration.clouds import prepare_clouds
-from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.pairs import Registered, register_pairs
 from hodge_pipeline.stages import TrackedModel, Workers
-from hodge_pipeline.types import CloudSet, Floats, Ints, ViewGraph
+from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, ViewGraph
 
 LEAST_HELD_OUT = 4
 
 
 @dataclass(frozen=True)
 class DepthEdges:
-    """The registered edges between bodies; pairs of images (H, 2) held out, their clouds' folder; and remarks."""
+    """The registered edges between bodies; pairs (H, 2) held out, of the images (D,) with depth; and remarks."""
 
     graph: ViewGraph
     held_out: Ints
     images: Ints
+    clouds: Path | None
     notes: tuple[str, ...]
 
 
-def depth_edges(model: TrackedModel, options: ModelRefinement, folder: Path, workers: Workers) -> DepthEdges:
-    """Edges between the images that have depth, of a model in metres; their clouds are left in the folder.
+def depth_edges(model: TrackedModel, options: ModelRefinement, stages: ModelStages, workers: Workers) -> DepthEdges:
+    """Edges between the images that have depth, of a model in metres.
 
     Pairs are proposed and registered from the model's own poses, so drift beyond the registrar's reach is not closed
     by depth alone.
@@ -39,25 +43,49 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, folder: Path, wor
         return no_depth_edges(model)
     frames = [model.frames[row] for row in images]
     poses = np.array([frame.world_from_cam for frame in frames])
-    clouds, notes = prepare_clouds(frames, options.clouds, workers)
-    clouds.save(folder)
-    candidates = options.edges.propose(frames, CloudSet.open(folder), poses)
+    clouds = _clouds(frames, options, stages, workers)
+    candidates = options.edges.propose(frames, CloudSet.open(clouds), poses)
     body = model.body_of_frame[images]
     between = body[candidates.pairs[:, 0]] != body[candidates.pairs[:, 1]]
     pairs = candidates.pairs[between]
     held = held_out(len(pairs), options.held_out_share, options.seed)
     chosen = pairs[~held]
     guesses = se3.inverse(poses[chosen[:, 0]]) @ poses[chosen[:, 1]]
-    registered = register_pairs(folder, options.registration, chosen, guesses, workers)
+    registered = _registered(clouds, chosen, guesses, options, stages, workers)
     reasons = options.acceptance.reasons(registered)
     notes = (
-        *notes,
+        *stages.notes("clouds"),
         *(f"{(reasons == why).sum()} pairs with depth left out: {why}" for why in np.unique(reasons) if why),
     )
     accepted = registered.select(reasons == "")
     names = np.array([str(frame.frame_id) for frame in frames])
     graph = accepted.as_graph(names, np.full(len(accepted.pairs), "depth"))
-    return DepthEdges(_between_bodies(model, graph, images), pairs[held], images, tuple(notes))
+    return DepthEdges(_between_bodies(model, graph, images), pairs[held], images, clouds, notes)
+
+
+def _clouds(frames: Sequence[Frame], options: ModelRefinement, stages: ModelStages, workers: Workers) -> Path:
+    """The folder of the frames' clouds."""
+    with stages.stage("clouds") as folder:
+        if not folder.finished:
+            clouds, notes = prepare_clouds(frames, options.clouds, workers)
+            clouds.save(folder.path)
+            artifacts.write_json(folder.path / NOTES, notes)
+    return stages.path("clouds")
+
+
+def _registered(
+    clouds: Path, pairs: Ints, guesses: Floats, options: ModelRefinement, stages: ModelStages, workers: Workers
+) -> Registered:
+    """The pairs registered; what was stopped goes on at its last block."""
+    with stages.stage("registered") as folder:
+        if not folder.finished:
+            blocks = BlockStore(folder.path / "blocks")
+            found = register_pairs(
+                clouds, options.registration, pairs, guesses, workers, finished=blocks.read(), on_block=blocks.write
+            )
+            artifacts.save(folder.path / "registered.npz", found)
+            blocks.remove()
+    return artifacts.load(stages.path("registered") / "registered.npz", Registered)
 
 
 def held_out(count: int, share: float, seed: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -69,16 +97,18 @@ def held_out(count: int, share: float, seed: int) -> np.ndarray[tuple[int], np.d
     return chosen
 
 
-def held_out_distances(edges: DepthEdges, folder: Path, pose_sets: Floats, workers: Workers) -> Floats:
+def held_out_distances(edges: DepthEdges, pose_sets: Floats, workers: Workers) -> Floats:
     """The cloud-to-cloud distance (S, H) of the pairs held out, under sets of image poses (S, N, 4, 4), metres."""
-    return edge_distances(folder, edges.held_out, pose_sets[:, edges.images], workers)
+    if edges.clouds is None or not len(edges.held_out):
+        return np.zeros((len(pose_sets), 0))
+    return edge_distances(edges.clouds, edges.held_out, pose_sets[:, edges.images], workers)
 
 
 def no_depth_edges(model: TrackedModel) -> DepthEdges:
     """What a model without depth has."""
     none = np.zeros((0, 2), np.int64)
     graph = ViewGraph.from_edges(np.array(model.body_names), none, np.zeros((0, 4, 4)))
-    return DepthEdges(graph, none, none[:, 0], ())
+    return DepthEdges(graph, none, none[:, 0], None, ())
 
 
 def joined_graphs(first: ViewGraph, second: ViewGraph) -> ViewGraph:

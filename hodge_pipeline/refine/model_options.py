@@ -26,6 +26,7 @@ class ModelRefinement:
     registration: Registrar = Field(description="how their clouds are registered")
     solver: ConsistencySolver = Field(description="how the poses are made consistent with all edges")
     executor: Executor = Field(description="where pairs are registered")
+    source: str | None = Field(default=None, description="the model; the command line names it")
     description: str = Field(default="", description="one sentence for `hodge recipes`")
     seed: int = Field(default=0, ge=0, description="of everything random")
     clouds: CloudOptions = CloudOptions()
