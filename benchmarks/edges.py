@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from edges_peers import LEVER_M, PEERS, Answer
+from edges_peers import LEVER_M, Answer, Peer, installed_peers
 
 from hodge_adapters.pair_log import PairLogReader
 from hodge_pipeline.complex.components import connected_components
@@ -66,7 +66,7 @@ def row(name: str, call: Callable[[], tuple[Answer, Floats | None]], truth: Pair
     }
 
 
-def scene(log: Path, with_peers: bool) -> dict[str, Any]:
+def scene(log: Path, peers: dict[str, Peer]) -> dict[str, Any]:
     """The table of one graph."""
     folder = log.parent
     true = PairLogReader(information=folder / "gt.info").open(folder / "gt.log").graph
@@ -75,7 +75,7 @@ def scene(log: Path, with_peers: bool) -> dict[str, Any]:
     truth = PairTruth.from_graph(true)
     right = right_edges(truth, graph.edges, graph.i_from_j)
     rows = [row("hodge diagnosis", lambda: diagnosis(graph), truth, right)]
-    for name, peer in PEERS.items() if with_peers else ():
+    for name, peer in peers.items():
         rows.append(row(name, lambda peer=peer: (peer(graph), None), truth, right))
     rows.append(row("oracle", lambda: (oracle(graph, right), None), truth, right))
     name = f"{folder.name.removesuffix('-evaluation')} {log.stem}"
@@ -119,9 +119,10 @@ def main() -> None:
     logs = [log for log in logs if (log.parent / "gt.log").is_file() and (log.parent / "gt.info").is_file()]
     if not logs:
         parser.error(f"{options.folder}: no SCENE/METHOD.log beside a gt.log and gt.info in it")
+    peers = {} if options.no_peers else installed_peers()
     found = []
     for log in logs:
-        found.append(scene(log, not options.no_peers))
+        found.append(scene(log, peers))
         print_scene(found[-1])
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n")

@@ -6,6 +6,8 @@ graphs: a lever of 2 m between rotation and translation, an error of 5 cm.
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -89,11 +91,26 @@ def gtsam_gnc(graph: ViewGraph, trust_odometry: bool) -> Answer:
     return kept, poses, connected_components(graph.edges[kept], graph.vertex_count)
 
 
-PEERS: dict[str, Callable[[ViewGraph], Answer]] = {
-    "Open3D line process": open3d_line_process,
-    "GTSAM GNC, odometry": lambda graph: gtsam_gnc(graph, True),
-    "GTSAM GNC": lambda graph: gtsam_gnc(graph, False),
+Peer = Callable[[ViewGraph], Answer]
+PEERS: dict[str, dict[str, Peer]] = {
+    "open3d": {"Open3D line process": open3d_line_process},
+    "gtsam": {
+        "GTSAM GNC, odometry": lambda graph: gtsam_gnc(graph, True),
+        "GTSAM GNC": lambda graph: gtsam_gnc(graph, False),
+    },
 }
+"""By the module that each needs."""
+
+
+def installed_peers() -> dict[str, Peer]:
+    """The peers whose library is here; a line on stderr for each that is not."""
+    found: dict[str, Peer] = {}
+    for module, peers in PEERS.items():
+        if importlib.util.find_spec(module) is not None:
+            found |= peers
+        else:
+            print(f"without {', '.join(peers)}: {module} is missing: pip install '.[bench]'", file=sys.stderr)
+    return found
 
 
 def _odometry_start(graph: ViewGraph, trusted: Bools) -> Floats:
