@@ -109,7 +109,7 @@ def installed_peers() -> dict[str, Peer]:
         if importlib.util.find_spec(module) is not None:
             found |= peers
         else:
-            print(f"without {', '.join(peers)}: {module} is missing: pip install '.[bench]'", file=sys.stderr)
+            print(f"without {' and '.join(peers)}: {module} is missing: pip install '.[bench]'", file=sys.stderr)
     return found
 
 
