@@ -11,7 +11,7 @@ from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.mending import mend
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.pieces import Alignment, align
-from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, TWICE, Fit, fit
+from hodge_pipeline.diagnosis.robust_poses import GATE, TWICE, Fit, fit, rough_fit
 from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.types import Floats, ViewGraph
 
@@ -42,9 +42,10 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
     if evidence.exhaustive:
         best = best_arrangement(evidence, graph, fit(evidence, graph, grown, TWICE), weight, options.cluster_gain, rng)
     else:
-        best = _regrown(evidence, graph, fit(evidence, graph, grown, ANNEALED), weight, options.cluster_gain, rng)
+        best = _regrown(evidence, graph, rough_fit(evidence, graph, grown), weight, options.cluster_gain, rng)
         if 0 < (~best.used).sum() <= FEW * len(best.used):
             best = max(best, _of_all(evidence, graph), key=lambda found: int(found.used.sum()))
+        best = fit(evidence, graph, Alignment(best.component, best.poses), (GATE,))
         best = mend(evidence, graph, best)
     agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
     return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
@@ -60,7 +61,7 @@ def _regrown(
         if (ends[:, 0] != ends[:, 1]).sum() < worth:
             break
         grown = align(evidence, weight, cluster_gain, rng, Alignment(best.component, best.poses))
-        found = fit(evidence, graph, grown, ANNEALED)
+        found = rough_fit(evidence, graph, grown)
         won = found.used.sum() - best.used.sum()
         best = found if won > 0 else best
         if won < worth:
@@ -73,7 +74,7 @@ def _of_all(evidence: Evidence, graph: ViewGraph) -> Fit:
     drifted while it grew.
     """
     found = solve(graph, objective="isotropic", max_iterations=STEPS)
-    return fit(evidence, graph, Alignment(found.component, found.world_from_cam), TWICE)
+    return rough_fit(evidence, graph, Alignment(found.component, found.world_from_cam))
 
 
 def _unvouched(probability: Floats, fit: Fit, evidence: Evidence) -> Floats:

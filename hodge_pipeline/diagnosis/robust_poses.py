@@ -9,6 +9,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.diagnosis.clusters import DIMENSION, FREEDOM, Springs, clustered
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.pieces import Alignment
 from hodge_pipeline.diagnosis.resistance import effective_resistance
@@ -17,16 +18,13 @@ from hodge_pipeline.solvers.newton import Limits
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
-FREEDOM = 4.0
-"""Degrees of freedom of Student's t: the tails of real registration errors."""
 GATE = 90.0
 """An edge of a larger χ² has no part in the poses."""
 ONCE, TWICE = (60.0,), (60.0, GATE)
-ANNEALED = (1e4, 1e3, GATE)
+ANNEALED = (1e4, 1e3, 300.0)
 """Gates for poses that drifted while they grew: edges that they miss by far pull them into place (graduated
 non-convexity, Yang et al. 2020), and what does not follow falls out.
 """
-DIMENSION = 6
 LARGE = 20_000
 """From so many edges on, a solve is stopped early: verdicts need millimetres less than seconds."""
 
@@ -52,48 +50,68 @@ class Fit:
 def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple[float, ...]) -> Fit:
     """The robust solution that an alignment leads to; `graph` holds the recentred edges.
 
-    For one gate after the other, the edges of a smaller χ² are solved, with errors as large as the gate allows.
+    For one gate after the other, the edges of a smaller χ² are solved.
     """
+    found = _as_grown(evidence, graph, alignment)
+    for gate, following in zip(gates, (*gates[1:], math.inf), strict=True):
+        used = found.chi2 < gate
+        if following < gate and np.array_equal(used, found.chi2 < following):
+            continue
+        poses, say = _solve(evidence, graph, found.poses, used)
+        found = _refitted(evidence, graph, poses, used, say)
+    return found
+
+
+def rough_fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment) -> Fit:
+    """The same with clusters of poses moved as one, and errors as large as each gate of `ANNEALED` allows: near the
+    robust solution, whatever the drift, at little cost.
+    """
+    found = _as_grown(evidence, graph, alignment)
+    cluster = clustered(evidence.edges, found.chi2 < GATE, evidence.vertex_count)
+    for gate in ANNEALED:
+        used, widened = found.chi2 < gate, gate / GATE
+        poses = Springs.of(evidence, used, cluster).settled(evidence, found.poses, found.chi2, widened)
+        say = np.where(used, FREEDOM / (FREEDOM + _squares(evidence, graph, poses) / widened), 0.0)
+        found = _refitted(evidence, graph, poses, used, say)
+    return found
+
+
+def _as_grown(evidence: Evidence, graph: ViewGraph, alignment: Alignment) -> Fit:
     poses, component = alignment.piece_from, alignment.piece
     used = component[evidence.edges[:, 0]] == component[evidence.edges[:, 1]]
     resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
     chi2 = _chi2(evidence, graph, poses, component, resistance, np.zeros(graph.edge_count))
-    for gate, following in zip(gates, (*gates[1:], math.inf), strict=True):
-        used = chi2 < gate
-        if following < gate and np.array_equal(used, chi2 < following):
-            continue
-        component = connected_components(evidence.edges[used], evidence.vertex_count)
-        poses, say = _solve(evidence, graph, poses, used, chi2, max(1.0, gate / GATE))
-        resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
-        chi2 = _chi2(evidence, graph, poses, component, resistance, say)
     return Fit(poses, component, chi2, chi2 < GATE, resistance)
 
 
-def _solve(
-    evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools, chi2: Floats, widened: float
-) -> tuple[Floats, Floats]:
-    """Poses, and what each edge (E,) weighed, 1 for one that fits and 0 for one that is not used.
+def _refitted(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools, say: Floats) -> Fit:
+    component = connected_components(evidence.edges[used], evidence.vertex_count)
+    resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
+    chi2 = _chi2(evidence, graph, poses, component, resistance, say)
+    return Fit(poses, component, chi2, chi2 < GATE, resistance)
 
-    `widened` is the factor by which squared errors may be larger than the noise. Where they may, poses that are far
-    off are given: then `chi2 (E,)` there says what an edge weighs at first.
-    """
+
+def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> tuple[Floats, Floats]:
+    """Poses, and what each edge (E,) weighed, 1 for one that fits and 0 for one that is not used."""
     chosen = graph.select(np.flatnonzero(used))
-    rough = widened > 1 or graph.edge_count > LARGE
+    rough = graph.edge_count > LARGE
     limits = Limits(3 if rough else 20, 1e-3 if rough else 1e-6)
     setup = prepare(chosen, poses, dimension=3)
     rotations, translations = setup.initial("given")
-    squares = chi2[used] / widened if widened > 1 else np.full(chosen.edge_count, float(DIMENSION))
+    squares = np.full(graph.edge_count, float(DIMENSION))
     for _ in range(2 if rough else 4):
-        share = ((FREEDOM + DIMENSION) / (FREEDOM + squares))[setup.weights.used]
+        share = ((FREEDOM + DIMENSION) / (FREEDOM + squares[used]))[setup.weights.used]
         problem = replace(setup.problem, kappa=share * setup.problem.kappa, tau=share * setup.problem.tau)
         point = descend_isotropic(problem, (rotations, translations), limits, setup.rounding).point
         rotations, translations, poses = point.rotations, point.translations, setup.poses(point)
-        angle, moved = left_over(chosen, poses)
-        squares = (angle / evidence.noise.rotation_rad[used]) ** 2 + (moved / evidence.noise.translation_m[used]) ** 2
-        squares /= widened
-    say = np.zeros(graph.edge_count)
-    say[used] = FREEDOM / (FREEDOM + squares)
-    return poses, say
+        squares = _squares(evidence, graph, poses)
+    return poses, np.where(used, FREEDOM / (FREEDOM + squares), 0.0)
+
+
+def _squares(evidence: Evidence, graph: ViewGraph, poses: Floats) -> Floats:
+    """χ² (E,) in the noise of the edges alone."""
+    angle, moved = left_over(graph, poses)
+    return np.asarray((angle / evidence.noise.rotation_rad) ** 2 + (moved / evidence.noise.translation_m) ** 2)
 
 
 def left_over(graph: ViewGraph, poses: Floats) -> tuple[Floats, Floats]:
