@@ -15,6 +15,7 @@ LOOKED_AT = 60
 """Paths inside a folder that the readers are asked about: some hundredths of a second."""
 DEPTH = 3
 NAMED = 3
+PACKED = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst")
 
 
 def unknown(path: Path) -> SourceError:
@@ -28,8 +29,23 @@ def unknown(path: Path) -> SourceError:
         named = ", ".join(f"{found} ({name})" for found, name in inside[:NAMED])
         more = "" if len(inside) <= NAMED else " and others"
         return SourceError(f"{path}: is no source itself, but holds some: give {named}{more}")
+    if nothing := _nothing(path):
+        return SourceError(f"{path}: {nothing}")
     remedy = "name one with --reader, in a run with --set source.reader="
     return SourceError(f"{path}: no reader knows this format (readers: {', '.join(readers)}): {remedy}")
+
+
+def _nothing(path: Path) -> str:
+    """What to do about a path without contents; nothing of one that has some."""
+    if path.is_file() and not path.stat().st_size:
+        return "the file is empty: record or copy it again"
+    if not path.is_dir():
+        return ""
+    children = _children(path)
+    packed = [child.name for child in children if child.suffix.lower() in PACKED]
+    if not children:
+        return "the folder is empty"
+    return f"holds packed files: unpack {packed[0]} first" if packed else ""
 
 
 def without_frames(source: Source) -> str:

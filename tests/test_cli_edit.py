@@ -127,7 +127,7 @@ def test_mistakes_are_one_line(run: Run, tmp_path: Path) -> None:
         (["edit", run.folder, "--disable", "nothing"], "nothing: no edge joins"),
         (["edit", tmp_path, "--list"], "no finished run"),
         (["edit", run.folder, "--undo", "--disable", "1-2"], "give it alone"),
-        (["solve", tmp_path], "no reader knows|no graph"),
+        (["solve", tmp_path], "no reader knows|no graph|is empty"),
     ):
         with pytest.raises(HodgeError, match=message):
             hodge(*arguments)

@@ -41,6 +41,14 @@ def test_the_name_tells_the_writer(tmp_path: Path) -> None:
     assert (tmp_path / "b.any").read_text().count(" ") == 11
 
 
+def test_a_result_is_not_written_into_the_folder_that_is_read(tmp_path: Path) -> None:
+    (tmp_path / "data/room").mkdir(parents=True)
+    (tmp_path / "data/room/poses.tum").write_text("0 0 0 0 0 0 0 1\n")
+    for source, out, what in (("data", "data", "is"), ("data/room/poses.tum", "data", "holds")):
+        with pytest.raises(RecipeError, match=f"{what} what is read"):
+            convert(tmp_path / source, tmp_path / out)
+
+
 def test_what_is_read_is_not_written_over(tmp_path: Path) -> None:
     (tmp_path / "graph.g2o").write_text("# mine\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
     (tmp_path / "same.g2o").symlink_to("graph.g2o")

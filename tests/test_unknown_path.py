@@ -37,6 +37,16 @@ def test_a_folder_of_sources_names_them(tmp_path: Path) -> None:
     assert told.endswith(f"give {tmp_path / 'data/loop.g2o'} (g2o), {tmp_path / 'data/room/first'} (tum)")
 
 
+def test_what_holds_nothing_or_something_packed_is_told_so(tmp_path: Path) -> None:
+    (tmp_path / "bag.mcap").write_bytes(b"")
+    assert complaint(tmp_path / "bag.mcap").endswith("the file is empty: record or copy it again")
+    (tmp_path / "folder").mkdir()
+    assert complaint(tmp_path / "folder").endswith("the folder is empty")
+    (tmp_path / "folder/bag.tar.xz").write_bytes(b"x")
+    (tmp_path / "folder/README.md").write_text("a bag")
+    assert complaint(tmp_path / "folder").endswith("unpack bag.tar.xz first")
+
+
 def test_a_folder_of_many_sources_names_a_few(tmp_path: Path) -> None:
     for number in range(200):
         (tmp_path / f"{number:03}.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")

@@ -186,6 +186,8 @@ def refuse_landmarks_alone(path: Path, other: dict[str, int]) -> None:
 
 
 KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1, **g2o_priors.KEYS}
+SPATIAL_TAGS = ("VERTEX_SE3:QUAT", g2o_priors.SPATIAL, g2o_priors.SPATIAL_OFFSET, g2o_priors.OFFSET)
+PLANAR_TAGS = ("VERTEX_SE2", g2o_priors.PLANAR, g2o_priors.PLANAR_POSITION)
 COLUMNS = {
     "VERTEX_SE3:QUAT": (7,),
     "EDGE_SE3:QUAT": (28,),
@@ -209,9 +211,11 @@ def load_g2o(path: Path | str) -> Source:
     if not spatial and not planar and not len(records["VERTEX_SE3:QUAT"]) and not len(records["VERTEX_SE2"]):
         refuse_landmarks_alone(path, other)
         raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
-    dimension = 2 if planar or len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"]) else 3
+    more_planar = len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"])
+    dimension = 2 if planar or (not spatial and more_planar) else 3
     half = _planar(records) if dimension == 2 else _spatial(records)
-    notes = skipped(other)
+    strange = {tag: len(records[tag]) for tag in (SPATIAL_TAGS if dimension == 2 else PLANAR_TAGS) if len(records[tag])}
+    notes = skipped({**other, **strange})
     for tag, what in (("VERTEX_SE3:QUAT", "vertices"), ("EDGE_SE3:QUAT", "edges")):
         notes += length_notes(records[tag].values[:, 3:7], what)
     return as_source(path, half, "g2o", records["FIX"].keys.reshape(-1), dimension, notes)

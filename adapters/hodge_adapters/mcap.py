@@ -245,10 +245,12 @@ def _with_pose(frame: Frame, world_from_cam: Floats) -> Frame:
 
 
 def _topics(recording: Recording) -> str:
-    return listed([f"{topic} ({name})" for topic, name in sorted(recording.topics.items())]) or "no topics"
+    return listed([f"{topic} ({name})" for topic, name in sorted(recording.topics.items())])
 
 
 def _nothing(path: Path, recording: Recording, notes: list[str]) -> SourceError:
     why = "".join(f"; {note}" for note in recording.complaints.notes())
     remedy = "record depth images, point clouds or odometry"
+    if not recording.topics:
+        return SourceError(f"{path}: holds no message{why}: {remedy}")
     return SourceError(f"{path}: no depth, clouds, images or poses in {_topics(recording)}{why}: {remedy}")

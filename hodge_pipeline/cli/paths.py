@@ -8,9 +8,15 @@ from hodge_pipeline.errors import RecipeError
 
 
 def keep_source(source: Path, out: Path) -> None:
-    """Raise `RecipeError` where the result would be written over what is read: not every line of it may come back."""
-    if out.is_file() and source.exists() and out.samefile(source):
+    """Raise `RecipeError` where the result would be written over what is read, not every line of which may come back,
+    or into its folder.
+    """
+    if not out.exists() or not source.exists():
+        return
+    if out.samefile(source):
         raise RecipeError(f"{out}: is what is read: give another path for the result")
+    if out.is_dir() and out.resolve() in source.resolve().parents:
+        raise RecipeError(f"{out}: holds what is read: give the name of a file or of a folder in it")
 
 
 def check_result(out: Path) -> None:
