@@ -6,13 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from diagnosis_graphs import measured, poses_on_a_ring, spoiled
 from hodge_adapters.g2o import write_g2o
 from hodge_pipeline.cli.main import app
+from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.types import ViewGraph
 
 CHAIN = [(k, k + 1) for k in range(9)]
@@ -60,5 +63,65 @@ def test_the_command_says_so_and_what_to_register(tmp_path: Path) -> None:
     lines = done.stdout.splitlines()
     assert {line.split()[0] for line in lines[:3]} == {"8-9", "9-0", "0-1"}
     assert all("the loop 8-9-0-1 fails by" in line for line in lines[:3])
-    assert "1 is suspect; 2 cannot be tested" in done.stdout
+    assert "1 is suspect; 2 may be to blame for the loop 8-9-0-1, which fails by" in done.stdout
     assert any(line.startswith("register 1-9  tests 1 untestable edge;") for line in lines)
+
+
+SQUARES = [(0, 1), (1, 2), (2, 3), (3, 0), (3, 4), (4, 5), (5, 2)]
+"""0 - 1 - 2 - 5 - 4 - 3 - 0 with 2 - 3 across: two squares that share a side."""
+THETA = [(0, 1), (1, 2), (2, 7), (0, 3), (3, 4), (4, 7), (0, 5), (5, 6), (6, 7)]
+"""Three ways of three edges from 0 to 7."""
+
+
+def verdicts(edges: list[tuple[int, int]], *bad: int) -> tuple[ViewGraph, Diagnosis]:
+    graph = measured(poses_on_a_ring(1 + max(map(max, edges))), np.array(edges))
+    graph = spoiled(graph, np.array(bad))[0]
+    return graph, diagnose(graph)
+
+
+def test_one_edge_that_explains_two_loops_is_blamed_and_the_loop_without_it_is_listed() -> None:
+    graph, found = verdicts(SQUARES, 2)
+    assert found.verdict[2] == WRONG and (np.delete(found.verdict, 2) == CONSISTENT).all()
+    assert all(reason.startswith("1 of 2 cycles close") for reason in np.delete(found.reason, 2))
+
+
+@pytest.mark.parametrize(
+    ("edges", "bad", "mates"),
+    [(SQUARES, 0, {0, 1, 3}), (THETA, 0, {0, 1, 2}), (THETA, 4, {3, 4, 5}), ([*THETA, (0, 8), (8, 7)], 9, {9, 10})],
+)
+def test_edges_in_series_share_the_blame_and_no_other_does(
+    edges: list[tuple[int, int]], bad: int, mates: set[int]
+) -> None:
+    graph, found = verdicts(edges, bad)
+    doubted = set(np.flatnonzero(found.verdict != CONSISTENT).tolist())
+    assert doubted == mates and set(found.verdict[sorted(mates)].tolist()) == {SUSPECT, UNTESTABLE}
+    names = ", ".join(f"{i}-{j}" for i, j in graph.edges[sorted(mates)].tolist())
+    assert all(f"one of {names} is wrong, and no other cycle says which" in found.reason[row] for row in mates)
+    assert found.piece.max() == 0, "one edge out of a loop leaves the graph in one piece"
+
+
+def test_a_wrong_step_under_two_good_loops_leaves_both_loops_alone() -> None:
+    graph = graph_of((9, 0), (7, 2), bad=4)
+    found = diagnose(graph)
+    assert set(found.verdict[[9, 10]].tolist()) == {CONSISTENT}
+    assert set(np.flatnonzero(found.verdict != CONSISTENT).tolist()) == {2, 3, 4, 5, 6}, "2 - 3 - … - 7 are in series"
+
+
+def test_edges_in_series_are_those_of_the_same_cycles() -> None:
+    edges = np.array([*SQUARES, (5, 6), (6, 6), (0, 1)])
+    classes = series_classes(edges, 7)
+    groups = {frozenset(np.flatnonzero(classes == name).tolist()) for name in set(classes.tolist()) - {-1}}
+    assert groups == {frozenset(rows) for rows in ({0}, {1, 3}, {2}, {4, 5, 6}, {8}, {9})}
+    assert np.flatnonzero(classes == -1).tolist() == [7], "a bridge is in no cycle"
+
+
+@given(seed=st.integers(0, 10_000))
+def test_edges_in_series_fall_into_bridges_when_one_is_taken_out(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    edges = rng.integers(0, 8, (11, 2))
+    classes = series_classes(edges, 8)
+    for row in range(len(edges)):
+        without = series_classes(np.delete(edges, row, axis=0), 8)
+        new_bridges = np.flatnonzero((without == -1) & (np.delete(classes, row) != -1))
+        mates = np.flatnonzero((np.delete(classes, row) == classes[row]) & (classes[row] != -1))
+        np.testing.assert_array_equal(new_bridges, mates)

@@ -24,6 +24,8 @@ MOST_GROWTHS, WORTH = 3, 1e-3
 """Times that pieces grow again, while more than this share of the edges is to be won by it."""
 FEW = 0.01
 """With no more than this share of its edges left out, a graph may be right as it is."""
+SMALL = 3000
+"""Vertices, up to which another solve costs little."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,18 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
     else:
         best = _regrown(evidence, graph, rough_fit(evidence, graph, grown), weight, options.cluster_gain, rng)
         if 0 < (~best.used).sum() <= FEW * len(best.used):
-            best = max(best, _of_all(evidence, graph), key=lambda found: int(found.used.sum()))
+            best = max(best, _of_all(evidence, graph), key=_used)
         best = fit(evidence, graph, Alignment(best.component, best.poses), (GATE,))
+        if not best.used.all() and graph.vertex_count <= SMALL:
+            # an error that is spread over a loop in annealing can put all of its edges out of use
+            best = max(best, fit(evidence, graph, grown, TWICE), key=_used)
         best = mend(evidence, graph, best)
     agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
     return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
+
+
+def _used(found: Fit) -> int:
+    return int(found.used.sum())
 
 
 def _regrown(

@@ -17,7 +17,7 @@ from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior, prior_
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
 from hodge_pipeline.diagnosis.robust_poses import Fit, left_over
 from hodge_pipeline.diagnosis.shared_blame import share_blame
-from hodge_pipeline.diagnosis.short_cycles import cycle_errors, short_cycles
+from hodge_pipeline.diagnosis.short_cycles import cycle_errors, short_cycles, with_cycles_of
 from hodge_pipeline.diagnosis.testing_cycles import (
     closing_support,
     in_no_cycle,
@@ -73,6 +73,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
         reach_m=reach_m,
     )
     consensus = find_consensus(evidence, _with_noise(graph, motions, noise), options)
+    cycles = _with_witnesses(graph, cycles, consensus.fit.used, evidence)
     undecided = unattributable(graph.edges, graph.vertex_count, cycles)
     blame = share_blame(cycles, consensus.fit, evidence)
     unvouched = blame.unvouched & (consensus.probability >= options.consistent_from)
@@ -83,6 +84,17 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
     world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
     return _report(graph, cycles, probability, verdict, kept, undecided, consensus.fit, world_from_cam)
+
+
+def _with_witnesses(graph: ViewGraph, cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
+    """The cycles, and more where none that closes passes an edge in use, though others in use close one over it."""
+    told = np.zeros(graph.edge_count, bool)
+    told[cycles.loops.select(np.flatnonzero(cycles.closes)).edge] = True
+    wanted = used & ~told & ~evidence.alone
+    if not wanted.any():
+        return cycles
+    loops = with_cycles_of(used, cycles.loops, graph.edges, graph.vertex_count, wanted)
+    return judge_cycles(loops, *cycle_errors(loops, evidence.i_from_j), evidence.noise, evidence.reach_m)
 
 
 def _with_noise(graph: ViewGraph, motions: Floats, noise: Noise) -> ViewGraph:
@@ -115,7 +127,7 @@ def _report(
     telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
     share = 1 - 1 / (1 + fit.resistance)
     counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
-    tested = f"{len(cycles.loops)} cycles, {int(cycles.closes.sum())} of them close"
+    tested = f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close"
     return Diagnosis(
         verdict=verdict,
         probability=probability,

@@ -29,7 +29,7 @@ TRIED = 40
 """Groups of them, the weightiest, for each move."""
 DRIFTED_RAD, ALIKE = 0.1, 12.0
 """Motions are compared where they turn alike but for this, and for so many standard deviations."""
-LEAST_GAIN = 1.0
+LEAST_GAIN, AGREES = 0.5, 1.0
 """Nats."""
 UNIT = 1000
 """Of a nat, since flows are whole numbers."""
@@ -49,8 +49,10 @@ class _Proposals:
 
 
 def mend(evidence: Evidence, graph: ViewGraph, start: Fit) -> Fit:
-    """The solution after the moves; `graph` has the recentred edges. An edge counts −log of how likely it is wrong."""
-    nats = -np.log1p(-evidence.prior)
+    """The solution after the moves; `graph` has the recentred edges. An edge counts −log of how likely it is wrong,
+    and what it tells by agreeing.
+    """
+    nats = AGREES - np.log1p(-evidence.prior)
     found = start
     for _ in range(ROUNDS):
         poses = _moved(evidence, graph, found, nats)

@@ -19,10 +19,12 @@ LEAST_ODDS = 2.0
 """Of neighbours in order to be joined, in units of those of far pairs, for the order to count."""
 DOUBTED = 2
 SHARE_ROUNDS = 30
-FEW = 10
+FEW = 20
 """Edges of a gap, for which the usual share of right edges says as much as their own."""
 TRIED_FROM = 0.1
 """Share of the far pairs that are joined."""
+LEAST_DEGREE = 4
+"""Mean number of edges at a view."""
 
 
 def order_prior(edges: Ints, vertex_count: int) -> Floats:
@@ -78,17 +80,16 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
     """
     bounds = _bounds(vertex_count)
     place = np.maximum(np.searchsorted(bounds, np.abs(edges[:, 1] - edges[:, 0]), side="right") - 1, 0)
-    loops = cycles.loops
+    loops = cycles.loops.select(np.flatnonzero(~cycles.closes))
     row, entry = np.repeat(np.arange(len(loops)), loops.lengths), place[loops.edge]
-    closing = np.bincount(entry, cycles.closes[row], len(bounds))
+    passes = np.bincount(place[cycles.loops.edge], minlength=len(bounds))
     number = np.bincount(place, minlength=len(bounds))
-    share = np.full(len(bounds), usual)
+    share = np.full(len(bounds), min(usual, CEILING))
     for _ in range(SHARE_ROUNDS):
-        logs = np.log(share)[entry]
-        others = np.exp(np.bincount(row, logs, len(loops))[row] - logs)
-        expected = np.bincount(entry, others, len(bounds))
-        told = np.clip((closing + usual) / (expected + 1), FLOOR, (number + 1) / (number + 2))
-        share = np.sqrt(share * told)
+        # of a cycle that fails at least one edge is wrong (expectation), and each in its share of them (maximisation)
+        close = np.exp(np.bincount(row, np.log(share)[entry], len(loops)))
+        wrong = np.bincount(entry, ((1 - share)[entry] / (1 - close[row])), len(bounds))
+        share = np.clip(1 - (wrong + 1 - usual) / (passes + 1), FLOOR, (number + 1) / (number + 2))
     # few edges say little of their gap: one that is in doubt would tell against itself
     trust = number / (number + FEW)
     usual = float(np.clip(usual, FLOOR, CEILING))
@@ -98,6 +99,8 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
 
 def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
     """Whether far pairs are joined so often that registration seems to have been tried on all pairs."""
+    if len(edges) < LEAST_DEGREE / 2 * vertex_count:
+        return False  # of few views the ends of any loop are a large share of the far pairs
     return _far_rate(np.abs(edges[:, 1] - edges[:, 0]), vertex_count) >= TRIED_FROM
 
 

@@ -95,9 +95,33 @@ def sentence(graph: ViewGraph, diagnosis: Diagnosis) -> str:
         told.append(f"{counts[WRONG]} of {graph.edge_count} edges {_are(counts[WRONG])} wrong, worst of all {i}–{j}")
     if counts[SUSPECT]:
         told.append(f"{counts[SUSPECT]} {_are(counts[SUSPECT])} suspect")
-    if counts[UNTESTABLE]:
-        told.append(f"{counts[UNTESTABLE]} cannot be tested by anything in the graph")
+    told += _untestable(graph, diagnosis)
     return "; ".join(told)[:1].upper() + "; ".join(told)[1:] + "."
+
+
+def _untestable(graph: ViewGraph, diagnosis: Diagnosis) -> list[str]:
+    untestable = diagnosis.verdict == UNTESTABLE
+    in_cycle = np.zeros(graph.edge_count, bool)
+    in_cycle[diagnosis.cycles.loops.edge] = True
+    blamed, alone = np.flatnonzero(untestable & in_cycle), int((untestable & ~in_cycle).sum())
+    told = []
+    if len(blamed):
+        told.append(f"{len(blamed)} may be to blame for {_failing_loops(graph, diagnosis, blamed)}")
+    if alone:
+        one = alone == 1
+        told.append(
+            f"{alone} {'lies' if one else 'lie'} in no loop, so that nothing can test {'it' if one else 'them'}"
+        )
+    return told
+
+
+def _failing_loops(graph: ViewGraph, diagnosis: Diagnosis, blamed: Ints) -> str:
+    loops = np.unique(diagnosis.witnesses_against[blamed, 0])
+    loops = loops[loops >= 0]
+    if len(loops) == 1:
+        name = name_cycle(graph, diagnosis.cycles, int(loops[0]))
+        return f"the loop {name}, which {cycle_error(diagnosis.cycles, int(loops[0]))}: nothing says which edge it is"
+    return "loops that fail: nothing says which edges they are"
 
 
 def _are(count: int) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.result import Cycles
 from hodge_pipeline.diagnosis.robust_poses import Fit
@@ -16,8 +17,8 @@ from hodge_pipeline.types import Bools, Floats, Ints
 class SharedBlame:
     """Where an alignment had to leave out one of several edges that no cycle tells apart.
 
-    - `unvouched (E,)`: edges in use that alone hold two parts together, over which no cycle closes: they are in use
-      because another one was left out, and either may be the wrong one.
+    - `unvouched (E,)`: edges in use because another one was left out, and either may be the wrong one: those that the
+      same cycles pass as that one, and those that alone hold two parts together, over which no cycle closes.
     - `cycle (E,)`: the shortest failing cycle of each such edge, and of each that was left out for it; −1 elsewhere.
     - `probability (E,)`: of being right, of an edge left out that shares the blame: by its prior among those it shares
       it with, of which one is wrong; 0 elsewhere.
@@ -34,10 +35,11 @@ def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
     row, edge = np.repeat(np.arange(len(loops)), loops.lengths), loops.edge
     untold = np.bincount(edge, cycles.closes[row], count) == 0
     untold &= ~evidence.alone
-    unvouched = fit.used & np.isinf(fit.resistance) & untold
+    doubted = _in_series_with(~fit.used, evidence)
+    unvouched = fit.used & ((np.isinf(fit.resistance) & untold) | doubted)
     holds = np.bincount(row, unvouched[edge], len(loops)) > 0
     # an edge that was left out shares the blame where each of its cycles has an edge that nothing vouches for
-    left_out = ~fit.used & untold & (np.bincount(edge, ~holds[row], count) == 0)
+    left_out = ~fit.used & ((untold & (np.bincount(edge, ~holds[row], count) == 0)) | doubted)
     concerned = unvouched | left_out
     cycle = _shortest(loops.lengths, row, edge, concerned)
     odds = (1 - evidence.prior) / evidence.prior
@@ -45,6 +47,18 @@ def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
     probability = np.zeros(count)
     probability[left_out] = 1 - odds[left_out] / among[cycle[left_out]]
     return SharedBlame(unvouched, cycle, probability)
+
+
+def _in_series_with(chosen: Bools, evidence: Evidence) -> Bools:
+    """Edges (E,) that the same cycles pass as another one, where one of these is chosen (E,)."""
+    classes = series_classes(evidence.edges, evidence.vertex_count)
+    known = classes >= 0
+    count = int(classes.max(initial=-1)) + 1
+    several = np.bincount(classes[known], minlength=count) > 1
+    struck = np.bincount(classes[known], chosen[known], count) > 0
+    out = np.zeros(len(classes), bool)
+    out[known] = (several & struck)[classes[known]]
+    return out
 
 
 def _shortest(lengths: Ints, row: Ints, edge: Ints, concerned: Bools) -> Ints:

@@ -31,6 +31,18 @@ def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     return _distinct(_joined(found), len(edges))
 
 
+def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, wanted: Bools) -> Loops:
+    """These loops, and for wanted edges (E,) more of them that pass chosen edges (E,) alone.
+
+    Two cycles that fail over one edge make a third without it, which may be the only one that closes.
+    """
+    rows = np.flatnonzero(chosen)
+    more = _tree_loops(edges[rows], vertex_count, np.zeros(len(rows), bool))
+    more = Loops(more.offsets, rows[more.edge], more.sign)
+    passes = np.add.reduceat(wanted[more.edge], more.offsets[:-1]) > 0 if len(more) else np.zeros(0, bool)
+    return _distinct(_joined([loops, more.select(np.flatnonzero(passes))]), len(edges))
+
+
 def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
     """The angle (L,) in radians and the displacement (L,) in metres that the product of motions along each cycle
     leaves, the latter at the middle of the cycle's frames.

@@ -64,7 +64,7 @@ def suggest_pairs(
     keys = np.unique(low * count + high)
     pairs = np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    known = graph.edges[kept] if tried is None else np.concatenate([graph.edges[kept], tried])
+    known = graph.edges if tried is None else np.concatenate([graph.edges, tried])
     pairs = pairs[~_contains(known, pairs, count)]
     gains = _Gains.of(graph.edges[kept], graph.edges[diagnosis.verdict == UNTESTABLE], pairs, count)
     return _best_first(pairs, gains, most)

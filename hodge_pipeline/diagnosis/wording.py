@@ -9,6 +9,8 @@ from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE, Cycles
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LONGEST_NAMED = 12
+MOST_NAMED = 4
+"""Edges that share a blame; of more the number."""
 
 
 def name_cycle(graph: ViewGraph, cycles: Cycles, row: int) -> str:
@@ -43,7 +45,7 @@ def reasons(
     lines = []
     for edge in range(count):
         if undecided[edge] >= 0:
-            lines.append(_undecided(graph, cycles, int(undecided[edge])))
+            lines.append(_undecided(graph, cycles, int(undecided[edge]), undecided >= 0))
         elif verdict[edge] == UNTESTABLE:
             lines.append("no cycle passes it: nothing in the graph can test it")
         else:
@@ -82,12 +84,18 @@ def _against(is_bridge: bool, distance: str) -> str:
     return f"against it speaks where all kept edges together lay its ends: {distance}"
 
 
-def _undecided(graph: ViewGraph, cycles: Cycles, row: int) -> str:
-    length = int(cycles.loops.lengths[row])
-    return (
-        f"the loop {name_cycle(graph, cycles, row)} {cycle_error(cycles, row)}: one of its {length} edges is wrong, "
-        "and no other cycle says which"
-    )
+def _undecided(graph: ViewGraph, cycles: Cycles, row: int, doubted: Bools) -> str:
+    entry = slice(cycles.loops.offsets[row], cycles.loops.offsets[row + 1])
+    edges = cycles.loops.edge[entry]
+    mates = np.sort(edges[doubted[edges]])
+    if len(mates) == len(edges):
+        which = f"one of its {len(edges)} edges"
+    elif len(mates) > MOST_NAMED:
+        which = f"one of {len(mates)} of its {len(edges)} edges"
+    else:
+        which = "one of " + ", ".join(f"{i}-{j}" for i, j in graph.vertex_ids[graph.edges[mates]].tolist())
+    loop = f"the loop {name_cycle(graph, cycles, row)} {cycle_error(cycles, row)}"
+    return f"{loop}: {which} is wrong, and no other cycle says which"
 
 
 def cycle_error(cycles: Cycles, row: int) -> str:
