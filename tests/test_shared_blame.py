@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from diagnosis_graphs import measured, poses_on_a_ring, spoiled
+from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_adapters.g2o import write_g2o
+from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.diagnosis import diagnose
@@ -125,3 +127,36 @@ def test_edges_in_series_fall_into_bridges_when_one_is_taken_out(seed: int) -> N
         new_bridges = np.flatnonzero((without == -1) & (np.delete(classes, row) != -1))
         mates = np.flatnonzero((np.delete(classes, row) == classes[row]) & (classes[row] != -1))
         np.testing.assert_array_equal(new_bridges, mates)
+
+
+def stated(graph: ViewGraph, deviation_rad: float, deviation_m: float) -> ViewGraph:
+    information = np.diag(1 / np.repeat([deviation_rad, deviation_m], 3) ** 2)
+    return replace(graph, information=np.tile(information, (graph.edge_count, 1, 1)))
+
+
+@pytest.mark.parametrize(("deviation_rad", "deviation_m"), [(0.5, 1.0), (0.1, 0.2), (0.005, 0.01), (5e-5, 1e-4)])
+def test_a_bad_loop_is_seen_whatever_the_information_states(deviation_rad: float, deviation_m: float) -> None:
+    found = diagnose(stated(graph_of((9, 0), bad=9), deviation_rad, deviation_m))
+    assert set(found.verdict.tolist()) == {UNTESTABLE}
+    assert all("the loop 5-6-7-8-9-0-1-2-3-4 fails by" in reason for reason in found.reason)
+    doubted = deviation_rad != 0.005
+    assert any("the information states errors of" in note for note in found.notes) == doubted
+
+
+def test_a_good_loop_closes_though_the_information_states_errors_far_too_large() -> None:
+    good = measured(poses_on_a_ring(10), np.array([*CHAIN, (9, 0)]))
+    assert (diagnose(stated(good, 0.5, 1.0)).verdict == CONSISTENT).all()
+    dense = measured(poses_on_a_ring(12), near_pairs(12, 3))
+    spoilt, right = spoiled(dense, np.array([20]))
+    found = diagnose(stated(spoilt, 0.5, 1.0))
+    assert found.verdict[20] == WRONG and (found.verdict[right] == CONSISTENT).all()
+
+
+def test_views_that_turn_about_one_point_are_not_held_to_exactness() -> None:
+    """A ring in the plane, which all views look out of: at its middle nothing moves."""
+    angle = 2 * np.pi * np.arange(10) / 10
+    poses = se3.from_parts(
+        se3.so3_exp(np.outer(angle, [0, 0, 1])), np.stack([3 * np.cos(angle), 3 * np.sin(angle), 0 * angle], axis=1)
+    )
+    graph = stated(measured(poses, np.array([*CHAIN, (9, 0)])), 0.5, 1.0)
+    assert (diagnose(graph).verdict == CONSISTENT).all()

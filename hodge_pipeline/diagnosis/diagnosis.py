@@ -83,7 +83,8 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     verdict = _verdicts(probability, untestable, consensus.fit.used, options)
     kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
     world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
-    return _report(graph, cycles, probability, verdict, kept, undecided, consensus.fit, world_from_cam)
+    found = _report(graph, cycles, probability, verdict, kept, undecided, consensus.fit, world_from_cam)
+    return replace(found, notes=(*found.notes, *noise.doubts))
 
 
 def _with_witnesses(graph: ViewGraph, cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:

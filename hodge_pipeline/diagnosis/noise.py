@@ -14,6 +14,8 @@ MAXWELL_MEDIAN = 1.538
 DEFAULT_ANGLE_RAD = 0.03
 DEFAULT_SHARE = 0.05
 """Of an edge's usual length: its error where no cycle tells."""
+ABOUT_A_POINT = 0.2
+"""Of the usual step between views, where they all turn about one point, at which nothing moves."""
 FIRST_GATE_RAD = 0.35
 FIRST_GATE_SHARE = 0.6
 LONGEST_CYCLE = 4
@@ -24,8 +26,12 @@ STATED = 3.0
 """Standard deviations of the graph's own information that explain a cycle."""
 NEARLY_ALL = 0.95
 MAXWELL_NEARLY_ALL = 2.795
+GAP = 5.0
+"""Of the error that nearly all cycles that close stay below."""
 HEAVY_TAILS = 1.9
 """Errors of registration have heavier tails than a Gaussian of the same median."""
+LEAST_CREDIBLE, MOST_CREDIBLE = 0.2, 2.5
+"""Of the error where no cycle tells: what the information may state there, and be believed."""
 
 LEVER = 1.8
 """Of the reach: how far around the working point lies what is seen, which an error of rotation moves along."""
@@ -33,31 +39,63 @@ LEVER = 1.8
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations to an axis (E,) of each edge, radians and metres at the working point."""
+    """Standard deviations to an axis (E,) of each edge, radians and metres at the working point; and what of the
+    graph's information was not believed, in words.
+    """
 
     rotation_rad: Floats
     translation_m: Floats
+    doubts: tuple[str, ...] = ()
 
 
 def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, prior: Floats, reach_m: float) -> Noise:
     """The noise of each edge: the graph's information gives the proportions, cycles that close give the scale.
 
     Where the information explains nearly all of these, the scale does so too: edges of several kinds make long tails,
-    and what they say of themselves is sound as far as anything shows.
+    and what they say of themselves is sound as far as anything shows. Where too few cycles close to tell, the
+    information is believed within reason: errors as large as the motions would let any loop close, and errors as small
+    as those of rounding none.
     """
     rotation, translation, informed = _proportions(graph)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
     loops = loops.select(short)
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, moved[short])
-    turn = turned.scale(FIRST_GATE_RAD, prior, 1.0 if informed else DEFAULT_ANGLE_RAD)
-    shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, 1.0 if informed else DEFAULT_SHARE * reach_m)
+    usual = DEFAULT_ANGLE_RAD, DEFAULT_SHARE * max(reach_m, ABOUT_A_POINT * _usual_step(graph))
+    stated = usual if not informed else (_median(rotation), _median(translation))
+    believed = _credible(stated[0], usual[0]), _credible(stated[1], usual[1])
+    turn = turned.scale(FIRST_GATE_RAD, prior, believed[0] if informed else usual[0])
+    shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, believed[1] if informed else usual[1])
     closes = (turned.error < FIRST_GATE_RAD) & (shifted.error < FIRST_GATE_SHARE * reach_m)
     sound = (turned.ratio < STATED) & (shifted.ratio < STATED)
     if informed and closes.sum() >= FEWEST_CYCLES and sound[closes].mean() >= NEARLY_ALL:
-        turn, shift = max(turn, turned.scale_of_nearly(sound)), max(shift, shifted.scale_of_nearly(sound))
+        turn = max(turn, turned.scale_of_nearly(sound, closes))
+        shift = max(shift, shifted.scale_of_nearly(sound, closes))
     if not informed:
         shift = max(shift, LEVER * turn * reach_m)
-    return Noise(turn * rotation, shift * translation)
+    doubts = ()
+    if informed and (turn == believed[0] != 1.0 or shift == believed[1] != 1.0):
+        doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),)
+    return Noise(turn * rotation, shift * translation, doubts)
+
+
+def _usual_step(graph: ViewGraph) -> float:
+    return float(np.median(np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1))) if graph.edge_count else 0.0
+
+
+def _median(deviation: Floats) -> float:
+    return float(np.median(deviation)) if len(deviation) else 1.0
+
+
+def _credible(stated: float, usual: float) -> float:
+    """The factor that makes a stated error credible beside a usual one; 1 where it is."""
+    if stated > MOST_CREDIBLE * usual:
+        return usual / stated
+    return max(1.0, LEAST_CREDIBLE * usual / stated)
+
+
+def _doubt(stated: tuple[float, float], taken: tuple[float, float]) -> str:
+    said, used = (f"{np.degrees(turn):.2g}° and {shift:.2g} m" for turn, shift in (stated, taken))
+    return f"the information states errors of {said} to an edge, and too few short cycles close to tell: judged with {used}"
 
 
 def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
@@ -95,6 +133,9 @@ class _Errors:
         median = float(self.ratio[closes][order][np.searchsorted(total, total[-1] / 2)])
         return max(HEAVY_TAILS * median / MAXWELL_MEDIAN, 1e-3 * fallback)
 
-    def scale_of_nearly(self, chosen: Bools) -> float:
-        """The scale that explains nearly all of the cycles that are chosen (L,)."""
-        return float(np.quantile(self.ratio[chosen], NEARLY_ALL)) / MAXWELL_NEARLY_ALL
+    def scale_of_nearly(self, sound: Bools, closes: Bools) -> float:
+        """The scale that explains nearly all cycles that the information does (L,), unless a gap parts them from those
+        that close (L,): stated errors that are far too large would explain wrong edges too.
+        """
+        limit = GAP * float(np.quantile(self.ratio[closes], NEARLY_ALL))
+        return float(np.quantile(self.ratio[sound & (self.ratio < limit)], NEARLY_ALL)) / MAXWELL_NEARLY_ALL
