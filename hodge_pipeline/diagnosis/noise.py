@@ -30,8 +30,9 @@ GAP = 5.0
 """Of the error that nearly all cycles that close stay below."""
 HEAVY_TAILS = 1.9
 """Errors of registration have heavier tails than a Gaussian of the same median."""
-LEAST_CREDIBLE, MOST_CREDIBLE = 0.2, 2.5
-"""Of the error where no cycle tells: what the information may state there, and be believed."""
+LEAST_CREDIBLE, MOST_CREDIBLE, TOLD_FROM = 0.2, 2.5, 2.0
+"""Of the error where no cycle tells: what the information may state there, and be believed; and the factor from which
+it is told that it was not."""
 
 LEVER = 1.8
 """Of the reach: how far around the working point lies what is seen, which an error of rotation moves along."""
@@ -72,9 +73,9 @@ def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, pri
         shift = max(shift, shifted.scale_of_nearly(sound, closes))
     if not informed:
         shift = max(shift, LEVER * turn * reach_m)
-    doubts = ()
-    if informed and (turn == believed[0] != 1.0 or shift == believed[1] != 1.0):
-        doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),)
+    taken = turn == believed[0], shift == believed[1]
+    changed = any(own and not 1 / TOLD_FROM < by < TOLD_FROM for own, by in zip(taken, believed, strict=True))
+    doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if informed and changed else ()
     return Noise(turn * rotation, shift * translation, doubts)
 
 
@@ -95,7 +96,9 @@ def _credible(stated: float, usual: float) -> float:
 
 def _doubt(stated: tuple[float, float], taken: tuple[float, float]) -> str:
     said, used = (f"{np.degrees(turn):.2g}° and {shift:.2g} m" for turn, shift in (stated, taken))
-    return f"the information states errors of {said} to an edge, and too few short cycles close to tell: judged with {used}"
+    return (
+        f"the information states errors of {said} an edge, and too few short cycles close to tell: judged with {used}"
+    )
 
 
 def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
