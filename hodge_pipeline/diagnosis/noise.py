@@ -140,5 +140,6 @@ class _Errors:
         """The scale that explains nearly all cycles that the information does (L,), unless a gap parts them from those
         that close (L,): stated errors that are far too large would explain wrong edges too.
         """
-        limit = GAP * float(np.quantile(self.ratio[closes], NEARLY_ALL))
+        told = self.ratio[closes & (self.ratio > COPIES)]
+        limit = GAP * float(np.quantile(told, NEARLY_ALL)) if len(told) else np.inf
         return float(np.quantile(self.ratio[sound & (self.ratio < limit)], NEARLY_ALL)) / MAXWELL_NEARLY_ALL
