@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import subprocess
+import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -392,3 +395,32 @@ def test_real_frames_in_a_few_megabytes(data_dir: Path, tmp_path: Path) -> None:
     first = frames[0].encoded_colour
     assert first is not None
     assert bytes(rows(merged.path, layout.COLOUR, "EncodedImage:blob")[0][0]) == first().contents
+
+
+@pytest.mark.parametrize("flushes", [False, True])
+def test_a_recording_without_room_is_one_line_and_never_waits_for_ever(tmp_path: Path, flushes: bool) -> None:
+    pytest.importorskip("resource", reason="this system has no limit on the size of a file")
+    script = textwrap.dedent(f"""
+        import resource, sys
+        from pathlib import Path
+        import numpy as np
+        import rerun as rr
+        from hodge_pipeline.errors import WorkspaceError
+        from hodge_pipeline.recording import stream as streams
+        streams.TURN_S, streams.STALLED_S = 0.2, 0.6
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+        try:
+            with streams.writing(Path(sys.argv[1]) / "000-frames.rrd", "test", "test") as stream:
+                for _ in range(10):
+                    stream.log("points", rr.Points3D(np.random.default_rng(0).random((20_000, 3))))
+                    if {flushes}:
+                        try:
+                            stream.flush(timeout_sec=0.2)
+                        except RuntimeError:
+                            break
+        except WorkspaceError as error:
+            print(error)
+    """)
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, timeout=60)
+    assert "the recording cannot be written" in done.stdout and done.returncode == 0, done.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event, Thread
 
 import numpy as np
 import rerun as rr
 
+from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import layout
 from hodge_pipeline.types import Floats, Frame, Ints
 
+TURN_S, STALLED_S = 2.0, 60.0
+"""How long Rerun is waited for at a time, and after how long without a byte its writer counts as dead."""
+LEAST_FREE_BYTES = 1 << 16
 UNIX_STAMP_S = 1e8
 """Stamps above this (1973) are seconds since 1970, smaller ones count from a start of their own."""
 
@@ -40,13 +46,45 @@ def writing(
     stream.save(partial, default_blueprint=blueprint)
     try:
         yield stream
-    except BaseException:
-        stream.disconnect()
+        _finish(stream, partial)
+    except WorkspaceError:
         partial.unlink(missing_ok=True)
         raise
-    stream.flush()
-    stream.disconnect()
+    except BaseException:
+        _finish(stream, partial)
+        partial.unlink(missing_ok=True)
+        raise
     os.replace(partial, path)
+
+
+def _finish(stream: rr.RecordingStream, partial: Path) -> None:
+    """All of the stream in its file. Raises `WorkspaceError` where it cannot be written.
+
+    Once a write has failed, Rerun's own wait for the rest may never end, not even at exit: so it is waited for in
+    turns, and a stream whose file stands still is left to a thread that ends with the process.
+    """
+    size, stalled_s = -1, 0.0
+    while True:
+        try:
+            stream.flush(timeout_sec=TURN_S)
+        except RuntimeError as error:
+            grown = partial.stat().st_size
+            size, stalled_s = grown, 0.0 if grown > size else stalled_s + TURN_S
+            is_full = shutil.disk_usage(partial.parent).free < LEAST_FREE_BYTES
+            if "timed out" in str(error) and stalled_s < STALLED_S and not is_full:
+                continue
+            rr.unregister_shutdown()
+            Thread(target=_hold, args=(stream,), daemon=True).start()
+            raise WorkspaceError(
+                f"{partial.parent}: the recording cannot be written (is the disk full?): what was finished stays; "
+                "make room and run the same command again"
+            ) from error
+        stream.disconnect()
+        return
+
+
+def _hold(_: rr.RecordingStream) -> None:
+    Event().wait()
 
 
 def story_columns(slot: int, share: Floats) -> list[rr.TimeColumn]:
