@@ -24,7 +24,7 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 CLUSTERS = 6000
 """At most, in a graph that holds together: where there are no more poses than this, each is one."""
-STEPS, LEAST_DECREASE = 15, 1e-3
+STEPS, LEAST_DECREASE = 15, 1e-2
 HALVINGS = 4
 DAMPING = 1e-9
 """Of the diagonal: far above rounding, which edges of wild lengths would make singular."""

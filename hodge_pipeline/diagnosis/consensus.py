@@ -11,7 +11,7 @@ from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.mending import mend
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.pieces import Alignment, align
-from hodge_pipeline.diagnosis.robust_poses import GATE, TWICE, Fit, fit, rough_fit
+from hodge_pipeline.diagnosis.robust_poses import GATE, LARGE, TWICE, Fit, fit, rough_fit
 from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.types import Floats, ViewGraph
 
@@ -47,11 +47,15 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
         best = _regrown(evidence, graph, rough_fit(evidence, graph, grown), weight, options.cluster_gain, rng)
         if 0 < (~best.used).sum() <= FEW * len(best.used):
             best = max(best, _of_all(evidence, graph), key=_used)
-        best = fit(evidence, graph, Alignment(best.component, best.poses), (GATE,))
-        if not best.used.all() and graph.vertex_count <= SMALL:
-            # an error that is spread over a loop in annealing can put all of its edges out of use
-            best = max(best, fit(evidence, graph, grown, TWICE), key=_used)
-        best = mend(evidence, graph, best)
+        if graph.edge_count > LARGE:  # one exact solve is all that there is time for
+            best = mend(evidence, graph, best)
+            best = fit(evidence, graph, Alignment(best.component, best.poses), (GATE,))
+        else:
+            best = fit(evidence, graph, Alignment(best.component, best.poses), (GATE,))
+            if not best.used.all() and graph.vertex_count <= SMALL:
+                # an error that is spread over a loop in annealing can put all of its edges out of use
+                best = max(best, fit(evidence, graph, grown, TWICE), key=_used)
+            best = mend(evidence, graph, best)
     agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
     return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
 

@@ -17,12 +17,14 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.pieces import Alignment
-from hodge_pipeline.diagnosis.robust_poses import GATE, TWICE, Fit, chi2_at, fit
+from hodge_pipeline.diagnosis.robust_poses import GATE, GENTLE, LARGE, TWICE, Fit, chi2_at, fit, rough_fit
 from hodge_pipeline.diagnosis.votes import agreement_of
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 ROUNDS, MOVES = 4, 40
 """Solves at most, and sets of views that move before each."""
+SWEEPS_OF_LARGE = 3
+"""Times that a large graph's edges left out are compared, for the one solve that it has time for."""
 MOST_PROPOSALS = 1200
 """Edges left out that are compared with each other; of more, evenly spread ones."""
 TRIED = 40
@@ -49,16 +51,17 @@ class _Proposals:
 
 
 def mend(evidence: Evidence, graph: ViewGraph, start: Fit) -> Fit:
-    """The solution after the moves; `graph` has the recentred edges. An edge counts −log of how likely it is wrong,
-    and what it tells by agreeing.
+    """The solution after the moves, a rough one of a large graph; `graph` has the recentred edges. An edge counts −log
+    of how likely it is wrong, and what it tells by agreeing.
     """
     nats = AGREES - np.log1p(-evidence.prior)
     found = start
-    for _ in range(ROUNDS):
+    solver, gates = (rough_fit, GENTLE) if len(nats) > LARGE else (fit, TWICE)
+    for _ in range(ROUNDS if len(nats) <= LARGE else 1):
         poses = _moved(evidence, graph, found, nats)
         if poses is None:
             break
-        tried = fit(evidence, graph, Alignment(found.component, poses), TWICE)
+        tried = solver(evidence, graph, Alignment(found.component, poses), gates)
         if nats[tried.used].sum() <= nats[found.used].sum():
             break
         found = tried
@@ -68,15 +71,17 @@ def mend(evidence: Evidence, graph: ViewGraph, start: Fit) -> Fit:
 def _moved(evidence: Evidence, graph: ViewGraph, found: Fit, nats: Floats) -> Floats | None:
     """Poses (V, 4, 4) after all moves that are worth it; None where none is."""
     poses, moves = found.poses, 0
-    for _ in range(MOVES):
+    for _ in range(MOVES if len(nats) <= LARGE else SWEEPS_OF_LARGE):
         agreeing = np.maximum(0.0, 1 - chi2_at(evidence, graph, poses, found.component, found.resistance) / GATE)
         proposals = _proposals(evidence, poses, found.component, agreeing, nats)
-        move = _best_move(evidence, poses, agreeing, nats, proposals)
-        if move is None:
+        found_now = _good_moves(evidence, poses, found.component, agreeing, nats, proposals)
+        if not found_now:
             break
-        inside, motion = move
-        poses, moves = poses.copy(), moves + 1
-        poses[inside] = motion @ poses[inside]
+        poses, moves = poses.copy(), moves + len(found_now)
+        for inside, motion in found_now:
+            poses[inside] = motion @ poses[inside]
+        if moves >= MOVES:
+            break
     return poses if moves else None
 
 
@@ -104,15 +109,19 @@ def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints
     return first, second
 
 
-def _best_move(
-    evidence: Evidence, poses: Floats, agreeing: Floats, nats: Floats, proposals: _Proposals
-) -> tuple[Bools, Floats] | None:
-    """The weightiest group that outweighs its cut: the views (V,) that move, and how."""
+def _good_moves(
+    evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, nats: Floats, proposals: _Proposals
+) -> list[tuple[Bools, Floats]]:
+    """The groups that outweigh their cuts, the weightiest first: the views (V,) that move, and how. No group has to do
+    with views that move for another.
+    """
     weight = proposals.alike @ nats[proposals.edge]
     left = np.diff(proposals.alike.indptr) > 1
+    moved, moves = np.zeros(len(poses), bool), []
     for _ in range(TRIED):
+        left &= ~(moved[proposals.mover] | moved[proposals.stayer])
         if not left.any():
-            return None
+            break
         row = int(np.argmax(np.where(left, weight, -1.0)))
         entry = slice(proposals.alike.indptr[row], proposals.alike.indptr[row + 1])
         group, alike = proposals.alike.indices[entry], proposals.alike.data[entry]
@@ -120,9 +129,16 @@ def _best_move(
         left[row] = False
         share = alike * nats[proposals.edge[group]]
         inside = _cut(evidence, agreeing * nats, proposals, group, share)
-        if inside is not None:
-            return inside, _mean_motion(proposals, group, share, poses)
-    return None
+        if inside is None:
+            continue
+        whole = component == component[proposals.mover[row]]
+        inside, motion = inside & whole, _mean_motion(proposals, group, share, poses)
+        if 2 * inside.sum() > whole.sum():  # the smaller part moves, so that others can at the same time
+            inside, motion = whole & ~inside, se3.inverse(motion)
+        if not (inside & moved).any():
+            moves.append((inside, motion))
+            moved |= inside
+    return moves
 
 
 def _cut(evidence: Evidence, held: Floats, proposals: _Proposals, group: Ints, share: Floats) -> Bools | None:

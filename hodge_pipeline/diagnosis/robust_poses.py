@@ -25,6 +25,8 @@ ANNEALED = (1e4, 1e3, 300.0)
 """Gates for poses that drifted while they grew: edges that they miss by far pull them into place (graduated
 non-convexity, Yang et al. 2020), and what does not follow falls out.
 """
+GENTLE = ANNEALED[-1:]
+"""For poses that are near already."""
 LARGE = 20_000
 """From so many edges on, a solve is stopped early: verdicts need millimetres less than seconds."""
 
@@ -62,13 +64,15 @@ def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple
     return found
 
 
-def rough_fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment) -> Fit:
-    """The same with clusters of poses moved as one, and errors as large as each gate of `ANNEALED` allows: near the
+def rough_fit(
+    evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple[float, ...] = ANNEALED
+) -> Fit:
+    """The same with clusters of poses moved as one, and errors as large as each gate allows: near the
     robust solution, whatever the drift, at little cost.
     """
     found = _as_grown(evidence, graph, alignment)
     cluster = clustered(evidence.edges, found.chi2 < GATE, evidence.vertex_count)
-    for gate in ANNEALED:
+    for gate in gates:
         used, widened = found.chi2 < gate, gate / GATE
         poses = Springs.of(evidence, used, cluster).settled(evidence, found.poses, found.chi2, widened)
         say = np.where(used, FREEDOM / (FREEDOM + _squares(evidence, graph, poses) / widened), 0.0)
