@@ -64,9 +64,7 @@ def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple
     return found
 
 
-def rough_fit(
-    evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple[float, ...] = ANNEALED
-) -> Fit:
+def rough_fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple[float, ...] = ANNEALED) -> Fit:
     """The same with clusters of poses moved as one, and errors as large as each gate allows: near the
     robust solution, whatever the drift, at little cost.
     """

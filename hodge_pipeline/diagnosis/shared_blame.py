@@ -45,7 +45,8 @@ def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
     odds = (1 - evidence.prior) / evidence.prior
     among = np.bincount(row, np.where(concerned[edge], odds[edge], 0.0), len(loops))
     probability = np.zeros(count)
-    probability[left_out] = 1 - odds[left_out] / among[cycle[left_out]]
+    named = left_out & (cycle >= 0)  # of a large graph the longest cycles are not listed
+    probability[named] = 1 - odds[named] / among[cycle[named]]
     return SharedBlame(unvouched, cycle, probability)
 
 
