@@ -136,7 +136,13 @@ def diagnose_subject(subject: Subject) -> Diagnosed:
     pieces = int(found.piece.max(initial=-1)) + 1
     apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
     energy, complaints = energy_rows(subject.graph, found.world_from_cam, found.piece, found.kept)
-    notes = (*subject.notes, *found.notes, *((apart,) if pieces > 1 else ()), *complaints)
+    notes = (
+        *subject.notes,
+        *found.notes,
+        *((apart,) if pieces > 1 else ()),
+        *_side_by_side(subject, found),
+        *complaints,
+    )
     suggestions = suggest_pairs(
         subject.graph, found, SUGGESTED, overlapping=_overlapping(subject, found), tried=subject.tried
     )
@@ -152,8 +158,27 @@ def _overlapping(subject: Subject, found: Diagnosis) -> Ints | None:
     return subject.suggestions.among.propose(subject.frames, subject.clouds, poses).pairs
 
 
+def _beside_kept(graph: ViewGraph, found: Diagnosis) -> Bools:
+    """Wrong edges (E,) whose two views another edge joins that is kept: no pair of names tells them apart."""
+    low, high = np.sort(graph.edges, axis=1).T
+    pair = low * graph.vertex_count + high
+    return (found.verdict == WRONG) & np.isin(pair, pair[found.kept])
+
+
+def _side_by_side(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
+    rows = np.flatnonzero(_beside_kept(subject.graph, found))
+    if not len(rows):
+        return ()
+    named = ", ".join(dict.fromkeys(_names(subject.graph, subject.graph.edges[rows])))
+    return (
+        f"beside a wrong edge a right one joins the same two views ({named}): disabling the pair would take out both, "
+        "a robust solve takes out the wrong one alone",
+    )
+
+
 def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> tuple[str, ...]:
-    rows = np.array([row for row in ranked(found) if found.verdict[row] == WRONG and not subject.disabled[row]], int)
+    meant = (found.verdict == WRONG) & ~subject.disabled & ~_beside_kept(subject.graph, found)
+    rows = np.array([row for row in ranked(found) if meant[row]], int)
     wrong = _names(subject.graph, subject.graph.edges[rows])
     if not subject.is_run:
         if len(wrong) > COMMANDED:

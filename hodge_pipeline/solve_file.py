@@ -85,7 +85,7 @@ def read_graph(path: Path) -> Source:
     source = guess_reader(path).open(path)
     if source.graph is None:
         rest = (
-            ": run a recipe on it first, then solve its run folder"
+            ": run a recipe on it first, then give its run folder"
             if source.frames
             else f" but {without_frames(source)}"
         )

@@ -65,7 +65,7 @@ def test_the_command_says_so_and_what_to_register(tmp_path: Path) -> None:
     lines = done.stdout.splitlines()
     assert {line.split()[0] for line in lines[:3]} == {"8-9", "9-0", "0-1"}
     assert all("the loop 8-9-0-1 fails by" in line for line in lines[:3])
-    assert "1 is suspect; 2 may be to blame for the loop 8-9-0-1, which fails by" in done.stdout
+    assert "1 of 11 edges is suspect; 2 may be to blame for the loop 8-9-0-1, which fails by" in done.stdout
     assert any(line.startswith("register 1-9  tests 1 untestable edge;") for line in lines)
 
 
@@ -160,3 +160,27 @@ def test_views_that_turn_about_one_point_are_not_held_to_exactness() -> None:
     )
     graph = stated(measured(poses, np.array([*CHAIN, (9, 0)])), 0.5, 1.0)
     assert (diagnose(graph).verdict == CONSISTENT).all()
+
+
+def test_a_wrong_edge_beside_a_right_one_is_not_disabled_by_the_name_of_both(tmp_path: Path) -> None:
+    graph = spoiled(measured(poses_on_a_ring(4), np.array([(0, 1), (1, 2), (2, 3), (1, 2), (1, 2)])), np.array([3]))[0]
+    write_g2o(tmp_path / "thrice.g2o", graph, poses_on_a_ring(4))
+    done = CliRunner().invoke(app, ["diagnose", str(tmp_path / "thrice.g2o")], catch_exceptions=False)
+    assert "1 of 5 edges is wrong, worst of all 1–2; 2 lie in no loop, so that nothing can test them." in done.stdout
+    assert "a right one joins the same two views (1-2)" in done.stdout and "--disable" not in done.stdout
+
+
+def test_nothing_left_over_is_said_so_and_not_shared_out(tmp_path: Path) -> None:
+    exact = measured(poses_on_a_ring(4), near_pairs(4, 1), noise=0.0)
+    write_g2o(tmp_path / "exact.g2o", exact, poses_on_a_ring(4))
+    done = CliRunner().invoke(app, ["diagnose", str(tmp_path / "exact.g2o")], catch_exceptions=False)
+    assert "energy   rotation none, nothing is left over; translation none" in done.stdout
+    assert "closes to 0 m, 0°" in done.stdout and "e-1" not in done.stdout
+
+
+def test_an_edge_alone_cannot_be_tested(tmp_path: Path) -> None:
+    single = measured(poses_on_a_ring(2), np.array([(0, 1)]))
+    write_g2o(tmp_path / "single.g2o", single, poses_on_a_ring(2))
+    done = CliRunner().invoke(app, ["diagnose", str(tmp_path / "single.g2o")], catch_exceptions=False)
+    assert "1 of 1 edges lies in no loop, so that nothing can test it" in done.stdout
+    assert "information states" not in done.stdout

@@ -46,9 +46,13 @@ class EnergyRow:
         return _share(self.rotation), _share(self.translation)
 
 
+ROUNDING = 1e-20
+"""Energies below it, squares of radians and metres, are those of rounding."""
+
+
 def _share(energy: Floats) -> Floats:
     total = float(energy.sum())
-    return energy / total if total > 0 else np.zeros(3)
+    return energy / total if total > ROUNDING else np.zeros(3)
 
 
 def energy_rows(
@@ -76,12 +80,17 @@ def in_words(rows: Sequence[EnergyRow]) -> tuple[str, ...]:
     for row in rows:
         if row.group == ALL_EDGES:
             told = [
-                f"{kind} " + ", ".join(f"{100 * share:.1f} % {part}" for share, part in zip(shares, PARTS, strict=True))
-                for kind, shares in zip(("rotation", "translation"), row.shares, strict=True)
+                f"{kind} {_told(shares)}" for kind, shares in zip(("rotation", "translation"), row.shares, strict=True)
             ]
             which = "of all edges" if row.when == BEFORE else "of the edges kept"
             lines.append(f"{'; '.join(told)} ({which})")
     return tuple(lines)
+
+
+def _told(shares: Floats) -> str:
+    if not shares.any():
+        return "none, nothing is left over"
+    return ", ".join(f"{100 * share:.1f} % {part}" for share, part in zip(shares, PARTS, strict=True))
 
 
 def _place(group: str) -> tuple[int, str]:

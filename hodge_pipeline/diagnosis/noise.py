@@ -59,7 +59,7 @@ def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, pri
     """
     rotation, translation, informed = _proportions(graph)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
-    loops = loops.select(short)
+    any_cycle, loops = len(loops) > 0, loops.select(short)
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, moved[short])
     usual = DEFAULT_ANGLE_RAD, DEFAULT_SHARE * max(reach_m, ABOUT_A_POINT * _usual_step(graph))
     stated = usual if not informed else (_median(rotation), _median(translation))
@@ -75,7 +75,8 @@ def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, pri
         shift = max(shift, LEVER * turn * reach_m)
     taken = turn == believed[0], shift == believed[1]
     changed = any(own and not 1 / TOLD_FROM < by < TOLD_FROM for own, by in zip(taken, believed, strict=True))
-    doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if informed and changed else ()
+    told = informed and changed and any_cycle and not _is_unit(graph)
+    doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if told else ()
     return Noise(turn * rotation, shift * translation, doubts)
 
 
@@ -109,6 +110,12 @@ def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
     flat = graph.dimension == 2
     weights = edge_weights(graph, 2 if flat else 3)
     return _deviation(weights.kappa if flat else 2 * weights.kappa), _deviation(weights.tau), True
+
+
+def _is_unit(graph: ViewGraph) -> bool:
+    """Whether all edges have the identity that files hold where nothing is known, of angles or of half angles."""
+    diagonal = graph.information[:, range(6), range(6)]
+    return bool(np.isin(diagonal[:, :3], (0, 0.25, 1)).all() and np.isin(diagonal[:, 3:], (0, 1)).all())
 
 
 def _deviation(precision: Floats) -> Floats:

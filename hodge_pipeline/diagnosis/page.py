@@ -92,11 +92,11 @@ def sentence(graph: ViewGraph, diagnosis: Diagnosis) -> str:
     if counts[WRONG]:
         worst = int(ranked(diagnosis)[0])
         i, j = graph.vertex_ids[graph.edges[worst]]
-        told.append(f"{counts[WRONG]} of {graph.edge_count} edges {_are(counts[WRONG])} wrong, worst of all {i}–{j}")
+        told.append(f"{counts[WRONG]} {_are(counts[WRONG])} wrong, worst of all {i}–{j}")
     if counts[SUSPECT]:
         told.append(f"{counts[SUSPECT]} {_are(counts[SUSPECT])} suspect")
     told += _untestable(graph, diagnosis)
-    return "; ".join(told)[:1].upper() + "; ".join(told)[1:] + "."
+    return "; ".join(told).replace(" ", f" of {graph.edge_count} edges ", 1) + "."
 
 
 def _untestable(graph: ViewGraph, diagnosis: Diagnosis) -> list[str]:

@@ -9,6 +9,7 @@ from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE, Cycles
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LONGEST_NAMED = 12
+ROUNDING = 1e-9
 MOST_NAMED = 4
 """Edges that share a blame; of more the number."""
 
@@ -101,10 +102,15 @@ def _undecided(graph: ViewGraph, cycles: Cycles, row: int, doubted: Bools) -> st
 def cycle_error(cycles: Cycles, row: int) -> str:
     """Whether a cycle closes, and by how much it does not, in words."""
     verb = "closes to" if cycles.closes[row] else "fails by"
-    return f"{verb} {cycles.displacement_m[row]:.3g} m, {np.degrees(cycles.angle_rad[row]):.3g}°"
+    return f"{verb} {_amount(cycles.displacement_m[row], np.degrees(cycles.angle_rad[row]))}"
 
 
 def _distance(metres: float, degrees: float) -> str:
     if not np.isfinite(metres):
         return "its ends lie in different pieces"
-    return f"{metres:.3g} m, {degrees:.3g}° from the poses"
+    return f"{_amount(metres, degrees)} from the poses"
+
+
+def _amount(metres: float, degrees: float) -> str:
+    metres, degrees = (value if value >= ROUNDING else 0.0 for value in (metres, degrees))
+    return f"{metres:.3g} m, {degrees:.3g}°"
