@@ -162,7 +162,7 @@ def _beside_kept(graph: ViewGraph, found: Diagnosis) -> Bools:
     """Wrong edges (E,) whose two views another edge joins that is kept: no pair of names tells them apart."""
     low, high = np.sort(graph.edges, axis=1).T
     pair = low * graph.vertex_count + high
-    return (found.verdict == WRONG) & np.isin(pair, pair[found.kept])
+    return np.asarray((found.verdict == WRONG) & np.isin(pair, pair[found.kept]))
 
 
 def _side_by_side(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
