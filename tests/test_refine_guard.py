@@ -52,3 +52,8 @@ def test_an_uncertainty_that_is_unknown_never_calls_a_change_insignificant():
 def test_the_help_sends_a_graph_file_to_solve():
     found = CliRunner().invoke(app, ["refine", "--help"])
     assert found.exit_code == 0 and "hodge solve" in found.output and "trajectory" in found.output
+
+
+def test_a_change_is_told_in_millimetres_and_degrees():
+    told = str(Change(0.0125, 0.25, 0.004, 0.5))
+    assert told == "poses moved by 12.5 mm and 0.25° (RMS), known to 4 mm and 0.5°"

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
+from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
 from hodge_pipeline.evaluation.report import (
     EdgeRow,
     LoopRow,
@@ -297,3 +298,18 @@ def test_tables_and_terminal_lines(report: Report) -> None:
 def test_numbers_in_words() -> None:
     assert [length(value) for value in (0.0012, 0.0305, 1.303, float("nan"))] == ["1.2 mm", "3.05 cm", "1.3 m", "–"]
     assert [percent(value) for value in (-0.406, 0.1)] == ["−41 %", "+10 %"]
+
+
+def test_what_is_a_large_residual_and_how_many_pairs_may_see_nothing_goes_by_the_scene(report: Report) -> None:
+    def said(scale: float, unmatched: int) -> str:
+        distances_m = np.full((1, 200), 0.01 * scale)
+        distances_m[0, :unmatched] = NO_NEIGHBOUR_M * scale
+        pairs = np.stack([np.arange(200), np.arange(1, 201)], axis=1)
+        scores = ScoreTable(("result",), "result", (GraphScores("iou", pairs, distances_m, scale),))
+        far = replace(report.worst_edges[0], residual_m=0.15, residual_deg=0.0, weight=1.0)
+        return "\n".join(suspicions(replace(report, scores=scores, worst_edges=(far,))))
+
+    assert "1 edges that the solver used are more than 10 cm" in said(1.0, 0)
+    assert "that the solver used are more than" not in said(10.0, 0)
+    assert "have no point within" not in said(1.0, 2)
+    assert "result: 3 of 200" in said(1.0, 3)
