@@ -24,13 +24,13 @@ GAP = 8
 
 def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
     """Write the page and the recording into a folder, made if it is not there, and give back their paths."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
     html, recording = folder / "compare.html", folder / "compare.rrd"
     models = _model(comparison.a, np.eye(4)), _model(comparison.b, comparison.a_from_b)
-    write_text(html, _page(comparison, models))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(html, _page(comparison, models))
+    except OSError as error:
+        raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
     names = comparison.a.name, comparison.b.name
     poses = comparison.a_poses, comparison.b_poses
     record_comparison(recording, names, poses, models, comparison.apart_m, _markdown(comparison))
