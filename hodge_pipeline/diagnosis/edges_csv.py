@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+from math import isfinite
 from pathlib import Path
-
-import numpy as np
 
 from hodge_pipeline import artifacts
 from hodge_pipeline.diagnosis.result import Diagnosis
@@ -29,7 +28,7 @@ def write_edges_csv(path: Path, graph: ViewGraph, diagnosis: Diagnosis) -> None:
     ends = graph.vertex_ids[graph.edges].tolist()
     rest = zip(diagnosis.verdict.tolist(), graph.source.tolist(), diagnosis.reason, strict=True)
     for (i, j), values, (verdict, source, reason) in zip(ends, numbers, rest, strict=True):
-        table.writerow((i, j, verdict, *("" if not np.isfinite(v) else f"{v:.6g}" for v in values), source, reason))
+        table.writerow((i, j, verdict, *(f"{v:.6g}" if isfinite(v) else "" for v in values), source, reason))
     try:
         artifacts.write_text(path, text.getvalue())
     except OSError as error:

@@ -23,8 +23,8 @@ from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 ROUNDS, MOVES = 4, 40
 """Solves at most, and sets of views that move before each."""
-SWEEPS_OF_LARGE = 3
-"""Times that a large graph's edges left out are compared, for the one solve that it has time for."""
+SWEEPS_OF_LARGE, PROPOSALS_OF_LARGE = 2, 500
+"""Times that edges of a large graph are compared, for the one solve that it has time for, and how many."""
 MOST_PROPOSALS = 1200
 """Edges left out that are compared with each other; of more, evenly spread ones."""
 TRIED = 40
@@ -88,7 +88,8 @@ def _moved(evidence: Evidence, graph: ViewGraph, found: Fit, nats: Floats) -> Fl
 def _proposals(evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, nats: Floats) -> _Proposals:
     i, j = evidence.edges.T
     rows = np.flatnonzero((agreeing == 0) & (component[i] == component[j]) & (i != j))
-    rows = rows[:: max(-(-len(rows) // MOST_PROPOSALS), 1)]
+    most = MOST_PROPOSALS if len(i) <= LARGE else PROPOSALS_OF_LARGE
+    rows = rows[:: max(-(-len(rows) // most), 1)]
     motion = poses[i[rows]] @ evidence.i_from_j[rows] @ se3.inverse(poses[j[rows]])
     motion = np.concatenate([motion, se3.inverse(motion)])
     edge, mover, stayer = np.tile(rows, 2), np.concatenate([j[rows], i[rows]]), np.concatenate([i[rows], j[rows]])

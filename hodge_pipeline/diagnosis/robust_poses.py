@@ -70,8 +70,10 @@ def rough_fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates:
     """
     found = _as_grown(evidence, graph, alignment)
     cluster = clustered(evidence.edges, found.chi2 < GATE, evidence.vertex_count)
-    for gate in gates:
+    for gate, following in zip(gates, (*gates[1:], GATE), strict=True):
         used, widened = found.chi2 < gate, gate / GATE
+        if np.array_equal(used, found.chi2 < following):
+            continue
         poses = Springs.of(evidence, used, cluster).settled(evidence, found.poses, found.chi2, widened)
         say = np.where(used, FREEDOM / (FREEDOM + _squares(evidence, graph, poses) / widened), 0.0)
         found = _refitted(evidence, graph, poses, used, say)

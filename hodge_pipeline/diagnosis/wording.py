@@ -19,7 +19,7 @@ def name_cycle(graph: ViewGraph, cycles: Cycles, row: int) -> str:
     loops = cycles.loops
     entry = slice(loops.offsets[row], loops.offsets[row + 1])
     tails = graph.edges[loops.edge[entry], np.where(loops.sign[entry] > 0, 0, 1)]
-    names = [str(graph.vertex_ids[vertex]) for vertex in tails]
+    names = list(map(str, graph.vertex_ids[tails].tolist()))
     if len(names) > LONGEST_NAMED:
         names = [*names[:6], f"({len(names) - 9} more)", *names[-3:]]
     return "-".join(names)
