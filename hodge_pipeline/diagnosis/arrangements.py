@@ -2,7 +2,8 @@
 
 Growing pieces best first can take a place for another that looks like it, and from there no single move leads back. So
 a second start knows only the edges between consecutive views, which are wrong more rarely; and from both the views are
-moved with two opinions on how many of the expected edges a placement must show.
+moved with two opinions on how many of the expected edges a placement must show. Of all arrangements on the way the one
+of most worth is taken, and improved while that makes it worth more.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from hodge_pipeline.diagnosis.cuts import pair_nats
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.joining import Joining
+from hodge_pipeline.diagnosis.improve import improved
+from hodge_pipeline.diagnosis.laws import learned
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.pieces import Alignment, align
-from hodge_pipeline.diagnosis.rearrange import learned, rearrange, scene_of
+from hodge_pipeline.diagnosis.rearrange import rearranged
 from hodge_pipeline.diagnosis.robust_poses import ONCE, TWICE, Fit, fit
+from hodge_pipeline.diagnosis.worth import worth
 from hodge_pipeline.types import Floats, ViewGraph
 
 FAIR_SHARES = (0.75, 0.5)
@@ -37,10 +39,11 @@ def best_arrangement(
     starts = [start]
     if np.ptp(evidence.prior) > 0:
         starts.append(_in_order(evidence, graph, weight, cluster_gain, rng))
-    found = [rearrange(evidence, graph, one, share) for one in starts for share in FAIR_SHARES]
-    laws = [learned(evidence, one) for one in found]
-    values = [sum(_total(evidence, one, law) for law in laws) for one in found]
-    return found[int(np.argmax(values))]
+    found = [one for begun in starts for share in FAIR_SHARES for one in rearranged(evidence, graph, begun, share)]
+    laws = [learned(evidence, found[0]), learned(evidence, found[-1])]
+    values = [worth(evidence, one.poses, one.component, laws) for one in found]
+    best = improved(evidence, graph, found[int(np.argmax(values))], FAIR_SHARES)
+    return fit(evidence, graph, Alignment(best.component, best.poses), ONCE)
 
 
 def _in_order(
@@ -60,10 +63,3 @@ def _in_order(
     )
     chained = fit(chain, graph.select(rows), align(chain, weight[rows], cluster_gain, rng), ONCE)
     return fit(evidence, graph, Alignment(chained.component, chained.poses), TWICE)
-
-
-def _total(evidence: Evidence, found: Fit, joining: Joining) -> float:
-    """Nats for the whole arrangement over all views being apart."""
-    together = np.triu(found.component[:, None] == found.component[None], 1)
-    layers = scene_of(evidence, joining, found).layers(found.poses, found.poses)
-    return float(pair_nats(layers)[together].sum())

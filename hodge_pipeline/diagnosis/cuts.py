@@ -13,7 +13,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.joining import Joining
+from hodge_pipeline.diagnosis.laws import Laws
 from hodge_pipeline.types import Bools, Floats, Ints
 
 GATE = 60.0
@@ -40,12 +40,13 @@ UNSUPPORTED, SUPPORTED = 0.05, 0.3
 class Scene:
     """What a placement is judged by.
 
-    - `joining`: the law by which views are joined; `usual`: its mean over the scene, 0 where views have no order.
+    - `laws`: how views are joined, and how cameras are held; `usual`: the mean probability that views of one piece are
+      joined, 0 where views have no order.
     - `fair_share`: of the edges that a placement makes expected, those from which on they speak for it.
     """
 
     evidence: Evidence
-    joining: Joining
+    laws: Laws
     usual: float
     fair_share: float
 
@@ -59,7 +60,7 @@ class Scene:
         """For each ordered pair of views (3, V, V), the first where it is and the second moved: whether an edge agrees
         (from 1 down to 0), the probability that one would, and the nats of their order.
         """
-        agreeing, expected = self._agreeing(still, moved), self.joining.between(still, moved)
+        agreeing, expected = self._agreeing(still, moved), self.laws.joining.between(still, moved)
         order = np.zeros_like(expected)
         if self.usual:
             rows = np.flatnonzero(np.abs(self.evidence.edges[:, 1] - self.evidence.edges[:, 0]) == 1)
@@ -87,6 +88,13 @@ class Scene:
         squares = (np.arccos(cosine) / noise.rotation_rad) ** 2
         squares += np.einsum("ni,ni->n", left[:, :3, 3], left[:, :3, 3]) / noise.translation_m**2
         return np.asarray(np.sqrt(np.maximum(0.0, 1 - squares / GATE)))
+
+
+def scene_of(evidence: Evidence, laws: Laws, poses: Floats, piece: Ints, fair_share: float = 1.0) -> Scene:
+    """What moves of poses (V, 4, 4) in pieces (V,) are judged by."""
+    same = piece[:, None] == piece[None]
+    usual = float(laws.joining.between(poses, poses)[same].mean()) if np.ptp(evidence.prior) > 0 else 0.0
+    return Scene(evidence, laws, usual, fair_share)
 
 
 def consecutive_nats(evidence: Evidence) -> Floats:

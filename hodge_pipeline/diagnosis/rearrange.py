@@ -1,4 +1,4 @@
-"""A solution improved by moving sets of views to where more speaks for them, until none wants to move.
+"""A solution changed by moving sets of views to where more speaks for them, until none wants to move.
 
 Pieces that grew together best first are never parted again, also where one wrong edge between consecutive views came
 before many right ones between others. Here each edge that disagrees proposes a motion; with the edges that propose the
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.cuts import GATE, Scene, consecutive_nats, interval_sums, pair_nats, sums_of
+from hodge_pipeline.diagnosis.cuts import Scene, interval_sums, pair_nats, scene_of, sums_of
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.joining import Joining, learn_joining
+from hodge_pipeline.diagnosis.laws import learned
 from hodge_pipeline.diagnosis.pieces import Alignment
-from hodge_pipeline.diagnosis.robust_poses import ONCE, TWICE, Fit, fit
+from hodge_pipeline.diagnosis.proposals import Proposals, propose
+from hodge_pipeline.diagnosis.robust_poses import ONCE, Fit, fit
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 ROUNDS = 10
@@ -25,115 +25,114 @@ TRIED = 60
 """Motions in each round."""
 LEAST_GAIN = 2.0
 """Nats."""
-MOST_PROPOSALS = 2000
 
 
 @dataclass(frozen=True)
-class _Proposals:
-    """Disagreeing edges, each in both directions: `mover (P,)` by `motion (P, 4, 4)`, in the frame of `stayer`;
-    `alike (P, P)` from 1 down to 0 how well the second agrees with the motion of the first.
-    """
+class Move:
+    """Views `inside (V,)` that are moved by `motion (4, 4)` into a piece, and the nats that are gained."""
 
-    mover: Ints
-    stayer: Ints
-    motion: Floats
-    alike: Floats
-    urgent: Floats
-
-
-@dataclass(frozen=True)
-class _Move:
     gain: float
     inside: Bools
     motion: Floats
     piece: int
 
-
-def rearrange(evidence: Evidence, graph: ViewGraph, start: Fit, fair_share: float) -> Fit:
-    """The solution after the moves; `graph` has the recentred edges, for `fair_share` see `Scene`."""
-    found, joining = start, None
-    for _ in range(ROUNDS):
-        joining = learned(evidence, found, joining)
-        move = _best_move(scene_of(evidence, joining, found, fair_share), found)
-        if move is None:
-            break
+    def made(self, found: Fit) -> Alignment:
+        """The alignment after the move."""
         poses, piece = found.poses.copy(), found.component.copy()
-        poses[move.inside], piece[move.inside] = move.motion @ poses[move.inside], move.piece
-        found = fit(evidence, graph, Alignment(piece, poses), ONCE)
-    return start if found is start else fit(evidence, graph, Alignment(found.component, found.poses), TWICE)
+        poses[self.inside], piece[self.inside] = self.motion @ poses[self.inside], self.piece
+        return Alignment(piece, poses)
 
 
-def learned(evidence: Evidence, found: Fit, known: Joining | None = None) -> Joining:
-    """The law of joining that the edges which a solution uses show."""
-    joined = np.zeros((evidence.vertex_count, evidence.vertex_count), bool)
-    i, j = evidence.edges[found.used].T
-    joined[i, j] = joined[j, i] = True
-    return learn_joining(found.poses, found.component, joined, evidence.reach_m, known)
+@dataclass(frozen=True)
+class _Now:
+    """A solution before a move: its layers (3, V, V), the nats of each run of views, where up is (V, 3), and the nats
+    (V,) of how each camera is held.
+    """
+
+    found: Fit
+    layers: Floats
+    runs: Floats
+    up: Floats
+    held: Floats
 
 
-def scene_of(evidence: Evidence, joining: Joining, found: Fit, fair_share: float = 1.0) -> Scene:
-    """What moves of this solution are judged by."""
-    same = found.component[:, None] == found.component[None]
-    usual = float(joining.between(found.poses, found.poses)[same].mean()) if np.ptp(evidence.prior) > 0 else 0.0
-    return Scene(evidence, joining, usual, fair_share)
+def rearranged(evidence: Evidence, graph: ViewGraph, start: Fit, fair_share: float) -> list[Fit]:
+    """The solutions after each move, `start` first; `graph` has the recentred edges, for `fair_share` see `Scene`."""
+    found, laws = [start], None
+    for _ in range(ROUNDS):
+        laws = learned(evidence, found[-1], laws)
+        scene = scene_of(evidence, laws, found[-1].poses, found[-1].component, fair_share)
+        best = best_moves(scene, found[-1])[:1]
+        if not best or best[0].gain <= LEAST_GAIN:
+            break
+        found.append(fit(evidence, graph, best[0].made(found[-1]), ONCE))
+    return found
 
 
-def _best_move(scene: Scene, found: Fit) -> _Move | None:
-    poses, piece = found.poses, found.component
-    together = piece[:, None] == piece[None]
-    now = scene.layers(poses, poses) * (together & ~np.eye(len(piece), dtype=bool))
-    proposals = _proposals(scene, found)
-    runs_now = scene.nats(interval_sums(now)[2])
-    best, left = None, np.ones(len(proposals.mover), bool)
+def best_moves(scene: Scene, found: Fit) -> list[Move]:
+    """For each motion that is proposed the best set of views to move, by what they gain, the best first."""
+    now, proposals = _before(scene, found), propose(scene, found)
+    moves, left = [], np.ones(len(proposals.mover), bool)
     for _ in range(TRIED):
         if not left.any():
             break
-        row = int(np.argmax(np.where(left, proposals.urgent, -1.0)))
-        left &= proposals.alike[row] < 0.5
-        left[row] = False
-        move = _move(scene, found, now, runs_now, proposals, row)
-        if move is not None and move.gain > (LEAST_GAIN if best is None else best.gain):
-            best = move
-    return best
+        moves.append(_move(scene, now, proposals, proposals.next(left)))
+    return sorted((move for move in moves if move.inside.any()), key=lambda move: -move.gain)
 
 
-def _move(scene: Scene, found: Fit, now: Floats, runs_now: Floats, proposals: _Proposals, row: int) -> _Move | None:
+def _before(scene: Scene, found: Fit) -> _Now:
+    poses, piece, upright = found.poses, found.component, scene.laws.upright
+    together = (piece[:, None] == piece[None]) & ~np.eye(len(piece), dtype=bool)
+    layers = scene.layers(poses, poses) * together
+    up = upright.world_up(poses[:, :3, :3], piece)
+    return _Now(found, layers, scene.nats(interval_sums(layers)[2]), up, upright.nats(poses[:, :3, :3], up))
+
+
+def _move(scene: Scene, now: _Now, proposals: Proposals, row: int) -> Move:
     """The best set of views to move as one proposal has it."""
-    poses, piece = found.poses, found.component
+    poses, piece = now.found.poses, now.found.component
     home, movable = piece[proposals.stayer[row]], piece == piece[proposals.mover[row]]
-    motion = _mean_motion(proposals, row, poses)
+    motion = proposals.mean_motion(row, poses)
     moved = scene.layers(poses, motion @ poses) * ((piece == home)[:, None] & ~np.eye(len(piece), dtype=bool))
-    then = np.where(movable[None, None], moved, now)
-    sets = [_grown(then, now, movable, proposals.mover[proposals.alike[row] > 0])]
+    then = np.where(movable[None, None], moved, now.layers)
+    up = np.broadcast_to(now.up[proposals.stayer[row]], now.up.shape)
+    held = scene.laws.upright.nats(motion[:3, :3] @ poses[:, :3, :3], up) - now.held
+    sets = [_grown(pair_nats(then) - pair_nats(now.layers), held, movable, proposals.mover[proposals.alike[row] > 0])]
     if not movable[proposals.stayer[row]]:
         sets.append(movable)
     if scene.usual:
-        sets.append(_best_run(scene, then, runs_now, movable))
-    best = None
-    for inside in sets:
-        gain = float(scene.nats(sums_of(then, inside)) - scene.nats(sums_of(now, inside))) if inside.any() else 0.0
-        if best is None or gain > best.gain:
-            best = _Move(gain, inside, motion, int(home))
-    return best
+        sets.append(_best_run(scene, then, now.runs, held, movable))
+    gains = [_gain(scene, now.layers, then, held, inside) for inside in sets]
+    best = int(np.argmax(gains))
+    return Move(gains[best], sets[best], motion, int(home))
 
 
-def _best_run(scene: Scene, then: Floats, runs_now: Floats, movable: Bools) -> Bools:
+def _gain(scene: Scene, now: Floats, then: Floats, held: Floats, inside: Bools) -> float:
+    if not inside.any():
+        return 0.0
+    return float(scene.nats(sums_of(then, inside)) - scene.nats(sums_of(now, inside)) + held[inside].sum())
+
+
+def _best_run(scene: Scene, then: Floats, runs_now: Floats, held: Floats, movable: Bools) -> Bools:
     low, high, after = interval_sums(then)
     blocked = np.concatenate([[0], np.cumsum(~movable)])
-    gain = np.where(blocked[high] > blocked[low], -np.inf, scene.nats(after) - runs_now)
+    upright = np.concatenate([[0.0], np.cumsum(held)])
+    gain = scene.nats(after) - runs_now + upright[high] - upright[low]
+    gain = np.where(blocked[high] > blocked[low], -np.inf, gain)
     best, inside = int(np.argmax(gain)), np.zeros(len(movable), bool)
     if np.isfinite(gain[best]):
         inside[low[best] : high[best]] = True
     return inside
 
 
-def _grown(then: Floats, now: Floats, movable: Bools, seed: Ints) -> Bools:
-    """The set that grows, and shrinks, one view at a time from the seed while the sum over single pairs improves."""
-    gain = pair_nats(then) - pair_nats(now)
+def _grown(gain: Floats, held: Floats, movable: Bools, seed: Ints) -> Bools:
+    """The set that grows, and shrinks, one view at a time from the seed while the sum of gains (V, V) of single pairs
+    and of gains (V,) of single views improves.
+    """
     inside = np.zeros(len(movable), bool)
     inside[seed] = True
     inside &= movable
-    enters, leaves = (~inside).astype(float) @ gain, gain @ inside.astype(float)
+    enters, leaves = (~inside).astype(float) @ gain + held, gain @ inside.astype(float)
     for _ in range(2 * len(movable)):
         better = np.where(movable, np.where(inside, leaves - enters, enters - leaves), -np.inf)
         view = int(np.argmax(better))
@@ -144,43 +143,3 @@ def _grown(then: Floats, now: Floats, movable: Bools, seed: Ints) -> Bools:
         enters -= sign * gain[view]
         leaves += sign * gain[:, view]
     return inside
-
-
-def _proposals(scene: Scene, found: Fit) -> _Proposals:
-    evidence, poses = scene.evidence, found.poses
-    i, j = evidence.edges.T
-    agreeing = np.where(found.component[i] == found.component[j], scene.agreement(poses[i], poses[j]), 0.0)
-    rows = np.flatnonzero((agreeing == 0) & (i != j))
-    value = consecutive_nats(evidence)[rows]
-    rows = np.sort(rows[np.argsort(-value, kind="stable")[: MOST_PROPOSALS // 2]])
-    i, j = i[rows], j[rows]
-    forward = poses[i] @ evidence.i_from_j[rows] @ se3.inverse(poses[j])
-    mover, motion = np.concatenate([j, i]), np.concatenate([forward, se3.inverse(forward)])
-    rows = np.concatenate([rows, rows])
-    alike = _alike(motion, poses[mover, :3, 3], evidence.noise.rotation_rad[rows], evidence.noise.translation_m[rows])
-    in_order = (np.abs(evidence.edges[rows, 1] - evidence.edges[rows, 0]) == 1) & (scene.usual > 0)
-    urgent = 2.0 * np.log1p(alike.sum(1)) + np.where(in_order, consecutive_nats(evidence)[rows], 0.0)
-    return _Proposals(mover, np.concatenate([i, j]), motion, alike, urgent)
-
-
-def _alike(motion: Floats, point: Floats, turn: Floats, shift: Floats) -> Floats:
-    quat = se3.to_quat_xyzw(motion)
-    cosine = np.minimum(1.0, np.abs(quat @ quat.T))
-    first, second = np.nonzero(cosine >= np.cos(np.minimum(np.sqrt(GATE) * turn, np.pi) / 2))
-    at = np.einsum("nij,nj->ni", motion[first, :3, :3] - motion[second, :3, :3], point[second])
-    at += motion[first, :3, 3] - motion[second, :3, 3]
-    squares = (2 * np.arccos(cosine[first, second]) / turn[second]) ** 2
-    squares += np.einsum("ni,ni->n", at, at) / shift[second] ** 2
-    out = np.zeros(cosine.shape)
-    out[first, second] = np.sqrt(np.maximum(0.0, 1 - squares / GATE))
-    return out
-
-
-def _mean_motion(proposals: _Proposals, row: int, poses: Floats) -> Floats:
-    """The mean (4, 4) of the motions that agree with one."""
-    weight = proposals.alike[row] / proposals.alike[row].sum()
-    used = np.flatnonzero(weight)
-    weight, motion, point = weight[used], proposals.motion[used], poses[proposals.mover[used], :3, 3]
-    rotation = se3.project_to_so3(np.einsum("n,nij->ij", weight, motion[:, :3, :3])[None])[0]
-    landed = weight @ (np.einsum("nij,nj->ni", motion[:, :3, :3], point) + motion[:, :3, 3])
-    return se3.from_parts(rotation, landed - rotation @ (weight @ point))
