@@ -184,3 +184,16 @@ def test_an_edge_alone_cannot_be_tested(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["diagnose", str(tmp_path / "single.g2o")], catch_exceptions=False)
     assert "1 of 1 edges lies in no loop, so that nothing can test it" in done.stdout
     assert "information states" not in done.stdout
+
+
+def test_a_few_frames_of_a_camera_that_only_turns_are_not_blamed_for_moving_little() -> None:
+    """Their steps are a centimetre, and so are their errors, as the information states."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        poses = se3.exp(np.cumsum(rng.normal(size=(6, 6)) * np.repeat([0.15, 0.012], 3), axis=0))
+        edges = np.array([(i, j) for i in range(6) for j in range(i + 1, min(i + 4, 6))])
+        errors = se3.exp(rng.normal(size=(len(edges), 6)) * np.repeat([0.012, 0.008], 3))
+        graph = ViewGraph.from_edges(np.arange(6), edges, se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ errors)
+        stated = np.diag(np.repeat([0.015, 0.007], 3) ** -2.0)
+        found = diagnose(replace(graph, information=np.tile(stated, (len(edges), 1, 1))))
+        assert found.kept.all()

@@ -19,7 +19,7 @@ ABOUT_A_POINT = 0.2
 FIRST_GATE_RAD = 0.35
 FIRST_GATE_SHARE = 0.6
 LONGEST_CYCLE = 4
-FEWEST_CYCLES = 20
+FEWEST_CYCLES, SOME_CYCLES = 20, 4
 COPIES = 1e-5
 """Of the gate: cycles that close so exactly join copies of one measurement, and tell nothing."""
 STATED = 3.0
@@ -63,7 +63,7 @@ def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, pri
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, moved[short])
     usual = DEFAULT_ANGLE_RAD, DEFAULT_SHARE * max(reach_m, ABOUT_A_POINT * _usual_step(graph))
     stated = usual if not informed else (_median(rotation), _median(translation))
-    believed = _credible(stated[0], usual[0]), _credible(stated[1], usual[1])
+    believed = tuple(map(_credible, stated, usual, (turned.shown(), shifted.shown())))
     turn = turned.scale(FIRST_GATE_RAD, prior, believed[0] if informed else usual[0])
     shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, believed[1] if informed else usual[1])
     closes = (turned.error < FIRST_GATE_RAD) & (shifted.error < FIRST_GATE_SHARE * reach_m)
@@ -88,10 +88,10 @@ def _median(deviation: Floats) -> float:
     return float(np.median(deviation)) if len(deviation) else 1.0
 
 
-def _credible(stated: float, usual: float) -> float:
-    """The factor that makes a stated error credible beside a usual one; 1 where it is."""
+def _credible(stated: float, usual: float, shown: float) -> float:
+    """The factor that makes a stated error credible beside a usual one and what the cycles show; 1 where it is."""
     if stated > MOST_CREDIBLE * usual:
-        return usual / stated
+        return min(max(usual / stated, shown), 1.0)
     return max(1.0, LEAST_CREDIBLE * usual / stated)
 
 
@@ -142,6 +142,12 @@ class _Errors:
         total = np.cumsum(weight[order])
         median = float(self.ratio[closes][order][np.searchsorted(total, total[-1] / 2)])
         return max(HEAVY_TAILS * median / MAXWELL_MEDIAN, 1e-3 * fallback)
+
+    def shown(self) -> float:
+        """The scale that explains half of all cycles, if these are some: more than half of few are hardly wrong."""
+        if len(self.ratio) < SOME_CYCLES:
+            return 0.0
+        return HEAVY_TAILS * float(np.median(self.ratio)) / MAXWELL_MEDIAN
 
     def scale_of_nearly(self, sound: Bools, closes: Bools) -> float:
         """The scale that explains nearly all cycles that the information does (L,), unless a gap parts them from those
