@@ -16,8 +16,10 @@ from hodge_adapters.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.complex.series import series_classes
+from hodge_pipeline.diagnosis import short_cycles
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
+from hodge_pipeline.diagnosis.wording import TOO_LONG
 from hodge_pipeline.types import ViewGraph
 
 CHAIN = [(k, k + 1) for k in range(9)]
@@ -197,3 +199,18 @@ def test_a_few_frames_of_a_camera_that_only_turns_are_not_blamed_for_moving_litt
         stated = np.diag(np.repeat([0.015, 0.007], 3) ** -2.0)
         found = diagnose(replace(graph, information=np.tile(stated, (len(edges), 1, 1))))
         assert found.kept.all()
+
+
+def test_edges_of_a_loop_too_long_to_be_listed_are_told_from_those_of_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(short_cycles, "LONGEST_ENTRIES", 20)
+    poses = poses_on_a_ring(31)
+    ring = near_pairs(30, 1)
+    graph = measured(poses, np.concatenate([ring, [[0, 30]]]))
+    found = diagnose(graph)
+    assert set(found.reason[:30]) == {TOO_LONG} and found.reason[30].startswith("no cycle passes it")
+    path = tmp_path / "ring.g2o"
+    write_g2o(path, graph, poses)
+    done = CliRunner().invoke(app, ["diagnose", str(path), "--out", str(tmp_path / "why")])
+    assert "1 of 31 edges lies in no loop, so that nothing can test it; 30 lie in loops too long" in done.stdout

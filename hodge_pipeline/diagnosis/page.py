@@ -13,7 +13,7 @@ from hodge_pipeline.diagnosis.advice import ranked
 from hodge_pipeline.diagnosis.energy import CAVEAT, PARTS, SHARE_CAVEAT, EnergyRow
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.suggestions import Suggestions
-from hodge_pipeline.diagnosis.wording import cycle_error, name_cycle
+from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle
 from hodge_pipeline.evaluation.page import STYLE
 from hodge_pipeline.evaluation.plots import Plot
 from hodge_pipeline.evaluation.summary import in_runs
@@ -103,7 +103,8 @@ def _untestable(graph: ViewGraph, diagnosis: Diagnosis) -> list[str]:
     untestable = diagnosis.verdict == UNTESTABLE
     in_cycle = np.zeros(graph.edge_count, bool)
     in_cycle[diagnosis.cycles.loops.edge] = True
-    blamed, alone = np.flatnonzero(untestable & in_cycle), int((untestable & ~in_cycle).sum())
+    blamed, long = np.flatnonzero(untestable & in_cycle), diagnosis.reason.count(TOO_LONG)
+    alone = int((untestable & ~in_cycle).sum()) - long
     told = []
     if len(blamed):
         told.append(f"{len(blamed)} may be to blame for {_failing_loops(graph, diagnosis, blamed)}")
@@ -112,6 +113,8 @@ def _untestable(graph: ViewGraph, diagnosis: Diagnosis) -> list[str]:
         told.append(
             f"{alone} {'lies' if one else 'lie'} in no loop, so that nothing can test {'it' if one else 'them'}"
         )
+    if long:
+        told.append(f"{long} {'lies' if long == 1 else 'lie'} in loops too long to be listed")
     return told
 
 

@@ -44,7 +44,9 @@ def closing_support(cycles: Cycles, prior: Floats) -> Floats:
 
 
 def in_no_cycle(edges: Ints, vertex_count: int, cycles: Cycles) -> Bools:
-    """Where (E,) no listed cycle passes an edge: bridges, and self-loops, which are no measurement of anything."""
+    """Where (E,) no listed cycle passes an edge: bridges, edges of loops too long to list, and self-loops, which are no
+    measurement of anything.
+    """
     alone = np.ones(len(edges), bool)
     alone[cycles.loops.edge] = False
     return alone

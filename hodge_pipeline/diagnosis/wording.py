@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE, Cycles
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -12,6 +13,7 @@ LONGEST_NAMED = 12
 ROUNDING = 1e-9
 MOST_NAMED = 4
 """Edges that share a blame; of more the number."""
+TOO_LONG = "every loop through it is too long to be listed: nothing tests it"
 
 
 def name_cycle(graph: ViewGraph, cycles: Cycles, row: int) -> str:
@@ -43,12 +45,13 @@ def reasons(
     closing = np.repeat(cycles.closes, cycles.loops.lengths)
     closed = np.bincount(cycles.loops.edge, closing, count).astype(np.int64)
     sound = _sound(cycles, (verdict == CONSISTENT) | (verdict == UNTESTABLE))
+    in_loop = _in_loop(graph, (passing == 0) & (verdict == UNTESTABLE))
     lines = []
     for edge in range(count):
         if undecided[edge] >= 0:
             lines.append(_undecided(graph, cycles, int(undecided[edge]), undecided >= 0))
         elif verdict[edge] == UNTESTABLE:
-            lines.append("no cycle passes it: nothing in the graph can test it")
+            lines.append(TOO_LONG if in_loop[edge] else "no cycle passes it: nothing in the graph can test it")
         else:
             good = verdict[edge] == CONSISTENT
             witness = int(witnesses[0 if good else 1][edge, 0])
@@ -61,6 +64,14 @@ def reasons(
                 distance = _against(bool(bridge[edge]), distance)
             lines.append(f"{text}; {distance}")
     return tuple(lines)
+
+
+def _in_loop(graph: ViewGraph, wanted: Bools) -> Bools:
+    """Which of the wanted edges (E,) some cycle passes, listed or not."""
+    if not wanted.any():
+        return wanted
+    proper = graph.edges[:, 0] != graph.edges[:, 1]
+    return np.asarray(wanted & proper & (series_classes(graph.edges, graph.vertex_count) >= 0))
 
 
 def _sound(cycles: Cycles, kept: Bools) -> Ints:
