@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline.diagnosis.cuts import scene_of
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.laws import Laws, learned
-from hodge_pipeline.diagnosis.proposals import propose
+from hodge_pipeline.diagnosis.proposals import Proposals, propose
 from hodge_pipeline.diagnosis.rearrange import Move, best_moves
 from hodge_pipeline.diagnosis.robust_poses import ONCE, Fit, fit
 from hodge_pipeline.diagnosis.worth import worth
@@ -30,8 +30,9 @@ def improved(evidence: Evidence, graph: ViewGraph, found: Fit, fair_shares: tupl
     value = worth(evidence, found.poses, found.component, [laws])
     for _ in range(ROUNDS):
         shown = learned(evidence, found)
-        moves = [move for share in fair_shares for move in _distinct(evidence, found, shown, share)]
-        moves += _unions(evidence, found, laws, value)
+        proposals = propose(scene_of(evidence, shown, found.poses, found.component), found)
+        moves = [move for share in fair_shares for move in _distinct(evidence, found, shown, share, proposals)]
+        moves += _unions(evidence, found, laws, value, proposals)
         after = [fit(evidence, graph, move.made(found), ONCE) for move in moves]
         values = [worth(evidence, one.poses, one.component, [laws]) for one in after]
         if not values or max(values) < value + LEAST_GAIN:
@@ -40,10 +41,11 @@ def improved(evidence: Evidence, graph: ViewGraph, found: Fit, fair_shares: tupl
     return found
 
 
-def _distinct(evidence: Evidence, found: Fit, laws: Laws, fair_share: float) -> list[Move]:
+def _distinct(evidence: Evidence, found: Fit, laws: Laws, fair_share: float, proposals: Proposals) -> list[Move]:
     """The moves that gain most by themselves, one for each set of views and place."""
     moves: dict[tuple[bytes, int, bytes], Move] = {}
-    for move in best_moves(scene_of(evidence, laws, found.poses, found.component, fair_share), found):
+    scene = scene_of(evidence, laws, found.poses, found.component, fair_share)
+    for move in best_moves(scene, found, proposals):
         place = np.round(move.motion).tobytes()
         moves.setdefault((move.inside.tobytes(), move.piece, place), move)
         if len(moves) == MOVES:
@@ -51,10 +53,9 @@ def _distinct(evidence: Evidence, found: Fit, laws: Laws, fair_share: float) -> 
     return list(moves.values())
 
 
-def _unions(evidence: Evidence, found: Fit, laws: Laws, value: float) -> list[Move]:
+def _unions(evidence: Evidence, found: Fit, laws: Laws, value: float, proposals: Proposals) -> list[Move]:
     """The moves of whole pieces onto others after which, with nothing settled yet, all is worth most."""
     poses, piece, upright = found.poses, found.component, laws.upright
-    proposals = propose(scene_of(evidence, laws, poses, piece), found)
     size, up = np.bincount(piece), upright.world_up(poses[:, :3, :3], piece)
     mover, stayer = piece[proposals.mover], piece[proposals.stayer]
     left = (size[mover] < size[stayer]) | ((size[mover] == size[stayer]) & (mover > stayer))

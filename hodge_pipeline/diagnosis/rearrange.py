@@ -62,16 +62,16 @@ def rearranged(evidence: Evidence, graph: ViewGraph, start: Fit, fair_share: flo
     for _ in range(ROUNDS):
         laws = learned(evidence, found[-1], laws)
         scene = scene_of(evidence, laws, found[-1].poses, found[-1].component, fair_share)
-        best = best_moves(scene, found[-1])[:1]
+        best = best_moves(scene, found[-1], propose(scene, found[-1]))[:1]
         if not best or best[0].gain <= LEAST_GAIN:
             break
         found.append(fit(evidence, graph, best[0].made(found[-1]), ONCE))
     return found
 
 
-def best_moves(scene: Scene, found: Fit) -> list[Move]:
+def best_moves(scene: Scene, found: Fit, proposals: Proposals) -> list[Move]:
     """For each motion that is proposed the best set of views to move, by what they gain, the best first."""
-    now, proposals = _before(scene, found), propose(scene, found)
+    now = _before(scene, found)
     moves, left = [], np.ones(len(proposals.mover), bool)
     for _ in range(TRIED):
         if not left.any():

@@ -48,7 +48,7 @@ class Upright:
         out, directions = np.zeros((len(piece), 3)), _directions()
         for name in np.unique(piece):
             rows = np.flatnonzero(piece == name)
-            seen = np.einsum("nji,kj->kni", rotations[rows], directions)
+            seen = np.tensordot(directions, rotations[rows], (1, 1))
             out[rows] = self._settled(rotations[rows], directions[int(np.argmax(self._log_density(seen).sum(1)))])
         return out
 
@@ -118,7 +118,7 @@ def _law(rotations: Floats, piece: Ints) -> Upright:
 
 def _densest(rotations: Floats) -> Upright:
     """A wide law about the direction in camera axes that most cameras of one piece can share."""
-    seen = np.einsum("nji,kj->kni", rotations, _directions())
+    seen = np.tensordot(_directions(), rotations, (1, 1))
     near = np.exp(DENSE * (seen @ seen.swapaxes(1, 2) - 1))
     world, view = np.unravel_index(int(np.argmax(near.sum(2))), near.shape[:2])
     up = near[world, view] @ seen[world]
