@@ -63,8 +63,8 @@ def solve(
         if out is None and not (path / RECIPE_FILE).is_file():
             run_folder = run_folder or path
     if out is not None:
-        keep_source(path, out)
         check_result(out)
+        keep_source(path, out)
     with Terminal(quiet or as_json) as terminal, terminal.stage("solve", 1):
         solved = solve_file(path, options)
     if out is not None:
