@@ -14,7 +14,7 @@ import numpy as np
 from hodge_pipeline.diagnosis.cuts import Scene, scene_of
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.laws import Laws
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
 FAIR_SHARE = 0.75
 
@@ -33,7 +33,7 @@ def _worth(scene: Scene, poses: Floats, piece: Ints) -> float:
     return held + _coming_together(scene, (layers + layers.swapaxes(1, 2)) / 2, together)
 
 
-def _coming_together(scene: Scene, sums: Floats, possible: Floats) -> float:
+def _coming_together(scene: Scene, sums: Floats, possible: Bools) -> float:
     """The nats of the cuts by which views come together, the strongest of those that are possible (V, V) first;
     `sums (3, V, V)` of the layers between any two are added up on the way.
     """

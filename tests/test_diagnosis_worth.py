@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from diagnosis_graphs import every_pair_tried
+from hodge_pipeline import se3
+from hodge_pipeline.diagnosis import consensus
+from hodge_pipeline.diagnosis.arrangements import FAIR_SHARES, best_arrangement
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.improve import improved
+from hodge_pipeline.diagnosis.laws import learned
+from hodge_pipeline.diagnosis.robust_poses import Fit
+from hodge_pipeline.diagnosis.worth import worth
+from hodge_pipeline.types import ViewGraph
+
+PART = np.arange(50) < 15
+ASIDE = se3.exp(np.array([[0.0, 0.0, 1.0, 4.0, 1.0, 0.0]]))[0]
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[Evidence, ViewGraph, Fit]:
+    """A room in one piece, with the evidence for it."""
+    kept: list[tuple[Evidence, ViewGraph, Fit]] = []
+
+    def watched(evidence: Evidence, graph: ViewGraph, *rest: object) -> Fit:
+        found = best_arrangement(evidence, graph, *rest)  # type: ignore[arg-type]
+        kept.append((evidence, graph, found))
+        return found
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(consensus, "best_arrangement", watched)
+        diagnose(every_pair_tried(3)[0])
+    assert np.ptp(kept[0][2].component) == 0
+    return kept[0]
+
+
+def test_a_scene_is_worth_less_with_a_part_of_it_elsewhere_or_apart(solved: tuple[Evidence, ViewGraph, Fit]) -> None:
+    evidence, _, found = solved
+    laws = [learned(evidence, found)]
+    value = worth(evidence, found.poses, found.component, laws)
+    moved = np.where(PART[:, None, None], ASIDE @ found.poses, found.poses)
+    assert worth(evidence, moved, found.component, laws) < value - 5
+    apart = np.where(PART, 1, 0)
+    assert worth(evidence, found.poses, apart, laws) < value - 5
+    assert worth(evidence, moved, apart, laws) == pytest.approx(worth(evidence, found.poses, apart, laws))
+
+
+@pytest.mark.parametrize("in_one_piece", [False, True])
+def test_a_part_that_lies_elsewhere_is_laid_back(solved: tuple[Evidence, ViewGraph, Fit], in_one_piece: bool) -> None:
+    evidence, graph, found = solved
+    moved = np.where(PART[:, None, None], ASIDE @ found.poses, found.poses)
+    i, j = evidence.edges.T
+    wrong = replace(found, poses=moved, component=PART * int(not in_one_piece), used=found.used & (PART[i] == PART[j]))
+    back = improved(evidence, graph, wrong, FAIR_SHARES)
+    assert np.ptp(back.component) == 0
+    relative = se3.inverse(back.poses[:1]) @ back.poses, se3.inverse(found.poses[:1]) @ found.poses
+    assert np.linalg.norm((relative[0] - relative[1])[:, :3, 3], axis=1).max() < 0.3
