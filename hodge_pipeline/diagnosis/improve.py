@@ -26,10 +26,9 @@ TILTED = -5.0
 
 def improved(evidence: Evidence, graph: ViewGraph, found: Fit, fair_shares: tuple[float, ...]) -> Fit:
     """The solution after the moves that are worth it; `graph` has the recentred edges, for fair shares see `Scene`."""
-    laws = learned(evidence, found)
+    laws = shown = learned(evidence, found)
     value = worth(evidence, found.poses, found.component, [laws])
     for _ in range(ROUNDS):
-        shown = learned(evidence, found)
         proposals = propose(scene_of(evidence, shown, found.poses, found.component), found)
         moves = [move for share in fair_shares for move in _distinct(evidence, found, shown, share, proposals)]
         moves += _unions(evidence, found, laws, value, proposals)
@@ -38,6 +37,7 @@ def improved(evidence: Evidence, graph: ViewGraph, found: Fit, fair_shares: tupl
         if not values or max(values) < value + LEAST_GAIN:
             break
         found, value = after[int(np.argmax(values))], max(values)
+        shown = learned(evidence, found)
     return found
 
 

@@ -18,7 +18,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.pieces import Alignment
 from hodge_pipeline.diagnosis.robust_poses import GATE, GENTLE, LARGE, TWICE, Fit, chi2_at, fit, rough_fit
-from hodge_pipeline.diagnosis.votes import agreement_of
+from hodge_pipeline.diagnosis.votes import agreement_of, mean_motion
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 ROUNDS, MOVES = 4, 40
@@ -133,7 +133,10 @@ def _good_moves(
         if inside is None:
             continue
         whole = component == component[proposals.mover[row]]
-        inside, motion = inside & whole, _mean_motion(proposals, group, share, poses)
+        inside, motion = (
+            inside & whole,
+            mean_motion(proposals.motion[group], poses[proposals.mover[group], :3, 3], share),
+        )
         if 2 * inside.sum() > whole.sum():  # the smaller part moves, so that others can at the same time
             inside, motion = whole & ~inside, se3.inverse(motion)
         if not (inside & moved).any():
@@ -163,11 +166,3 @@ def _cut(evidence: Evidence, held: Floats, proposals: _Proposals, group: Ints, s
     won = share[inside[mover] & ~inside[stayer]].sum()
     lost = held[used][inside[i] != inside[j]].sum()
     return inside[:count] if won - lost > LEAST_GAIN else None
-
-
-def _mean_motion(proposals: _Proposals, group: Ints, share: Floats, poses: Floats) -> Floats:
-    share = share / share.sum()
-    motion, point = proposals.motion[group], poses[proposals.mover[group], :3, 3]
-    rotation = se3.project_to_so3(np.einsum("n,nab->ab", share, motion[:, :3, :3])[None])[0]
-    landed = share @ (np.einsum("nab,nb->na", motion[:, :3, :3], point) + motion[:, :3, 3])
-    return np.asarray(se3.from_parts(rotation, landed - rotation @ (share @ point)))

@@ -9,6 +9,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.cuts import GATE, Scene, consecutive_nats
 from hodge_pipeline.diagnosis.robust_poses import Fit
+from hodge_pipeline.diagnosis.votes import mean_motion
 from hodge_pipeline.types import Bools, Floats, Ints
 
 MOST = 2000
@@ -36,12 +37,8 @@ class Proposals:
 
     def mean_motion(self, row: int, poses: Floats) -> Floats:
         """The mean (4, 4) of the motions that agree with one."""
-        weight = self.alike[row] / self.alike[row].sum()
-        used = np.flatnonzero(weight)
-        weight, motion, point = weight[used], self.motion[used], poses[self.mover[used], :3, 3]
-        rotation = se3.project_to_so3(np.einsum("n,nij->ij", weight, motion[:, :3, :3])[None])[0]
-        landed = weight @ (np.einsum("nij,nj->ni", motion[:, :3, :3], point) + motion[:, :3, 3])
-        return se3.from_parts(rotation, landed - rotation @ (weight @ point))
+        used = np.flatnonzero(self.alike[row])
+        return mean_motion(self.motion[used], poses[self.mover[used], :3, 3], self.alike[row, used])
 
 
 def propose(scene: Scene, found: Fit) -> Proposals:

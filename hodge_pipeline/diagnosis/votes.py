@@ -109,6 +109,14 @@ def agreed_motions(votes: Votes, chosen: Ints, weight: Floats) -> Floats:
     return se3.from_parts(rotation, landed - np.einsum("nij,nj->ni", rotation, middle))
 
 
+def mean_motion(motion: Floats, point: Floats, share: Floats) -> Floats:
+    """The mean (4, 4) of motions (n, 4, 4) by where they bring their points (n, 3), each counting its share (n,)."""
+    share = share / share.sum()
+    rotation = se3.project_to_so3(np.einsum("n,nab->ab", share, motion[:, :3, :3])[None])[0]
+    landed = share @ (np.einsum("nab,nb->na", motion[:, :3, :3], point) + motion[:, :3, 3])
+    return np.asarray(se3.from_parts(rotation, landed - rotation @ (share @ point)))
+
+
 def _sums(row: Ints, share: Floats, values: Floats, count: int) -> Floats:
     flat = values.reshape(len(values), -1) * share[:, None]
     columns = [np.bincount(row, column, count) for column in flat.T]
