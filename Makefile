@@ -4,14 +4,17 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
+BASELINE ?= ../hodge-baseline
 
-.PHONY: help setup demo paper test fuzz docs lint format clean
+.PHONY: help setup demo paper test fuzz baseline compare-baseline docs lint format clean
 help:
 	@echo "make setup   system libraries, $(VENV) and everything in it"
 	@echo "make demo    make a room, reconstruct it: runs/demo"
 	@echo "make paper   the paper's tables for every sequence that is there: runs/paper"
 	@echo "make test    the tests"
 	@echo "make fuzz    every reader on 2000 damaged inputs"
+	@echo "make baseline          what real data gives now, kept in $(BASELINE)"
+	@echo "make compare-baseline  what has changed since"
 	@echo "make docs    docs/recipes.md from the code"
 	@echo "make lint    ruff, mypy, import directions"
 
@@ -35,6 +38,12 @@ test: $(STAMP)
 
 fuzz: $(STAMP)
 	PYTHONWARNINGS=ignore $(BIN)/python tests/fuzz_readers.py 2000
+
+baseline: $(STAMP)
+	$(BIN)/python benchmarks/baseline.py store $(BASELINE)
+
+compare-baseline: $(STAMP)
+	$(BIN)/python benchmarks/baseline.py compare $(BASELINE)
 
 docs: $(STAMP)
 	$(BIN)/python tools/recipe_reference.py
