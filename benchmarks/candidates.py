@@ -16,18 +16,18 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.seven_scenes import SevenScenesReader
-from hodge_pipeline.edges.drift import DriftEdges
-from hodge_pipeline.edges.overlap import OverlapEdges
 from hodge_pipeline.executors.local import LocalExecutor
+from hodge_pipeline.pairs.drift import DriftEdges
+from hodge_pipeline.pairs.overlap import OverlapEdges
 from hodge_pipeline.registration.clouds import CloudOptions, prepare_clouds
 from hodge_pipeline.registration.global_landmarks import LandmarkConsensus
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.registration.global_registrars import FpfhConsensus
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.stages import GlobalRegistrar, Workers
+from hodge_pipeline.start.unordered.options import GlobalStart
+from hodge_pipeline.start.unordered.similarity import LocalDescriptors, all_pairs, similar_pairs
 from hodge_pipeline.types import CloudSet, Ints
-from hodge_pipeline.unordered.options import GlobalStart
-from hodge_pipeline.unordered.similarity import LocalDescriptors, all_pairs, similar_pairs
 
 REACH = 5
 TIMED_PAIRS = 200

@@ -21,7 +21,7 @@ SCRIPT = """
 import sys
 from pathlib import Path
 import hodge_pipeline
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 import hodge_pipeline.steps as steps, dataclasses
 recipe, source, out, count, *overrides = sys.argv[1:]
 read = steps.read

@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline import artifacts
 from hodge_pipeline.evaluation.scores import score_table
 from hodge_pipeline.evaluation.trajectory import absolute_error
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import true_poses
 from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 SEEDS = 20

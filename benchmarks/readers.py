@@ -20,14 +20,14 @@ LARGE_BYTES = 450e6
 
 
 def inspected(path: Path) -> str:
-    from hodge_pipeline.inspection import inspect
+    from hodge_pipeline.sources.inspect import inspect
 
     return f"{inspect(path)['frames']} frames"
 
 
 def clouds(path: Path) -> str:
-    from hodge_pipeline.inspection import guess_reader
     from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
+    from hodge_pipeline.sources.inspect import guess_reader
 
     options = CloudOptions(voxel_m=0.03)
     made = [make_cloud(frame, options)[0] for frame in guess_reader(path).open(path).frames]
@@ -54,7 +54,7 @@ def write_large(sequence: Path, path: Path) -> Path:
     import numpy as np
     from mcap.writer import CompressionType, Writer
 
-    from hodge_pipeline.inspection import guess_reader
+    from hodge_pipeline.sources.inspect import guess_reader
     from mcap_data import DEPTH, INFO, OPTICAL, calibration, raw_image, ros_header
     from mcap_encoding import CDR, encode_cdr, schema_bytes
 

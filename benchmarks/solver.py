@@ -30,7 +30,7 @@ from peers import g2o_seconds, gnc_weights, gtsam_seconds
 from pose_graphs import SHAPES, synthetic, with_wrong_edges
 
 from hodge_adapters.g2o import information_for_file, load_g2o, write_g2o
-from hodge_pipeline.solvers.hodge import solve
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.robust import solve_robust
 from hodge_pipeline.solvers.setup import relative_gradient
 from hodge_pipeline.types import Solution, ViewGraph

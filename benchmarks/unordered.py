@@ -22,8 +22,8 @@ from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.global_registrars import FpfhConsensus, FpfhFgr, FpfhRansac, KissMatcher
 from hodge_pipeline.stages import GlobalRegistrar
+from hodge_pipeline.start.unordered.options import HypothesisLimits
 from hodge_pipeline.types import Floats, PointCloud
-from hodge_pipeline.unordered.options import HypothesisLimits
 
 REFINE = Gicp(distances_m=(0.3, 0.1, 0.05), source_points=(2000, 4000, 8000))
 

@@ -17,14 +17,14 @@ from hodge_adapters.g2o import write_g2o
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import demo_source
-from hodge_pipeline.diagnose_path import diagnose_subject, open_subject, write_diagnosed
-from hodge_pipeline.diagnosis.plots import draw
 from hodge_pipeline.diagnosis.result import WRONG
-from hodge_pipeline.edge_pictures import edge_pictures
-from hodge_pipeline.edits import Edit, History, write_history
-from hodge_pipeline.evaluation import splat
+from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.pipeline import solve_again
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.report import splat
+from hodge_pipeline.report.diagnosed import diagnose_subject, open_subject, write_diagnosed
+from hodge_pipeline.report.diagnosis_plots import draw
+from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.rounds import true_poses
 from hodge_pipeline.types import CloudSet, Floats, ViewGraph
 

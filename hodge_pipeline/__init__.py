@@ -27,11 +27,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hodge_pipeline.pipeline import Run, run
-    from hodge_pipeline.recipe import Recipe, load_recipe
+    from hodge_pipeline.recipe.schema import Recipe, load_recipe
+    from hodge_pipeline.refine.colmap import refine_colmap
     from hodge_pipeline.refine.open3d_objects import solve_pose_graph
-    from hodge_pipeline.refined_colmap import refine_colmap
-    from hodge_pipeline.refined_trajectory import frames_from_images, refine_trajectory
-    from hodge_pipeline.solvers.hodge import solve
+    from hodge_pipeline.refine.trajectory import frames_from_images, refine_trajectory
+    from hodge_pipeline.solvers.maximum_likelihood import solve
     from hodge_pipeline.types import Solution, ViewGraph
 
 __all__ = [

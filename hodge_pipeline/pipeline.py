@@ -6,21 +6,26 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from hodge_pipeline import binding, guarding, outputs, starting, steps, tracked
-from hodge_pipeline.edited_round import edited_rounds
-from hodge_pipeline.edits import listed_edges
-from hodge_pipeline.evaluation.contents import Report
+from hodge_pipeline import steps
 from hodge_pipeline.evaluation.scores import ScoreTable
-from hodge_pipeline.guarding import Refined
-from hodge_pipeline.job import Job, logging_to
-from hodge_pipeline.recipe import Recipe, load_recipe, with_source
-from hodge_pipeline.record import Recording
+from hodge_pipeline.pairs.by_hand import edited_rounds
+from hodge_pipeline.pairs.edits import listed_edges
+from hodge_pipeline.pairs.suggested import suggested_rounds
+from hodge_pipeline.recipe import binding
+from hodge_pipeline.recipe.scale import apply_scale
+from hodge_pipeline.recipe.schema import Recipe, load_recipe, with_source
+from hodge_pipeline.recording.run import Recording
+from hodge_pipeline.refine import verdict
+from hodge_pipeline.refine.verdict import Refined
+from hodge_pipeline.report import run_files
+from hodge_pipeline.report.contents import Report
 from hodge_pipeline.rounds import Round
-from hodge_pipeline.scale import apply_scale
-from hodge_pipeline.suggested_rounds import suggested_rounds
+from hodge_pipeline.start import first_poses, key_frames
+from hodge_pipeline.start.key_frames import Tracked
+from hodge_pipeline.store.job import Job, logging_to
+from hodge_pipeline.store.progress import Nobody, Watcher
+from hodge_pipeline.store.workspace import RECIPE_FILE, Workspace
 from hodge_pipeline.types import Source
-from hodge_pipeline.watch import Nobody, Watcher
-from hodge_pipeline.workspace import RECIPE_FILE, Workspace
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,7 @@ class Run:
     result: Round
     report: Report
     refined: Refined | None = None
-    tracked: tracked.Tracked | None = None
+    tracked: Tracked | None = None
 
 
 def run(
@@ -83,8 +88,8 @@ def _run(job: Job) -> Run:
     source = read(job)
     with Recording(job, source) as recording:
         rounds, models, scores = compute(job, source, recording)
-    refined = None if job.given is None else guarding.finish(job, job.given, rounds)
-    report = outputs.write(job, source, rounds, models, scores, refined)
+    refined = None if job.given is None else verdict.finish(job, job.given, rounds)
+    report = run_files.write(job, source, rounds, models, scores, refined)
     return Run(job.workspace.folder, source, rounds[-1], report, refined, job.tracked)
 
 
@@ -92,7 +97,7 @@ def read(job: Job) -> Source:
     """The source, of a long one its key frames; the recipe's lengths are those of its scene from here on."""
     source = steps.read(job)
     apply_scale(job, source)
-    return tracked.key_frames(job, source)
+    return key_frames.key_frames(job, source)
 
 
 def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round], dict[str, Path], ScoreTable | None]:
@@ -101,12 +106,12 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
     with job.recipe.executor.open() as workers:
         clouds = steps.prepare_clouds(job, source, workers)
         recording.clouds(clouds)
-        rounds = [starting.first_poses(job, source, workers)]
+        rounds = [first_poses.first_poses(job, source, workers)]
         recording.first_poses(rounds[0])
         for number in range(1, job.recipe.outer_iterations + 1):
             poses = rounds[-1].world_from_cam
             proposed = steps.propose_edges(job, number, source, clouds, poses, measured)
-            candidates = starting.with_start_edges(proposed, rounds[0])
+            candidates = first_poses.with_start_edges(proposed, rounds[0])
             registered = steps.register_edges(job, number, candidates, poses, workers)
             recording.registration(number, registered, poses, clouds)
             rounds.append(steps.solve(job, number, source, candidates, registered, poses, measured))
@@ -121,7 +126,7 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
         recording.diagnosis(rounds[-1])
         scores = steps.evaluate(job, source, rounds, workers)
         recording.scores(scores)
-    frames, poses = tracked.frames_to_fuse(job, source, rounds[-1])
+    frames, poses = key_frames.frames_to_fuse(job, source, rounds[-1])
     models = steps.fuse(job, frames, poses, len(rounds) - 1)
     recording.models(models)
     return rounds, models, scores

@@ -10,29 +10,31 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline import artifacts, given, se3
-from hodge_pipeline.accepted import rejections
+from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.edges.pairs import select
 from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.evaluation.scaled_scores import scaled_score_table
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphScores, ScoreTable
 from hodge_pipeline.fusion.ply import write_ply
-from hodge_pipeline.job import Job, unnamed_key
-from hodge_pipeline.measured import digest, joined, measured_edges, without_measured
-from hodge_pipeline.opening import open_source
-from hodge_pipeline.recipe import cloud_options
+from hodge_pipeline.pairs.candidates import select
+from hodge_pipeline.recipe.schema import cloud_options
 from hodge_pipeline.refine.held_out import is_held_out
 from hodge_pipeline.registration import clouds as cloud_stage
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
+from hodge_pipeline.registration.acceptance import rejections
 from hodge_pipeline.registration.block_store import BlockStore
 from hodge_pipeline.registration.gaps import has_gap
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.sources.measured_edges import digest, joined, measured_edges, without_measured
+from hodge_pipeline.sources.opening import open_source
 from hodge_pipeline.stages import Workers
+from hodge_pipeline.start import given
+from hodge_pipeline.start.unordered.tour import propose_along_tour
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.store.job import Job, unnamed_key
 from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Source, ViewGraph
-from hodge_pipeline.unordered.tour import propose_along_tour
 
 HELD_OUT = "held_out.npz"
 

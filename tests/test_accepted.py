@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.accepted import strays
+from hodge_pipeline.registration.acceptance import strays
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.types import Floats, Registration
 

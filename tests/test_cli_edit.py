@@ -12,10 +12,10 @@ import hodge_pipeline
 from hodge_adapters.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.edits import Edit, History, read_history, write_history
 from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError
+from hodge_pipeline.pairs.edits import Edit, History, read_history, write_history
 from hodge_pipeline.pipeline import Run, solve_again
-from hodge_pipeline.recipe import Recipe, load_recipe
+from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.types import ViewGraph
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 

@@ -12,12 +12,12 @@ from rerun.chunk import RrdReader
 
 from hodge_pipeline import registry, se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.compare_report import write_comparison
-from hodge_pipeline.comparison import compare, tables
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.evaluation.report import Report, SourceSummary, write_report
 from hodge_pipeline.fusion.ply import write_ply
 from hodge_pipeline.recording import layout
+from hodge_pipeline.report.compared import write_comparison
+from hodge_pipeline.report.comparison import compare, tables
+from hodge_pipeline.report.write import Report, SourceSummary, write_report
 from hodge_pipeline.types import Floats, Model, Source, Trajectory
 from test_recording import circle, rows
 from test_report import read_page

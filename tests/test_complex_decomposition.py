@@ -11,11 +11,11 @@ from complex_graphs import SQUARE, TWO_TRIANGLES, complete, graphs, torus_grid, 
 from hodge_pipeline.complex.betti import betti_numbers
 from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.coboundary import coboundary_0
+from hodge_pipeline.complex.cotangent import cotangent_weights
 from hodge_pipeline.complex.decomposition import HodgeDecomposition, hodge_decomposition
 from hodge_pipeline.complex.embedding import Surface, embed, triangulate
-from hodge_pipeline.complex.form import surface_form
 from hodge_pipeline.complex.homology import homology_generators
-from hodge_pipeline.complex.metric import cotangent_weights
+from hodge_pipeline.complex.one_form import surface_form
 from hodge_pipeline.complex.rotation import random_rotation
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints

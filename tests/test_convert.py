@@ -7,10 +7,10 @@ import pytest
 from typer.testing import CliRunner
 
 from hodge_adapters.poses_text import read_tum
-from hodge_pipeline.cli.converting import convert, writer_name
+from hodge_pipeline.cli.convert import convert, writer_name
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
-from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.types import Source
 from readers_data import seven_scenes_sequence, tum_line
 

@@ -9,7 +9,7 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.diagnosis.solver import DiagnosedSolver
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import ViewGraph
 

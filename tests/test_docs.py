@@ -17,7 +17,7 @@ import typer.main
 
 import hodge_pipeline
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -138,7 +138,7 @@ def test_the_example_package_is_installed_and_runs(workplace: Path, tmp_path: Pa
     subprocess.run([*pip, str(tmp_path / "site"), str(EXAMPLE)], check=True, capture_output=True)
     script = textwrap.dedent(f"""
         import hodge_pipeline
-        from hodge_pipeline.recipe import load_recipe
+        from hodge_pipeline.recipe.schema import load_recipe
         changes = {[*SMALL[:-2], "outer_iterations=1", "recording.level=off"]!r}
         recipe = load_recipe({str(EXAMPLE / "far_loops.yaml")!r}, changes)
         hodge_pipeline.run(recipe, "run", source={str(workplace / "SEQUENCE")!r})

@@ -12,12 +12,12 @@ from pydantic import ValidationError
 
 from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_pipeline import se3
-from hodge_pipeline.edges.centroid import CentroidEdges
-from hodge_pipeline.edges.combined import CombinedEdges
-from hodge_pipeline.edges.overlap import OverlapEdges, pairwise_iou
-from hodge_pipeline.edges.pairs import merge
-from hodge_pipeline.edges.sequential import SequentialEdges
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.pairs.candidates import merge
+from hodge_pipeline.pairs.centroid import CentroidEdges
+from hodge_pipeline.pairs.combined import CombinedEdges
+from hodge_pipeline.pairs.overlap import OverlapEdges, pairwise_iou
+from hodge_pipeline.pairs.sequential import SequentialEdges
 from hodge_pipeline.stages import EdgeBuilder
 from hodge_pipeline.types import Candidates, CloudSet, Frame, PointCloud
 
@@ -107,7 +107,7 @@ def test_iou_in_many_blocks_is_that_of_one(monkeypatch: pytest.MonkeyPatch) -> N
     rng = np.random.default_rng(3)
     clouds = [PointCloud(rng.uniform(0, 1, (30, 3)).astype(np.float32)) for _ in range(9)]
     whole = pairwise_iou(clouds, poses_at(*[0.0] * 9), 0.2)
-    monkeypatch.setattr("hodge_pipeline.edges.overlap.BLOCK_ENTRIES", 18)
+    monkeypatch.setattr("hodge_pipeline.pairs.overlap.BLOCK_ENTRIES", 18)
     assert whole.nnz == 36
     assert (pairwise_iou(clouds, poses_at(*[0.0] * 9), 0.2) != whole).nnz == 0
 

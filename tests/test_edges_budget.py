@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_pipeline.edges.budget import spread, thinning_order
+from hodge_pipeline.pairs.budget import spread, thinning_order
 from hodge_pipeline.types import Candidates
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.edges.drift import DriftEdges, best_of_each
-from hodge_pipeline.edges.overlap import OverlapEdges
+from hodge_pipeline.pairs.drift import DriftEdges, best_of_each
+from hodge_pipeline.pairs.overlap import OverlapEdges
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud
 
 COUNT, RADIUS_M, SEEN_M = 80, 12.0, 4.0

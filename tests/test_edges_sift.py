@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from hodge_adapters.seven_scenes import SevenScenesReader
-from hodge_pipeline.descriptors import match
-from hodge_pipeline.edges.sift import SiftEdges
-from hodge_pipeline.edges.sift_features import Features
-from hodge_pipeline.edges.sift_matching import count_inliers
-from hodge_pipeline.edges.sift_similarity import most_similar
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.pairs.sift import SiftEdges
+from hodge_pipeline.pairs.sift_features import Features
+from hodge_pipeline.pairs.sift_matching import count_inliers
+from hodge_pipeline.pairs.sift_similarity import most_similar
+from hodge_pipeline.registration.descriptors import match
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Frame, PointCloud
 
 CAMERA = Camera(200, 150, 180.0, 180.0, 99.5, 74.5)

@@ -16,7 +16,7 @@ from hodge_adapters.g2o import (
 from hodge_adapters.toro import ToroReader, load_toro
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.solvers.hodge import solve
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import ViewGraph
 
 IDENTITY_21 = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4 0 0 4 0 4"

@@ -16,8 +16,8 @@ from hodge_pipeline.registration.global_evidence import depth_view, free_directi
 from hodge_pipeline.registration.global_features import describe, mutual_matches
 from hodge_pipeline.registration.global_registrars import FpfhConsensus, FpfhFgr, FpfhRansac, KissMatcher
 from hodge_pipeline.stages import GlobalRegistrar
+from hodge_pipeline.start.unordered.options import HypothesisLimits
 from hodge_pipeline.types import Camera, Floats, PointCloud
-from hodge_pipeline.unordered.options import HypothesisLimits
 
 KISS = importlib.util.find_spec("kiss_matcher") is not None
 CAMERA = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)

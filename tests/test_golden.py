@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import hodge_pipeline
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 
 GOLDEN = json.loads((Path(__file__).parent / "golden.json").read_text())
 LIGHT = ("fusion=[]", "recording.level=off", "evaluation.tables=false")

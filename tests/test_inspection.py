@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.artifacts import json_text
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.inspection import inspect
-from hodge_pipeline.inspection_frames import frame_facts
-from hodge_pipeline.inspection_graph import graph_facts
+from hodge_pipeline.sources.frame_facts import frame_facts
+from hodge_pipeline.sources.graph_facts import graph_facts
+from hodge_pipeline.sources.inspect import inspect
+from hodge_pipeline.store.artifacts import json_text
 from hodge_pipeline.types import Camera, Frame, ViewGraph
 
 CAMERA = Camera(4, 3, 10, 10, 2, 1.5)

@@ -14,8 +14,8 @@ from hodge_adapters.open3d_json import Open3dPoseGraphWriter
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.measured import GraphFile, MeasuredOptions, joined, measured_edges, without_measured
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.sources.measured_edges import GraphFile, MeasuredOptions, joined, measured_edges, without_measured
 from hodge_pipeline.types import Candidates, Frame, Source, Trajectory, ViewGraph
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 

@@ -9,7 +9,7 @@ from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_adapters.tum import TumReader
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.opening import open_source
+from hodge_pipeline.sources.opening import open_source
 
 
 @pytest.fixture(scope="module")

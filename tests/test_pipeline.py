@@ -19,7 +19,7 @@ import hodge_pipeline
 from hodge_adapters.poses_text import read_tum
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError, WorkspaceError
 from hodge_pipeline.pipeline import Run
-from hodge_pipeline.recipe import Recipe, load_recipe
+from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
@@ -121,7 +121,7 @@ def test_a_killed_registration_keeps_its_blocks(run: Run, tmp_path: Path) -> Non
     script = textwrap.dedent(f"""
         import os, signal, sys
         import hodge_pipeline
-        from hodge_pipeline.recipe import load_recipe
+        from hodge_pipeline.recipe.schema import load_recipe
         from hodge_pipeline import steps
         keep = steps.BlockStore.write
         def write(self, block, result):

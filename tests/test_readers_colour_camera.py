@@ -12,7 +12,7 @@ from hodge_adapters.colour_camera import LIRIS, NOMINAL, ColourCamera, colour_pi
 from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import RecipeError
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera
 from readers_data import seven_scenes_sequence

@@ -9,7 +9,7 @@ from hodge_adapters.log_text import LogWriter
 from hodge_adapters.pair_log import PairLogReader, read_information
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Source
 

@@ -19,7 +19,7 @@ from hodge_adapters.open3d_json import Open3dPoseGraphWriter, Open3dReader, Open
 from hodge_adapters.trajectory_files import KittiPosesReader, TumPosesReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Frame, Source, Trajectory, ViewGraph
 

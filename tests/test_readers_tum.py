@@ -11,7 +11,7 @@ from hodge_adapters.association import interpolated_poses, nearest_pairs
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Source, Trajectory
 from readers_data import HEIGHT, WIDTH, agreement, depth_values, some_poses, tum_folder, tum_line, write_depth

@@ -12,7 +12,7 @@ import hodge_pipeline
 from hodge_adapters.mcap import McapReader
 from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_adapters.tum import TumReader
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from mcap_data import COMPRESSED, RAW, compressed_depth, compressed_inverse_depth, png, raw_image
 from mcap_encoding import CDR, ENCODINGS

@@ -13,8 +13,8 @@ from hodge_adapters.colmap_refining import ColmapModels
 from hodge_adapters.colmap_tracked import ColmapModel
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.edits import listed_edges
 from hodge_pipeline.errors import CheckError, SourceError, WorkspaceError
+from hodge_pipeline.pairs.edits import listed_edges
 from hodge_pipeline.refine.scale import metric_scale
 from test_readers_colmap import synthetic
 

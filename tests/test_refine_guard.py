@@ -3,8 +3,8 @@ import math
 from typer.testing import CliRunner
 
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.guarding import chi2_measure
 from hodge_pipeline.refine.guard import Change, Measure, decide
+from hodge_pipeline.refine.verdict import chi2_measure
 
 BETTER = Measure("held-out distance", 0.010, 0.009)
 WORSE = Measure("held-out score", 0.90, 0.88, better="higher")

@@ -15,11 +15,11 @@ from hodge_adapters.tum import TumReader
 from hodge_pipeline import registry, se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import GraphError, SourceError
-from hodge_pipeline.inspection import guess_reader
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.refine.correction import spread_correction
 from hodge_pipeline.refine.given_poses import GivenOptions, match_poses
 from hodge_pipeline.refine.key_frames import KeyFrameOptions, choose_key_frames
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.types import Floats, Frame, Source, Trajectory
 
 SMALL = ("clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1")

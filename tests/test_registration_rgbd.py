@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hodge_pipeline import se3
-from hodge_pipeline.descriptors import match, root_sift
+from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.guided import guided_match
 from hodge_pipeline.registration.landmarks import back_projected, find_landmarks
 from hodge_pipeline.registration.rgbd import Rgbd

@@ -13,7 +13,12 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
-from hodge_pipeline.evaluation.report import (
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.scores import GraphScores, ScoreTable
+from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows, worst_edges
+from hodge_pipeline.report.tables import score_tables, summary_lines
+from hodge_pipeline.report.verdict import judge, length, percent, suspicions
+from hodge_pipeline.report.write import (
     EdgeRow,
     LoopRow,
     Path3D,
@@ -25,11 +30,6 @@ from hodge_pipeline.evaluation.report import (
     as_json,
     write_report,
 )
-from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.evaluation.scores import GraphScores, ScoreTable
-from hodge_pipeline.evaluation.summary import graph_summary, in_runs, trajectory_rows, worst_edges
-from hodge_pipeline.evaluation.tables import score_tables, summary_lines
-from hodge_pipeline.evaluation.verdict import judge, length, percent, suspicions
 from hodge_pipeline.types import Floats, ViewGraph
 
 VOID = {"meta", "img", "br"}

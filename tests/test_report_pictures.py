@@ -9,9 +9,9 @@ import numpy as np
 from PIL import Image
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.evaluation import splat
-from hodge_pipeline.evaluation.contents import EdgeRow
-from hodge_pipeline.report_pictures import four_sides, worst_pairs
+from hodge_pipeline.report import splat
+from hodge_pipeline.report.contents import EdgeRow
+from hodge_pipeline.report.sides import four_sides, worst_pairs
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud, Source
 
 RED, BLUE = (200, 0, 0), (0, 0, 200)

@@ -11,8 +11,8 @@ import pytest
 import hodge_pipeline
 from hodge_adapters.ply_points import write_ply
 from hodge_pipeline import se3
-from hodge_pipeline.recipe import load_recipe
-from hodge_pipeline.scale import measured_scale, scaled_recipe
+from hodge_pipeline.recipe.scale import measured_scale, scaled_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.types import Floats, Frame, PointCloud
 from test_global_registration import furnished_corner
 

@@ -14,8 +14,8 @@ from hodge_adapters.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError
-from hodge_pipeline.inspection import guess_reader
-from hodge_pipeline.solve_file import Choices, disabled_edges, solve_file
+from hodge_pipeline.refine.pose_graph import Choices, disabled_edges, solve_file
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.types import ViewGraph
 
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers import minimise
-from hodge_pipeline.solvers.full import full_residuals
-from hodge_pipeline.solvers.hodge import solve
+from hodge_pipeline.solvers.full_information import full_residuals
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.objective import best_translations, quadratic_model, residuals, rotation_gradient
 from hodge_pipeline.solvers.rotations import exponential, project
 from hodge_pipeline.solvers.setup import prepare

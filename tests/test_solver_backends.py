@@ -13,9 +13,9 @@ from hodge_pipeline.solvers import multigrid as multigrid_module
 from hodge_pipeline.solvers.backends import BackendName, backend, choose, installed
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.covariance import marginal_covariances
-from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, aggregates, multigrid
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from solver_graphs import laplacian

@@ -5,8 +5,8 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.certificate import Certificate, bounded, certificate_matrix, certify, lower_bound
-from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.solvers.lifted import LiftedObjective, tangent
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.objective import best_translations, residuals
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import Floats, ViewGraph

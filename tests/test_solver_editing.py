@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.editing import GraphEditor
-from hodge_pipeline.solvers.hodge import solve
 from hodge_pipeline.solvers.linear import corrected, factorise
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Solution, ViewGraph
 from solver_graphs import laplacian
 

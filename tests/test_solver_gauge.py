@@ -7,7 +7,7 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.hodge import HodgeSolver, solve
+from hodge_pipeline.solvers.maximum_likelihood import HodgeSolver, solve
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import Priors, ViewGraph
 from solver_graphs import ladder

@@ -9,7 +9,7 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.hodge import HodgeSolver, solve
+from hodge_pipeline.solvers.maximum_likelihood import HodgeSolver, solve
 from hodge_pipeline.types import ViewGraph
 from solver_graphs import ladder
 

@@ -6,7 +6,7 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.solvers import chordal, multilevel
 from hodge_pipeline.solvers.elimination import independent_set
-from hodge_pipeline.solvers.hodge import solve
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.multilevel import RotationGraph, multilevel_rotations
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import ViewGraph

@@ -7,7 +7,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
 from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
-from hodge_pipeline.solvers.hodge import solve
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.robust import RobustSolver, solve_robust
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import ViewGraph

@@ -12,18 +12,20 @@ import pytest
 import hodge_pipeline
 from hodge_adapters.poses_text import read_tum
 from hodge_adapters.tum import TumReader
-from hodge_pipeline import se3, starting, tracked
+from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
-from hodge_pipeline.edits import Edit, History, write_history
 from hodge_pipeline.executors.local import InProcess
+from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.pipeline import solve_again
-from hodge_pipeline.recipe import Recipe, load_recipe
+from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, frame_blocks, track_block
 from hodge_pipeline.rounds import Round
-from hodge_pipeline.tracked import Tracked, tracking_options
+from hodge_pipeline.start import first_poses as starting
+from hodge_pipeline.start import key_frames as tracked
+from hodge_pipeline.start.key_frames import Tracked, tracking_options
+from hodge_pipeline.start.unordered.start import Start
 from hodge_pipeline.types import CloudSet, Floats32, Frame, Source, ViewGraph
-from hodge_pipeline.unordered.start import Start
 
 FRAMES = 64
 SMALL = (
@@ -79,7 +81,7 @@ def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeli
 
 def test_every_frame_that_was_found_is_fused(run: hodge_pipeline.Run) -> None:
     assert run.tracked is not None
-    job = hodge_pipeline.job.Job(small_recipe(run.folder), None, hodge_pipeline.watch.Nobody())  # type: ignore[arg-type]
+    job = hodge_pipeline.store.job.Job(small_recipe(run.folder), None, hodge_pipeline.store.progress.Nobody())  # type: ignore[arg-type]
     found = np.arange(FRAMES) != 5
     job.tracked = replace(run.tracked, found=found)
     frames, poses = tracked.frames_to_fuse(job, run.source, run.result)
@@ -103,7 +105,7 @@ def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(sequence: Path,
 def test_a_source_that_is_short_enough_is_registered_whole(sequence: Path) -> None:
     recipe = small_recipe(sequence, "key_frames.whole_up_to=64")
     source = TumReader().open(sequence)
-    job = hodge_pipeline.job.Job(recipe, None, hodge_pipeline.watch.Nobody())  # type: ignore[arg-type]
+    job = hodge_pipeline.store.job.Job(recipe, None, hodge_pipeline.store.progress.Nobody())  # type: ignore[arg-type]
     assert tracked.key_frames(job, source) is source
 
 

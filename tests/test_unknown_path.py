@@ -11,7 +11,7 @@ from hodge_adapters.colmap_refining import ColmapModels
 from hodge_adapters.g2o import load_g2o
 from hodge_adapters.toro import load_toro
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.inspection import guess_reader, inspect
+from hodge_pipeline.sources.inspect import guess_reader, inspect
 from readers_data import tum_folder
 
 ISAM = (

@@ -11,21 +11,21 @@ import pytest
 import hodge_pipeline
 from hodge_adapters.ply_points import write_ply
 from hodge_pipeline import se3
-from hodge_pipeline.edges.sequential import SequentialEdges
 from hodge_pipeline.executors.local import LocalExecutor
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.pairs.sequential import SequentialEdges
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView
 from hodge_pipeline.stages import no_progress
+from hodge_pipeline.start.unordered.folds import Pieces, contradictions, unfolded, within_parts
+from hodge_pipeline.start.unordered.hypotheses import allowed_hue_conflict, allowed_violation
+from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
+from hodge_pipeline.start.unordered.pieces import laid_apart
+from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
+from hodge_pipeline.start.unordered.start import Scene, Start, find_start
+from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
 from hodge_pipeline.types import Camera, CloudSet, Floats, Frame, PointCloud, ViewGraph
-from hodge_pipeline.unordered.folds import Pieces, contradictions, unfolded, within_parts
-from hodge_pipeline.unordered.hypotheses import allowed_hue_conflict, allowed_violation
-from hodge_pipeline.unordered.options import GlobalStart, HypothesisLimits
-from hodge_pipeline.unordered.pieces import laid_apart
-from hodge_pipeline.unordered.scan_checks import check_scans, unregistrable
-from hodge_pipeline.unordered.start import Scene, Start, find_start
-from hodge_pipeline.unordered.tour import propose_along_tour, tour
 from test_global_registration import furnished_corner
 
 OPTIONS = CloudOptions(voxel_m=0.05, min_range_m=0.0, max_range_m=100.0)

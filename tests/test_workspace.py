@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_pipeline import artifacts
 from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.store.workspace import Workspace, key_of
 from hodge_pipeline.types import Solution, SolverIteration, ViewGraph
-from hodge_pipeline.workspace import Workspace, key_of
 
 RECIPE = {"seed": 0, "edges": {"stage": "overlap", "min_iou": 0.3}}
 

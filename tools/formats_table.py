@@ -6,8 +6,8 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from hodge_pipeline import inspection
 from hodge_pipeline.errors import HodgeError
+from hodge_pipeline.sources import inspect as inspection
 
 OPENED_WHOLE = 0.6
 """A folder that a reader is so sure of is opened as one; its files are its own."""

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
-from hodge_pipeline import binding, recipe_file, registry, yaml_file
+from hodge_pipeline import registry
 from hodge_pipeline.errors import HodgeError
-from hodge_pipeline.recipe import Recipe
+from hodge_pipeline.recipe import binding, recipe_file, yaml_file
+from hodge_pipeline.recipe.schema import Recipe
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "recipes.md"
 OURS = "hodge-pipeline "

@@ -9,7 +9,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from hodge_pipeline.cli import refining
+from hodge_pipeline.cli import refine as refining
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -87,7 +87,7 @@ def run(
     json: Json = False,
 ) -> None:
     """Run a recipe on a source: poses, fused model, report and recording in --out."""
-    from hodge_pipeline.cli import running
+    from hodge_pipeline.cli import run as running
 
     running.run(recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live)
 
@@ -95,7 +95,7 @@ def run(
 @app.command()
 def demo(out: Out, overrides: Overrides = None, overwrite: Overwrite = False, quiet: Quiet = False) -> None:
     """Make a furnished room with Kinect-like noise and run the recipe `demo` on it."""
-    from hodge_pipeline.cli import running
+    from hodge_pipeline.cli import run as running
 
     running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet)
 
@@ -132,7 +132,7 @@ def solve(
     json: Json = False,
 ) -> None:
     """Solve a pose graph: maximum-likelihood poses, certified where asked for."""
-    from hodge_pipeline.cli import solving
+    from hodge_pipeline.cli import solve as solving
 
     options = solving.choices(
         objective,
@@ -161,7 +161,7 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Say which edges are wrong, why, and what to do: by the cycles that they lie in, before any solve."""
-    from hodge_pipeline.cli import diagnosing
+    from hodge_pipeline.cli import diagnose as diagnosing
 
     diagnosing.diagnose(path, out, top=top, quiet=quiet, as_json=json)
 
@@ -190,7 +190,7 @@ def edit(
     json: Json = False,
 ) -> None:
     """Switch edges of a run off or on, or have more registered; `hodge solve RUN` then solves and fuses again."""
-    from hodge_pipeline.cli import editing
+    from hodge_pipeline.cli import edit as editing
 
     pairs = editing.Pairs(disable or [], enable or [], register or [])
     editing.edit(run_folder, pairs, undo=undo, listing=listing, quiet=quiet, as_json=json)
@@ -199,7 +199,7 @@ def edit(
 @app.command()
 def inspect(source: Path, reader: Reader = None, overrides: ReaderSet = None, json: Json = False) -> None:
     """Say what a path is: format, frames, stamps, depth range, intrinsics, oddities."""
-    from hodge_pipeline.cli import listing
+    from hodge_pipeline.cli import list as listing
 
     listing.inspect(source, reader=reader, settings=overrides or [], as_json=json)
 
@@ -213,7 +213,7 @@ def convert(
     overrides: ReaderSet = None,
 ) -> None:
     """Write what a path holds in another format."""
-    from hodge_pipeline.cli import converting
+    from hodge_pipeline.cli import convert as converting
 
     converting.convert(source, out, to=to, reader=reader, settings=overrides or [])
 
@@ -223,7 +223,7 @@ def stages(
     kind: Annotated[Optional[str], typer.Argument(help="Only this kind, with every option.")] = None,  # noqa: UP045
 ) -> None:
     """List the stages that are installed, and their options."""
-    from hodge_pipeline.cli import listing
+    from hodge_pipeline.cli import list as listing
 
     listing.stages(kind)
 
@@ -234,7 +234,7 @@ def recipes(
     schema: Annotated[bool, typer.Option("--schema", help="Print NAME's JSON schema for editors.")] = False,
 ) -> None:
     """List the recipes that come with the package."""
-    from hodge_pipeline.cli import listing
+    from hodge_pipeline.cli import list as listing
 
     listing.recipes(name, schema=schema)
 
@@ -245,7 +245,7 @@ def view(
     web: Annotated[bool, typer.Option("--web", help="As a page that only this machine can see.")] = False,
 ) -> None:
     """Open a run's recording in the Rerun viewer."""
-    from hodge_pipeline.cli import recording
+    from hodge_pipeline.cli import record as recording
 
     recording.view(run_folder, web=web)
 
@@ -258,7 +258,7 @@ def record(
     quiet: Quiet = False,
 ) -> None:
     """Make the recording of a run again, at another size, without computing anything again."""
-    from hodge_pipeline.cli import recording
+    from hodge_pipeline.cli import record as recording
 
     recording.record(run_folder, level, max_megabytes, quiet=quiet)
 
@@ -270,7 +270,7 @@ def compare(
     out: Annotated[Optional[Path], typer.Option(help="Folder for compare.html and .rrd; default: the second.")] = None,  # noqa: UP045
 ) -> None:
     """Compare two runs: numbers, options that differ, poses and models."""
-    from hodge_pipeline.cli import recording
+    from hodge_pipeline.cli import record as recording
 
     recording.compare(first, second, out)
 

@@ -13,9 +13,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.artifacts import write_atomically
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
+from hodge_pipeline.store.artifacts import write_atomically
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Ints
 
 STRIDE = 3  # pixels: 34 000 points of a VGA frame, which fill nearly all pixels of the pictures

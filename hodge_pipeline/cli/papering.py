@@ -10,7 +10,6 @@ from typing import Annotated, Optional
 
 import typer
 
-from hodge_pipeline import artifacts
 from hodge_pipeline.cli.console import Terminal
 from hodge_pipeline.cli.paper_sequences import Found, find_sequences, peer_poses
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
@@ -19,8 +18,9 @@ from hodge_pipeline.evaluation.paper_tables import NAN, Measured, Results
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphKind, score_table
 from hodge_pipeline.pipeline import Run
 from hodge_pipeline.pipeline import run as run_pipeline
-from hodge_pipeline.recipe import load_recipe
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.rounds import has_truth, true_poses
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Solution
 
 HEADING = "The paper's tables"

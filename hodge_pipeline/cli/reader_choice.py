@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from hodge_pipeline import binding, registry, yaml_file
+from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
-from hodge_pipeline.inspection import guess_reader
+from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import FrameReader
 
 

@@ -12,7 +12,7 @@ from hodge_pipeline.diagnosis.mending import mend
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.pieces import Alignment, align
 from hodge_pipeline.diagnosis.robust_poses import GATE, LARGE, TWICE, Fit, fit, rough_fit
-from hodge_pipeline.solvers.hodge import solve
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Floats, ViewGraph
 
 PRIOR_SHARE = 0.3

@@ -13,7 +13,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.robust_poses import left_over
-from hodge_pipeline.solvers.hodge import ObjectiveName
+from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.robust import CHI2_99_PLANAR, CHI2_99_SPATIAL, solve_robust
 from hodge_pipeline.solvers.weights import edge_weights
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.edges.overlap import OverlapEdges
+from hodge_pipeline.pairs.overlap import OverlapEdges
 from hodge_pipeline.stages import EdgeBuilder
 
 

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 
-from hodge_pipeline.evaluation.page import STYLE
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, SIGMA_M, GraphKind
-from hodge_pipeline.evaluation.tables import Table
+from hodge_pipeline.report.page import STYLE
+from hodge_pipeline.report.tables import Table
 
 NAN = float("nan")
 COLUMNS = ("GT", "BF", "Hodge 1st", "Hodge 3rd")

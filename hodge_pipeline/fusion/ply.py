@@ -9,8 +9,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.artifacts import write_atomically
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.store.artifacts import write_atomically
 from hodge_pipeline.types import Model
 
 POINTS, NORMALS, COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.inspection import guesses
+from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.types import Floats, Frame, Ints, Source, Trajectory
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hodge_pipeline import artifacts, se3
+from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.refine.guard import Change, Decision, Measure, decide
@@ -18,6 +18,7 @@ from hodge_pipeline.refine.model_stages import NOTES, ModelStages, measured_edge
 from hodge_pipeline.refine.scale import Scale, metric_scale
 from hodge_pipeline.refine.uncertainty import SIGMAS
 from hodge_pipeline.stages import TrackedModel, Workers
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats
 
 ADJUSTMENTS = 2

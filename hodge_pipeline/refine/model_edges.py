@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline import artifacts, se3
+from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import edge_distances
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_stages import NOTES, ModelStages
@@ -16,6 +16,7 @@ from hodge_pipeline.registration.block_store import BlockStore
 from hodge_pipeline.registration.clouds import prepare_clouds
 from hodge_pipeline.registration.pairs import Registered, register_pairs
 from hodge_pipeline.stages import TrackedModel, Workers
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, ViewGraph
 
 LEAST_HELD_OUT = 4

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline import binding, recipe_file
+from hodge_pipeline.recipe import binding, recipe_file
+from hodge_pipeline.recipe.yaml_file import Document, Keys
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, ModelReader, Registrar
-from hodge_pipeline.yaml_file import Document, Keys
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 RECIPE = "colmap-refine"

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hodge_pipeline import artifacts
 from hodge_pipeline.stages import TrackedModel
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.store.workspace import StageFolder, Workspace, key_of
 from hodge_pipeline.types import ViewGraph
-from hodge_pipeline.workspace import StageFolder, Workspace, key_of
 
 NOTES = "notes.json"
 

@@ -6,8 +6,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from hodge_pipeline import artifacts
 from hodge_pipeline.registration.pairs import Registered
+from hodge_pipeline.store import artifacts
 
 
 @dataclass(frozen=True)

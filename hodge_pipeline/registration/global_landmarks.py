@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.descriptors import match, root_sift
 from hodge_pipeline.registration.consensus import rigid_consensus
+from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.types import Bytes, Floats32, Landmarks, Match, PointCloud
 
 

@@ -16,8 +16,8 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
-from hodge_pipeline.descriptors import match, root_sift
 from hodge_pipeline.registration.assessment import Assessment, assess, unregistered
+from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.gicp import Gicp, PreparedCloud
 from hodge_pipeline.registration.guided import guided_match
 from hodge_pipeline.registration.visual import VisualMotion, visual_motion

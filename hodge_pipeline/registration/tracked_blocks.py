@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline import artifacts
 from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.registration.tracking import TrackedBlock
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Floats, Ints
 
 STEP, CLOUD = "step_", "cloud_"

@@ -9,7 +9,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.full import FullObjective
+from hodge_pipeline.solvers.full_information import FullObjective
 from hodge_pipeline.solvers.linear import factorise_blocks
 from hodge_pipeline.solvers.setup import Setup, prepare
 from hodge_pipeline.solvers.weights import PLANAR_AXES

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.hodge import ObjectiveName
-from hodge_pipeline.solvers.local import settled_nearby
+from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
+from hodge_pipeline.solvers.neighbourhood import settled_nearby
 from hodge_pipeline.solvers.newton import Descent, Limits
 from hodge_pipeline.solvers.priors import PER_EDGE
 from hodge_pipeline.solvers.problem import reweighted

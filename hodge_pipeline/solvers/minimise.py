@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from hodge_pipeline.solvers import direct
-from hodge_pipeline.solvers.full import FullObjective
-from hodge_pipeline.solvers.joint import CG_FIRST_TO, JointObjective, cg_first
+from hodge_pipeline.solvers.full_information import FullObjective
+from hodge_pipeline.solvers.isotropic import CG_FIRST_TO, JointObjective, cg_first
 from hodge_pipeline.solvers.newton import CG_LIMIT_REACHED, Descent, Limits, Point, descend
 from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
 from hodge_pipeline.solvers.problem import Problem

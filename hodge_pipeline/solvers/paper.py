@@ -20,8 +20,8 @@ from hodge_pipeline.complex.cycles import (
     loop_products,
     spanning_forest,
 )
-from hodge_pipeline.complex.form import Logarithm
 from hodge_pipeline.complex.minimum_cycles import MOST_CANDIDATES, minimum_cycle_basis
+from hodge_pipeline.complex.one_form import Logarithm
 from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem, path_lengths
 from hodge_pipeline.solvers.paper_surface import (
     MOST_CHECKED_EDGES,

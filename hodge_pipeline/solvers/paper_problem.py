@@ -13,7 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import orthonormal
 from hodge_pipeline.complex.components import connected_components, first_of_component
 from hodge_pipeline.complex.edge_weights import edge_weights
-from hodge_pipeline.complex.form import Logarithm, centroids, residual_form, shifted
+from hodge_pipeline.complex.one_form import Logarithm, centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.potential import moved, poisson, residual_metrics
 from hodge_pipeline.types import Floats, Ints, ViewGraph

@@ -23,8 +23,8 @@ from hodge_pipeline.complex.cycles import (
     spanning_forest,
 )
 from hodge_pipeline.complex.edge_weights import EdgeWeighting, edge_weights
-from hodge_pipeline.complex.form import Logarithm, centroids, residual_form, shifted
 from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
+from hodge_pipeline.complex.one_form import Logarithm, centroids, residual_form, shifted
 from hodge_pipeline.solvers.potential import moved, poisson, residual_metrics, residuals
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, SolverIteration, ViewGraph
 

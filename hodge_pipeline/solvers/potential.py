@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from hodge_pipeline import se3
 from hodge_pipeline.complex.coboundary import grounded_laplacian
 from hodge_pipeline.complex.components import first_of_component
-from hodge_pipeline.complex.form import Logarithm
+from hodge_pipeline.complex.one_form import Logarithm
 from hodge_pipeline.solvers.linear import factorise
 from hodge_pipeline.types import Floats, Ints
 

@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
 from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
-from hodge_pipeline.solvers.hodge import ObjectiveName, solve
+from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.minimise import descend_isotropic
 from hodge_pipeline.solvers.newton import Limits, Point
 from hodge_pipeline.solvers.objective import residuals

@@ -1,0 +1,73 @@
+"""The commands about recordings: `hodge view`, `hodge record`, `hodge compare`."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, get_args
+
+from hodge_pipeline.cli.console import Terminal, print_table
+from hodge_pipeline.errors import RecipeError, WorkspaceError
+from hodge_pipeline.recording.options import Level
+
+
+def record(run_folder: Path, level: str | None, max_megabytes: float | None, *, quiet: bool) -> None:
+    """Make a run's recording again and say where it is."""
+    levels = [name for name in get_args(Level) if name != "off"]
+    if level is not None and level not in levels:
+        raise RecipeError(f"--level {level}: expected {', '.join(levels)}")
+    if max_megabytes is not None and not max_megabytes > 0:
+        raise RecipeError(f"--max-megabytes {max_megabytes:g}: expected a size above zero")
+    from hodge_pipeline.recording.replay import record_again
+
+    given: dict[str, Any] = {"level": level, "max_megabytes": max_megabytes}
+    with Terminal(quiet) as terminal:
+        path, missing = record_again(
+            run_folder, {name: value for name, value in given.items() if value is not None}, terminal
+        )
+    if not quiet:
+        print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+        if missing:
+            print(f"the run is not finished: it is recorded up to the stage '{missing}'")
+
+
+def view(run_folder: Path, *, web: bool) -> None:
+    """Open the recording in the viewer, or serve it on this machine, and wait until it is closed."""
+    recording = run_folder / "recording.rrd" if run_folder.is_dir() else run_folder
+    if not recording.is_file():
+        raise WorkspaceError(f"{recording}: no recording here: make one with `hodge record RUN --level normal`")
+    from hodge_pipeline.recording import live
+
+    if web:
+        with live.served([recording], opens_browser=True) as (_, page):
+            print(f"{page}\nCtrl-C ends it", flush=True)
+            with suppress(KeyboardInterrupt):
+                while True:
+                    time.sleep(3600)
+    elif not live.has_screen():
+        raise WorkspaceError(f"{recording}: there is no screen here: add --web")
+    else:
+        viewer = live.start([str(recording.resolve()), "--bind", live.HOST, "--port", "auto"])
+        try:
+            failed = viewer.wait()
+        finally:
+            viewer.kill()
+        if failed:
+            raise WorkspaceError(f"{recording}: the viewer ended with an error: try --web")
+
+
+def compare(first: Path, second: Path, out: Path | None) -> None:
+    """Print two runs side by side, and write their comparison as a page and as a recording."""
+    from hodge_pipeline.report.compared import write_comparison
+    from hodge_pipeline.report.comparison import compare as compare_runs
+    from hodge_pipeline.report.comparison import tables
+
+    comparison = compare_runs(first, second)
+    folder = second if out is None else out
+    written = write_comparison(folder, comparison)
+    for table in tables(comparison):
+        if table.rows:
+            print_table(table.title, table.header, table.rows)
+    for path in written:
+        print(f"{'written':<8} {path}")

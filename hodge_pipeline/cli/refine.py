@@ -1,0 +1,111 @@
+"""The commands that make existing poses better: `hodge refine`. Only parsing happens here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+HELP = """Make the poses of COLMAP or SLAM better, in their own format.
+
+The result is measured before it is written: where it is worse by its own measures the input is given back byte for
+byte and the exit code is 3 (--force writes the result all the same).
+
+A graph file (g2o, TORO, …) needs no frames: give it to `hodge solve`.
+
+Examples:
+
+\b
+  hodge refine trajectory CameraTrajectory.txt --frames rgbd_dataset_freiburg1_desk --out runs/desk
+  hodge refine trajectory scene/trajectory.log --frames DIR --out runs/scene
+  hodge refine colmap sparse/0 --database database.db --out runs/model
+  hodge refine colmap sparse --depth depth --depth-scale 1000 --out runs/metric
+"""
+
+group = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode=None)
+
+
+@group.command()
+def trajectory(
+    poses: Annotated[
+        Path, typer.Argument(help="TUM, KITTI, EuRoC csv, Redwood .log, MCAP, 7-Scenes poses, Open3D JSON.")
+    ],
+    frames: Annotated[Path, typer.Option("--frames", help="The sequence the poses belong to, with depth or clouds.")],
+    out: Annotated[Path, typer.Option("--out", help="The run folder: refined.<suffix of POSES>, report, recording.")],
+    match: Annotated[
+        str, typer.Option(help="How a pose finds its frame: stamp, number, row (n-th pose, n-th frame), or auto.")
+    ] = "auto",
+    force: Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")] = False,
+    recipe: Annotated[
+        str, typer.Option("--recipe", help="A recipe like slam-refine, which is the default; for TUM slam-refine-tum.")
+    ] = "",
+    overrides: Annotated[
+        Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
+        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Refine SLAM poses with the frames they belong to: loops, registration, a robust solve."""
+    from hodge_pipeline.cli import refine_trajectory as refining_trajectory
+
+    refining_trajectory.refine(
+        poses, frames, out, match, recipe, overrides or [], force=force, overwrite=overwrite, quiet=quiet, as_json=json
+    )
+
+
+@group.command()
+def colmap(
+    model: Annotated[Path, typer.Argument(help="A COLMAP model, .bin or .txt; or the folder of several: 0, 1, …")],
+    out: Annotated[
+        Path, typer.Option("--out", help="The run folder: sparse/0 (the model), report; it goes on where it stopped.")
+    ],
+    database: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--database", help="COLMAP's database.db; default: the one beside or above the model."),
+    ] = None,
+    images: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--images", help="Folder of the colour images; default: images/ beside or above the model."),
+    ] = None,
+    depth: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--depth", help="Folder of sensor depth, PNGs named as the images (or depth for color)."),
+    ] = None,
+    depth_scale: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option("--depth-scale", help="Stored units of depth to the metre; default: the recipe's, 1000."),
+    ] = None,
+    depth_camera: Annotated[
+        Optional[tuple[float, float, float, float]],  # noqa: UP045
+        typer.Option("--depth-camera", help="FX FY CX CY of depth that is not on the pixels of the colour images."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")] = False,
+    recipe: Annotated[str, typer.Option("--recipe", help="A recipe like colmap-refine, by name or file.")] = "",
+    overrides: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe colmap-refine."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Refine a COLMAP model: edges measured anew, a robust solve, bundle adjustment; metric where there is depth."""
+    from hodge_pipeline.cli import refine_colmap as refining_colmap
+
+    given = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale}
+    sets = [f"model.{name}={value}" for name, value in given.items() if value is not None]
+    if depth_camera is not None:
+        sets.append(f"model.depth_camera=[{', '.join(map(str, depth_camera))}]")
+    refining_colmap.refine(
+        model,
+        out,
+        [*sets, *(overrides or [])],
+        recipe=recipe,
+        force=force,
+        overwrite=overwrite,
+        quiet=quiet,
+        as_json=json,
+    )

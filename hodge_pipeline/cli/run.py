@@ -1,0 +1,110 @@
+"""The commands that run: `hodge run`, `hodge demo`."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from hodge_pipeline.cli.console import Terminal, print_table
+from hodge_pipeline.errors import CheckError, RecipeError
+from hodge_pipeline.recipe.schema import load_recipe
+
+if TYPE_CHECKING:
+    from hodge_pipeline.pipeline import Run
+
+
+def run(
+    recipe: str,
+    source: Path | None,
+    out: Path,
+    overrides: Sequence[str],
+    *,
+    overwrite: bool,
+    quiet: bool,
+    as_json: bool,
+    live: bool = False,
+) -> None:
+    """Run a recipe and print what came out."""
+    loaded = load_recipe(recipe, overrides, source)
+    if loaded.source.path is None:
+        raise RecipeError(f"recipe '{recipe}' names no source: add --source PATH")
+    from hodge_pipeline.pipeline import run as run_pipeline
+
+    with resumable(out), Terminal(quiet or as_json) as terminal, _viewer(live, terminal) as address:
+        result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal, live=address)
+    print_result(result, quiet=quiet, as_json=as_json)
+    if result.refined is not None and result.refined.decision.exit_code:
+        raise CheckError(result.refined.decision.reason)
+
+
+def print_result(result: Run, *, quiet: bool, as_json: bool) -> None:
+    """Print the report of a run: tables and notes, or JSON."""
+    if as_json:
+        from hodge_pipeline.report.write import as_json as report_json
+        from hodge_pipeline.store.artifacts import json_text
+
+        print(json_text(report_json(result.report)), end="")
+    elif not quiet:
+        _print_summary(result)
+
+
+@contextmanager
+def _viewer(live: bool, terminal: Terminal) -> Iterator[str | None]:
+    """The address of a viewer where one is wished for, and a line that says where it is seen."""
+    if not live:
+        yield None
+        return
+    from hodge_pipeline.recording.live import viewer
+
+    with viewer() as (address, where):
+        terminal.say(f"live: {where}")
+        yield address
+
+
+class Terminated(KeyboardInterrupt):
+    """The system asks the process to end, as Ctrl-C does."""
+
+
+def _terminate(*_: object) -> None:
+    raise Terminated
+
+
+@contextmanager
+def resumable(out: Path) -> Iterator[None]:
+    """Says in one line how a run that was stopped goes on, and exits: 130 after Ctrl-C, 143 after a TERM."""
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        recording = out / "recording.rrd"
+        shown = f"; {recording} shows what was done" if recording.is_file() else ""
+        print(f"stopped: the same command goes on where it stopped{shown}", file=sys.stderr)
+        raise typer.Exit(143 if isinstance(stop, Terminated) else 130) from stop
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def demo(out: Path, overrides: Sequence[str], *, overwrite: bool, quiet: bool) -> None:
+    """Make the demo sequence, or find it in the cache, and run the recipe `demo` on it."""
+    from hodge_pipeline.demo.sequence import DemoOptions, demo_source
+
+    options = DemoOptions()
+    with Terminal(quiet) as terminal, terminal.stage("render the demo room", options.frames) as advance:
+        folder = demo_source(options=options, advance=advance)
+    run("demo", folder, out, overrides, overwrite=overwrite, quiet=quiet, as_json=False)
+
+
+def _print_summary(result: Run) -> None:
+    from hodge_pipeline.report.tables import graph_tables, score_tables, summary_lines
+
+    for table in (*score_tables(result.report), *graph_tables(result.report)):
+        print_table(table.title, table.header, table.rows)
+    for label, line in summary_lines(result.report):
+        print(f"{label:<8} {line}")
+    print(f"{'report':<8} {result.folder / 'report.html'}")

@@ -1,0 +1,139 @@
+"""The command that solves a pose-graph file: `hodge solve`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.cli.convert import writer_name
+from hodge_pipeline.cli.paths import check_result, keep_source
+from hodge_pipeline.errors import CheckError, RecipeError
+from hodge_pipeline.pairs.edits import read_history
+from hodge_pipeline.refine.pose_graph import Choices, SolvedFile, solve_file, write_solved
+from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
+from hodge_pipeline.solvers.setup import InitialName
+from hodge_pipeline.store.workspace import RECIPE_FILE
+from hodge_pipeline.types import Source
+
+KNOWN_ENDINGS = (".tum", ".kitti", ".csv", ".log", ".json", ".ply")
+"""Endings that say the format. `.txt` does not: many programs name their g2o files so."""
+
+
+def choices(
+    objective: str | None,
+    start: str,
+    disable: list[str],
+    time_limit_s: float,
+    *,
+    robust: bool,
+    certificate: bool,
+    sesync_units: bool,
+) -> Choices:
+    """The options as given, checked. Only the isotropic objective has a certificate, so asking for one implies it."""
+    named = objective or ("isotropic" if certificate or sesync_units else "full")
+    for option, value, known in (
+        ("--objective", named, get_args(ObjectiveName)),
+        ("--start", start, ("given", "chordal")),
+    ):
+        if value not in known:
+            raise RecipeError(f"{option} {value}: expected {' or '.join(known)}")
+    if named == "full" and (certificate or sesync_units):
+        raise RecipeError("--certificate and --sesync-units are for the isotropic objective: add --objective isotropic")
+    if time_limit_s <= 0:
+        raise RecipeError(f"--time-limit {time_limit_s:g}: expected seconds above zero")
+    initial: InitialName = "given" if start == "given" else "chordal"
+    chosen: ObjectiveName = "isotropic" if named == "isotropic" else "full"
+    return Choices(chosen, initial, robust, certificate, sesync_units, tuple(disable), time_limit_s)
+
+
+def solve(
+    path: Path, options: Choices, *, out: Path | None, run_folder: Path | None, quiet: bool, as_json: bool
+) -> None:
+    """Solve a file, write what was asked for, print a summary; `CheckError` where the result fails its own checks.
+
+    A run folder given alone is solved and fused again, with its edits, and brought up to date.
+    """
+    if out is None and run_folder is None and options == Choices() and (path / RECIPE_FILE).is_file():
+        _solve_run(path, quiet=quiet, as_json=as_json)
+        return
+    if path.is_dir() and (history := read_history(path)).edits:
+        options = replace(options, disable=(*options.disable, *history.disabled))
+        if out is None and not (path / RECIPE_FILE).is_file():
+            run_folder = run_folder or path
+    if out is not None:
+        check_result(out)
+        keep_source(path, out)
+    with Terminal(quiet or as_json) as terminal, terminal.stage("solve", 1):
+        solved = solve_file(path, options)
+    if out is not None:
+        write_solved(out, solved, _writer(out, solved.source))
+    left_out: tuple[str, ...] = ()
+    if run_folder is not None:
+        from hodge_pipeline.report.solved import write_run_folder
+
+        left_out = write_run_folder(run_folder, solved)
+    summary = solved.summary()
+    summary["notes"] += left_out
+    if as_json:
+        from hodge_pipeline.store.artifacts import json_text
+
+        print(
+            json_text({"source": str(solved.source.path), "out": None if out is None else str(out), **summary}), end=""
+        )
+    elif not quiet:
+        for label, text in _lines(solved, summary, out, run_folder):
+            print(f"{label:<12}{text}")
+    _check(summary)
+
+
+def _writer(out: Path, source: Source) -> str:
+    """The writer of a result by its ending: those of poses, and Open3D's; any other name is that of a g2o file."""
+    return writer_name(out, source) if out.suffix.lower() in KNOWN_ENDINGS else "g2o"
+
+
+def _solve_run(folder: Path, *, quiet: bool, as_json: bool) -> None:
+    from hodge_pipeline.cli.run import print_result
+    from hodge_pipeline.pipeline import solve_again
+
+    with Terminal(quiet or as_json) as terminal:
+        result = solve_again(folder, watcher=terminal)
+    print_result(result, quiet=quiet, as_json=as_json)
+
+
+def _lines(
+    solved: SolvedFile, summary: dict[str, Any], out: Path | None, run_folder: Path | None
+) -> list[tuple[str, str]]:
+    """What the summary says, a label and a text each."""
+    name = {"full": "chi2", "isotropic": "F"}[summary["objective"]]
+    before = summary["cost_before"]
+    ignored = f", {summary['edges_ignored']} ignored" if summary["edges_ignored"] else ""
+    lines = [
+        (
+            "graph",
+            f"{solved.source.name}, {summary['dimension']}-D: {summary['poses']} poses, {summary['edges']} edges",
+        ),
+        ("", f"{summary['pieces']} piece{'s' * (summary['pieces'] != 1)}{ignored}"),
+        (name, f"{summary['cost_after']:.12g}" if before is None else f"{before:.12g} -> {summary['cost_after']:.12g}"),
+    ]
+    if summary["certified"] is not None:
+        within = (
+            f"globally optimal, within {summary['gap_bound']:.3g}" if summary["certified"] else "NOT proven optimal"
+        )
+        lines.append(("certificate", within))
+    lines.append(
+        ("time", f"{summary['wall_s']:.3f} s, {summary['cpu_s']:.3f} s of CPU, {summary['newton_steps']} steps")
+    )
+    lines += [("note", note) for note in summary["notes"]]
+    lines += [("written", str(path)) for path in (out, run_folder) if path is not None]
+    return lines
+
+
+def _check(summary: dict[str, Any]) -> None:
+    if summary["certified"] is False:
+        raise CheckError("the result is not proven to be the global minimum: see the notes; try --start chordal")
+    if not summary["converged"]:
+        late = any("time limit" in note for note in summary["notes"])
+        remedy = "raise --time-limit" if late else "if edges may be wrong, hodge diagnose names them, or add --robust"
+        raise CheckError(f"the solver stopped before it converged, with the best poses so far: {remedy}")

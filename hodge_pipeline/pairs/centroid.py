@@ -1,0 +1,37 @@
+"""Pairs of frames whose clouds have their centroids close together (the paper's first rule)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from scipy.spatial import cKDTree
+
+from hodge_pipeline import se3
+from hodge_pipeline.pairs.candidates import labelled, usable_rows
+from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Ints
+
+
+def centroids_in_world(clouds: CloudSet, world_from_cam: Floats, rows: Ints) -> Floats:
+    """The mean point (R, 3) of the clouds of these rows, metres, under the poses (N, 4, 4)."""
+    means = np.array([clouds[int(row)].points_in_cam.mean(axis=0, dtype=float) for row in rows]).reshape(-1, 1, 3)
+    return se3.transform(world_from_cam[rows], means)[:, 0]
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class CentroidEdges:
+    """Pairs the frames whose clouds have nearby centroids."""
+
+    max_distance_m: float = Field(
+        0.2, gt=0, description="metres between the two centroids in the world frame; 0.2 is the paper's"
+    )
+
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+        """Pairs of centroids less than `max_distance_m` apart; none for frames without points or a finite pose."""
+        rows = usable_rows(clouds, world_from_cam)
+        if len(rows) < 2:
+            return labelled(np.zeros((0, 2), np.int64), "centroid")
+        tree = cKDTree(centroids_in_world(clouds, world_from_cam, rows))
+        return labelled(rows[tree.query_pairs(self.max_distance_m, output_type="ndarray")], "centroid")

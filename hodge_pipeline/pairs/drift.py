@@ -1,0 +1,108 @@
+"""Pairs that may see the same space although the poses have drifted: overlap with a tolerance that grows on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline import se3
+from hodge_pipeline.pairs.candidates import labelled, usable_rows
+from hodge_pipeline.pairs.overlap import pairwise_iou
+from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Ints
+
+OCTAVES = 8
+FRAMES_LOOKED_AT = 50
+NOTHING = np.zeros((0, 2), np.int64)
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class DriftEdges:
+    """Pairs the frames whose clouds may share space, however far odometry has drifted between them.
+
+    Two frames are compared in voxels that are as wide as the poses may have drifted on the way from one to the other:
+    small ones after a short way, large ones after a long way.
+    """
+
+    drift_share: float = Field(
+        default=0.05,
+        gt=0,
+        lt=1,
+        description="drift over the length of the way, where a turn counts as the way that the scene moves before the "
+        "camera; odometry of RGB-D frames drifts by 1 to 5 %, of lidar by less",
+    )
+    min_iou: float = Field(
+        default=0.2, ge=0, lt=1, description="share in [0, 1): a pair's IoU in such voxels exceeds it"
+    )
+    voxel_m: float = Field(
+        default=0.2,
+        gt=0,
+        description="metres: the smallest voxels, which forgive as much drift; the largest are 128 times",
+    )
+    per_frame: int = Field(
+        default=6, ge=1, description="pairs of a frame with earlier ones, at most: those of the largest IoU"
+    )
+    reach: int = Field(
+        default=5,
+        ge=1,
+        description="frames: of so many consecutive ones only the best is paired, and none so near: odometry has "
+        "joined them",
+    )
+
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+        """Pairs of one sequence, with their IoU; between sequences the poses say nothing."""
+        names = np.array([frame.sequence for frame in frames], dtype=np.str_)
+        usable = usable_rows(clouds, world_from_cam)
+        found = [
+            self._of_one(usable[names[usable] == name], clouds, world_from_cam) for name in np.unique(names[usable])
+        ]
+        pairs = np.concatenate([NOTHING, *(pairs for pairs, _ in found)])
+        return labelled(pairs, "drift", np.concatenate([np.zeros(0), *(overlap for _, overlap in found)]))
+
+    def _of_one(self, rows: Ints, clouds: CloudSet, world_from_cam: Floats) -> tuple[Ints, Floats]:
+        """The pairs of one sequence's rows, in their order, and their IoU."""
+        if len(rows) < 2:
+            return NOTHING, np.zeros(0)
+        own, poses = [clouds[int(row)] for row in rows], world_from_cam[rows]
+        way_m = _way_m(poses, _usual_range_m(clouds, rows))
+        pairs, overlap = [NOTHING], [np.zeros(0)]
+        for octave in range(OCTAVES):
+            voxel_m = self.voxel_m * 2**octave
+            iou = pairwise_iou(own, poses, voxel_m, above=self.min_iou).tocoo()
+            i, j = iou.row.astype(np.int64), iou.col.astype(np.int64)
+            drift_m = self.drift_share * (way_m[j] - way_m[i])
+            mine = (j - i > self.reach) & (drift_m <= voxel_m) & ((drift_m > voxel_m / 2) | (octave == 0))
+            pairs.append(np.stack([i, j], axis=1)[mine])
+            overlap.append(iou.data[mine])
+            if self.drift_share * way_m[-1] <= voxel_m:
+                break
+        every, scores = np.concatenate(pairs), np.concatenate(overlap)
+        kept = best_of_each(every, scores, self.per_frame, self.reach)
+        return rows[every[kept]], scores[kept]
+
+
+def best_of_each(pairs: Ints, scores: Floats, most: int, reach: int) -> Ints:
+    """Rows of the pairs (P, 2), i < j: for each j the `most` best, no two of them within `reach` of each other."""
+    kept: list[int] = []
+    taken: dict[int, list[int]] = {}
+    for row in np.lexsort((pairs[:, 0], -scores)).tolist():
+        i, j = int(pairs[row, 0]), int(pairs[row, 1])
+        partners = taken.setdefault(j, [])
+        if len(partners) < most and all(abs(i - other) > reach for other in partners):
+            partners.append(i)
+            kept.append(row)
+    return np.sort(np.array(kept, np.int64))
+
+
+def _way_m(world_from_cam: Floats, range_m: float) -> Floats:
+    """The length (N,) of the way to each pose: steps, and turns by what they move at the scene's distance."""
+    motions = se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:]
+    turns = np.linalg.norm(se3.so3_log(motions[:, :3, :3]), axis=1)
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(motions[:, :3, 3], axis=1) + range_m * turns)])
+
+
+def _usual_range_m(clouds: CloudSet, rows: Ints) -> float:
+    some = rows[:: max(1, len(rows) // FRAMES_LOOKED_AT)].tolist()
+    return float(np.median([np.median(np.linalg.norm(clouds[row].points_in_cam, axis=1)) for row in some]))

@@ -1,0 +1,1 @@
+"""YAML to a typed recipe: files, overrides, binding, units."""

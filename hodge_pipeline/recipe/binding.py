@@ -1,0 +1,191 @@
+"""Plain data to typed options and back: stages by name inside typed sections, every error with its file and line."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+
+from hodge_pipeline import registry
+from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.recipe.yaml_file import Keys
+
+T = TypeVar("T")
+Where = Callable[[Keys], str]
+"""Gives `file:line` of a key path."""
+WORDS = {float: "number", int: "whole number", bool: "true or false", str: "text", type(None): "nothing"}
+
+
+def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | None = None) -> T:
+    """An instance of a pydantic dataclass from a mapping; nested sections and stages included.
+
+    A stage that has an option `seed` and is not given one takes the section's `seed`, so that a recipe's one seed
+    reaches everything random in it.
+
+    Raises `RecipeError`: `file:line: key: what was expected`, with the nearest known name for an unknown key.
+    """
+    if not isinstance(data, Mapping):
+        raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected a mapping of options, got {data!r}")
+    hints = get_type_hints(cls)
+    known = {field.name: hints[field.name] for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    for key in data:
+        if key not in known:
+            here = (*keys, key)
+            raise RecipeError(f"{where(here)}: {_dotted(here)}: unknown option{registry.suggestion(key, list(known))}")
+    if isinstance(data.get("seed"), int):
+        seed = data["seed"]
+    elif "seed" in known and seed is not None:
+        data = {**data, "seed": seed}
+    values = {key: _value(known[key], value, where, (*keys, key), seed) for key, value in data.items()}
+    try:
+        return cls(**values)
+    except ValidationError as error:
+        raise _first_error(error, where, keys, known) from error
+
+
+def _value(annotation: Any, value: Any, where: Where, keys: Keys, seed: int | None) -> Any:
+    """A field's value with its stages and sections built; anything else is left to pydantic."""
+    if value is None:
+        return None
+    if get_origin(annotation) in (typing.Union, types.UnionType):
+        inner = [arg for arg in get_args(annotation) if registry.kind_of(arg) or _is_section(arg)]
+        return _value(inner[0], value, where, keys, seed) if inner else value
+    kind = registry.kind_of(annotation)
+    if kind:
+        return bind_stage(kind.name, value, where, keys, seed)
+    if get_origin(annotation) is tuple and isinstance(value, list):
+        item = get_args(annotation)[0]
+        return tuple(_value(item, each, where, (*keys, row), seed) for row, each in enumerate(value))
+    if not _is_section(annotation):
+        return value
+    if isinstance(value, Mapping) and value.get("stage") == registry.name_of_class(annotation):
+        value = {key: item for key, item in value.items() if key != "stage"}  # an option that takes this stage alone
+    return bind(annotation, value, where, keys, seed=seed)
+
+
+def bind_stage(kind: str, value: Any, where: Where, keys: Keys, seed: int | None = None) -> Any:
+    """The stage that `{stage: name, option: …}`, or the name alone, stands for."""
+    options = {"stage": value} if isinstance(value, str) else value
+    if not isinstance(options, Mapping) or not isinstance(options.get("stage"), str):
+        known = ", ".join(registry.names(kind))
+        raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected {{stage: NAME, …}} with a NAME of: {known}")
+    try:
+        cls = registry.load(kind, options["stage"])
+    except RecipeError as error:
+        raise RecipeError(f"{where((*keys, 'stage'))}: {_dotted(keys)}: {error}") from error
+    return bind(cls, {key: item for key, item in options.items() if key != "stage"}, where, keys, seed=seed)
+
+
+def unbind(value: Any) -> Any:
+    """Options as plain data that `bind` reads back: every default written out, a stage as `{stage: name, …}`."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: unbind(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {"stage": registry.name_of(value), **fields} if _is_stage(value) else fields
+    if isinstance(value, Mapping):
+        return {str(key): unbind(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [unbind(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _is_stage(value: Any) -> bool:
+    """Whether it has the methods of a kind of stage; an option that is only called like one does not count."""
+    protocols = [kind.protocol for kind in registry.KINDS.values() if isinstance(value, kind.protocol)]
+    return any(
+        all(callable(getattr(value, name)) for name in vars(protocol) if not name.startswith("_"))
+        for protocol in protocols
+    )
+
+
+def _spelled(annotation: Any) -> str:
+    """A type in the words of a recipe."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_spelled(part) for part in parts)
+    if origin is typing.Literal:
+        return " or ".join(map(repr, parts))
+    if origin is tuple:
+        return f"[{', '.join('…' if part is ... else _spelled(part) for part in parts)}]"
+    return WORDS.get(annotation, str(annotation))
+
+
+def _is_section(annotation: Any) -> bool:
+    return isinstance(annotation, type) and dataclasses.is_dataclass(annotation)
+
+
+def _dotted(keys: Keys) -> str:
+    return ".".join(map(str, keys)) or "recipe"
+
+
+def _first_error(error: ValidationError, where: Where, keys: Keys, known: Mapping[str, Any]) -> RecipeError:
+    """The first of pydantic's complaints as one line at its own key; of an option of several types, what they are."""
+    first = error.errors()[0]
+    field = first["loc"][0] if first["loc"] else None
+    if isinstance(field, str) and len({other["loc"][1:2] for other in error.errors() if other["loc"][0] == field}) > 1:
+        given, here = error.errors()[0]["input"], (*keys, field)
+        return RecipeError(f"{where(here)}: {_dotted(here)}: expected {_spelled(known[field])}, got {given!r}")
+    here = (*keys, *(key for key in first["loc"] if isinstance(key, (str, int))))
+    while len(here) > len(keys) and isinstance(here[-1], str) and "-" in here[-1]:
+        here = here[:-1]
+    what = first["msg"][0].lower() + first["msg"][1:]
+    if first["type"] == "missing":
+        return RecipeError(f"{where(keys)}: {_dotted(here)}: this option is required")
+    return RecipeError(f"{where(here)}: {_dotted(here)}: {what.rstrip('.')}, got {first['input']!r}")
+
+
+KIND = "x-stage-kind"
+
+
+class _StageSchema(GenerateJsonSchema):
+    """JSON schema in which a field typed by a stage Protocol is marked with that kind, and a stage may say its name."""
+
+    def is_instance_schema(self, schema: Any) -> JsonSchemaValue:
+        """A mark in place of the kind; `_linked` makes a reference of it once pydantic has checked its own."""
+        kind = registry.kind_of(schema["cls"])
+        return {KIND: kind.name} if kind else super().is_instance_schema(schema)
+
+    def dataclass_schema(self, schema: Any) -> JsonSchemaValue:
+        """An option that takes one stage alone: `stage: name` may stand among its options, as `bind` reads it."""
+        found, name = super().dataclass_schema(schema), registry.name_of_class(schema["cls"])
+        if ":" not in name:
+            found["properties"] = {"stage": {"const": name}, **found.get("properties", {})}
+        return found
+
+
+def json_schema(cls: type) -> dict[str, Any]:
+    """JSON schema (draft 2020-12) of a recipe with every installed stage, for editors; a broken plugin is left out."""
+    schema: dict[str, Any] = TypeAdapter(cls).json_schema(schema_generator=_StageSchema)
+    definitions = schema.setdefault("$defs", {})
+    for kind in registry.KINDS:
+        options = []
+        for name in registry.names(kind):
+            try:
+                options.append(_stage_schema(kind, name, definitions))
+            except RecipeError:
+                continue
+        definitions[f"kind-{kind}"] = {"anyOf": options} if options else {"type": "object"}
+    return dict(_linked(schema))
+
+
+def _stage_schema(kind: str, name: str, definitions: dict[str, Any]) -> dict[str, Any]:
+    stage = TypeAdapter(registry.load(kind, name)).json_schema(schema_generator=_StageSchema)
+    definitions.update(stage.pop("$defs", {}))
+    stage["properties"] = {**stage.get("properties", {}), "stage": {"const": name}}
+    stage["required"] = ["stage", *stage.get("required", [])]
+    return {"anyOf": [{"const": name}, stage]}
+
+
+def _linked(node: Any) -> Any:
+    """The schema with each mark as a reference to the definition of its kind."""
+    if isinstance(node, list):
+        return [_linked(item) for item in node]
+    if not isinstance(node, dict):
+        return node
+    linked = {key: _linked(value) for key, value in node.items() if key != KIND}
+    return {**linked, "$ref": f"#/$defs/kind-{node[KIND]}"} if isinstance(node.get(KIND), str) else linked

@@ -1,0 +1,120 @@
+"""Recipe files: found by name or path, composed by `extends`, changed by overrides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hodge_pipeline import registry
+from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.recipe import yaml_file
+from hodge_pipeline.recipe.yaml_file import Document, Keys
+
+MAX_EXTENDS = 8
+
+
+def recipe_folder() -> Path:
+    """Where the recipes of this package lie: inside it when it was installed from a wheel, else in the checkout."""
+    package = Path(__file__).parents[1]
+    inside = package / "recipes"
+    return inside if inside.is_dir() else package.parent / "recipes"
+
+
+def recipe_names() -> list[str]:
+    """The names of the recipes that come with the package, sorted."""
+    return sorted(path.stem for path in recipe_folder().glob("*.yaml"))
+
+
+def find(name_or_path: str, beside: Path | None = None) -> Path:
+    """The file of a recipe: a path (relative to `beside`, for `extends`), or the name of one that is installed."""
+    path = Path(name_or_path)
+    if path.suffix in (".yaml", ".yml"):
+        found = [base for base in ((beside or Path()) / path, path) if base.is_file()]
+        if not found:
+            raise RecipeError(f"{path}: no such recipe file")
+        return found[0]
+    installed = recipe_folder() / f"{name_or_path}.yaml"
+    if path.name != name_or_path and path.exists():
+        raise RecipeError(f"{name_or_path}: is no recipe: give the name of one, and this with --source")
+    if not installed.is_file() or path.name != name_or_path:
+        raise RecipeError(f"no recipe '{name_or_path}'{registry.suggestion(name_or_path, recipe_names())}")
+    return installed
+
+
+def load(name_or_path: str, overrides: Sequence[str] = ()) -> Document:
+    """The plain data of a recipe with everything that it extends, and the overrides (`a.b=value`) on top."""
+    document = _extended(find(name_or_path), depth=0)
+    for override in overrides:
+        document = _overridden(document, override)
+    return document
+
+
+def _extended(path: Path, depth: int) -> Document:
+    """A recipe merged over the one that it extends."""
+    document = yaml_file.read(path)
+    parent = document.data.pop("extends", None)
+    if parent is None:
+        return document
+    where = document.origins[("extends",)]
+    if not isinstance(parent, str) or depth == MAX_EXTENDS:
+        raise RecipeError(f"{where}: extends: expected the name of a recipe, in a chain of at most {MAX_EXTENDS}")
+    try:
+        base = _extended(find(parent, beside=path.parent), depth + 1)
+    except RecipeError as error:
+        raise error if ":" in str(error).split(" ")[0] else RecipeError(f"{where}: extends: {error}") from error
+    return Document(_merged(base.data, document.data), {**base.origins, **document.origins})
+
+
+def _merged(base: Any, over: Any) -> Any:
+    """Mappings merge key by key, anything else is replaced; so are the options of a stage that another replaces."""
+    over_stage = over.get("stage") if isinstance(over, dict) else None
+    if isinstance(base, str) and over_stage is None and isinstance(over, dict):
+        base = {"stage": base}
+    if not isinstance(base, dict) or not isinstance(over, dict):
+        return over
+    if over_stage is not None and over_stage != base.get("stage", over_stage):
+        return over
+    return {**base, **{key: _merged(base[key], value) if key in base else value for key, value in over.items()}}
+
+
+def _overridden(document: Document, override: str) -> Document:
+    """The document with one `a.b=value`; a number in the path is a row of a list."""
+    name = f"--set {override}"
+    path, equals, text = override.partition("=")
+    keys = path.strip().split(".")
+    if not equals or not all(keys):
+        raise RecipeError(f"{name}: expected a.b=value")
+    value = yaml_file.parse_value(text, name)
+    typed, change = _typed(keys), _nested(document.data, keys, value, name)
+    merges = isinstance(value, dict)
+    kept = {key: line for key, line in document.origins.items() if merges or key[: len(typed)] != typed}
+    return Document(change, {**{typed[:end]: name for end in range(1, len(typed))}, **kept, typed: name})
+
+
+def _typed(keys: list[str]) -> Keys:
+    return tuple(int(key) if key.isdigit() else key for key in keys)
+
+
+def _nested(data: Any, keys: list[str], value: Any, name: str) -> Any:
+    """A copy of the data in which the value stands at the path."""
+    if not keys:
+        return _merged(data, value) if isinstance(value, dict) else value
+    head, rest = keys[0], keys[1:]
+    if isinstance(data, list):
+        if not head.isdigit() or int(head) >= len(data):
+            raise RecipeError(f"{name}: '{head}' is not a row of a list of {len(data)}")
+        row = int(head)
+        return [*data[:row], _nested(data[row], rest, value, name), *data[row + 1 :]]
+    if isinstance(data, str) and data in _stage_names():
+        data = {"stage": data}
+    if data is not None and not isinstance(data, dict):
+        raise RecipeError(f"{name}: '{head}' lies in a value that has no options: {data!r}")
+    old = data or {}
+    if head == "stage" and not rest and old.get("stage") != value:
+        return {"stage": value}
+    return {**old, head: _nested(old.get(head), rest, value, name)}
+
+
+def _stage_names() -> set[str]:
+    return {name for kind in registry.KINDS for name in registry.names(kind)}

@@ -1,0 +1,37 @@
+"""The recording of a graph that was solved on its own, without a run's stages."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline.recording.recorder import Recorder
+from hodge_pipeline.recording.run import FILE
+from hodge_pipeline.types import Floats, Solution, ViewGraph
+
+
+def record_graph(
+    folder: Path,
+    name: str,
+    graph: ViewGraph,
+    start: Floats,
+    solution: Solution,
+    sets: Mapping[str, Floats],
+    notes: Sequence[str] = (),
+) -> tuple[str, ...]:
+    """Write `recording.rrd`: the graph as it was, the film of the solve, the edges under its result, further poses.
+
+    What was left out of it, in words.
+    """
+    identity = hashlib.sha256(np.ascontiguousarray(solution.world_from_cam).tobytes()).hexdigest()[:32]
+    with tempfile.TemporaryDirectory(dir=folder) as parts:
+        recorder = Recorder(Path(parts), identity)
+        left_out = [*recorder.frames(name, (), tuple(notes))]
+        left_out += [note for label, poses in sets.items() for note in recorder.poses(label, poses)]
+        left_out += [*recorder.edges(1, graph, start), *recorder.solution(1, graph, start, solution)]
+        merged = recorder.finish(folder / FILE)
+    return (*left_out, *(merged.notes if merged else ()))

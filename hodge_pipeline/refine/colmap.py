@@ -1,0 +1,89 @@
+"""Refine a COLMAP model from Python or the command line: options in, models and a run folder out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from hodge_pipeline.recipe import binding
+from hodge_pipeline.refine.model import RefinedModel, refine_models
+from hodge_pipeline.refine.model_folder import model_workspace, write_run_folder
+from hodge_pipeline.refine.model_options import RECIPE, ModelRefinement, load_model_refinement
+from hodge_pipeline.refine.model_stages import ModelStages, models_key
+from hodge_pipeline.store.cost import Monitor
+from hodge_pipeline.store.job import versions
+from hodge_pipeline.store.progress import Nobody, Watcher
+
+
+@dataclass(frozen=True)
+class RefinedColmap:
+    """What became of each model, and the folder that it was written to, if to any.
+
+    `models` are pycolmap's: the refined ones, or the inputs as they came where the guard kept those.
+    """
+
+    results: tuple[RefinedModel, ...]
+    folder: Path | None
+
+    @property
+    def models(self) -> list[Any]:
+        """The resulting models as `pycolmap.Reconstruction`, the largest first."""
+        return [model.native for result in self.results for model in result.kept]
+
+    @property
+    def exit_code(self) -> int:
+        """3 where a result failed its own checks, else 0."""
+        return max(result.decision.exit_code for result in self.results)
+
+
+def refine_colmap(
+    model: Any,
+    *,
+    database: Path | str | None = None,
+    images: Path | str | None = None,
+    depth: Path | str | None = None,
+    depth_scale: float | None = None,
+    out: Path | str | None = None,
+    force: bool = False,
+    overwrite: bool = False,
+    recipe: str = RECIPE,
+    overrides: Sequence[str] = (),
+    watcher: Watcher | None = None,
+) -> RefinedColmap:
+    """A COLMAP model with better poses: `model` is its folder, a `pycolmap.Reconstruction`, or a list of those.
+
+    `depth`: folder of sensor depth images named as the colour images, `depth_scale` stored units to the metre. Without
+    `out` nothing is written; with it a refinement that was stopped goes on (that of models in memory begins anew), and
+    another one is replaced where it may `overwrite`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
+    """
+    given = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale}
+    sets = [f"model.{name}={value}" for name, value in given.items() if value is not None]
+    options = load_model_refinement(recipe, [*sets, *overrides])
+    folder = None if out is None else Path(out)
+    return run_refinement(model, options, out=folder, force=force, overwrite=overwrite, watcher=watcher)
+
+
+def run_refinement(
+    model: Any,
+    options: ModelRefinement,
+    *,
+    out: Path | None,
+    force: bool,
+    overwrite: bool,
+    watcher: Watcher | None = None,
+) -> RefinedColmap:
+    """The same with the options bound already."""
+    watcher = watcher or Nobody()
+    is_path = isinstance(model, (str, Path))
+    options = replace(options, source=str(model) if is_path else None)
+    given = Path(model) if is_path else model if isinstance(model, (list, tuple)) else [model]
+    with model_workspace(out, options, overwrite=overwrite) as workspace:
+        with Monitor().measure() as cost, watcher.stage("refine", 1):
+            models = options.model.open_models(given)
+            stages = ModelStages(workspace, models_key(models, binding.unbind(options), versions()))
+            results = refine_models(models, options, stages, force=force)
+        if out is not None:
+            write_run_folder(out, results, options, cost)
+    return RefinedColmap(results, out)

@@ -1,0 +1,167 @@
+"""A pose-graph file solved: read by whichever reader knows it, solved, written back with its ids, edges and order."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hodge_pipeline import registry
+from hodge_pipeline.errors import GraphError, SourceError
+from hodge_pipeline.pairs.edits import joining
+from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
+from hodge_pipeline.solvers.robust import solve_robust
+from hodge_pipeline.solvers.setup import InitialName
+from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.sources.unknown import without_frames
+from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, ViewGraph
+
+RUN_GRAPH = "graph.g2o"
+GRAPH_WRITERS = ("g2o", "open3d_pose_graph")
+"""Writers that take the poses by the rows of the vertices."""
+SESYNC_UNITS = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+"""SE-Sync takes the information of q_vec, half an angle, for that of the angle."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How a file is solved; `disable` holds pairs of vertex ids, `a-b`."""
+
+    objective: ObjectiveName = "full"
+    initial: InitialName = "chordal"
+    robust: bool = False
+    certificate: bool = False
+    sesync_units: bool = False
+    disable: Sequence[str] = ()
+    time_limit_s: float = math.inf
+
+
+@dataclass(frozen=True)
+class SolvedFile:
+    """What was read, its solution with a weight for every edge of the file, and the seconds it took."""
+
+    source: Source
+    graph: ViewGraph
+    solution: Solution
+    cpu_s: float
+    wall_s: float
+
+    @property
+    def start(self) -> Floats | None:
+        """The file's own poses, where it has one for each vertex."""
+        return None if self.source.trajectory is None else self.source.trajectory.world_from_cam
+
+    def summary(self) -> dict[str, Any]:
+        """The numbers of the solve under stable keys, for people and programs."""
+        metrics, graph = self.solution.metrics, self.graph
+        return {
+            "poses": graph.vertex_count,
+            "edges": graph.edge_count,
+            "edges_ignored": int((self.solution.weights <= 0).sum()),
+            "dimension": graph.dimension,
+            "pieces": int(self.solution.component.max(initial=-1)) + 1,
+            "objective": "full" if "chi2" in metrics else "isotropic",
+            "cost_before": metrics.get("objective_at_start"),
+            "cost_after": metrics["objective"],
+            "converged": bool(metrics["converged"]),
+            "certified": bool(metrics["certified"]) if "certified" in metrics else None,
+            "gap_bound": metrics.get("gap_bound"),
+            "newton_steps": int(metrics["iterations"]),
+            "cg_steps": int(metrics["cg_steps"]),
+            "cpu_s": self.cpu_s,
+            "wall_s": self.wall_s,
+            "notes": [*self.source.notes, *self.solution.notes],
+        }
+
+
+def read_graph(path: Path) -> Source:
+    """The graph at a path: of any registered format, or of a run folder. Raises `SourceError` where there is none."""
+    path = path / RUN_GRAPH if (path / RUN_GRAPH).is_file() else path
+    source = guess_reader(path).open(path)
+    if source.graph is None:
+        rest = (
+            ": run a recipe on it first, then give its run folder"
+            if source.frames
+            else f" but {without_frames(source)}"
+        )
+        raise SourceError(f"{path}: holds no graph of measured edges{rest}")
+    return source
+
+
+def disabled_edges(graph: ViewGraph, pairs: Sequence[str]) -> Bools:
+    """Where (E,) an edge joins one of the pairs of vertex ids `a-b`, in either direction; parallel ones all.
+
+    Raises `GraphError` where a pair has no edge.
+    """
+    found = np.zeros(graph.edge_count, bool)
+    for pair in pairs:
+        hit = joining(graph, pair)
+        if not hit.any():
+            raise GraphError(
+                f"--disable {pair}: no edge joins these vertices: give two vertex ids of the file, as 12-87"
+            )
+        found |= hit
+    return found
+
+
+def solve_file(path: Path, choices: Choices) -> SolvedFile:
+    """The solution of the graph at a path. Raises `SourceError`, `GraphError` where it cannot be read or solved."""
+    source = read_graph(path)
+    assert source.graph is not None
+    start = None if source.trajectory is None else source.trajectory.world_from_cam
+    if choices.initial == "given" and start is None:
+        raise SourceError(f"{source.path}: has no pose for every vertex to start from: use --start chordal")
+    off = disabled_edges(source.graph, choices.disable)
+    graph = source.graph.select(~off)
+    if choices.sesync_units and graph.dimension == 3:
+        graph = replace(graph, information=graph.information * np.outer(SESYNC_UNITS, SESYNC_UNITS))
+    cpu_s, wall_s = time.process_time(), time.monotonic()
+    solution = _solved(graph, start, choices)
+    cpu_s, wall_s = time.process_time() - cpu_s, time.monotonic() - wall_s
+    weights = np.zeros(len(off))
+    weights[~off] = solution.weights
+    notes = (f"{int(off.sum())} edges are disabled", *solution.notes) if off.any() else solution.notes
+    return SolvedFile(source, source.graph, replace(solution, weights=weights, notes=notes), cpu_s, wall_s)
+
+
+def _solved(graph: ViewGraph, start: Floats | None, choices: Choices) -> Solution:
+    if choices.robust:
+        return solve_robust(graph, start=start, objective=choices.objective, certificate=choices.certificate)
+    return solve(
+        graph,
+        start=start,
+        objective=choices.objective,
+        initial=choices.initial,
+        certificate=choices.certificate,
+        time_limit_s=choices.time_limit_s,
+        keep_history=graph.vertex_count <= MOST_POSES_FILMED,
+    )
+
+
+MOST_POSES_FILMED = 20_000
+"""Above it the recording shows the start and the end of the solve only."""
+
+
+def write_solved(path: Path, solved: SolvedFile, writer: str = "g2o") -> None:
+    """The solved poses in the format of a writer; where that is of graphs, with every edge as it was measured.
+
+    Ignored edges are written too, all in the order read. Poses without edges are in the order of the vertices' numbers.
+    """
+    poses, graph = solved.solution.world_from_cam, solved.graph
+    trajectory = Trajectory(np.arange(len(poses), dtype=float), poses)
+    if writer not in GRAPH_WRITERS:
+        trajectory = vertex_trajectory(graph, poses)
+    registry.load("writers", writer)().write(path, replace(solved.source, trajectory=trajectory))
+
+
+def vertex_trajectory(graph: ViewGraph, world_from_vertex: Floats) -> Trajectory:
+    """Poses (V, 4, 4) in the order of the vertices' numbers, which are the stamps; of names the rows are."""
+    ids = graph.vertex_ids
+    numbers = ids.astype(float) if ids.dtype.kind in "iu" else np.arange(len(ids), dtype=float)
+    order = np.argsort(numbers, kind="stable")
+    return Trajectory(numbers[order], world_from_vertex[order])

@@ -1,0 +1,119 @@
+"""Refine a trajectory from Python: arrays, Open3D objects or files in, the same kind out."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from hodge_pipeline import pipeline
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.refine.given_poses import RECIPE, recipe_for
+from hodge_pipeline.refine.guard import Decision
+from hodge_pipeline.refine.open3d_objects import poses_of, with_poses
+from hodge_pipeline.report.contents import Report
+from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.store.progress import Watcher
+from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source
+
+Array = TypeVar("Array")
+
+
+@dataclass(frozen=True)
+class RefinedTrajectory:
+    """`poses` of the kind that was given (array (N, 4, 4), or Open3D's trajectory), the decision and the report.
+
+    Where the decision keeps the input, `poses` are the very ones that were given.
+    """
+
+    poses: Any
+    decision: Decision
+    report: Report
+
+
+def frames_from_images(
+    depths_m: Sequence[Floats32],
+    camera: Camera | Floats,
+    colours: Sequence[Bytes] | None = None,
+    stamps_s: Sequence[float] | None = None,
+) -> tuple[Frame, ...]:
+    """Frames of images in memory: depths (H, W) in metres, 0 where there is none, and RGB colours (H, W, 3), 8 bit.
+
+    `camera`: ours, or the 3x3 matrix K, as Open3D's `intrinsic.intrinsic_matrix`. Without stamps the frames are
+    one second apart.
+    """
+    if not len(depths_m):
+        raise SourceError("no depth image given: refinement needs what the frames saw")
+    height, width = np.asarray(depths_m[0]).shape
+    if not isinstance(camera, Camera):
+        k = np.asarray(camera, float)
+        camera = Camera(width, height, *(float(k[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))))
+    return tuple(
+        Frame(
+            frame_id=row,
+            stamp_s=float(row if stamps_s is None else stamps_s[row]),
+            camera=camera,
+            read_depth=partial(_same, np.asarray(depth, np.float32)),
+            read_colour=None if colours is None else partial(_same, np.asarray(colours[row], np.uint8)),
+        )
+        for row, depth in enumerate(depths_m)
+    )
+
+
+def refine_trajectory(
+    poses: Any,
+    frames: Path | str | Sequence[Frame],
+    *,
+    out: Path | str | None = None,
+    force: bool = False,
+    recipe: str = "",
+    overrides: Sequence[str] = (),
+    watcher: Watcher | None = None,
+) -> RefinedTrajectory:
+    """Poses made better by the frames they belong to, one pose for each frame.
+
+    `poses`: world_from_cam (N, 4, 4), or an `open3d.camera.PinholeCameraTrajectory`. `frames`: a path that a reader
+    opens, or frames (see `frames_from_images`). `recipe`: slam-refine, or slam-refine-tum for TUM's folders. `out`
+    keeps the run folder with report and recording. Files of poses go to `hodge refine trajectory`. Raises `HodgeError`
+    (see `errors`) for whatever the user can mend.
+    """
+    open3d = not isinstance(poses, (np.ndarray, list, tuple))
+    given = poses_of(poses) if open3d else np.asarray(poses, float)
+    source = _source(frames, given)
+    chosen = recipe or (recipe_for(Path(frames)) if isinstance(frames, (str, Path)) else RECIPE)
+    loaded = load_recipe(chosen, ["given.poses=frames", f"guard.force={str(force).lower()}", *overrides])
+    with tempfile.TemporaryDirectory(prefix="hodge-refine-") as scratch:
+        folder = Path(scratch) / "run" if out is None else Path(out)
+        run = pipeline.run(loaded, folder, source=source, watcher=watcher)
+    assert run.refined is not None
+    decision = run.refined.decision
+    if decision.keeps_input:
+        return RefinedTrajectory(poses, decision, run.report)
+    found = run.refined.world_from_cam
+    return RefinedTrajectory(with_poses(poses, found) if open3d else found, decision, run.report)
+
+
+def _source(frames: Path | str | Sequence[Frame], poses: Floats) -> Source:
+    opened = guess_reader(Path(frames)).open(Path(frames)) if isinstance(frames, (str, Path)) else None
+    listed = (
+        tuple(frames) if opened is None and not isinstance(frames, (str, Path)) else opened.frames if opened else ()
+    )
+    if poses.shape != (len(listed), 4, 4):
+        raise SourceError(f"poses of shape {poses.shape} for {len(listed)} frames: give one 4x4 matrix for each frame")
+    posed = tuple(
+        replace(frame, world_from_cam=pose if np.isfinite(pose).all() else None)
+        for frame, pose in zip(listed, poses, strict=True)
+    )
+    if opened is not None:
+        return replace(opened, frames=posed)
+    return Source("frames in memory", Path("memory"), posed)
+
+
+def _same(array: Array) -> Array:
+    return array

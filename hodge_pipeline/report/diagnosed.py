@@ -1,0 +1,242 @@
+"""A run or a pose-graph file diagnosed: what is judged, and what is left of it in a folder."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import registry
+from hodge_pipeline.diagnosis.advice import advice, ranked
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.energy import EnergyRow, energy_rows
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
+from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
+from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
+from hodge_pipeline.errors import HodgeError, WorkspaceError
+from hodge_pipeline.pairs.edits import REJECTED, joining, listed_edges, read_history, vertex_rows
+from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
+from hodge_pipeline.report.diagnosis_csv import write_edges_csv
+from hodge_pipeline.report.diagnosis_page import PageContents, render
+from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
+from hodge_pipeline.report.edge_pictures import edge_pictures
+from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.start.unordered.pieces import laid_apart
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.store.workspace import RECIPE_FILE, is_run_folder
+from hodge_pipeline.types import Bools, CloudSet, Frame, Ints, Source, ViewGraph
+
+PICTURED, LEAST_PICTURED = 6, 2
+SUGGESTED, REGISTERED = 12, 6
+"""Pairs that are ranked, and those that a command to type names."""
+COMMANDED = 20
+"""Edges at most that a command to type names."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A graph to judge. A run also has its frames and clouds; `disabled (E,)` edges are off by hand, pairs (P, 2) were
+    `tried` in vain.
+    """
+
+    path: Path
+    name: str
+    graph: ViewGraph
+    disabled: Bools
+    is_run: bool = False
+    options: DiagnosisOptions = field(default_factory=DiagnosisOptions)
+    suggestions: SuggestionOptions = field(default_factory=SuggestionOptions)
+    tried: Ints | None = None
+    frames: Sequence[Frame] = ()
+    clouds: CloudSet | None = None
+    notes: tuple[str, ...] = ()
+
+
+def open_subject(path: Path) -> Subject:
+    """The graph of a run's last round, or of a file that a reader knows. Raises `HodgeError` where there is none."""
+    stage = path / "stages" / "diagnose"
+    if (stage / "graph.npz").is_file():
+        return _run_subject(path, artifacts.load(stage / "graph.npz", ViewGraph))
+    if is_run_folder(path):
+        raise WorkspaceError(
+            f"{path}: this run is not finished: run the same command again, it goes on where it stopped"
+        )
+    source = read_graph(path)
+    assert source.graph is not None
+    name = path.stem if path.is_file() else path.name
+    return Subject(path, name, source.graph, _disabled(path, source.graph), notes=source.notes)
+
+
+def _run_subject(path: Path, graph: ViewGraph) -> Subject:
+    recipe = load_recipe(str(path / RECIPE_FILE))
+    frames, notes = _frames(recipe)
+    clouds = path / "stages" / "clouds"
+    return Subject(
+        path,
+        path.resolve().name,
+        graph,
+        _disabled(path, graph),
+        is_run=True,
+        options=recipe.diagnosis,
+        suggestions=recipe.suggestions,
+        tried=_rejected(path, graph),
+        frames=frames if len(frames) == graph.vertex_count else (),
+        clouds=CloudSet.open(clouds) if (clouds / "offsets.npy").is_file() else None,
+        notes=notes,
+    )
+
+
+def _rejected(path: Path, graph: ViewGraph) -> Ints:
+    """The pairs of a run that were registered and not accepted."""
+    return vertex_rows(graph.vertex_ids, [edge.name for edge in listed_edges(path) if edge.status == REJECTED])
+
+
+def _frames(recipe: Recipe) -> tuple[Sequence[Frame], tuple[str, ...]]:
+    """The frames, for their images alone: a run can be diagnosed when its source has gone."""
+    if recipe.source.path is None:
+        return (), ()
+    try:
+        return (recipe.source.reader or guess_reader(recipe.source.path)).open(recipe.source.path).frames, ()
+    except (HodgeError, OSError) as error:
+        return (), (f"without colour images: {error}",)
+
+
+def _disabled(path: Path, graph: ViewGraph) -> Bools:
+    found = np.zeros(graph.edge_count, bool)
+    for pair in read_history(path).disabled if path.is_dir() else ():
+        found |= joining(graph, pair)
+    return found
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """A subject with its diagnosis, advice (E,), energy, the commands to type and the pairs to register next."""
+
+    subject: Subject
+    diagnosis: Diagnosis
+    advice: tuple[str, ...]
+    energy: tuple[EnergyRow, ...]
+    commands: tuple[str, ...]
+    notes: tuple[str, ...]
+    suggestions: Suggestions
+
+    @property
+    def rows(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+        """The edges, the worst first."""
+        return ranked(self.diagnosis)
+
+
+def diagnose_subject(subject: Subject) -> Diagnosed:
+    """The verdicts, and what follows from them."""
+    found = diagnose(subject.graph, subject.options)
+    pieces = int(found.piece.max(initial=-1)) + 1
+    apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
+    energy, complaints = energy_rows(subject.graph, found.world_from_cam, found.piece, found.kept)
+    notes = (
+        *subject.notes,
+        *found.notes,
+        *((apart,) if pieces > 1 else ()),
+        *_side_by_side(subject, found),
+        *complaints,
+    )
+    suggestions = suggest_pairs(
+        subject.graph, found, SUGGESTED, overlapping=_overlapping(subject, found), tried=subject.tried
+    )
+    commands = _commands(subject, found, suggestions)
+    return Diagnosed(subject, found, advice(found, subject.disabled), energy, commands, notes, suggestions)
+
+
+def _overlapping(subject: Subject, found: Diagnosis) -> Ints | None:
+    """The pairs of a run that see something in common at the robust poses."""
+    if subject.clouds is None or not subject.frames:
+        return None
+    poses = laid_apart(found.piece, found.world_from_cam, subject.clouds)
+    return subject.suggestions.among.propose(subject.frames, subject.clouds, poses).pairs
+
+
+def _beside_kept(graph: ViewGraph, found: Diagnosis) -> Bools:
+    """Wrong edges (E,) whose two views another edge joins that is kept: no pair of names tells them apart."""
+    low, high = np.sort(graph.edges, axis=1).T
+    pair = low * graph.vertex_count + high
+    return np.asarray((found.verdict == WRONG) & np.isin(pair, pair[found.kept]))
+
+
+def _side_by_side(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
+    rows = np.flatnonzero(_beside_kept(subject.graph, found))
+    if not len(rows):
+        return ()
+    named = ", ".join(dict.fromkeys(_names(subject.graph, subject.graph.edges[rows])))
+    return (
+        f"beside a wrong edge a right one joins the same two views ({named}): disabling the pair would take out both, "
+        "a robust solve takes out the wrong one alone",
+    )
+
+
+def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> tuple[str, ...]:
+    meant = (found.verdict == WRONG) & ~subject.disabled & ~_beside_kept(subject.graph, found)
+    rows = np.array([row for row in ranked(found) if meant[row]], int)
+    wrong = _names(subject.graph, subject.graph.edges[rows])
+    if not subject.is_run:
+        if len(wrong) > COMMANDED:
+            return (f"hodge solve {subject.path} --out solved.g2o --robust",)
+        off = " ".join(f"--disable {pair}" for pair in wrong)
+        return (f"hodge solve {subject.path} --out solved.g2o {off}",) if wrong else ()
+    useful = suggestions.pairs[suggestions.score >= subject.suggestions.min_gain][:REGISTERED]
+    if not wrong and not len(useful):
+        return ()
+    edit = f"--disable {','.join(wrong) if len(wrong) <= COMMANDED else WRONG}"
+    if not wrong:
+        edit = f"--register {','.join(_names(subject.graph, useful))}"
+    return f"hodge edit {subject.path} {edit}", f"hodge solve {subject.path}"
+
+
+def _names(graph: ViewGraph, pairs: Ints) -> list[str]:
+    return ["{}-{}".format(*ends) for ends in graph.vertex_ids[pairs]]
+
+
+def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:
+    """`edges.csv`, `poses.tum`, `diagnosis.html` and `diagnosis.rrd` in a folder, made if it is not there."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WorkspaceError(f"{out}: cannot be written ({error.strerror}): give another --out") from error
+    subject, found = diagnosed.subject, diagnosed.diagnosis
+    write_edges_csv(out / "edges.csv", subject.graph, found)
+    _write_poses(out / "poses.tum", subject, found)
+    artifacts.write_text(out / "diagnosis.html", render(_page(diagnosed)))
+    if recording:
+        from hodge_pipeline.recording.diagnosis_file import write_diagnosis
+
+        identity = hashlib.sha256(np.ascontiguousarray(found.world_from_cam).tobytes()).hexdigest()[:32]
+        placed = side_by_side(found.world_from_cam, found.piece)
+        write_diagnosis(out / "diagnosis.rrd", identity, subject.graph, placed, found)
+
+
+def _write_poses(path: Path, subject: Subject, found: Diagnosis) -> None:
+    """The robust poses by the numbers of their vertices."""
+    trajectory = vertex_trajectory(subject.graph, found.world_from_cam)
+    registry.load("writers", "tum")().write(path, Source(subject.name, subject.path, trajectory=trajectory))
+
+
+def _page(diagnosed: Diagnosed) -> PageContents:
+    subject, found = diagnosed.subject, diagnosed.diagnosis
+    rows = diagnosed.rows[: max(LEAST_PICTURED, min(PICTURED, int((found.verdict != CONSISTENT).sum())))]
+    pictures = edge_pictures(subject.graph, found, rows, subject.frames, subject.clouds)
+    return PageContents(
+        title=subject.name,
+        path=str(subject.path),
+        graph=subject.graph,
+        diagnosis=found,
+        advice=diagnosed.advice,
+        energy=diagnosed.energy,
+        plots=draw(subject.graph, found, diagnosed.energy),
+        edges=pictures,
+        suggestions=diagnosed.suggestions,
+        commands=diagnosed.commands,
+        notes=diagnosed.notes,
+    )

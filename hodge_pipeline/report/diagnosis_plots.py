@@ -1,0 +1,152 @@
+"""The pictures of a diagnosis that need no images: the viewing graph by verdict, the cameras from above, energy."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+
+from hodge_pipeline.diagnosis.energy import ALL_EDGES, PARTS, EnergyRow
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
+from hodge_pipeline.report.plots import Plot
+from hodge_pipeline.types import Floats, Ints, ViewGraph
+
+COLOURS = {CONSISTENT: "#3c73e1", UNTESTABLE: "#7f7f7f", SUSPECT: "#e69f00", WRONG: "#d5308f"}
+"""Blue, grey, amber, magenta, as in the recording; markers tell them apart without colour."""
+MARKERS = {CONSISTENT: "s", UNTESTABLE: "D", SUSPECT: "^", WRONG: "X"}
+PART_COLOURS = ("#56b4e9", "#e69f00", "#444444")
+DOTS_PER_INCH = 140
+GAP_SHARE = 0.25
+FEW = 15
+
+
+def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> tuple[Plot, ...]:
+    """Every picture that there are data for."""
+    return tuple(_plots(graph, diagnosis, energy))
+
+
+def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> Iterator[Plot]:
+    if graph.edge_count:
+        yield plot(
+            "Viewing graph by verdict",
+            "A dot is an edge between the frames of its row and column. Above the diagonal: its verdict. Below: the "
+            "probability that it is right; untestable edges have none.",
+            lambda figure: _matrix(figure, graph, diagnosis),
+        )
+        yield plot(
+            "Edges from above",
+            "The frames at their robust poses, seen across their flattest direction, with the edges by verdict; pieces "
+            "that nothing sound connects are drawn beside each other.",
+            lambda figure: _above(figure, graph, diagnosis),
+        )
+    if energy:
+        yield plot(
+            "Energy of the residual motions",
+            "Rotation left, translation right. Exact: what moving frames would take away. Co-exact: seen in triangles. "
+            "Harmonic: around loops that no triangles fill.",
+            lambda figure: _bars(figure, [row for row in energy if row.group == ALL_EDGES]),
+        )
+
+
+def plot(title: str, caption: str, paint: Callable[[Figure], None], size: tuple[float, float] = (5.0, 4.2)) -> Plot:
+    """A painted figure as a picture."""
+    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    paint(figure)
+    target = io.BytesIO()
+    # savefig would lay out and draw it all twice
+    canvas.print_png(target, metadata={"Software": None})  # type: ignore[no-untyped-call]
+    return Plot(title, caption, target.getvalue())
+
+
+def _matrix(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
+    axes = figure.add_subplot()
+    low, high = graph.edges.min(axis=1), graph.edges.max(axis=1)
+    size = float(np.clip(60_000 / graph.vertex_count**2, 0.5, 30))
+    for name in (CONSISTENT, UNTESTABLE, SUSPECT, WRONG):
+        rows = np.flatnonzero(diagnosis.verdict == name)
+        larger = size if name == CONSISTENT else size * (1 + 2 * _rarity(len(rows)))
+        label = f"{len(rows)} {name}"
+        axes.scatter(high[rows], low[rows], s=larger, c=COLOURS[name], marker=MARKERS[name], linewidths=0, label=label)
+    known = np.flatnonzero(np.isfinite(diagnosis.probability))
+    order = known[np.argsort(-diagnosis.probability[known], kind="stable")]
+    dots = axes.scatter(
+        low[order], high[order], s=size, c=diagnosis.probability[order], cmap="cividis", vmin=0, vmax=1, linewidths=0
+    )
+    figure.colorbar(dots, ax=axes, label="probability of being right", shrink=0.8)
+    axes.set_xlim(-0.5, graph.vertex_count - 0.5)
+    axes.set_ylim(graph.vertex_count - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel("frame (row)")
+    _legend(figure, axes)
+
+
+def _legend(figure: Figure, axes: Any) -> None:
+    drawn, labels = axes.get_legend_handles_labels()
+    legend = figure.legend(drawn, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=8)
+    for handle in legend.legend_handles:
+        if isinstance(handle, PathCollection):
+            handle.set_sizes([25.0])
+
+
+def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
+    axes = figure.add_subplot()
+    places = flat(side_by_side(diagnosis.world_from_cam, diagnosis.piece)[:, :3, 3])
+    for name in (CONSISTENT, UNTESTABLE, SUSPECT, WRONG):
+        rows = np.flatnonzero(diagnosis.verdict == name)
+        thick = 0.4 if name == CONSISTENT else 0.4 + 1.2 * _rarity(len(rows))
+        style = {CONSISTENT: "-", UNTESTABLE: ":", SUSPECT: "--", WRONG: "-"}[name]
+        # one line with gaps: a path for each of 100,000 edges would take seconds
+        ends = np.concatenate([places[graph.edges[rows]], np.full((len(rows), 1, 2), np.nan)], axis=1).reshape(-1, 2)
+        axes.plot(ends[:, 0], ends[:, 1], style, color=COLOURS[name], linewidth=thick, label=name)
+    axes.scatter(places[:, 0], places[:, 1], s=4, c="#222222", linewidths=0, zorder=3)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.autoscale_view()
+    axes.set_xlabel("m")
+    _legend(figure, axes)
+
+
+def _rarity(count: int) -> float:
+    """1 for a few edges, towards 0 for very many: what is rare is drawn large."""
+    return min(1.0, FEW / max(count, 1))
+
+
+def side_by_side(world_from_cam: Floats, piece: Ints) -> Floats:
+    """The poses (V, 4, 4) with the pieces moved apart along x, so that none lies upon another; the largest stays."""
+    placed = np.array(world_from_cam)
+    first = placed[piece == 0, :3, 3]
+    gap = max(GAP_SHARE * float(np.ptp(first, axis=0).max()), 0.1) if len(first) else 0.1
+    edge = -np.inf
+    for number in range(int(piece.max(initial=-1)) + 1):
+        rows = np.flatnonzero(piece == number)
+        if np.isfinite(edge):
+            placed[rows, 0, 3] += edge + gap - placed[rows, 0, 3].min()
+        edge = placed[rows, 0, 3].max()
+    return placed
+
+
+def flat(positions: Floats) -> Floats:
+    """The positions (V, 2) along the two directions in which they spread most."""
+    centred = positions - positions.mean(axis=0)
+    return np.asarray(centred @ np.linalg.eigh(centred.T @ centred)[1][:, :0:-1])
+
+
+def _bars(figure: Figure, rows: Sequence[EnergyRow]) -> None:
+    for axes, kind, title in zip(figure.subplots(1, 2, sharey=True), (0, 1), ("rotation", "translation"), strict=True):
+        left = np.zeros(len(rows))
+        for part, name, colour, hatch in zip(range(3), PARTS, PART_COLOURS, ("", "//", ".."), strict=True):
+            shares = np.array([100 * row.shares[kind][part] for row in rows])
+            axes.barh(
+                [row.when for row in rows], shares, left=left, color=colour, hatch=hatch, edgecolor="white", label=name
+            )
+            left += shares
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("%")
+        axes.spines[["top", "right"]].set_visible(False)
+    axes.invert_yaxis()
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=8)

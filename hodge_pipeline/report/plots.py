@@ -1,0 +1,232 @@
+"""The pictures of a report, as PNG. Colours are Okabe and Ito's, and no curve is told apart by its colour alone."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from hodge_pipeline.report.contents import Path3D, Report
+from hodge_pipeline.report.verdict import GRAPH_NAMES
+from hodge_pipeline.types import Floats, Ints
+
+STYLES: tuple[dict[str, Any], ...] = (
+    {"color": "#000000", "linestyle": (0, (4, 2)), "linewidth": 1.2},
+    {"color": "#D55E00", "linestyle": (0, (1, 1)), "linewidth": 1.6},
+    {"color": "#0072B2", "linestyle": "-", "linewidth": 1.6},
+    {"color": "#009E73", "linestyle": (0, (6, 1, 1, 1)), "linewidth": 1.4},
+    {"color": "#CC79A7", "linestyle": (0, (8, 2)), "linewidth": 1.4},
+    {"color": "#56B4E9", "linestyle": (0, (2, 2)), "linewidth": 1.4},
+)
+MARKERS = "osD^vP"
+DOTS_PER_INCH = 150
+HISTOGRAM_BINS = 40
+WIDE = 5
+"""Values that differ by less than this factor are legible on a linear axis."""
+SMALLEST_RESIDUAL = 1e-3
+"""Where a logarithmic histogram begins, in centimetres and degrees: nothing below it is of interest."""
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A picture with its title and what it shows, in a sentence."""
+
+    title: str
+    caption: str
+    png: bytes
+
+
+def draw(report: Report) -> tuple[Plot, ...]:
+    """Every plot that the report has data for."""
+    return tuple(_plots(report))
+
+
+def _plots(report: Report) -> Iterator[Plot]:
+    pictures = report.pictures
+    if any(np.isfinite(path.positions).any() for path in pictures.paths):
+        yield _plot(
+            "Trajectory from above", "Aligned to the reference, seen across its flattest direction.", _paths, report
+        )
+    if report.scores is not None and any(len(graph.pairs) for graph in report.scores.graphs):
+        yield _plot("Score of each pair", "Further right is better.", _score_histogram, report)
+    if any(len(residuals.translation_m) for residuals in pictures.residuals):
+        yield _plot(
+            "Residual of each edge", "Measured motions against the poses: further left is better.", _residuals, report
+        )
+    if pictures.graph is not None and pictures.graph.edge_count:
+        caption = "Above the diagonal: where each edge comes from. Below: how far it is off the result."
+        yield _plot("Viewing graph", caption, _matrix, report)
+    if any(pictures.convergence.values()) or report.loops:
+        yield _plot(
+            "Convergence", "Objective of the solver, and mean deviation of a loop, by iteration.", _convergence, report
+        )
+
+
+def _plot(title: str, caption: str, paint: Callable[[Figure, Report], None], report: Report) -> Plot:
+    figure = Figure(figsize=(5.0, 3.9), dpi=DOTS_PER_INCH, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    paint(figure, report)
+    for axes in figure.axes:
+        axes.grid(alpha=0.25, linewidth=0.5)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+    target = io.BytesIO()
+    # savefig would lay out and draw it all twice
+    canvas.print_png(target, metadata={"Software": None})  # type: ignore[no-untyped-call]
+    return Plot(title, caption, target.getvalue())
+
+
+def _style(report: Report, name: str) -> dict[str, Any]:
+    """The same line for a set of poses in every plot: the reference dashed, before dotted, after solid."""
+    fixed = {report.before: 1, report.after: 2}
+    if name in fixed:
+        return STYLES[fixed[name]]
+    others = [other for other in _names(report) if other not in fixed]
+    free = (0, 3, 4, 5)
+    return STYLES[free[others.index(name) % len(free)]] if name in others else STYLES[0]
+
+
+def _names(report: Report) -> list[str]:
+    scored = () if report.scores is None else report.scores.names
+    return list(dict.fromkeys((*(path.name for path in report.pictures.paths), *scored)))
+
+
+def _paths(figure: Figure, report: Report) -> None:
+    axes = figure.add_subplot()
+    paths, component = report.pictures.paths, report.pictures.component
+    origin, plane = _flattest_plane(paths[0])
+    for path in paths:
+        along, across = plane @ (_broken(path.positions, component) - origin).T
+        axes.plot(along, across, label=path.name, **_style(report, path.name))
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("m")
+    axes.set_ylabel("m")
+    axes.legend(frameon=False, fontsize=9)
+
+
+def _flattest_plane(path: Path3D) -> tuple[Floats, Floats]:
+    """The mean of a path, and the two directions (2, 3) along which it spreads most."""
+    known = path.positions[np.isfinite(path.positions).all(axis=1)]
+    if not len(known):
+        return np.zeros(3), np.eye(3)[:2]
+    origin = known.mean(axis=0)
+    spread = (known - origin).T @ (known - origin)
+    return origin, np.linalg.eigh(spread)[1][:, :0:-1].T
+
+
+def _broken(positions: Floats, component: Ints) -> Floats:
+    """The path with a gap wherever the component changes."""
+    cuts = np.flatnonzero(np.diff(component)) + 1 if len(component) == len(positions) else np.zeros(0, np.int64)
+    return np.asarray(np.insert(positions, cuts, np.nan, axis=0))
+
+
+def _score_histogram(figure: Figure, report: Report) -> None:
+    table = report.scores
+    assert table is not None
+    graph = max(table.graphs, key=lambda graph: len(graph.pairs))
+    axes = figure.add_subplot()
+    known = graph.scores[np.isfinite(graph.scores)]
+    lowest = min(float(np.quantile(known, 0.002)), 0.9) if len(known) else 0.0
+    bins = np.linspace(lowest, 1.0, HISTOGRAM_BINS).tolist()
+    for row, name in enumerate(table.names):
+        scores = graph.scores[row][np.isfinite(graph.scores[row])]
+        mean = f", mean {scores.mean():.3f}" if len(scores) else ", not scored"
+        axes.hist(scores, bins=bins, histtype="step", label=f"{name}{mean}", **_style(report, name))
+    axes.set_xlabel(f"score, {len(graph.pairs)} {GRAPH_NAMES[graph.kind]}")
+    axes.set_ylabel("pairs")
+    axes.legend(frameon=False, fontsize=9, loc="best")
+
+
+def _residuals(figure: Figure, report: Report) -> None:
+    for axes, unit, columns in zip(
+        figure.subplots(2, 1),
+        ("residual translation, cm", "residual rotation, °"),
+        (
+            [(r.name, r.translation_m * 100) for r in report.pictures.residuals],
+            [(r.name, np.rad2deg(r.angle_rad)) for r in report.pictures.residuals],
+        ),
+        strict=True,
+    ):
+        _log_histogram(axes, report, columns)
+        axes.set_xlabel(unit)
+        axes.set_ylabel("edges")
+        axes.legend(frameon=False, fontsize=8)
+
+
+def _log_histogram(axes: Any, report: Report, columns: list[tuple[str, Floats]]) -> None:
+    known = [(name, np.maximum(values[np.isfinite(values)], SMALLEST_RESIDUAL)) for name, values in columns]
+    every = np.concatenate([values for _, values in known if len(values)] or [np.array([SMALLEST_RESIDUAL])])
+    bins = np.geomspace(every.min(), max(every.max(), 2 * every.min()) * 1.001, HISTOGRAM_BINS)
+    for name, values in known:
+        median = f", median {np.median(values):.2g}" if len(values) else ""
+        axes.hist(values, bins=bins, histtype="step", label=f"{name}{median}", **_style(report, name))
+    axes.set_xscale("log")
+
+
+def _matrix(figure: Figure, report: Report) -> None:
+    graph = report.pictures.graph
+    assert graph is not None
+    axes = figure.add_subplot()
+    low, high = graph.edges.min(axis=1), graph.edges.max(axis=1)
+    size = float(np.clip(60_000 / graph.vertex_count**2, 0.3, 30))
+    for rank, name in enumerate(np.unique(graph.source)):
+        rows = graph.source == name
+        colour = STYLES[(2, 1, 3, 4, 5, 0)[rank % 6]]["color"]
+        marker = MARKERS[rank % len(MARKERS)]
+        axes.scatter(high[rows], low[rows], s=size, color=colour, marker=marker, linewidths=0, label=str(name))
+    _residual_dots(figure, axes, report, low, high, size)
+    axes.set_xlim(-0.5, graph.vertex_count - 0.5)
+    axes.set_ylim(graph.vertex_count - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel("frame (row)")
+    axes.legend(
+        frameon=False,
+        fontsize=8,
+        markerscale=(16 / size) ** 0.5,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 1.14),
+        ncols=3,
+    )
+
+
+def _residual_dots(figure: Figure, axes: Any, report: Report, low: Ints, high: Ints, size: float) -> None:
+    after = [residuals for residuals in report.pictures.residuals if residuals.name == report.after]
+    if not after:
+        return
+    order = np.argsort(after[0].translation_m)
+    centimetres = np.maximum(after[0].translation_m[order] * 100, 0.1)
+    top = max(float(np.nanmax(centimetres, initial=1.0)), 1.0)
+    dots = axes.scatter(
+        low[order], high[order], s=size, c=centimetres, cmap="cividis_r", norm=LogNorm(0.1, top), linewidths=0
+    )
+    figure.colorbar(dots, ax=axes, label="residual, cm", shrink=0.8)
+
+
+def _convergence(figure: Figure, report: Report) -> None:
+    series = {name: values for name, values in report.pictures.convergence.items() if values}
+    panels = figure.subplots(1 + bool(series and report.loops), 1, squeeze=False)[:, 0]
+    if series:
+        for rank, (name, values) in enumerate(series.items()):
+            axes_style = {**STYLES[(2, 1, 3, 4, 5, 0)[rank % 6]], "marker": MARKERS[rank % 6], "markersize": 4}
+            panels[0].plot(range(len(values)), values, label=name, **axes_style)
+        _log_where_positive(panels[0], [value for values in series.values() for value in values])
+        panels[0].set_ylabel("objective")
+        panels[0].legend(frameon=False, fontsize=8)
+    if report.loops:
+        means = [row.mean for row in report.loops]
+        panels[-1].plot(range(len(means)), means, marker="o", markersize=4, **STYLES[2])
+        _log_where_positive(panels[-1], means)
+        panels[-1].set_ylabel("mean D of a loop")
+    panels[-1].set_xlabel("iteration")
+
+
+def _log_where_positive(axes: Any, values: list[float]) -> None:
+    if values and 0 < WIDE * min(values) < max(values):
+        axes.set_yscale("log")
+    axes.xaxis.get_major_locator().set_params(integer=True)

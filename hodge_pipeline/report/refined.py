@@ -1,0 +1,69 @@
+"""The report of a refined model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.refine.model import RefinedModel
+from hodge_pipeline.refine.model_options import ModelRefinement
+from hodge_pipeline.refine.verdict import summary
+from hodge_pipeline.report.contents import (
+    Path3D,
+    Pictures,
+    Report,
+    Residuals,
+    SourceSummary,
+    StageRow,
+)
+from hodge_pipeline.report.summary import graph_summary, worst_edges
+from hodge_pipeline.store.cost import Cost
+from hodge_pipeline.store.job import versions
+
+NO_METRES = "There is no depth that tells the scale: lengths are in the model's own unit, called metres here."
+
+
+def _scales(result: RefinedModel) -> str:
+    before = "; ".join(str(scale) for scale in dict.fromkeys(result.scales))
+    after = "" if not result.final_scale.is_observable else f". After: {result.final_scale}"
+    return f"Before: {before}{after}."
+
+
+def model_report(results: Sequence[RefinedModel], options: ModelRefinement, source: str, cost: Cost) -> Report:
+    """The report of the first result, which has most images; the others in its notes."""
+    first = results[0]
+    others = [
+        f"model {number} ({result.start.quality.images} images): {result.decision.outcome}, {result.decision.reason}"
+        for number, result in enumerate(results[1:], start=1)
+    ]
+    metric = () if first.final_scale.is_observable else (NO_METRES,)
+    solved = first.solved
+    sets = {"start": first.start.world_from_body, "result": first.model.world_from_body}
+    quality = first.start.quality
+    pictures = Pictures(paths=tuple(Path3D(name, poses[:, :3, 3]) for name, poses in sets.items()))
+    if solved is not None:
+        pictures = Pictures(
+            paths=pictures.paths,
+            component=solved.solution.component,
+            residuals=tuple(Residuals(name, *edge_residuals(solved.graph, poses)) for name, poses in sets.items()),
+            graph=solved.graph,
+        )
+    return Report(
+        title=f"{source}, refined",
+        source=SourceSummary(f"COLMAP model, {quality.points} points", source, quality.images),
+        before="start",
+        refinement=replace(summary(first.decision), scale=_scales(first)),
+        graph=None
+        if solved is None
+        else graph_summary(solved.graph, solved.solution.component, solved.solution.weights),
+        worst_edges=()
+        if solved is None
+        else worst_edges(solved.graph, first.model.world_from_body, solved.solution.weights),
+        stages=(StageRow("refine", cost.wall_s, cost.cpu_s, cost.peak_mb),),
+        notes=(*metric, *others, *first.notes),
+        versions=versions(),
+        recipe=yaml_file.dump(binding.unbind(options)),
+        pictures=pictures,
+    )

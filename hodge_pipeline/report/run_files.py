@@ -1,0 +1,239 @@
+"""What a run leaves for people: poses, graph, edges, report, recording."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline import registry
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.evaluation.trajectory import absolute_error
+from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.refine.verdict import Refined, summary
+from hodge_pipeline.report.contents import (
+    LoopRow,
+    Path3D,
+    Pictures,
+    Report,
+    Residuals,
+    SourceSummary,
+    StageRow,
+    TrajectoryRow,
+)
+from hodge_pipeline.report.sides import four_sides, worst_pairs
+from hodge_pipeline.report.summary import graph_summary, trajectory_rows, worst_edges
+from hodge_pipeline.report.write import write_report
+from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.store.job import Job, versions
+from hodge_pipeline.types import CloudSet, Floats, Ints, Solution, Source, Trajectory, ViewGraph
+
+EDGE_COLUMNS = (
+    "i", "j", "source", "status", "fitness", "rmse_m", "correspondences", "weight", "residual_m", "residual_deg",
+    "verdict", "probability", "why",
+)  # fmt: skip
+
+
+def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
+    """`poses.tum` and `poses.kitti`; of several sequences `poses-<sequence>.*` each, since their stamps may repeat."""
+    sequences = sequences_of(source)
+    for name, rows in sequences.items():
+        stamps = np.array([source.frames[row].stamp_s for row in rows])
+        part = Source(source.name, source.path, trajectory=Trajectory(stamps, world_from_cam[rows]))
+        stem = "poses" if len(sequences) == 1 else f"poses-{name}"
+        for writer in ("tum", "kitti"):
+            registry.load("writers", writer)().write(folder / f"{stem}.{writer}", part)
+
+
+def write_graph(folder: Path, source: Source, last: Round) -> None:
+    """`graph.g2o` (vertices by frame number, or by row where frames have names) and `edges.csv`."""
+    graph = last.graph
+    ids = graph.vertex_ids if graph.vertex_ids.dtype.kind == "i" else np.arange(graph.vertex_count)
+    numbered = dataclasses.replace(graph, vertex_ids=ids)
+    trajectory = Trajectory(np.arange(graph.vertex_count, dtype=float), last.world_from_cam)
+    whole = Source(source.name, source.path, trajectory=trajectory, graph=numbered)
+    registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)
+    weights = np.ones(graph.edge_count) if last.solution is None else last.solution.weights
+    rejected = [
+        [graph.vertex_ids[i], graph.vertex_ids[j], reason, "rejected", *[""] * 9]
+        for (i, j), reason in zip(last.rejected_pairs, last.rejected_reasons, strict=True)
+    ]
+    artifacts.write_text(folder / "edges.csv", edge_table(graph, last.world_from_cam, weights, rejected, last))
+
+
+def edge_table(
+    graph: ViewGraph,
+    world_from_cam: Floats,
+    weights: Floats,
+    rejected: Sequence[Sequence[object]] = (),
+    judged: Round | None = None,
+) -> str:
+    """Every edge with its residual under the poses as CSV, then the pairs that became no edge; the round of a run adds
+    verdicts, and what was switched off by hand.
+    """
+    out = io.StringIO()
+    translation_m, angle_rad = edge_residuals(graph, world_from_cam)
+    table = csv.writer(out, lineterminator="\n")
+    table.writerow(EDGE_COLUMNS)
+    verdicts = None if judged is None else judged.verdicts
+    off = np.zeros(graph.edge_count, bool) if judged is None or judged.disabled is None else judged.disabled
+    for row, (i, j) in enumerate(graph.edges):
+        table.writerow(
+            [
+                graph.vertex_ids[i],
+                graph.vertex_ids[j],
+                graph.source[row],
+                "disabled" if off[row] else "used" if weights[row] > 0 else "ignored",
+                f"{graph.fitness[row]:.4f}",
+                f"{graph.rmse_m[row]:.5f}",
+                graph.correspondences[row],
+                f"{weights[row]:.4f}",
+                f"{translation_m[row]:.6f}",
+                f"{np.rad2deg(angle_rad[row]):.5f}",
+                *_verdict_cells(verdicts, row),
+            ]
+        )
+    table.writerows(rejected)
+    return out.getvalue()
+
+
+def _verdict_cells(verdicts: Verdicts | None, row: int) -> tuple[str, str, str]:
+    if verdicts is None:
+        return "", "", ""
+    probability = verdicts.probability[row]
+    known = "" if np.isnan(probability) else f"{probability:.6g}"
+    return str(verdicts.verdict[row]), known, str(verdicts.reason[row])
+
+
+def make_report(
+    job: Job, source: Source, rounds: Sequence[Round], scores: ScoreTable | None, refined: Refined | None = None
+) -> Report:
+    """Everything that the run measured."""
+    last, whole = rounds[-1], _whole(job, source)
+    sets = pose_sets(rounds)
+    assert last.solution is not None
+    component = last.solution.component
+    verdict = None if last.verdicts is None else last.verdicts.verdict
+    worst = worst_edges(last.graph, last.world_from_cam, last.solution.weights, verdict=verdict)
+    return Report(
+        title=f"{source.name}",
+        before=rounds[0].name,
+        source=SourceSummary(
+            name=source.name,
+            path=str(source.path),
+            frames=len(whole.frames),
+            frames_with_truth=sum(frame.world_from_cam is not None for frame in whole.frames),
+            key_frames=len(source.frames) if len(source.frames) < len(whole.frames) else None,
+            sequences=tuple(name for name in sequences_of(source) if name),
+            notes=source.notes,
+        ),
+        scores=scores,
+        trajectories=_trajectories(job, source, sets, component),
+        loops=_loop_rows(last.solution),
+        graph=graph_summary(last.graph, component, last.solution.weights, last.rejected_counts, verdict),
+        worst_edges=worst,
+        stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in job.costs()),
+        notes=tuple(job.notes),
+        versions=versions(),
+        recipe=yaml_file.dump(binding.unbind(job.recipe)),
+        last_shift_m=_last_shift(rounds, component),
+        pictures=dataclasses.replace(
+            _pictures(source, rounds, sets),
+            sides=four_sides(CloudSet.open(job.path("clouds")), sets[rounds[0].name], sets["result"], component),
+            worst_pairs=worst_pairs(source, worst),
+        ),
+        refinement=None if refined is None else summary(refined.decision),
+    )
+
+
+def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
+    """How far the last round moved the positions (root mean square, aligned); None where it is the first to solve, or
+    that of edits, which are meant to move them.
+    """
+    if len(rounds) < 3 or rounds[-1].disabled is not None:
+        return None
+    shift_m = absolute_error(rounds[-2].world_from_cam, rounds[-1].world_from_cam, component).rmse_m
+    return float(shift_m) if np.isfinite(shift_m) else None
+
+
+def _whole(job: Job, source: Source) -> Source:
+    """The source with all of its frames, where a run works on key frames alone."""
+    if job.tracked is not None:
+        return job.tracked.whole
+    return source if job.given is None else job.given.whole
+
+
+def _trajectories(job: Job, source: Source, sets: Mapping[str, Floats], component: Ints) -> tuple[TrajectoryRow, ...]:
+    """The errors of each set of poses, over all frames, those that are not key frames included."""
+    if job.tracked is not None:
+        source, component = job.tracked.whole, component[job.tracked.anchors]
+        sets = {name: job.tracked.all_poses(poses) for name, poses in sets.items()}
+    if not has_truth(source):
+        return ()
+    sequences = [frame.sequence for frame in source.frames]
+    delta_frames = job.recipe.evaluation.rpe_delta_frames
+    return trajectory_rows(sets, true_poses(source), component, sequences, delta_frames=delta_frames)
+
+
+def _loop_rows(solution: Solution) -> tuple[LoopRow, ...]:
+    loops = int(solution.metrics.get("loops", 0))
+    measured = solution.metrics.get("measured_loop_deviation_sum")
+    rows = [] if measured is None else [LoopRow("measured edges", loops, measured)]
+    for number, step in enumerate(solution.history, start=1):
+        if "loop_deviation_sum" in step.metrics:
+            rows.append(LoopRow(f"adjusted edges, inner iteration {number}", loops, step.metrics["loop_deviation_sum"]))
+    return tuple(rows)
+
+
+def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) -> Pictures:
+    """The plots' data: paths aligned to the truth, or as they are where there is none."""
+    last = rounds[-1]
+    assert last.solution is not None
+    component = last.solution.component
+    shown = {name: sets[name] for name in (rounds[0].name, "result")}
+    if has_truth(source):
+        truth = true_poses(source)
+        aligned = {name: absolute_error(poses, truth, component).aligned for name, poses in shown.items()}
+        shown = {"truth": truth, **aligned}
+    paths = [Path3D(name, poses[:, :3, 3]) for name, poses in shown.items()]
+    residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in (rounds[0].name, "result"))
+    convergence = {
+        f"round {number}": tuple(step.objective for step in one.solution.history)
+        for number, one in enumerate(rounds)
+        if one.solution is not None
+    }
+    return Pictures(tuple(paths), component, residuals, last.graph, convergence)
+
+
+def write(
+    job: Job,
+    source: Source,
+    rounds: Sequence[Round],
+    models: dict[str, Path],
+    scores: ScoreTable | None,
+    refined: Refined | None = None,
+) -> Report:
+    """Write everything but the recording into the run folder; gives the report.
+
+    Of a refinement the poses of all frames; where nothing could be refined the report alone.
+    """
+    folder = job.workspace.folder
+    if job.tracked is not None:
+        write_poses(folder, job.tracked.whole, job.tracked.all_poses(rounds[-1].world_from_cam))
+    elif refined is None:
+        write_poses(folder, source, rounds[-1].world_from_cam)
+    elif job.given is not None and refined.decision.outcome != "nothing":
+        write_poses(folder, job.given.whole, refined.world_from_cam)
+    if refined is None or refined.decision.outcome != "nothing":
+        write_graph(folder, source, rounds[-1])
+        for name, path in models.items():
+            artifacts.link_or_copy(path, folder / f"{name}.ply")
+    report = make_report(job, source, rounds, scores, refined)
+    write_report(folder, report)
+    return report

@@ -1,0 +1,136 @@
+"""The rows of a report from the data that flows between stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
+from hodge_pipeline.report.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow
+from hodge_pipeline.types import Floats, Ints, ViewGraph
+
+CENTIMETRES_PER_DEGREE = 1.0
+"""How a residual's angle counts beside its translation when edges are ranked: a scene lies about 0.6 m away."""
+
+MAX_RUNS_LISTED = 12
+VERDICTS = ("consistent", "suspect", "wrong", "untestable")
+
+
+def trajectory_rows(
+    pose_sets: Mapping[str, Floats],
+    truth: Floats,
+    component: Ints | None = None,
+    sequence: Sequence[str] | None = None,
+    *,
+    with_scale: bool = False,
+    delta_frames: int = 1,
+) -> tuple[TrajectoryRow, ...]:
+    """The errors of each named set of poses (N, 4, 4) against the truth (N, 4, 4), NaN where a frame has none.
+
+    Each component (N,) is aligned apart; a frame that is one by itself is left out, since it would fit its truth
+    exactly. Relative motions, over `delta_frames`, also stop at the end of a sequence.
+    """
+    parts = _distinct(component, sequence, len(truth))
+    if component is not None:
+        alone = np.bincount(component)[component] == 1
+        truth = truth if alone.all() else np.where(alone[:, None, None], np.nan, truth)
+    return tuple(
+        _trajectory_row(
+            name,
+            absolute_error(poses, truth, component, with_scale=with_scale),
+            relative_error(poses, truth, delta_frames, component=parts),
+        )
+        for name, poses in pose_sets.items()
+    )
+
+
+def _trajectory_row(name: str, absolute: AbsoluteError, relative: RelativeError) -> TrajectoryRow:
+    return TrajectoryRow(
+        name=name,
+        frames=absolute.frames,
+        left_out=absolute.left_out,
+        ate_rmse_m=absolute.rmse_m,
+        ate_median_m=absolute.median_m,
+        ate_max_m=absolute.max_m,
+        rpe_translation_m=relative.translation_rmse_m,
+        rpe_rotation_deg=relative.rotation_rmse_deg,
+        rpe_delta_frames=relative.delta_frames,
+        degenerate=any(alignment.degenerate for alignment in absolute.alignments),
+    )
+
+
+def _distinct(component: Ints | None, sequence: Sequence[str] | None, count: int) -> Ints:
+    """One label (N,) for each combination of component and sequence."""
+    labels = np.zeros(count, np.int64) if component is None else np.asarray(component, np.int64)
+    if sequence is None:
+        return labels
+    names = np.unique(np.asarray(sequence, str), return_inverse=True)[1]
+    return np.asarray(labels * (names.max(initial=0) + 1) + names, np.int64)
+
+
+def graph_summary(
+    graph: ViewGraph,
+    component: Ints,
+    weights: Floats | None = None,
+    rejected: Mapping[str, int] | None = None,
+    verdict: NDArray[np.str_] | None = None,
+) -> GraphSummary:
+    """The viewing graph in numbers; `component (V,)` and `weights (E,)` as the solution has them (0: ignored)."""
+    sources, counts = np.unique(graph.source, return_counts=True)
+    labels, sizes = np.unique(component, return_counts=True)
+    largest_first = labels[np.argsort(-sizes, kind="stable")]
+    rows = [np.flatnonzero(component == label) for label in largest_first]
+    return GraphSummary(
+        vertices=graph.vertex_count,
+        edges=graph.edge_count,
+        edges_by_source={str(name): int(count) for name, count in zip(sources, counts, strict=True)},
+        components=tuple(ComponentRow(len(row), in_runs(row, graph.vertex_ids)) for row in rows),
+        edges_ignored=0 if weights is None else int((weights <= 0).sum()),
+        rejected=dict(rejected or {}),
+        verdicts=_counts(verdict),
+        verdicts_in_use=_counts(verdict if verdict is None or weights is None else verdict[weights > 0]),
+    )
+
+
+def _counts(verdict: NDArray[np.str_] | None) -> dict[str, int]:
+    return {} if verdict is None else {name: int((verdict == name).sum()) for name in VERDICTS}
+
+
+def in_runs(rows: Ints, vertex_ids: Ints | np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> str:
+    """Ascending rows in words, `0–120, 124, 130–131`, as the source names their frames."""
+    if not len(rows):
+        return "none"
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    words = [f"{vertex_ids[run[0]]}" + (f"–{vertex_ids[run[-1]]}" if len(run) > 1 else "") for run in runs]
+    more = f", and {len(runs) - MAX_RUNS_LISTED} more" if len(runs) > MAX_RUNS_LISTED else ""
+    return ", ".join(words[:MAX_RUNS_LISTED]) + more
+
+
+def worst_edges(
+    graph: ViewGraph,
+    world_from_cam: Floats,
+    weights: Floats | None = None,
+    count: int = 10,
+    verdict: NDArray[np.str_] | None = None,
+) -> tuple[EdgeRow, ...]:
+    """The edges furthest from the poses (V, 4, 4), worst first: a centimetre counts like a degree."""
+    translation_m, angle_rad = edge_residuals(graph, world_from_cam)
+    size_cm = translation_m * 100 + np.rad2deg(angle_rad) * CENTIMETRES_PER_DEGREE
+    worst = np.argsort(-np.nan_to_num(size_cm, nan=-1.0), kind="stable")[:count]
+    known = np.ones(graph.edge_count) if weights is None else weights
+    return tuple(
+        EdgeRow(
+            i=str(graph.vertex_ids[graph.edges[row, 0]]),
+            j=str(graph.vertex_ids[graph.edges[row, 1]]),
+            source=str(graph.source[row]),
+            fitness=float(graph.fitness[row]),
+            weight=float(known[row]),
+            residual_m=float(translation_m[row]),
+            residual_deg=float(np.rad2deg(angle_rad[row])),
+            verdict="" if verdict is None else str(verdict[row]),
+        )
+        for row in worst
+    )

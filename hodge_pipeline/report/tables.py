@@ -1,0 +1,203 @@
+"""A report as rows of text: the same for the page and for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
+from hodge_pipeline.report.contents import RefinementSummary, Report
+from hodge_pipeline.report.verdict import GRAPH_NAMES, judge, length, suspicions
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a header; the first `names` columns are words, the rest numbers. The caption explains it."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+    names: int = 1
+
+
+def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
+    """The report in a few (label, text) lines for a terminal."""
+    lines = [("verdict", judge(report).sentence)]
+    source, graph = report.source, report.graph
+    lines.append(("source", f"{source.name}, {source.counted}, {source.frames_with_truth} with a true pose"))
+    if graph is not None:
+        by_source = ", ".join(f"{count} {name}" for name, count in graph.edges_by_source.items())
+        sources = f" ({by_source})" if by_source else ""
+        lines.append(("graph", f"{graph.edges} edges{sources}, {len(graph.components)} connected part(s)"))
+    if report.stages:
+        wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
+        lines.append(("time", f"{wall:.1f} s, {cpu:.1f} CPU s, at most {_peak(report):.0f} MB"))
+    return (*lines, *(("note", line) for line in suspicions(report)))
+
+
+def vertex_name(report: Report) -> str:
+    """What the vertices of the viewing graph are."""
+    return "frames" if report.source.key_frames is None else "key frames"
+
+
+def _peak(report: Report) -> float:
+    return max(stage.peak_mb for stage in report.stages)
+
+
+def score_tables(report: Report) -> Iterator[Table]:
+    """Scores and trajectory errors of each set of poses, where they were measured."""
+    if report.refinement is not None and report.refinement.measures:
+        yield _measures(report.refinement)
+    if report.scores is not None:
+        yield _scores(report)
+    if report.trajectories:
+        yield _trajectories(report)
+
+
+def graph_tables(report: Report) -> Iterator[Table]:
+    """The viewing graph, its parts where there are several, and the loop deviation."""
+    if report.graph is not None:
+        yield _graph(report)
+        if len(report.graph.components) > 1:
+            parts = tuple((str(n), str(part.count), part.frames) for n, part in enumerate(report.graph.components))
+            yield Table(
+                "Connected parts", ("part", vertex_name(report), "which"), parts, "Nothing measured joins two parts.", 3
+            )
+    if report.loops:
+        yield _loops(report)
+
+
+def _measures(refinement: RefinementSummary) -> Table:
+    rows = tuple(
+        (row.name, f"{row.before:.4g}", f"{row.after:.4g}", row.unit, row.better, "worse" if row.is_worse else "ok")
+        for row in refinement.measures
+    )
+    header = ("measure", "before", "after", "unit", "better", "judgement")
+    caption = "Where one is worse by more than its own noise the input is kept. "
+    caption += " ".join(filter(None, (refinement.change, refinement.scale)))
+    return Table("Measures", header, rows, caption)
+
+
+def _scores(report: Report) -> Table:
+    table = report.scores
+    assert table is not None
+    counts = ", ".join(f"{len(graph.pairs)} {GRAPH_NAMES[graph.kind]}" for graph in table.graphs)
+    columns = [(f"score, {GRAPH_NAMES[graph.kind]}", "d", "pairs") for graph in table.graphs]
+    rows = [
+        (name, *(cell for graph in table.graphs for cell in _score_cells(graph, row)))
+        for row, name in enumerate(table.names)
+    ]
+    caption = (
+        f"How well overlapping clouds lie on each other, on the pairs of the {table.reference} poses ({counts}). "
+        f"d: mean point-to-plane distance; score: mean of exp(−d / {table.scale * SIGMA_M * 1000:g} mm), 1 is perfect. "
+        "Compare rows with each other: a score has no meaning alone."
+    )
+    return Table("Scores", ("poses", *(cell for column in columns for cell in column)), tuple(rows), caption)
+
+
+def _score_cells(graph: GraphScores, row: int) -> tuple[str, str, str]:
+    score, distance, count = graph.mean_score[row], graph.mean_distance_m[row], graph.counts[row]
+    return number(score, ".4f"), number(distance * 1000, ".2f", " mm"), str(count)
+
+
+def _trajectories(report: Report) -> Table:
+    header = ("poses", "ATE", "median", "largest", "RPE", "RPE, rotation", "frames")
+    absolute_m = max((row.ate_rmse_m for row in report.trajectories if row.frames), default=0.0)
+    relative_m = max((row.rpe_translation_m for row in report.trajectories if row.frames), default=0.0)
+    rows = tuple(
+        (
+            row.name,
+            *(length(metres, absolute_m) for metres in (row.ate_rmse_m, row.ate_median_m, row.ate_max_m)),
+            length(row.rpe_translation_m, relative_m),
+            number(row.rpe_rotation_deg, ".3f", "°"),
+            str(row.frames),
+        )
+        for row in report.trajectories
+    )
+    delta = report.trajectories[0].rpe_delta_frames if report.trajectories else 1
+    caption = (
+        "Distance from the true positions after the best rigid alignment (ATE, root mean square), and error of the "
+        f"motion from each frame to {'the next' if delta == 1 else f'the one {delta} frames on'} (RPE). The truth of a "
+        "benchmark has errors of its own."
+    )
+    return Table("Trajectory", header, rows, caption)
+
+
+def _graph(report: Report) -> Table:
+    graph = report.graph
+    assert graph is not None
+    rows = [
+        (vertex_name(report), str(graph.vertices)),
+        ("edges", str(graph.edges)),
+        *((f"edges: {name}", str(count)) for name, count in graph.edges_by_source.items()),
+        ("edges ignored by the solver", str(graph.edges_ignored)),
+        *((f"edges judged {verdict}", str(count)) for verdict, count in graph.verdicts.items()),
+        ("connected parts", str(len(graph.components))),
+        *((f"pairs rejected: {reason}", str(count)) for reason, count in graph.rejected.items()),
+    ]
+    return Table("Viewing graph", ("what", "count"), tuple(rows), "An edge is a measured motion between two frames.")
+
+
+def _loops(report: Report) -> Table:
+    rows = tuple((row.iteration, f"{row.mean:.3g}", f"{row.total:.3g}", str(row.loops)) for row in report.loops)
+    caption = (
+        "Deviation D of a loop: how far the product of motions along it is from the identity, ‖Π A − I‖, before the "
+        "solve for the measured motions, then for the adjusted ones."
+    )
+    return Table("Loop deviation", ("after", "mean D of a loop", "sum", "loops"), rows, caption)
+
+
+def source_table(report: Report) -> Table:
+    """What was read."""
+    source = report.source
+    rows = [
+        ("format", source.name),
+        ("path", source.path),
+        ("frames", str(source.frames)),
+        *((("key frames", str(source.key_frames)),) if source.key_frames is not None else ()),
+        ("frames with a true pose", str(source.frames_with_truth)),
+        ("sequences", ", ".join(source.sequences) or "one"),
+        *(("reader's remark", note) for note in source.notes),
+    ]
+    return Table("Input", ("what", "value"), tuple(rows), names=2)
+
+
+def worst_edges_table(report: Report) -> Table:
+    """The edges furthest from the result."""
+    rows = tuple(
+        (
+            edge.i,
+            edge.j,
+            edge.source,
+            number(edge.fitness, ".2f"),
+            number(edge.weight, ".2g"),
+            number(edge.residual_m * 100, ".1f", " cm"),
+            number(edge.residual_deg, ".2f", "°"),
+            edge.verdict or "–",
+        )
+        for edge in report.worst_edges
+    )
+    caption = (
+        "Measured motions that disagree most with the result, worst first: a wrong edge, or a wrong result there. "
+        "Fitness: share of the cloud that found a partner. Weight: 0 where the solver ignored the edge. "
+        "Verdict: what the cycles through the edge say."
+    )
+    header = ("i", "j", "source", "fitness", "weight", "off by", "turned by", "verdict")
+    return Table("Worst edges", header, rows, caption, 3)
+
+
+def stages_table(report: Report) -> Table:
+    """What each stage cost, with the total."""
+    rows = [(s.name, f"{s.wall_s:.1f} s", f"{s.cpu_s:.1f} s", f"{s.peak_mb:.0f} MB") for s in report.stages]
+    wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
+    rows.append(("all", f"{wall:.1f} s", f"{cpu:.1f} s", f"{_peak(report):.0f} MB"))
+    caption = "CPU time and peak memory are summed over all processes; a stage that was resumed cost nothing."
+    return Table("Time", ("stage", "wall", "CPU", "peak memory"), tuple(rows), caption)
+
+
+def number(value: float, form: str, unit: str = "") -> str:
+    """A number in this form, a dash where it is not finite."""
+    return f"{value:{form}}{unit}".replace("-", "−") if np.isfinite(value) else "–"

@@ -1,0 +1,103 @@
+"""The report of a run: one page for people, the same numbers as JSON for programs."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from hodge_pipeline.evaluation.scores import SIGMA_M, ScoreTable
+from hodge_pipeline.report.contents import (
+    ComponentRow,
+    EdgeRow,
+    GraphSummary,
+    LoopRow,
+    Path3D,
+    Pictures,
+    Report,
+    Residuals,
+    SourceSummary,
+    StageRow,
+    TrajectoryRow,
+)
+from hodge_pipeline.report.page import render
+from hodge_pipeline.report.plots import draw
+from hodge_pipeline.report.verdict import judge, suspicions
+from hodge_pipeline.store.artifacts import write_json, write_text
+
+__all__ = [
+    "ComponentRow",
+    "EdgeRow",
+    "GraphSummary",
+    "LoopRow",
+    "Path3D",
+    "Pictures",
+    "Report",
+    "Residuals",
+    "SourceSummary",
+    "StageRow",
+    "TrajectoryRow",
+    "as_json",
+    "write_report",
+]
+
+FORMAT_VERSION = 1
+"""Raised when a key of `report.json` is renamed, moved or removed."""
+
+
+def write_report(folder: Path, report: Report) -> tuple[Path, Path]:
+    """Write `report.html` and `report.json` into a folder that exists, and give back their paths."""
+    page, numbers = folder / "report.html", folder / "report.json"
+    write_text(page, render(report, draw(report)))
+    write_json(numbers, as_json(report))
+    return page, numbers
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """The numbers of a report under stable keys; lengths in metres, angles in degrees where the key says so."""
+    verdict = judge(report)
+    return {
+        "format_version": FORMAT_VERSION,
+        "title": report.title,
+        "verdict": {
+            "outcome": verdict.outcome,
+            "sentence": verdict.sentence,
+            "before": report.before,
+            "after": report.after,
+            "changes": [{**asdict(change), "share": change.share} for change in verdict.changes],
+        },
+        "refinement": None if report.refinement is None else asdict(report.refinement),
+        "source": asdict(report.source),
+        "scores": None if report.scores is None else _scores(report.scores),
+        "trajectories": [asdict(row) for row in report.trajectories],
+        "loops": [{**asdict(row), "mean": row.mean} for row in report.loops],
+        "graph": None if report.graph is None else asdict(report.graph),
+        "worst_edges": [asdict(row) for row in report.worst_edges],
+        "convergence": {name: list(series) for name, series in report.pictures.convergence.items()},
+        "stages": [asdict(row) for row in report.stages],
+        "notes": list(suspicions(report)),
+        "versions": dict(report.versions),
+        "recipe": report.recipe,
+    }
+
+
+def _scores(table: ScoreTable) -> dict[str, Any]:
+    return {
+        "reference": table.reference,
+        "sigma_m": table.scale * SIGMA_M,
+        "graphs": {
+            graph.kind: {
+                "edges": len(graph.pairs),
+                "poses": {
+                    name: {
+                        "score": graph.mean_score[row],
+                        "distance_m": graph.mean_distance_m[row],
+                        "edges_scored": graph.counts[row],
+                        "edges_unmatched": graph.unmatched[row],
+                    }
+                    for row, name in enumerate(table.names)
+                },
+            }
+            for graph in table.graphs
+        },
+    }

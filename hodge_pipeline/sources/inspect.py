@@ -1,0 +1,86 @@
+"""What a path is, with no reading of more than needed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hodge_pipeline import registry
+from hodge_pipeline.errors import HodgeError, SourceError
+from hodge_pipeline.sources.frame_facts import frame_facts, trajectory_facts
+from hodge_pipeline.sources.graph_facts import graph_facts
+from hodge_pipeline.sources.unknown import unknown
+from hodge_pipeline.stages import FrameReader, Sniff
+from hodge_pipeline.store.workspace import is_run_folder
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A reader and how sure it is of a path."""
+
+    name: str
+    sniff: Sniff
+
+
+def guesses(path: Path) -> list[Guess]:
+    """Every reader that takes the path for its format, the surest first; a broken plugin is passed over."""
+    found = []
+    for name in registry.names("readers"):
+        try:
+            sniff = registry.load("readers", name)().sniff(path)
+        except HodgeError:
+            continue
+        if sniff.confidence > 0:
+            found.append(Guess(name, sniff))
+    return sorted(found, key=lambda guess: (-guess.sniff.confidence, guess.name))
+
+
+def guess_reader(path: Path, known: Sequence[Guess] | None = None) -> FrameReader:
+    """The surest reader of a path, with its default options, of the guesses that are `known`, else of all.
+
+    Raises `SourceError` where none knows it.
+    """
+    if not path.exists():
+        raise SourceError(f"{path}: no such file or folder")
+    if not path.is_file() and not path.is_dir():
+        raise SourceError(f"{path}: neither a file nor a folder: give one that holds data")
+    if is_run_folder(path):
+        raise SourceError(
+            f"{path}: the folder of a run, no source: give a file of it, such as poses.tum, graph.g2o or mesh.ply"
+        )
+    best = guesses(path) if known is None else known
+    if not best:
+        raise unknown(path)
+    reader: FrameReader = registry.load("readers", best[0].name)()
+    return reader
+
+
+def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
+    """Facts of a path as plain data: guesses, frames, stamps, cameras, depth, poses, graph, notes, oddities.
+
+    The surest reader opens it where none is given.
+
+    Images are not read but for the depth of a few frames. What has no value (a range of nothing) is left out.
+    """
+    known = guesses(path) if path.is_file() or path.is_dir() else []
+    source = (reader or guess_reader(path, known)).open(path)
+    oddities: list[str] = []
+    facts: dict[str, Any] = {
+        "path": str(path),
+        "formats": [{"reader": g.name, "confidence": g.sniff.confidence, "why": g.sniff.reason} for g in known],
+        "frames": len(source.frames),
+    }
+    if source.frames:
+        facts.update(frame_facts(source.frames, oddities))
+    if source.trajectory is not None:
+        facts["trajectory poses"] = len(source.trajectory)
+        if not source.frames and len(source.trajectory):
+            # The poses of a graph's vertices stand in no order of time: a step between them means nothing.
+            facts.update(trajectory_facts(source.trajectory, oddities) if source.graph is None else {})
+    if source.graph is not None and source.graph.vertex_count:
+        facts["graph"] = graph_facts(source.graph, oddities)
+    facts["notes"] = list(source.notes)
+    facts["oddities"] = oddities
+    return {name: value for name, value in facts.items() if value is not None}

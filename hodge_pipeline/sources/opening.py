@@ -1,0 +1,66 @@
+"""A path opened by the reader that the recipe names; where it looks like another format, that is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from hodge_pipeline import registry
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.recipe import recipe_file
+from hodge_pipeline.sources.inspect import Guess, guess_reader, guesses
+from hodge_pipeline.sources.unknown import without_frames
+from hodge_pipeline.stages import FrameReader
+from hodge_pipeline.store.job import source_key
+from hodge_pipeline.types import Source
+
+SURE = 0.6
+"""Confidence of a reader from which a path is said to look like its format."""
+MARGIN = 0.2
+"""How much surer it must be than the reader of the recipe."""
+
+
+def open_source(path: Path, reader: FrameReader | None) -> tuple[Source, str]:
+    """The source at a path and its key; without a reader, by the surest.
+
+    Where another reader is much surer of the path than this one, the error (`SourceError`), or else a note, names it
+    and the recipe for it.
+    """
+    chosen = reader or guess_reader(path)
+    try:
+        source = chosen.open(path)
+    except SourceError as error:
+        likelier = _likelier(path, chosen)
+        if likelier is None:
+            raise
+        raise SourceError(f"{error}; it looks like {_described(likelier)}: {_remedy(likelier.name, path)}") from error
+    likelier = None if reader is None else _likelier(path, chosen)
+    if likelier is not None:
+        read_as = f"read as {registry.name_of(chosen)}, but it looks like {_described(likelier)}"
+        source = replace(source, notes=(*source.notes, f"{read_as}: {_remedy(likelier.name, path)}"))
+    return source, source_key(source, chosen)
+
+
+def _likelier(path: Path, chosen: FrameReader) -> Guess | None:
+    """The surest reader, where it is another than the chosen one and much surer."""
+    if not path.exists() or chosen.sniff(path).confidence > 1 - MARGIN:
+        return None
+    best = next(iter(guesses(path)), None)
+    if best is None or best.name == registry.name_of(chosen) or best.sniff.confidence < SURE:
+        return None
+    return best if best.sniff.confidence >= chosen.sniff(path).confidence + MARGIN else None
+
+
+def _described(guess: Guess) -> str:
+    return f"{guess.name} ({guess.sniff.reason})"
+
+
+def _remedy(reader: str, path: Path) -> str:
+    """The recipe that is named as the reader, else the option that takes it; the command for what has no frames."""
+    if reader in recipe_file.recipe_names():
+        return f"try the recipe {reader}"
+    try:
+        source: Source = registry.load("readers", reader)().open(path)
+    except SourceError as error:
+        return f"which does not open it either ({error})"
+    return f"try --set source.reader={reader}" if source.frames else without_frames(source)

@@ -1,0 +1,1 @@
+"""Where the first poses of a run come from."""

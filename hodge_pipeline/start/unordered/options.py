@@ -1,0 +1,94 @@
+"""How poses are found from nothing."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.pairs.drift import DriftEdges
+from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.global_landmarks import LandmarkConsensus
+from hodge_pipeline.registration.global_registrars import FpfhConsensus
+from hodge_pipeline.stages import GlobalRegistrar, Registrar
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class HypothesisLimits:
+    """Which hypotheses become edges that the diagnosis judges; the others are counted, each with its reason."""
+
+    min_inliers: int = Field(default=15, ge=4, description="matches that agree; by chance up to about ten do")
+    min_overlap: float = Field(
+        default=0.2, ge=0, le=1, description="share of the smaller cloud with a point of the other nearby"
+    )
+    max_rmse_m: float = Field(default=0.06, gt=0, description="metres: RMS distance of those points")
+    max_violation: float = Field(
+        default=0.15,
+        ge=0,
+        le=1,
+        description="share of points in view that the other depth image saw through, at most, however noisy the camera",
+    )
+    violation_floor: float = Field(
+        default=0.03,
+        ge=0,
+        le=1,
+        description="what every camera may: below it no pair is refused. Between the two, 8 times the median of the "
+        "run's pairs is allowed: places that look alike differ in what surrounds them",
+    )
+    hue_floor: float = Field(
+        default=0.02,
+        ge=0,
+        le=1,
+        description="share of common points whose hue may differ, in coloured clouds; where the best quarter of the "
+        "run's pairs reaches a twelfth of it, as where colours lie badly on depth, 12 times that",
+    )
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+class GlobalStart:
+    """How frames or scans in no order are joined."""
+
+    use: Literal["auto", "images", "geometry"] = Field(
+        default="auto",
+        description="what pairs are matched by; auto: images where at least half of the clouds have landmarks",
+    )
+    registrar: GlobalRegistrar = Field(default=FpfhConsensus(), description="how two clouds are matched by geometry")
+    images: GlobalRegistrar = Field(default=LandmarkConsensus(), description="how two frames are matched by image")
+    refine: Registrar = Field(
+        default=Gicp(distances_m=(0.1, 0.05), source_points=(2000, 4000)),
+        description="how a match is refined before it is judged",
+    )
+    all_pairs_up_to: int = Field(
+        default=30, ge=0, description="frames: up to so many every pair is tried, beyond it the most similar ones"
+    )
+    similar_per_frame: int = Field(
+        default=12, ge=1, description="the most similar frames, by global descriptors, that each frame is matched with"
+    )
+    reach: int = Field(
+        default=5,
+        ge=1,
+        description="frames: after odometry, of so many consecutive ones only the most similar is matched, and none so "
+        "near, since odometry has joined them",
+    )
+    drift: DriftEdges | None = Field(
+        default=DriftEdges(),
+        description="after odometry, which pairs are matched as well: those whose poses bring them together with a "
+        "tolerance that grows along the trajectory; null: none",
+    )
+    landmarks: int = Field(
+        default=1000, ge=15, description="landmarks of a frame, where `clouds.landmarks` leaves it to the start; 60 ms"
+    )
+    limits: HypothesisLimits = HypothesisLimits()
+    diagnosis: DiagnosisOptions = Field(
+        default=DiagnosisOptions(order_prior=False),
+        description="who judges the edges together; the order of the frames is no evidence here",
+    )
+    similarity_voxel_m: float = Field(
+        default=0.05,
+        gt=0,
+        description="metres: scale of the features that scans are compared by, where the registrar has none",
+    )
+    words: int = Field(default=32, ge=1, description="words of the global descriptors' vocabulary")
+    seed: int = Field(default=0, ge=0, description="of the vocabulary's sample")

@@ -1,0 +1,1 @@
+"""Steps that are computed once and remembered: keys, files, cost, progress."""

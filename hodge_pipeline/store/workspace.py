@@ -1,0 +1,235 @@
+"""The run folder: stage artifacts and their keys, atomic commits, resume."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.recipe import yaml_file
+from hodge_pipeline.store import artifacts
+
+KEY_FILE = "key.json"
+RECIPE_FILE = "recipe.yaml"
+RUN, REFINEMENT = "stages", "refinement"
+"""The folder of the stages of a run, and of the refinement of a model."""
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, None)
+"""What the system says when a file cannot be written; None is numpy's own short write."""
+
+
+def key_of(*parts: Any) -> str:
+    """The key of a stage: a hash of its resolved options, versions and the keys of its inputs."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def is_run_folder(path: Path) -> bool:
+    """Whether a path is what a run left, finished or not."""
+    return (path / RECIPE_FILE).is_file() and (path / RUN).is_dir()
+
+
+@dataclass(frozen=True)
+class StageFolder:
+    """Where one stage's artifacts lie. `finished`: read `path`; else write into `path`, which commits on leaving."""
+
+    path: Path
+    key: str
+    finished: bool
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What was noted of a finished stage (`Workspace.stage` writes the key, the caller may add its cost)."""
+        return dict(artifacts.read_json(self.path / KEY_FILE)) if self.finished else {}
+
+
+class Workspace:
+    """One run folder, held by one process at a time.
+
+    `stages/<name>` holds a finished stage, `stages/<name>.part` one that was begun; a part is continued when its key
+    is still the same. Everything else in the folder is for people. `kind` is what `stages` is called: what runs and
+    what refines a model never share a folder.
+    """
+
+    def __init__(self, folder: Path, lock: IO[str], kind: str = RUN) -> None:
+        self.folder, self.kind = folder, kind
+        self._lock = lock
+
+    @classmethod
+    def open(
+        cls,
+        folder: Path,
+        recipe: dict[str, Any],
+        *,
+        overwrite: bool = False,
+        refusal: str = "holds a run of another recipe ({change}): --overwrite replaces it",
+        kind: str = RUN,
+    ) -> Workspace:
+        """The run folder for this recipe, made if it is not there.
+
+        Raises `WorkspaceError` where the folder is something else, belongs to another recipe (without `overwrite`;
+        `refusal` then says so, with the first `{change}`) or is in use.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = (folder / ".lock").open("a+")
+        except OSError as error:
+            raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
+        _hold(lock, folder)
+        try:
+            _check_kind(folder, kind)
+            _check_recipe(folder, recipe, overwrite, refusal, kind)
+            (folder / kind).mkdir(exist_ok=True)
+        except BaseException:
+            lock.close()
+            raise
+        return cls(folder, lock, kind)
+
+    @classmethod
+    def reopen(cls, folder: Path, recipe: dict[str, Any]) -> Workspace:
+        """The run folder of a run that is there, by its own recipe.
+
+        Raises `WorkspaceError` as `open` does, and where another version, which knew other options, has made it.
+        """
+        again = f"hodge run {folder / RECIPE_FILE} --out {folder} --overwrite"
+        refusal = f"was made by another version (the recipe's {{change}}): '{again}' brings it up to date first"
+        return cls.open(folder, recipe, refusal=refusal)
+
+    @property
+    def identity(self) -> str:
+        """A name of this run that stays the same when it is resumed."""
+        return key_of((self.folder / RECIPE_FILE).read_text("utf-8"))
+
+    def close(self) -> None:
+        """Let another process have the folder."""
+        self._lock.close()
+
+    def __enter__(self) -> Workspace:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def is_finished(self, name: str, key: str) -> bool:
+        """Whether the stage is there under its key."""
+        return _key_at(self.path(name)) == key
+
+    def path(self, name: str) -> Path:
+        """Where the artifacts of a finished stage lie."""
+        return self.folder / self.kind / name
+
+    @contextmanager
+    def stage(self, name: str, key: str) -> Iterator[StageFolder]:
+        """The folder of one stage under its key; what the body writes is committed when it leaves without an error.
+
+        A full disk raises `WorkspaceError`; what other stages finished stays.
+        """
+        path = self.path(name)
+        if _key_at(path) == key:
+            yield StageFolder(path, key, finished=True)
+            return
+        part = path.with_name(f"{name}.part")
+        with _disk_errors(part):
+            if _key_at(part) != key:
+                shutil.rmtree(part, ignore_errors=True)
+                part.mkdir(parents=True)
+                artifacts.write_json(part / KEY_FILE, {"key": key})
+            yield StageFolder(part, key, finished=False)
+            shutil.rmtree(path, ignore_errors=True)
+            os.replace(part, path)
+
+    def note(self, name: str, info: dict[str, Any]) -> None:
+        """Add facts (cost, versions) to a finished stage."""
+        path = self.path(name) / KEY_FILE
+        artifacts.write_json(path, {**artifacts.read_json(path), **info})
+
+
+@contextmanager
+def holding(folder: Path) -> Iterator[None]:
+    """While the body runs no run uses the folder. Raises `WorkspaceError` where one does already."""
+    try:
+        lock = (folder / ".lock").open("a+")
+    except OSError as error:
+        raise WorkspaceError(f"{folder}: cannot be written ({error.strerror})") from error
+    with lock:
+        _hold(lock, folder)
+        yield
+
+
+def _hold(lock: IO[str], folder: Path) -> None:
+    """Take the folder's lock, which ends with the process."""
+    try:
+        import fcntl
+    except ImportError:  # Windows has no flock: there two runs in one folder are the user's care
+        return
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        lock.close()
+        raise WorkspaceError(f"{folder}: another run uses this folder: wait for it, or name another folder") from error
+
+
+def _check_kind(folder: Path, kind: str) -> None:
+    for other, content in ((RUN, "a run"), (REFINEMENT, "a refined model")):
+        if kind != other and (folder / other).is_dir():
+            raise WorkspaceError(f"{folder}: holds {content}: give another --out")
+
+
+def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal: str, kind: str) -> None:
+    """Write the resolved recipe, or refuse a folder that is not this recipe's."""
+    path = folder / RECIPE_FILE
+    text = yaml_file.dump(recipe)
+    if path.exists():
+        if path.read_text("utf-8") == text:
+            return
+        if not overwrite and _has_stages(folder / kind):
+            change = _first_change(yaml_file.read(path).data, recipe)
+            raise WorkspaceError(f"{folder}: {refusal.replace('{change}', change)}")
+    elif any(entry.name != ".lock" for entry in folder.iterdir()):
+        with suppress(OSError):
+            (folder / ".lock").unlink()
+        raise WorkspaceError(f"{folder}: is not empty and not a run folder: give another --out")
+    with _disk_errors(path):
+        artifacts.write_text(path, text)
+
+
+def _has_stages(stages: Path) -> bool:
+    """Whether a stage was begun: a run that failed before, by a source that is not there, is nobody's work."""
+    return stages.is_dir() and any(stages.iterdir())
+
+
+def _first_change(old: Any, new: Any, key: str = "") -> str:
+    """Where two recipes first differ, in words."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        names = [*new, *(name for name in old if name not in new)]
+        for name in sorted(names, key=lambda name: bool(not key and name == "description")):
+            if old.get(name) != new.get(name):
+                return _first_change(old.get(name), new.get(name), f"{key}.{name}" if key else name)
+    return f"{key} was {old!r}, is {new!r}" if key else "formatting"
+
+
+def _key_at(path: Path) -> str | None:
+    """The key of a stage folder, None where there is none that can be read."""
+    try:
+        return str(artifacts.read_json(path / KEY_FILE)["key"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+@contextmanager
+def _disk_errors(path: Path) -> Iterator[None]:
+    """A full or unwritable disk as one line."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        raise WorkspaceError(
+            f"{path}: {error.strerror or error}: what was finished stays; make room and run the same command again"
+        ) from error
