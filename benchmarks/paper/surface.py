@@ -1,6 +1,6 @@
 """The same ω through the embedding surface and through the plain graph Laplacian: accuracy, spread, size, time.
 
-    python benchmarks/paper.py runs/paper/redkitchen-distance [round]
+    python -m benchmarks.paper.surface runs/paper/redkitchen-distance [round]
 
 reads the registered edges of a finished run (its first round, unless another is given) and prints a Markdown table.
 """

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.paper.tables import SEQUENCES
 from hodge_pipeline import registry, se3
 from hodge_pipeline.errors import HodgeError, SourceError
-from hodge_pipeline.evaluation.paper_tables import SEQUENCES
 from hodge_pipeline.evaluation.trajectory import associate
 from hodge_pipeline.types import Floats, Frame
 

@@ -1,4 +1,4 @@
-"""The paper's tables from start to end: `python -m hodge_pipeline.cli.papering`, which `make paper` calls."""
+"""The paper's tables from start to end: `python -m benchmarks.paper`, which `make paper` calls."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Annotated, Optional
 
 import typer
 
+from benchmarks.paper import tables as paper_tables
+from benchmarks.paper.sequences import Found, find_sequences, peer_poses
+from benchmarks.paper.tables import NAN, Measured, Results
 from hodge_pipeline.cli.console import Terminal
-from hodge_pipeline.cli.paper_sequences import Found, find_sequences, peer_poses
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
-from hodge_pipeline.evaluation import paper_tables
-from hodge_pipeline.evaluation.paper_tables import NAN, Measured, Results
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphKind, score_table
 from hodge_pipeline.pipeline import Run
 from hodge_pipeline.pipeline import run as run_pipeline
@@ -32,7 +32,7 @@ def default_data() -> Path:
     return Path(os.environ.get("HODGE_DATA", Path("..") / "shared" / "data"))
 
 
-def papering(
+def paper(
     data: Annotated[
         Optional[Path],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
         typer.Option(help="The folder with the sequences, or with seven_scenes/ and icl_nuim/. Default: HODGE_DATA."),
@@ -155,7 +155,7 @@ def _peer_score(run: Run, kind: GraphKind, peer: Floats) -> float:
 
 
 def _picture(name: str, run: Run, peer: Floats | None, peer_name: str, out: Path) -> dict[str, str]:
-    from hodge_pipeline.cli.paper_picture import draw_comparison
+    from benchmarks.paper.picture import draw_comparison
 
     sets = {"GT": true_poses(run.source)} if has_truth(run.source) else {}
     if peer is not None:
@@ -170,7 +170,7 @@ def _picture(name: str, run: Run, peer: Floats | None, peer_name: str, out: Path
 def main() -> None:
     """Run it; what a user can mend is one line and exit code 1."""
     try:
-        typer.run(papering)
+        typer.run(paper)
     except HodgeError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
