@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,36 +11,27 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import orthonormal
-from hodge_pipeline.complex.components import connected_components, first_of_component
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.edge_weights import edge_weights
 from hodge_pipeline.complex.one_form import Logarithm, centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.potential import moved, poisson, residual_metrics
+from hodge_pipeline.solvers.potential import CentredProblem, poisson
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 LEVER_ARM_M = 1.0  # a rotation counts as the displacement that it causes this far away, in a path's uncertainty
 
 
 @dataclass(frozen=True)
-class PaperProblem:
+class PaperProblem(CentredProblem):
     """The edges that join two vertices, in the order and orientation of the complex, and the centred start poses.
 
     - `rows (E,)` of the graph's edges, sorted by their vertices, so that the surface and its random orders depend
       neither on the order in which edges were measured nor on their directions;
     - `edges (E, 2)` and `i_from_j (E, 4, 4)` with i < j; `sign (E,)` is −1 where the measurement ran from j to i.
-
-    The poses are around the centroid of their component: far from the world's origin a little rotation would be much
-    translation, and ω would depend on where the origin is.
     """
 
     rows: Ints
-    edges: Ints
-    i_from_j: Floats
     sign: Ints
-    component: Ints
-    start: Floats
-    offset: Floats
-    start_in_world: Floats
     self_loops: int
 
     def form(self, poses: Floats, log: Logarithm) -> Floats:
@@ -51,24 +42,9 @@ class PaperProblem:
         motions[backwards] = se3.inverse(motions[backwards])
         return np.asarray(self.sign[:, None] * residual_form(as_measured, motions, poses, log))
 
-    def in_world(self, poses: Floats) -> Floats:
-        """The poses away from the centroid again; first vertices are those of the start to the last bit."""
-        out = shifted(poses, self.offset)
-        gauge = first_of_component(self.component)
-        out[gauge] = self.start_in_world[gauge]
-        return out
-
     def poisson(self, d0: csr_matrix, weights: Floats) -> Callable[[Floats], Floats]:
         """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω`, of mean zero on each component (Eq. (7))."""
         return poisson(d0, weights, self.component)
-
-    def moved(self, poses: Floats, correction: Floats, log: Logarithm) -> Floats:
-        """`exp(f_k) T_k` (V, 4, 4), then each component as one body, so that its first vertex is at its start."""
-        return moved(poses, correction, self.start, self.component, log)
-
-    def residual_metrics(self, poses: Floats) -> Mapping[str, float]:
-        """Mean and median disagreement of the edges with the poses, metres and radians."""
-        return residual_metrics(self.edges, self.i_from_j, poses)
 
     def notes(self) -> tuple[str, ...]:
         """What was ignored."""
