@@ -11,11 +11,11 @@ from rerun.chunk import RrdReader
 from typer.testing import CliRunner
 
 import hodge_pipeline
+from betti import betti_numbers
 from hodge_adapters.g2o import write_g2o
 from hodge_adapters.poses_text import parse_tum
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.complex.betti import betti_numbers
 from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from betti import sparse_rank
 from complex_graphs import FIGURE_EIGHT, SQUARE, TRIANGLE, complete, graphs, random_motions, torus_grid
 from hodge_pipeline import se3
-from hodge_pipeline.complex.betti import sparse_rank
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.complex.cycles import (

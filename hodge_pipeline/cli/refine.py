@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
+
+from hodge_pipeline.cli.options import Force, Json, Overrides, Overwrite, Quiet
 
 HELP = """Make the poses of COLMAP or SLAM better, in their own format.
 
@@ -36,17 +38,14 @@ def trajectory(
     match: Annotated[
         str, typer.Option(help="How a pose finds its frame: stamp, number, row (n-th pose, n-th frame), or auto.")
     ] = "auto",
-    force: Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")] = False,
+    force: Force = False,
     recipe: Annotated[
         str, typer.Option("--recipe", help="A recipe like slam-refine, which is the default; for TUM slam-refine-tum.")
     ] = "",
-    overrides: Annotated[
-        Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
-        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe."),
-    ] = None,
-    overwrite: Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    overrides: Overrides = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Refine SLAM poses with the frames they belong to: loops, registration, a robust solve."""
     from hodge_pipeline.cli import refine_trajectory as refining_trajectory
@@ -63,34 +62,31 @@ def colmap(
         Path, typer.Option("--out", help="The run folder: sparse/0 (the model), report; it goes on where it stopped.")
     ],
     database: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--database", help="COLMAP's database.db; default: the one beside or above the model."),
     ] = None,
     images: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--images", help="Folder of the colour images; default: images/ beside or above the model."),
     ] = None,
     depth: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--depth", help="Folder of sensor depth, PNGs named as the images (or depth for color)."),
     ] = None,
     depth_scale: Annotated[
-        Optional[float],  # noqa: UP045
+        float | None,
         typer.Option("--depth-scale", help="Stored units of depth to the metre; default: the recipe's, 1000."),
     ] = None,
     depth_camera: Annotated[
-        Optional[tuple[float, float, float, float]],  # noqa: UP045
+        tuple[float, float, float, float] | None,
         typer.Option("--depth-camera", help="FX FY CX CY of depth that is not on the pixels of the colour images."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")] = False,
+    force: Force = False,
     recipe: Annotated[str, typer.Option("--recipe", help="A recipe like colmap-refine, by name or file.")] = "",
-    overrides: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe colmap-refine."),
-    ] = None,
+    overrides: Overrides = None,
     overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Refine a COLMAP model: edges measured anew, a robust solve, bundle adjustment; metric where there is depth."""
     from hodge_pipeline.cli import refine_colmap as refining_colmap
