@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -13,7 +11,7 @@ from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.cycles import Loops, loop_deviation
 from hodge_pipeline.complex.minimum_cycles import MOST_CANDIDATES
 from hodge_pipeline.complex.one_form import Logarithm
-from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem, path_lengths
+from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem
 from hodge_pipeline.solvers.paper_surface import (
     MOST_CHECKED_EDGES,
     PaperSurface,
@@ -23,7 +21,6 @@ from hodge_pipeline.solvers.paper_surface import (
 )
 from hodge_pipeline.solvers.potential import (
     AroundLoops,
-    CycleBasis,
     deviation_metrics,
     iterate,
     loops_of,
@@ -52,11 +49,6 @@ class PaperSolver:
         "the angle of the neighbours in each vertex's principal plane, which makes smaller cells and less genus",
     )
     seed: int = Field(0, ge=0, description="of the random orders; the same seed gives the same poses")
-    paths: Literal["hops", "uncertainty"] = Field(
-        "hops",
-        description="what Algorithm 2's shortest paths are shortest by: the number of edges (the paper), or the sum of "
-        "their standard deviations, from the information of the edges",
-    )
     log: Logarithm = Field(
         "pairing",
         description="logarithm of the residual motion: pairing is the paper's (rotation vector, translation), which "
@@ -67,11 +59,6 @@ class PaperSolver:
     )
     tolerance: float = Field(
         1e-10, gt=0, description="stop once the RMS of f over the vertices (radians and metres) is below this"
-    )
-    cycle_basis: CycleBasis = Field(
-        "auto",
-        description="the loops over which D is summed: those of a breadth-first tree, or a basis of least total "
-        "length, mostly triangles; auto takes the shortest while vertices × edges is at most two million",
     )
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
@@ -88,9 +75,8 @@ class PaperSolver:
         if not len(problem.edges):
             note = "no edge joins two vertices: every pose is as it was at the start"
             return Solution(world_from_cam.copy(), problem.component, np.zeros(graph.edge_count), notes=(*pieces, note))
-        lengths = path_lengths(graph.select(problem.rows), self.paths)
-        surface = make_surface(problem.edges, problem.start, lengths, self.rotation, self.seed)
-        around_loops = loops_of(self.cycle_basis, problem.edges, len(problem.component), MOST_CANDIDATES)
+        surface = make_surface(problem.edges, problem.start, self.rotation, self.seed)
+        around_loops = loops_of(problem.edges, len(problem.component), MOST_CANDIDATES)
         generators = surface.generators() if surface.is_checked else None
         history = self._iterate(problem, surface, around_loops, generators)
         measured = loop_deviation(around_loops(problem.i_from_j))

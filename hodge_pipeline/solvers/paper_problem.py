@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -12,13 +11,9 @@ from scipy.sparse import csr_matrix
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import orthonormal
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.edge_weights import edge_weights
 from hodge_pipeline.complex.one_form import Logarithm, centroids, residual_form, shifted
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.potential import CentredProblem, poisson
 from hodge_pipeline.types import Floats, Ints, ViewGraph
-
-LEVER_ARM_M = 1.0  # a rotation counts as the displacement that it causes this far away, in a path's uncertainty
 
 
 @dataclass(frozen=True)
@@ -75,19 +70,3 @@ def make_problem(graph: ViewGraph, world_from_cam: Floats) -> PaperProblem:
         start_in_world=world_from_cam,
         self_loops=graph.edge_count - len(rows),
     )
-
-
-def path_lengths(graph: ViewGraph, kind: Literal["hops", "uncertainty"]) -> Floats:
-    """The length (E,) of each edge for Algorithm 2: 1, or its standard deviation in metres.
-
-    The deviation is the root of the edge's mean variance, rotations counted as displacements 1 m away.
-    """
-    if kind == "hops":
-        return np.ones(graph.edge_count)
-    weights, _ = edge_weights(graph, "information", LEVER_ARM_M)
-    if not (weights > 0).all():
-        bad = int((weights <= 0).sum())
-        raise GraphError(
-            f"paths: uncertainty needs positive information, {bad} of {len(weights)} edges have none: hops"
-        )
-    return np.asarray(1.0 / np.sqrt(weights))

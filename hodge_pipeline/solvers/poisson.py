@@ -19,7 +19,6 @@ from hodge_pipeline.complex.one_form import Logarithm, centroids, shifted
 from hodge_pipeline.solvers.potential import (
     AroundLoops,
     CentredProblem,
-    CycleBasis,
     deviation_metrics,
     iterate,
     loops_of,
@@ -34,7 +33,7 @@ SMALLEST_WEIGHT = 1e-6  # a rejected edge still ties its ends together, so that 
 SMALLEST_SCALE_M = 1e-6
 AFFORDABLE_BASIS = 1_000_000  # vertices times edges: a few tenths of a second
 MAD_TO_SIGMA = 1.4826
-TUNING = {"huber": 1.345, "geman_mcclure": 3.0}  # in sigmas: 95 % efficiency; half weight at about 2 sigma
+TUNING = 3.0  # in sigmas: half weight at about 2 sigma
 
 
 @plain_dataclass(frozen=True)
@@ -64,13 +63,13 @@ class PoissonSolver:
 
     weights: EdgeWeighting = Field(
         "unit",
-        description="weight of each edge: unit as in the paper up to a factor; fitness of its registration; "
+        description="weight of each edge: unit as in the paper up to a factor; "
         "information, 6 / tr(S Ω⁻¹ S) with S = diag(lever_arm_m × 3, 1 × 3), for measured pose graphs",
     )
-    robust: Literal["none", "huber", "geman_mcclure"] = Field(
+    robust: Literal["none", "geman_mcclure"] = Field(
         "geman_mcclure",
-        description="kernel against false edges: none is the paper's least squares; huber bounds the pull of a false "
-        "edge; geman_mcclure, the default, all but removes it",
+        description="kernel against false edges: none is the paper's least squares; geman_mcclure, the default, all "
+        "but removes a false edge",
     )
     scale_m: float | None = Field(
         None,
@@ -96,12 +95,6 @@ class PoissonSolver:
         description="logarithm of the residual motion: se3 does not depend on the edges' directions; pairing is the "
         "paper's own (rotation vector, translation), which does",
     )
-    cycle_basis: CycleBasis = Field(
-        "auto",
-        description="the loops over which D is summed: those of a breadth-first tree, or a basis of least total "
-        "length, mostly triangles; auto takes the shortest while vertices × edges is at most a million. D grows with "
-        "the loops' length, so compare it only on the same basis; the poses do not depend on it",
-    )
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """Consistent poses; a graph of several components is solved piece by piece, isolated vertices keep their pose.
@@ -115,7 +108,7 @@ class PoissonSolver:
         used = proper & (base_weights > 0)
         problem = _problem(graph, used, base_weights, world_from_cam)
         robust_weights, scale = self._robust_weights(problem)
-        around_loops = loops_of(self.cycle_basis, problem.edges, len(problem.component), AFFORDABLE_BASIS)
+        around_loops = loops_of(problem.edges, len(problem.component), AFFORDABLE_BASIS)
         history = self._iterate(problem, robust_weights, around_loops)
         weights = np.zeros(graph.edge_count)
         weights[used] = robust_weights
@@ -160,7 +153,7 @@ class PoissonSolver:
             poses = problem.moved(poses, correction, self.log)
             residual = self._displacement(problem, poses)
             scale = self.scale_m or _robust_scale(residual)
-            previous, weights = weights, _kernel(residual / (TUNING[self.robust] * scale), self.robust)
+            previous, weights = weights, _kernel(residual / (TUNING * scale))
             if np.abs(weights - previous).mean() < WEIGHTS_SETTLED:
                 break
         return weights, scale
@@ -198,9 +191,8 @@ def _robust_scale(residual: Floats) -> float:
     return max(MAD_TO_SIGMA * float(np.median(voting)) if len(voting) else 0.0, SMALLEST_SCALE_M)
 
 
-def _kernel(ratio: Floats, robust: str) -> Floats:
-    weight = 1.0 / np.maximum(ratio, 1.0) if robust == "huber" else 1.0 / (1.0 + ratio**2) ** 2
-    return np.maximum(weight, SMALLEST_WEIGHT)
+def _kernel(ratio: Floats) -> Floats:
+    return np.maximum(1.0 / (1.0 + ratio**2) ** 2, SMALLEST_WEIGHT)
 
 
 def _edge_notes(proper: Bools, base_weights: Floats) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -26,7 +26,6 @@ from hodge_pipeline.solvers.linear import factorise
 from hodge_pipeline.types import Floats, Ints, SolverIteration
 
 STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
-CycleBasis: TypeAlias = Literal["auto", "tree", "shortest"]
 AroundLoops: TypeAlias = Callable[[Floats], Floats]
 """The motions (L, 4, 4) around the loops of one cycle basis, from the motions (E, 4, 4) of the edges."""
 
@@ -68,9 +67,11 @@ class CentredProblem:
         return (f"{count} edges disagree with the start by a half turn: the sign of their ω is arbitrary",)
 
 
-def loops_of(basis: CycleBasis, edges: Ints, vertex_count: int, affordable: int) -> AroundLoops:
-    """The products around a cycle basis; `auto` takes the shortest one up to so many vertices times edges."""
-    if basis == "shortest" or (basis == "auto" and vertex_count * len(edges) <= affordable):
+def loops_of(edges: Ints, vertex_count: int, affordable: int) -> AroundLoops:
+    """The products around the shortest cycle basis, mostly triangles, up to so many vertices times edges; beyond that
+    around the loops of a breadth-first tree. D grows with the loops' length; the poses do not depend on the basis.
+    """
+    if vertex_count * len(edges) <= affordable:
         return partial(loop_products, minimum_cycle_basis(edges, vertex_count))
     return partial(fundamental_products, spanning_forest(edges, vertex_count))
 
