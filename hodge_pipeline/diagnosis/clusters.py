@@ -17,7 +17,7 @@ from hodge_pipeline.complex.components import connected_components, first_of_com
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.solvers.backends import backend
 from hodge_pipeline.solvers.elimination import plan_elimination
-from hodge_pipeline.solvers.linear import factorise_blocks, fill_reducing_order
+from hodge_pipeline.solvers.linear import fill_reducing_order
 from hodge_pipeline.solvers.problem import Structure
 from hodge_pipeline.solvers.rotations import cross
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -154,7 +154,7 @@ class _LeftOver:
             return np.stack([*own, -across, -np.swapaxes(across, 1, 2)])
 
         matrix = structure.symmetric_pattern.assemble(blocks, (6, 6))
-        factor = factorise_blocks(structure.elimination, matrix)
+        factor = structure.backend.factorise_blocks(structure.elimination, matrix)
         out = np.zeros_like(pull)
         free = structure.free_count
         out[structure.order[:free]] = -factor.solve(pull[:free].reshape(-1)).reshape(-1, 6)

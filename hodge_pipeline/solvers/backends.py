@@ -1,4 +1,4 @@
-"""Linear back ends behind one small interface: what factorises, or preconditions, and on which graph.
+"""Linear back ends behind one small interface: which library factorises, or preconditions, and on which graph.
 
 A direct one factorises; an iterative one preconditions conjugate gradients, at a cost that grows with the graph alone
 and not with its fill.
@@ -6,21 +6,25 @@ and not with its fill.
 
 from __future__ import annotations
 
+import importlib.util
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.sparse import csc_matrix, csr_matrix
+from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
-from hodge_pipeline.solvers.linear import Factor, factorise, fill_reducing_order
-from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioning, multigrid
+from hodge_pipeline.solvers.linear import Factor, factorise, factorise_blocks, fill_reducing_order
+from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioner, Preconditioning, multigrid
 from hodge_pipeline.types import Floats, Ints
 
-BackendName: TypeAlias = Literal["auto", "superlu", "multigrid"]
+BackendName: TypeAlias = Literal["auto", "superlu", "cholmod", "pyamg", "multigrid"]
 ITERATIVE_FROM = 15_000
 """Vertices: below, a factorisation and a hundred solves cost less than the hierarchies."""
 CHAIN_EDGES_PER_VERTEX = 1.5
@@ -33,16 +37,19 @@ SECONDS_A_PRODUCT, SECONDS_A_BLOCK = 0.25e-9, 6e-6
 """Measured, of one Newton step: of products of entries in a factorisation; of blocks of the matrix by multigrid."""
 JOINT_SIZE = 6
 SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
+MODULES = {"cholmod": ("sksparse.cholmod", "scikit-sparse"), "pyamg": ("pyamg", "pyamg")}
 
 
 @dataclass(frozen=True)
 class Backend:
-    """How linear systems of a graph are solved: by SuperLU's factors, or, with `precondition`, by conjugate gradients.
+    """How linear systems of a graph are solved: by factors, or, with `precondition`, by conjugate gradients.
 
-    `precondition` gives an approximate inverse, symmetric and positive definite, of a block matrix.
+    `factorise_core` gives what solves with a matrix in the order of elimination; None is SuperLU, which can do so in
+    single precision. `precondition` gives an approximate inverse, symmetric and positive definite, of a block matrix.
     """
 
     name: BackendName
+    factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]] | None = None
     precondition: Preconditioning | None = None
 
     @property
@@ -55,12 +62,39 @@ class Backend:
         size = int(laplacian.shape[0])
         if size and self.precondition is not None:
             return _conjugate_gradients(csr_matrix(laplacian), self.precondition)
+        if size and self.factorise_core is not None:
+            return Factor(size, self.factorise_core(laplacian))
         return factorise(laplacian, "NATURAL")
+
+    def factorise_blocks(self, plan: Elimination, matrix: bsr_matrix, single: bool = False) -> Factor:
+        """The factor of a block matrix in the order of elimination; `single`: in float32, where there is a choice.
+
+        An iterative back end leaves it to SuperLU. Raises `GraphError` where the matrix is singular.
+        """
+        return factorise_blocks(plan, matrix, single and self.factorise_core is None, self.factorise_core)
 
 
 def backend(name: BackendName) -> Backend:
-    """The back end of this name, not `auto`."""
-    return Backend(name, _multigrid()) if name == "multigrid" else Backend("superlu")
+    """The back end of this name, not `auto`. Raises `GraphError` where its library is not installed."""
+    if name in MODULES and not installed(name):
+        raise GraphError(f"back end {name} is not installed: pip install {MODULES[name][1]}, or take backend auto")
+    if name == "cholmod":
+        return Backend(name, factorise_core=_cholmod)
+    if name in ("pyamg", "multigrid"):
+        return Backend(name, precondition=_pyamg if name == "pyamg" else _multigrid())
+    return Backend("superlu")
+
+
+@cache
+def installed(name: BackendName) -> bool:
+    """Whether the library of a back end can be imported: looked up once, since a search of the path takes as long as a
+    twentieth of a solve for a thousand poses.
+    """
+    module = MODULES.get(name, ("scipy", ""))[0]
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
 
 
 def choose(name: BackendName, tail: Ints, head: Ints, count: int, direct: bool = False) -> tuple[Backend, Elimination]:
@@ -69,7 +103,7 @@ def choose(name: BackendName, tail: Ints, head: Ints, count: int, direct: bool =
     `auto` is the cheaper of a factorisation, whose fill is foretold, and multigrid; where one will be needed
     (`direct`), it is a factorisation.
     """
-    factors = backend("superlu" if name == "auto" else name)
+    factors = backend("cholmod" if installed("cholmod") else "superlu") if name == "auto" else backend(name)
     if factors.iterative:
         return factors, unordered(count)
     if name != "auto" or direct or count <= ITERATIVE_FROM:
@@ -118,3 +152,28 @@ def _multigrid() -> Preconditioning:
     """Multigrid for matrices that share their patterns, as those of one problem do."""
     coarsening = Coarsening()
     return lambda matrix, modes: multigrid(matrix, modes, lambda coarse: factorise(coarse).solve, coarsening).cycle
+
+
+def _cholmod(matrix: csc_matrix) -> Callable[[Floats], Floats]:
+    from sksparse.cholmod import CholmodError, cholesky
+
+    try:
+        factor = cholesky(csc_matrix(matrix, dtype=float), ordering_method="natural")
+    except CholmodError as error:
+        raise GraphError(f"a linear system of {matrix.shape[0]} unknowns is singular: {error}") from error
+    return lambda rhs: np.asarray(factor(rhs))
+
+
+def _pyamg(matrix: bsr_matrix, modes: Modes) -> Preconditioner:
+    import pyamg
+
+    size = matrix.blocksize[0]
+    near = modes.blocks(matrix.shape[0] // size, size).reshape(-1, size)
+    levels = pyamg.smoothed_aggregation_solver(matrix, B=near, symmetry="symmetric")
+    cycle = levels.aspreconditioner()
+
+    def apply(_: bsr_matrix, r: Floats) -> Floats:
+        columns = r.reshape(len(near), -1)
+        return np.stack([cycle @ column for column in columns.T], axis=1).reshape(r.shape)
+
+    return apply
