@@ -41,6 +41,45 @@ def no_progress(done: int) -> None:
 
 
 @dataclass(frozen=True)
+class Step:
+    """What a step's function is given beside its inputs: where it may write, whom it tells of progress and oddities.
+
+    `folder` survives a kill, so a function may go on from what it left there; a `Path` or `CloudSet` that it returns
+    lies in it. What the function writes and does not return it removes.
+    """
+
+    folder: Path
+    advance: Advance
+    note: Callable[[str], None]
+
+
+class Steps(Protocol):
+    """Remembers what was computed in a run folder."""
+
+    def step(
+        self, function: Callable[..., Result], *inputs: Any, title: str, total: int = 1, name: str = "", **resources: Any
+    ) -> Result:
+        """What `function(*inputs, **resources, step=Step)` returns, computed once for these inputs and read back
+        afterwards; its return type is the stored type. `resources`, such as workers, do not decide the result.
+
+        A step's name is its function's, or `name`, with the number of its call. `total` is how far `advance` counts.
+        """
+        ...
+
+    def remember(self, value: object, key: str) -> None:
+        """Let `value`, this very object, stand for `key` wherever it is an input."""
+        ...
+
+    def key(self, value: Any) -> str:
+        """The key of an input: of the step that made it, else of its contents."""
+        ...
+
+    def note(self, message: str) -> None:
+        """Tell the user, the log and the report, once."""
+        ...
+
+
+@dataclass(frozen=True)
 class Sniff:
     """How sure a reader is that a path is its format: `confidence` in [0, 1], and why, in a few words.
 

@@ -333,7 +333,7 @@ class CloudSet(Sequence[PointCloud]):
 
     `offsets (N + 1,)` cut `points (P, 3)`, `normals (P, 3)`, `colours (P, 3)` into frames; an empty slice is a frame
     without a valid measurement. `marks (N + 1,)` cut the landmarks' `mark_points (Q, 3)` and `mark_descriptors
-    (Q, 128)` likewise.
+    (Q, 128)` likewise. `folder` is where the columns lie, which worker processes open; None of what is in memory.
     """
 
     FILES = ("offsets", "points", "normals", "colours", "marks", "mark_points", "mark_descriptors")
@@ -347,14 +347,16 @@ class CloudSet(Sequence[PointCloud]):
         marks: Ints,
         mark_points: Floats32,
         mark_descriptors: Bytes,
+        folder: Path | None = None,
     ) -> None:
+        self.folder = folder
         self.offsets, self.points, self.normals, self.colours = offsets, points, normals, colours
         self.marks, self.mark_points, self.mark_descriptors = marks, mark_points, mark_descriptors
 
     @classmethod
     def open(cls, folder: Path) -> CloudSet:
         """The clouds that `save` wrote to this folder, mapped read-only."""
-        return cls(*(np.load(folder / f"{name}.npy", mmap_mode="r") for name in cls.FILES))
+        return cls(**{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in cls.FILES}, folder=folder)
 
     @classmethod
     def from_clouds(cls, clouds: Sequence[PointCloud]) -> CloudSet:

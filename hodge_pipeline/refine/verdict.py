@@ -12,7 +12,7 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
-from hodge_pipeline.refine.correction import spread_correction
+from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.refine.given_poses import Given
 from hodge_pipeline.refine.guard import Decision, Measure, decide
 from hodge_pipeline.refine.uncertainty import change, mean_chi2

@@ -135,7 +135,7 @@ class Workspace:
             yield StageFolder(path, key, finished=True)
             return
         part = path.with_name(f"{name}.part")
-        with _disk_errors(part):
+        with disk_errors(part):
             if _key_at(part) != key:
                 shutil.rmtree(part, ignore_errors=True)
                 part.mkdir(parents=True)
@@ -195,7 +195,7 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal
         with suppress(OSError):
             (folder / ".lock").unlink()
         raise WorkspaceError(f"{folder}: is not empty and not a run folder: give another --out")
-    with _disk_errors(path):
+    with disk_errors(path):
         artifacts.write_text(path, text)
 
 
@@ -223,7 +223,7 @@ def _key_at(path: Path) -> str | None:
 
 
 @contextmanager
-def _disk_errors(path: Path) -> Iterator[None]:
+def disk_errors(path: Path) -> Iterator[None]:
     """A full or unwritable disk as one line."""
     try:
         yield
