@@ -16,6 +16,7 @@ from hodge_pipeline.solvers.hodge import ObjectiveName
 from hodge_pipeline.solvers.local import settled_nearby
 from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
 from hodge_pipeline.solvers.newton import Descent, Limits
+from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.priors import PER_EDGE
 from hodge_pipeline.solvers.problem import reweighted
 from hodge_pipeline.solvers.setup import Setup, prepare
@@ -66,7 +67,8 @@ class GraphEditor:
     def __init__(
         self, graph: ViewGraph, solution: Solution | None = None, *, objective: ObjectiveName = "full"
     ) -> None:
-        if graph.priors is not None:
+        check_choice("objective", objective, ObjectiveName)
+        if graph.priors is not None and len(graph.priors.vertices):
             raise GraphError("priors cannot be edited yet: solve the graph with `solve`, or leave its priors out")
         if solution is not None and (
             solution.world_from_cam.shape != (graph.vertex_count, 4, 4) or len(solution.weights) != graph.edge_count

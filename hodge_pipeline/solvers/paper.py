@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.complex.checks import check_graph
+from hodge_pipeline.complex.checks import NO_EDGES, check_graph
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.cycles import (
     Loops,
@@ -92,8 +92,8 @@ class PaperSolver:
         weights[problem.rows] = 1.0
         pieces = describe_components(problem.component, graph.vertex_ids)
         if not len(problem.edges):
-            note = "no edge joins two vertices: every pose is as it was at the start"
-            return Solution(world_from_cam.copy(), problem.component, np.zeros(graph.edge_count), notes=(*pieces, note))
+            notes = (*problem.notes(), *pieces, NO_EDGES)
+            return Solution(world_from_cam.copy(), problem.component, np.zeros(graph.edge_count), notes=notes)
         lengths = path_lengths(graph.select(problem.rows), self.paths)
         surface = make_surface(problem.edges, problem.start, lengths, self.rotation, self.seed)
         around_loops = self._around_loops(problem)

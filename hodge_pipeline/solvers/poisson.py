@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.sparse import csr_matrix
 
-from hodge_pipeline.complex.checks import check_graph, orthonormal
+from hodge_pipeline.complex.checks import NO_EDGES, check_graph, orthonormal
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.components import connected_components, describe_components, first_of_component
 from hodge_pipeline.complex.cycles import (
@@ -222,7 +222,7 @@ class PoissonSolver:
 
     def _convergence_notes(self, problem: _Problem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
         if not history:
-            return ("no edge joins two vertices: every pose is as it was at the start",)
+            return (NO_EDGES,)
         notes = []
         half_turns = int((np.linalg.norm(self._form(problem, problem.start)[:, :3], axis=1) > np.pi - 1e-3).sum())
         if half_turns:
