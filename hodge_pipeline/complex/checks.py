@@ -42,6 +42,16 @@ def check_graph(graph: ViewGraph, world_from_cam: Floats | None = None) -> None:
         raise GraphError(f"{named} ({int(wrong.sum())} such edges): remove or mend it")
 
 
+def refuse_priors(graph: ViewGraph, solver: str) -> None:
+    """Raises `GraphError` where the graph has priors, for a solver that has no term for them."""
+    if graph.priors is not None and len(graph.priors.vertices):
+        count = len(graph.priors.vertices)
+        raise GraphError(
+            f"{solver} has no term for priors of single poses ({count} given): take solver hodge, robust or diagnosed, "
+            "or leave them out (priors=None)"
+        )
+
+
 def check_motions(motions: Floats, kind: str, name: Callable[[int], str]) -> None:
     """Raises `GraphError` with what is wrong with the first of the motions (N, 4, 4) that is not finite and rigid.
 
