@@ -314,7 +314,7 @@ class ModelQuality:
     """How well the points of a model fit its images: of N observations, pixels between a point seen and projected.
 
     `keypoints (N, 2)`: the row in `image_names`, and which of the image's keypoints; `errors_px (N,)`: infinite where
-    the point lies behind the camera.
+    the point lies behind the camera; beyond `cap_px` an observation is wrong, and how far off tells no more.
     """
 
     images: int
@@ -323,6 +323,7 @@ class ModelQuality:
     image_names: tuple[str, ...]
     keypoints: Ints
     errors_px: Floats
+    cap_px: float
 
 
 @dataclass(frozen=True)

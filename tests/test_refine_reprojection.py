@@ -11,6 +11,8 @@ import pytest
 
 import hodge_pipeline
 from hodge_adapters.colmap_refining import ColmapModels
+from hodge_adapters.colmap_reprojection import error_cap
+from hodge_adapters.colmap_uncertainty import standard_errors
 from hodge_pipeline import se3
 from hodge_pipeline.refine.reprojection import reprojection_measures
 from hodge_pipeline.types import ModelQuality
@@ -23,7 +25,8 @@ def quality(errors_px: dict[tuple[str, int], float]) -> ModelQuality:
     """A model with these errors at keypoints of images by name."""
     names = tuple(sorted({name for name, _ in errors_px}))
     keypoints = np.array([(names.index(name), column) for name, column in errors_px])
-    return ModelQuality(len(names), 1, 1.0, names, keypoints, np.array(list(errors_px.values())))
+    values = np.array(list(errors_px.values()))
+    return ModelQuality(len(names), 1, 1.0, names, keypoints, values, error_cap(values))
 
 
 def turned_round(model: Path, out: Path) -> Path:
@@ -80,6 +83,20 @@ def test_errors_are_those_of_pycolmap(tmp_path: Path) -> None:
     lengths = np.array([theirs.points3D[key].track.length() for key in model.records.points.ids.tolist()])
     means = np.add.reduceat(model.quality.errors_px, np.r_[0, np.cumsum(lengths)[:-1]]) / lengths
     np.testing.assert_allclose(means, [theirs.points3D[key].error for key in model.records.points.ids.tolist()])
+
+
+def test_one_point_near_the_plane_of_a_camera_does_not_make_every_pose_uncertain(tmp_path: Path) -> None:
+    right = pycolmap.Reconstruction(noisy(tmp_path))
+    wrong = pycolmap.Reconstruction(right)
+    point = wrong.points3D[min(wrong.points3D)]
+    cam_from_world = wrong.images[point.track.elements[0].image_id].cam_from_world()
+    in_cam = cam_from_world * point.xyz
+    point.xyz = cam_from_world.inverse() * np.array([in_cam[0], in_cam[1], 1e-2])
+    sure, unsure = (
+        np.sqrt((standard_errors(model.records, model.bodies) ** 2).mean(axis=0))
+        for model in (ColmapModels(database="none", images="none").open_models([one])[0] for one in (right, wrong))
+    )
+    np.testing.assert_allclose(unsure, sure, rtol=0.05)
 
 
 def test_no_number_of_a_refinement_is_that_of_a_point_behind_a_camera(tmp_path: Path) -> None:

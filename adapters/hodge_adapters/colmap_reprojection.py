@@ -15,6 +15,16 @@ NO_ERROR = -1.0
 SENTINEL_PX = 1e100
 """pycolmap takes the root of the largest double, 1e154 px, for an observation behind a camera; a point's error is the
 mean of its track's. No projection reaches this."""
+LEAST_CAP_PX = 4.0
+"""COLMAP's own limit (`filter_max_reproj_error`): beyond it an observation is wrong, and how far off tells no more."""
+CAP_MEDIANS = 3.0
+"""Of the median: where poses are disturbed by more than the limit, most errors still stay below the cap."""
+
+
+def error_cap(errors_px: Floats) -> float:
+    """The error beyond which an observation of these (N,) is wrong; those behind a camera do not count."""
+    seen = errors_px[np.isfinite(errors_px)]
+    return max(LEAST_CAP_PX, CAP_MEDIANS * float(np.median(seen))) if len(seen) else LEAST_CAP_PX
 
 
 def reprojection_errors(model: Model) -> tuple[Ints, Floats]:

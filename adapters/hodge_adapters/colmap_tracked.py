@@ -21,7 +21,7 @@ from hodge_adapters.colmap_edges import covisible_pairs, measured_graph
 from hodge_adapters.colmap_files import load_model
 from hodge_adapters.colmap_points import points_of_rays
 from hodge_adapters.colmap_records import Model
-from hodge_adapters.colmap_reprojection import reprojection_errors, update_errors
+from hodge_adapters.colmap_reprojection import error_cap, reprojection_errors, update_errors
 from hodge_adapters.colmap_scale import depth_ratios
 from hodge_adapters.colmap_ties import merge_matched_points
 from hodge_adapters.colmap_uncertainty import standard_errors
@@ -125,6 +125,7 @@ class ColmapModel:
             image_names=tuple(image.name for image in self.records.images),
             keypoints=keypoints,
             errors_px=errors_px,
+            cap_px=error_cap(errors_px),
         )
 
     def depth_ratios(self) -> Sequence[Floats]:

@@ -9,10 +9,6 @@ import numpy as np
 from hodge_pipeline.refine.guard import Measure
 from hodge_pipeline.types import Floats, Ints, ModelQuality
 
-LEAST_CAP_PX = 4.0
-"""COLMAP's own limit (`filter_max_reproj_error`): beyond it an observation is wrong, and how far off tells no more."""
-CAP_MEDIANS = 3.0
-"""Of the median before: where poses are disturbed by more than the limit, most errors still stay below the cap."""
 BEHIND_TOLERANCE = 0.001
 """Of the observations: a wrong match may put its point on either side of a camera."""
 
@@ -28,21 +24,14 @@ def reprojection_measures(
     count = errors_px.shape[1]
     behind = np.isinf(errors_px)
     seen = errors_px[:, ~behind.any(axis=0)]
-    cap_px = max(LEAST_CAP_PX, CAP_MEDIANS * float(np.median(seen[0]))) if seen.size else LEAST_CAP_PX
+    cap_px = max(quality.cap_px for quality in before)
     mean = np.minimum(seen, cap_px).mean(axis=1) if seen.size else np.full(2, np.nan)
     before_px, after_px = float(mean[0]), float(mean[1])
-    hidden_before, hidden_after = (int(one) for one in behind.sum(axis=1))
-    capped = f"mean reprojection error, capped at {cap_px:.4g} px"
+    lost_before, lost_after = (int(one) for one in behind.sum(axis=1))
+    name, most_lost = f"mean reprojection error, capped at {cap_px:.4g} px", BEHIND_TOLERANCE * count
     return (
-        Measure(
-            "observations behind a camera",
-            hidden_before,
-            hidden_after,
-            "lower",
-            BEHIND_TOLERANCE * count,
-            f"of {count}",
-        ),
-        Measure(capped, before_px, after_px, "lower", tolerance * before_px, "px"),
+        Measure("observations behind a camera", lost_before, lost_after, "lower", most_lost, f"of {count}"),
+        Measure(name, before_px, after_px, "lower", tolerance * before_px, "px"),
     )
 
 
