@@ -9,8 +9,8 @@ import numpy as np
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation import splat
 from hodge_pipeline.evaluation.contents import EdgeRow, Photograph
+from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.thumbnails import pair_of
-from hodge_pipeline.evaluation.verdict import length
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
 
 FRAMES = 200
