@@ -165,7 +165,11 @@ class ConsistencySolver(Protocol):
     """Makes the poses consistent with all edges at once."""
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
-        """Poses from the start (V, 4, 4); each connected component keeps its own gauge."""
+        """Poses from the start (V, 4, 4); each connected component keeps its own gauge.
+
+        The graph's fixed vertices stay at their start and its priors count, or a `GraphError` refuses them. See
+        `hodge_pipeline.testing.check_solver`.
+        """
         ...
 
 

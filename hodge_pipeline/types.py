@@ -311,13 +311,19 @@ class Model:
 
 @dataclass(frozen=True)
 class ModelQuality:
-    """How well the points of a model fit its images: pixels between a point seen and projected, images to a point."""
+    """How well the points of a model fit its images: of N observations, pixels between a point seen and projected.
+
+    `keypoints (N, 2)`: the row in `image_names`, and which of the image's keypoints; `errors_px (N,)`: infinite where
+    the point lies behind the camera; beyond `cap_px` an observation is wrong, and how far off tells no more.
+    """
 
     images: int
     points: int
-    observations: int
-    mean_reprojection_px: float
     mean_track_length: float
+    image_names: tuple[str, ...]
+    keypoints: Ints
+    errors_px: Floats
+    cap_px: float
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.sources.measured_edges import GraphFile, MeasuredOptions, joined, measured_edges, without_measured
-from hodge_pipeline.types import Candidates, Frame, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import Candidates, Frame, Priors, Source, Trajectory, ViewGraph
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 
@@ -53,6 +53,14 @@ def test_they_can_be_left_out_and_weighed() -> None:
     assert left.edge_count == 0 and "measured.use is false" in notes[0]
     weighed, _ = measured_edges(source, MeasuredOptions(information_scale=4.0))
     np.testing.assert_array_equal(weighed.information, 4 * np.eye(6)[None])
+
+
+def test_fixed_vertices_and_priors_have_no_part_in_a_run_and_a_note_says_so() -> None:
+    priors = Priors(np.array([0]), np.eye(4)[None], np.eye(6)[None])
+    own = replace(graph([0, 1], [(0, 1)]), fixed=np.array([0, 1]), priors=priors)
+    found, notes = measured_edges(Source("s", Path("s"), frames(0, 1), graph=own), MeasuredOptions())
+    assert not len(found.fixed) and found.priors is None
+    assert notes[0] == "s: its 2 fixed vertices and 1 priors have no part in a run: hodge solve heeds them"
 
 
 def test_files_of_fragments_begin_at_their_first_frame(tmp_path: Path) -> None:

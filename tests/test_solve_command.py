@@ -130,6 +130,7 @@ def test_wrong_edges_are_left_out(tmp_path):
         (["--start", "odometry"], RecipeError, "expected given or chordal"),
         (["--certificate", "--objective", "full"], RecipeError, "add --objective isotropic"),
         (["--time-limit", "0"], RecipeError, "above zero"),
+        (["--time-limit", "nan"], RecipeError, "--time-limit nan: expected seconds above zero"),
         (["--out", "nowhere/a.g2o"], RecipeError, "make it first"),
         (["--time-limit", "1e-9"], CheckError, "stopped before it converged"),
     ],

@@ -165,3 +165,12 @@ def test_vertices_in_two_components_have_no_relative_covariance():
     graph, truth = band(4, 1, 12)
     with pytest.raises(GraphError, match="two components"):
         relative_covariances(graph.select(np.array([0, 2])), truth, np.array([[0, 3]]))
+
+
+def test_fixed_vertices_without_a_start_hold_nothing_and_a_note_says_so():
+    """They were held where the rounds before the last solve had put them."""
+    graph, _ = band(16, 3, 0)
+    free = solve_robust(graph)
+    held = solve_robust(dataclasses.replace(graph, fixed=np.array([0, 7, 15])))
+    np.testing.assert_allclose(held.world_from_cam, free.world_from_cam, atol=1e-9)
+    assert any("3 fixed vertices have no pose" in note for note in held.notes)

@@ -41,7 +41,7 @@ def choices(
             raise RecipeError(f"{option} {value}: expected {' or '.join(known)}")
     if named == "full" and (certificate or sesync_units):
         raise RecipeError("--certificate and --sesync-units are for the isotropic objective: add --objective isotropic")
-    if time_limit_s <= 0:
+    if not time_limit_s > 0:
         raise RecipeError(f"--time-limit {time_limit_s:g}: expected seconds above zero")
     initial: InitialName = "given" if start == "given" else "chordal"
     chosen: ObjectiveName = "isotropic" if named == "isotropic" else "full"

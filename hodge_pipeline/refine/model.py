@@ -15,6 +15,7 @@ from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, j
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
 from hodge_pipeline.refine.model_stages import NOTES, ModelStages, measured_edges
+from hodge_pipeline.refine.reprojection import reprojection_measures
 from hodge_pipeline.refine.scale import Scale, metric_scale
 from hodge_pipeline.refine.uncertainty import SIGMAS
 from hodge_pipeline.stages import TrackedModel, Workers
@@ -180,13 +181,11 @@ def _measures(
     inputs: tuple[TrackedModel, ...], found: _Found, model: TrackedModel, options: ModelRefinement
 ) -> Sequence[Measure]:
     qualities = [one.quality for one in inputs]
-    count = sum(quality.observations for quality in qualities)
-    before_px = sum(quality.mean_reprojection_px * quality.observations for quality in qualities) / max(count, 1)
+    count = sum(len(quality.errors_px) for quality in qualities)
     length = count / max(sum(quality.points for quality in qualities), 1)
     after = model.quality
-    tolerance = options.reprojection_tolerance * before_px
     out = [
-        Measure("mean reprojection error", before_px, after.mean_reprojection_px, "lower", tolerance, "px"),
+        *reprojection_measures(qualities, after, options.reprojection_tolerance),
         Measure("mean track length", length, after.mean_track_length, "higher", 0.01 * length, "images"),
     ]
     assert found.solved is not None

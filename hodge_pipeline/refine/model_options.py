@@ -44,7 +44,9 @@ class ModelRefinement:
         "where depth took part in the solve, since tracks know all that edges from the same images know",
     )
     reprojection_tolerance: float = Field(
-        default=0.005, ge=0, description="relative: a mean reprojection error larger by more than this is worse"
+        default=0.005,
+        ge=0,
+        description="relative: a capped mean reprojection error that grows by more is worse",
     )
 
 

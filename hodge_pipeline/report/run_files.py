@@ -132,6 +132,8 @@ def make_report(
             key_frames=len(source.frames) if len(source.frames) < len(whole.frames) else None,
             sequences=tuple(name for name in sequences_of(source) if name),
             notes=source.notes,
+            kind="scans" if all(frame.read_depth is None for frame in source.frames) else "frames",
+            unordered=job.given is None and job.recipe.start == "global",
         ),
         scores=scores,
         trajectories=_trajectories(job, source, sets, component),

@@ -9,7 +9,8 @@ import numpy as np
 
 from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
 from hodge_pipeline.report.contents import RefinementSummary, Report
-from hodge_pipeline.report.verdict import GRAPH_NAMES, judge, length, suspicions
+from hodge_pipeline.report.difference import length
+from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m, judge, suspicions
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,6 @@ def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
     return (*lines, *(("note", line) for line in suspicions(report)))
 
 
-def vertex_name(report: Report) -> str:
-    """What the vertices of the viewing graph are."""
-    return "frames" if report.source.key_frames is None else "key frames"
-
-
 def _peak(report: Report) -> float:
     return max(stage.peak_mb for stage in report.stages)
 
@@ -63,9 +59,8 @@ def graph_tables(report: Report) -> Iterator[Table]:
         yield _graph(report)
         if len(report.graph.components) > 1:
             parts = tuple((str(n), str(part.count), part.frames) for n, part in enumerate(report.graph.components))
-            yield Table(
-                "Connected parts", ("part", vertex_name(report), "which"), parts, "Nothing measured joins two parts.", 3
-            )
+            header = ("part", report.source.vertex_name, "which")
+            yield Table("Connected parts", header, parts, "Nothing measured joins two parts.", 3)
     if report.loops:
         yield _loops(report)
 
@@ -106,12 +101,13 @@ def _score_cells(graph: GraphScores, row: int) -> tuple[str, str, str]:
 def _trajectories(report: Report) -> Table:
     header = ("poses", "ATE", "median", "largest", "RPE", "RPE, rotation", "frames")
     absolute_m = max((row.ate_rmse_m for row in report.trajectories if row.frames), default=0.0)
+    floor = floor_m(report)
     relative_m = max((row.rpe_translation_m for row in report.trajectories if row.frames), default=0.0)
     rows = tuple(
         (
             row.name,
-            *(length(metres, absolute_m) for metres in (row.ate_rmse_m, row.ate_median_m, row.ate_max_m)),
-            length(row.rpe_translation_m, relative_m),
+            *(length(metres, absolute_m, floor) for metres in (row.ate_rmse_m, row.ate_median_m, row.ate_max_m)),
+            length(row.rpe_translation_m, relative_m, floor),
             number(row.rpe_rotation_deg, ".3f", "°"),
             str(row.frames),
         )
@@ -130,7 +126,7 @@ def _graph(report: Report) -> Table:
     graph = report.graph
     assert graph is not None
     rows = [
-        (vertex_name(report), str(graph.vertices)),
+        (report.source.vertex_name, str(graph.vertices)),
         ("edges", str(graph.edges)),
         *((f"edges: {name}", str(count)) for name, count in graph.edges_by_source.items()),
         ("edges ignored by the solver", str(graph.edges_ignored)),

@@ -41,7 +41,7 @@ __all__ = [
     "write_report",
 ]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Raised when a key of `report.json` is renamed, moved or removed."""
 
 
@@ -62,6 +62,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "verdict": {
             "outcome": verdict.outcome,
             "sentence": verdict.sentence,
+            "pieces": verdict.pieces,
             "before": report.before,
             "after": report.after,
             "changes": [{**asdict(change), "share": change.share} for change in verdict.changes],

@@ -11,11 +11,12 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import orthonormal
-from hodge_pipeline.complex.components import connected_components, first_of_component
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.edge_weights import edge_weights
 from hodge_pipeline.complex.one_form import Logarithm, centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.potential import moved, poisson, residual_metrics
+from hodge_pipeline.solvers.problem import pinned_vertices
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 LEVER_ARM_M = 1.0  # a rotation counts as the displacement that it causes this far away, in a path's uncertainty
@@ -38,6 +39,7 @@ class PaperProblem:
     i_from_j: Floats
     sign: Ints
     component: Ints
+    fixed: Ints
     start: Floats
     offset: Floats
     start_in_world: Floats
@@ -52,19 +54,19 @@ class PaperProblem:
         return np.asarray(self.sign[:, None] * residual_form(as_measured, motions, poses, log))
 
     def in_world(self, poses: Floats) -> Floats:
-        """The poses away from the centroid again; first vertices are those of the start to the last bit."""
+        """The poses away from the centroid again; the held vertices are those of the start to the last bit."""
         out = shifted(poses, self.offset)
-        gauge = first_of_component(self.component)
-        out[gauge] = self.start_in_world[gauge]
+        held = pinned_vertices(self.component, self.fixed)
+        out[held] = self.start_in_world[held]
         return out
 
     def poisson(self, d0: csr_matrix, weights: Floats) -> Callable[[Floats], Floats]:
-        """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω`, of mean zero on each component (Eq. (7))."""
-        return poisson(d0, weights, self.component)
+        """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω` (Eq. (7)); see `potential.poisson`."""
+        return poisson(d0, weights, self.component, self.fixed)
 
     def moved(self, poses: Floats, correction: Floats, log: Logarithm) -> Floats:
-        """`exp(f_k) T_k` (V, 4, 4), then each component as one body, so that its first vertex is at its start."""
-        return moved(poses, correction, self.start, self.component, log)
+        """`exp(f_k) T_k` (V, 4, 4), with the held vertices at their start; see `potential.moved`."""
+        return moved(poses, correction, self.start, self.component, self.fixed, log)
 
     def residual_metrics(self, poses: Floats) -> Mapping[str, float]:
         """Mean and median disagreement of the edges with the poses, metres and radians."""
@@ -94,6 +96,7 @@ def make_problem(graph: ViewGraph, world_from_cam: Floats) -> PaperProblem:
         i_from_j=i_from_j,
         sign=np.where(backwards, -1, 1),
         component=component,
+        fixed=graph.fixed,
         start=orthonormal(shifted(world_from_cam, -offset)),
         offset=offset,
         start_in_world=world_from_cam,

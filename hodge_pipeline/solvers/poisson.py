@@ -12,9 +12,9 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.sparse import csr_matrix
 
-from hodge_pipeline.complex.checks import check_graph, orthonormal
+from hodge_pipeline.complex.checks import NO_EDGES, check_graph, orthonormal, refuse_priors
 from hodge_pipeline.complex.coboundary import coboundary_0
-from hodge_pipeline.complex.components import connected_components, describe_components, first_of_component
+from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.complex.cycles import (
     adjusted_edges,
     fundamental_products,
@@ -26,6 +26,7 @@ from hodge_pipeline.complex.edge_weights import EdgeWeighting, edge_weights
 from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
 from hodge_pipeline.complex.one_form import Logarithm, centroids, residual_form, shifted
 from hodge_pipeline.solvers.potential import moved, poisson, residual_metrics, residuals
+from hodge_pipeline.solvers.problem import pinned_vertices
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, SolverIteration, ViewGraph
 
 STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
@@ -49,15 +50,16 @@ class _Problem:
     base_weights: Floats
     d0: csr_matrix
     component: Ints
-    gauge: Bools
+    fixed: Ints
     start: Floats
     offset: Floats
     start_in_world: Floats
 
     def in_world(self, poses: Floats) -> Floats:
-        """The poses away from the centroid again; the gauge vertices are those of the start to the last bit."""
+        """The poses away from the centroid again; the held vertices are those of the start to the last bit."""
         out = shifted(poses, self.offset)
-        out[self.gauge] = self.start_in_world[self.gauge]
+        held = pinned_vertices(self.component, self.fixed)
+        out[held] = self.start_in_world[held]
         return out
 
 
@@ -68,7 +70,7 @@ class PoissonSolver:
     Every step is one scalar sparse factorisation with six right-hand sides. ω is formed around the centroid of each
     connected component: far from the world's origin a little rotation would become much translation, and the result
     would depend on where the origin is. f is taken with mean zero, then the component is moved back as one body, so
-    that its first vertex keeps its pose exactly.
+    that its first vertex keeps its pose exactly. Fixed vertices have f = 0, and a component with one is not moved back.
 
     With a robust kernel the edges are first reweighted (IRLS) by steps from the start poses; then the weights are
     frozen and the reported iterations begin at the start poses again. So the loop deviation D in the history falls
@@ -122,10 +124,11 @@ class PoissonSolver:
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """Consistent poses; a graph of several components is solved piece by piece, isolated vertices keep their pose.
 
-        Raises `GraphError` for motions or information that are not finite, and for an empty graph.
+        Raises `GraphError` for motions that are not finite and rigid, for an empty graph, and for priors.
         """
         world_from_cam = np.asarray(world_from_cam, float)
         check_graph(graph, world_from_cam)
+        refuse_priors(graph, "poisson")
         base_weights, notes = edge_weights(graph, self.weights, self.lever_arm_m)
         proper = graph.edges[:, 0] != graph.edges[:, 1]
         used = proper & (base_weights > 0)
@@ -171,7 +174,7 @@ class PoissonSolver:
         if len(problem.edges) == 0:
             return ()
         total = problem.base_weights * weights
-        potential = poisson(problem.d0, total, problem.component)
+        potential = poisson(problem.d0, total, problem.component, problem.fixed)
         poses, history = problem.start, []
         omega = self._form(problem, poses)
         for _ in range(self.inner_iterations):
@@ -200,7 +203,7 @@ class PoissonSolver:
         poses, scale = problem.start, float("nan")
         for _ in range(self.reweighting_steps):
             total = problem.base_weights * weights
-            correction = poisson(problem.d0, total, problem.component)(self._form(problem, poses))
+            correction = poisson(problem.d0, total, problem.component, problem.fixed)(self._form(problem, poses))
             poses = self._moved(problem, poses, correction)
             residual = self._displacement(problem, poses)
             scale = self.scale_m or _robust_scale(residual)
@@ -218,11 +221,11 @@ class PoissonSolver:
         return residual_form(problem.edges, problem.i_from_j, poses, self.log)
 
     def _moved(self, problem: _Problem, poses: Floats, correction: Floats) -> Floats:
-        return moved(poses, correction, problem.start, problem.component, self.log)
+        return moved(poses, correction, problem.start, problem.component, problem.fixed, self.log)
 
     def _convergence_notes(self, problem: _Problem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
         if not history:
-            return ("no edge joins two vertices: every pose is as it was at the start",)
+            return (NO_EDGES,)
         notes = []
         half_turns = int((np.linalg.norm(self._form(problem, problem.start)[:, :3], axis=1) > np.pi - 1e-3).sum())
         if half_turns:
@@ -245,7 +248,7 @@ def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam
         base_weights=base_weights[used],
         d0=coboundary_0(edges, graph.vertex_count),
         component=component,
-        gauge=first_of_component(component),
+        fixed=graph.fixed,
         start=orthonormal(shifted(world_from_cam, -offset)),
         offset=offset,
         start_in_world=world_from_cam,

@@ -9,20 +9,22 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.coboundary import grounded_laplacian
-from hodge_pipeline.complex.components import first_of_component
 from hodge_pipeline.complex.one_form import Logarithm
 from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.solvers.problem import pinned_vertices
 from hodge_pipeline.types import Floats, Ints
 
 
-def poisson(d0: csr_matrix, weights: Floats, component: Ints) -> Callable[[Floats], Floats]:
-    """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω`, of mean zero on each component (V,) (Eq. (7)).
+def poisson(d0: csr_matrix, weights: Floats, component: Ints, fixed: Ints) -> Callable[[Floats], Floats]:
+    """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω` (Eq. (7)).
 
+    f is 0 at the fixed vertices (rows), and of mean zero on each component (V,) that has none.
     The Laplacian is factorised once; six right-hand sides are solved at a time.
     """
-    gauge = first_of_component(component)
+    gauge = pinned_vertices(component, fixed)
     factor = factorise(grounded_laplacian(d0, weights, gauge))
-    count = np.bincount(component)[:, None]
+    count = np.bincount(component)[:, None].astype(float)
+    count[component[fixed]] = np.inf
 
     def solve(omega: Floats) -> Floats:
         divergence = d0.T @ (weights[:, None] * omega)
@@ -34,13 +36,18 @@ def poisson(d0: csr_matrix, weights: Floats, component: Ints) -> Callable[[Float
     return solve
 
 
-def moved(poses: Floats, correction: Floats, start: Floats, component: Ints, log: Logarithm) -> Floats:
-    """`exp(f_k) T_k` (V, 4, 4), then each component as one body, so that its first vertex is at its start exactly."""
+def moved(poses: Floats, correction: Floats, start: Floats, component: Ints, fixed: Ints, log: Logarithm) -> Floats:
+    """`exp(f_k) T_k` (V, 4, 4), then each component without a fixed vertex as one body, so that its first vertex is at
+    its start exactly, as the fixed vertices (rows) are.
+    """
     motion = se3.pairing_exp(correction) if log == "pairing" else se3.exp(correction)
     out = motion @ poses
     _, first = np.unique(component, return_index=True)
-    out = np.asarray((start[first] @ se3.inverse(out[first]))[component] @ out)
-    out[first] = start[first]
+    body = np.asarray(start[first] @ se3.inverse(out[first]))
+    body[component[fixed]] = np.eye(4)
+    out = np.asarray(body[component] @ out)
+    gauge = pinned_vertices(component, fixed)
+    out[gauge] = start[gauge]
     return out
 
 

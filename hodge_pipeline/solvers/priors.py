@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hodge_pipeline.complex.checks import check_motions
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, ViewGraph
 
@@ -15,7 +16,7 @@ def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: In
     """The graph with the world as its last vertex, held at the identity, and start poses (V + 1, 4, 4).
 
     Without a start every vertex begins at the world's origin, which only a descent from given poses would heed.
-    Raises `GraphError` where a prior names no vertex.
+    Raises `GraphError` where a prior names no vertex, or holds no motion.
     """
     vertices, count = np.asarray(priors.vertices, np.int64), graph.vertex_count
     outside = (vertices < 0) | (vertices >= count)
@@ -23,6 +24,8 @@ def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: In
         raise GraphError(
             f"prior {np.argmax(outside)} names vertex row {vertices[np.argmax(outside)]} of {count}: mend it"
         )
+    names = graph.vertex_ids[vertices]
+    check_motions(priors.world_from_vertex, "priors", lambda row: f"prior {row} (vertex {names[row]})")
     added = ViewGraph.from_edges(
         np.arange(count + 1),
         np.column_stack([np.full(len(vertices), count), vertices]),

@@ -19,7 +19,8 @@ from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.minimise import descend_isotropic
 from hodge_pipeline.solvers.newton import Limits, Point
 from hodge_pipeline.solvers.objective import residuals
-from hodge_pipeline.solvers.setup import NO_ROWS, Setup, prepare
+from hodge_pipeline.solvers.options import check_choice, check_positive
+from hodge_pipeline.solvers.setup import Setup, held_rows, prepare
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 Kernel: TypeAlias = Literal["truncated", "geman_mcclure"]
@@ -63,7 +64,13 @@ def solve_robust(
     `threshold`: an edge is wrong where its χ² with isotropic weights exceeds this; None takes the 99 % quantile of
     right edges. The graph's fixed vertices stay at their start. The components are those of the edges that are kept.
     """
-    setup = prepare(graph, start, NO_ROWS if start is None else graph.fixed, dimension)
+    check_choice("kernel", kernel, Kernel)
+    check_choice("objective", objective, ObjectiveName)
+    if threshold is not None:
+        check_positive("threshold", threshold, "χ²")
+    start = None if start is None else np.asarray(start, float)
+    fixed, unheld = held_rows(graph, start)
+    setup = prepare(graph, start, fixed, dimension)
     limit = threshold or (CHI2_99_PLANAR if setup.dimension == 2 else CHI2_99_SPATIAL)
     problem = setup.problem
     # the isotropic objective counts a rotation of θ as 2 κ θ²; in the plane κ is the information itself, so twice
@@ -83,9 +90,11 @@ def solve_robust(
         initial="given" if graph.priors is None else "chordal",
         objective=objective,
         dimension=2 if setup.dimension == 2 else 3,
+        fixed=fixed,
         certificate=certificate,
     )
     notes = (
+        *unheld,
         *(note for note in setup.weights.notes if note not in final.notes),
         f"{len(kept)} of {graph.edge_count} edges kept; short cycles test {tested} of them all",
         *final.notes,
@@ -133,7 +142,7 @@ def _truncated_after(setup: Setup, smooth: _Round, limit: float) -> _Round:
 def _graduate(setup: Setup, trust: Floats, point: Point, limit: float, kernel: Kernel) -> _Round:
     """Rounds of weighted solves in which the kernel goes from convex to its final shape."""
     squares = _squares(setup, point)
-    seen = np.average(squares, weights=np.maximum(trust, WEIGHT_FLOOR))
+    seen = np.average(squares, weights=np.maximum(trust, WEIGHT_FLOOR)) if len(squares) else 0.0
     worst = float(max(np.max(squares[trust > KEPT_FROM], initial=0.0), seen))
     control = limit / (2 * worst - limit) if worst > limit else math.inf
     if kernel == "geman_mcclure":

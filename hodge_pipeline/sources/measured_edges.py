@@ -118,6 +118,12 @@ def _between_frames(
     lost = int((~good).sum())
     if lost:
         notes.append(f"{name}: {lost} of {graph.edge_count} measured edges left out: they are not between two frames")
+    known = 0 if graph.priors is None else len(graph.priors.vertices)
+    if known or len(graph.fixed):
+        notes.append(
+            f"{name}: its {len(graph.fixed)} fixed vertices and {known} priors have no part in a run: "
+            "hodge solve heeds them"
+        )
     over_frames = replace(graph.select(good), edges=rows[good], vertex_ids=_no_edges(frames).vertex_ids)
     return replace(over_frames, dimension=3, fixed=np.zeros(0, np.int64))
 
