@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from hodge_pipeline.scene import Scene
 from hodge_pipeline.types import (
     Candidates,
     CloudSet,
@@ -101,6 +102,17 @@ class FrameReader(Protocol):
 
     def open(self, path: Path) -> Source:
         """What is there, lazily. Raises `SourceError` that names file, record and remedy."""
+        ...
+
+
+@runtime_checkable
+class Start(Protocol):
+    """Finds first poses."""
+
+    def begin(self, source: Source, clouds: Any, steps: Steps, workers: Workers) -> Scene:
+        """The frames to register with their clouds (`clouds`: `registration.clouds.CloudOptions`) and first poses, and
+        how all frames follow from them. What costs time is computed by `steps`, so that it is computed once.
+        """
         ...
 
 
