@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from hodge_pipeline.types import (
-    Candidates,
     CloudSet,
+    Edges,
     Floats,
     Frame,
     Ints,
@@ -69,7 +69,7 @@ class FrameReader(Protocol):
 class EdgeBuilder(Protocol):
     """Proposes pairs of frames to register."""
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs, given the current poses (N, 4, 4). Frames without points get none."""
         ...
 

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import shutil
-from typing import Any
 
 import numpy as np
 
 from hodge_pipeline import steps
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.pairs.candidates import labelled, merge
+from hodge_pipeline.pairs.candidates import merge
 from hodge_pipeline.registration.gaps import has_gap
 from hodge_pipeline.rounds import Round, sequences_of
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.start import given, key_frames
-from hodge_pipeline.start.unordered.graphs import COLUMNS
 from hodge_pipeline.start.unordered.start import Scene, Start, find_start
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import Job
-from hodge_pipeline.types import Candidates, Source, ViewGraph
+from hodge_pipeline.types import Edges, Source
 
 START = "start"
 
@@ -67,26 +65,24 @@ def _global_start(job: Job, source: Source, known: Round | None, inputs: tuple[s
             if known is not None and _stays(source, known, found):
                 first_graph, poses = known.graph, known.world_from_cam
                 job.note("nothing joins what tracking left apart: it starts where the guessed motion puts it")
-            columns = {name: getattr(first_graph, name) for name in ("vertex_ids", *COLUMNS)}
-            artifacts.save_arrays(folder.path / "graph.npz", columns)
+            artifacts.save(folder.path / "edges.npz", Edges.measured(first_graph))
             artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": poses})
-    stored: dict[str, Any] = artifacts.load_arrays(job.path(START) / "graph.npz")
-    graph = ViewGraph(**stored)
+    edges = artifacts.load(job.path(START) / "edges.npz", Edges)
     poses = artifacts.load_arrays(job.path(START) / "poses.npz")["world_from_cam"]
-    return Round(graph, poses, name=START)
+    return Round(edges, steps.vertex_ids(source), poses, name=START)
 
 
-def with_start_edges(candidates: Candidates, first: Round) -> Candidates:
+def with_start_edges(candidates: Edges, first: Round) -> Edges:
     """The candidates, and those edges of the start that join what the candidates leave apart.
 
     Consecutive frames join nothing here: across a gap they have nothing in common.
     """
     if first.name != START:
         return candidates
-    proven = candidates.pairs[~np.isin(candidates.source, ("sequential", "nearest"))]
+    proven = candidates.pairs[~np.isin(candidates.proposed_by, ("sequential", "nearest"))]
     component = connected_components(proven, first.graph.vertex_count)
     joining = component[first.graph.edges[:, 0]] != component[first.graph.edges[:, 1]]
     if not joining.any():
         return candidates
     pairs = np.unique(np.sort(first.graph.edges[joining], axis=1), axis=0)
-    return merge([candidates, labelled(pairs, START)])[0]
+    return merge([candidates, Edges.proposed(pairs, START)])[0]

@@ -19,7 +19,7 @@ from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import Job
 from hodge_pipeline.store.workspace import key_of
-from hodge_pipeline.types import Floats, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import Edges, Floats, Source, Trajectory
 
 SAME_M = 1e-6
 
@@ -56,8 +56,7 @@ def first_poses(job: Job, given: Given, source: Source) -> Round:
     with job.stage("start", "given poses", 1, digest(poses), ("clouds",)) as (_, advance):
         advance(1)
     ids = np.array([frame.frame_id for frame in source.frames])
-    none = ViewGraph.from_edges(ids, np.zeros((0, 2), np.int64), np.zeros((0, 4, 4)))
-    return Round(none, poses, name="start")
+    return Round(Edges.of([]), ids, poses, name="start")
 
 
 def key_source(given: Given, own: bool) -> Source:

@@ -16,7 +16,6 @@ from hodge_pipeline.recipe.schema import Recipe, cloud_options
 from hodge_pipeline.refine.correction import spread_correction
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.odometry import chained
-from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.report.summary import in_runs
@@ -25,7 +24,7 @@ from hodge_pipeline.stages import Advance, Workers
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import Job
 from hodge_pipeline.store.workspace import key_of
-from hodge_pipeline.types import Bools, CloudSet, Floats, Frame, Ints, Source
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, Source
 
 CLOUDS = "clouds"
 """The stage holds the key frames' clouds, as it does where all frames are registered."""
@@ -49,7 +48,7 @@ class Tracked:
     found: Bools
     world_from_key: Floats
     piece: Ints
-    steps: Registered
+    steps: Edges
 
     def all_poses(self, world_from_key: Floats) -> Floats:
         """Poses (N, 4, 4) of all frames that follow from those (K, 4, 4) of the key frames.
@@ -91,7 +90,7 @@ def key_frames(job: Job, source: Source) -> Source:
             for note in notes:
                 job.note(note)
     stored = artifacts.load_arrays(job.path(CLOUDS) / "tracked.npz")
-    steps = artifacts.load(job.path(CLOUDS) / "steps.npz", Registered)
+    steps = artifacts.load(job.path(CLOUDS) / "steps.npz", Edges)
     job.tracked = Tracked(whole=source, steps=steps, **stored)
     job.keys["source"] = key_of(job.keys["source"], job.keys[CLOUDS])
     frames = tuple(source.frames[row] for row in job.tracked.key_rows)
@@ -115,7 +114,7 @@ def first_poses(job: Job, tracked: Tracked, source: Source) -> Round:
     with job.stage("odometry", "odometry", 1, None, (CLOUDS,)) as (_, advance):
         advance(1)
     ids = np.array([frame.frame_id for frame in source.frames])
-    return Round(tracked.steps.as_graph(ids, np.full(len(tracked.steps.pairs), "sequential")), tracked.world_from_key)
+    return Round(tracked.steps, ids, tracked.world_from_key)
 
 
 def frames_to_fuse(job: Job, source: Source, last: Round) -> tuple[Sequence[Frame], Floats]:
@@ -124,7 +123,7 @@ def frames_to_fuse(job: Job, source: Source, last: Round) -> tuple[Sequence[Fram
     alone.
     """
     world_from_cam = last.world_from_cam
-    if job.tracked is not None and (job.scoring or last.disabled is None):
+    if job.tracked is not None and (job.scoring or not last.edited):
         poses = job.tracked.all_poses(world_from_cam)
         return job.tracked.whole.frames, np.asarray(np.where(job.tracked.found[:, None, None], poses, np.nan))
     if job.tracked is not None:
@@ -153,7 +152,7 @@ def _track(
     blocks.join_clouds(fresh, folder)
     key_rows = np.concatenate([part.keys[keep] for part, keep in zip(parts, fresh, strict=True)])
     key_of_row = {int(row): key for key, row in enumerate(key_rows)}
-    steps = Registered.joined([part.steps for part in parts])
+    steps = Edges.joined([part.steps for part in parts])
     steps = replace(steps, pairs=_renumbered(steps.pairs, key_of_row))
     key_sequences = [np.flatnonzero(np.isin(key_rows, rows)) for rows in sequences]
     poses = chained(len(key_rows), key_sequences, steps)
