@@ -114,11 +114,11 @@ def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round]
             candidates = first_poses.with_start_edges(proposed, rounds[0])
             registered = steps.register_edges(job, number, candidates, poses, workers)
             recording.registration(number, registered, poses, clouds)
-            rounds.append(steps.solve(job, number, source, candidates, registered, poses, measured))
+            rounds.append(steps.solve(job, number, source, registered, poses, measured))
             recording.round(number, rounds[-1])
         suggested = suggested_rounds(job, source, clouds, measured, rounds, workers)
         for more in chain(suggested, edited_rounds(job, source, measured, rounds, workers)):
-            if len(more.registered.pairs):
+            if len(more.registered):
                 recording.registration(len(rounds), more.registered, more.before, clouds)
             rounds.append(more.round)
             recording.round(len(rounds) - 1, more.round)

@@ -4,57 +4,55 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.types import Bools, Candidates, Floats, Ints, Solution, Source, ViewGraph
-
-
-def _no_pairs() -> Ints:
-    return np.zeros((0, 2), np.int64)
-
-
-def _no_reasons() -> NDArray[np.str_]:
-    return np.zeros(0, "U1")
-
-
-@dataclass(frozen=True)
-class Verdicts:
-    """What the diagnosis says of each edge (E,): its verdict, how probably it is right (NaN: untestable), and why."""
-
-    verdict: NDArray[np.str_]
-    probability: Floats
-    reason: NDArray[np.str_]
+from hodge_pipeline.types import Edges, Floats, Ints, Solution, Source, ViewGraph
+from hodge_pipeline.types.edges import REJECTED
 
 
 @dataclass(frozen=True)
 class Round:
-    """One outer iteration: its edges, and the poses (N, 4, 4) that they led to. Round 0 holds the first poses, which
-    `name` tells: odometry, or start where they were given.
+    """One outer iteration: every pair that it knows of, and the poses (N, 4, 4) that its edges led to. Round 0 holds
+    the first poses, which `name` tells: odometry, or start where they were given.
 
-    `registered` holds every pair that was, in the order of `candidates`; of them `rejected_pairs (R, 2)` were not
-    accepted, for `rejected_reasons (R,)`. Only the last round has `verdicts`; `disabled (E,)` are edges that a person
-    switched off.
+    The pairs that a round registered come first in `edges`, then those that came measured. A round is `edited` where a
+    person's edits made it.
     """
 
-    graph: ViewGraph
+    edges: Edges
+    vertex_ids: NDArray[np.generic]
     world_from_cam: Floats
-    candidates: Candidates | None = None
-    registered: Registered | None = None
     solution: Solution | None = None
-    rejected_pairs: Ints = field(default_factory=_no_pairs)
-    rejected_reasons: NDArray[np.str_] = field(default_factory=_no_reasons)
-    verdicts: Verdicts | None = None
-    disabled: Bools | None = None
+    edited: bool = False
     name: str = "odometry"
+
+    @cached_property
+    def graph_edges(self) -> Edges:
+        """The rows that are edges, in the order of `graph`: those that count, and those that are off by hand."""
+        return self.edges.select(self.edges.in_graph)
+
+    @cached_property
+    def graph(self) -> ViewGraph:
+        """The viewing graph."""
+        return self.graph_edges.as_graph(self.vertex_ids)
+
+    @property
+    def rejected(self) -> Edges:
+        """The pairs that were registered and are no edges."""
+        return self.edges.select(self.edges.status == REJECTED)
 
     @property
     def rejected_counts(self) -> Mapping[str, int]:
         """How many pairs were rejected for each reason."""
-        return dict(sorted(Counter(self.rejected_reasons.tolist()).items()))
+        return dict(sorted(Counter(self.rejected.why.tolist()).items()))
+
+    def registered(self, measured: ViewGraph) -> Edges:
+        """The rows without those that came measured."""
+        return self.edges.select(slice(len(self.edges) - measured.edge_count))
 
 
 def pose_sets(rounds: Sequence[Round]) -> dict[str, Floats]:

@@ -14,8 +14,8 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from hodge_pipeline.scene import Scene
 from hodge_pipeline.types import (
-    Candidates,
     CloudSet,
+    Edges,
     Floats,
     Frame,
     Ints,
@@ -120,7 +120,7 @@ class Start(Protocol):
 class EdgeBuilder(Protocol):
     """Proposes pairs of frames to register."""
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs, given the current poses (N, 4, 4). Frames without points get none."""
         ...
 

@@ -13,30 +13,30 @@ from numpy.typing import NDArray
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.evaluation.scaled_scores import scaled_score_table
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphScores, ScoreTable
 from hodge_pipeline.fusion.ply import write_ply
-from hodge_pipeline.pairs.candidates import select
 from hodge_pipeline.recipe.schema import cloud_options
 from hodge_pipeline.refine.held_out import is_held_out
 from hodge_pipeline.registration import clouds as cloud_stage
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
-from hodge_pipeline.registration.acceptance import rejections
+from hodge_pipeline.registration.acceptance import accepted
 from hodge_pipeline.registration.block_store import BlockStore
 from hodge_pipeline.registration.gaps import has_gap
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
-from hodge_pipeline.sources.measured_edges import digest, joined, measured_edges, without_measured
+from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.sources.measured_edges import digest, measured_edges, without_measured
 from hodge_pipeline.sources.opening import open_source
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.start import given
 from hodge_pipeline.start.unordered.tour import propose_along_tour
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import Job, unnamed_key
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Source, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
+from hodge_pipeline.types.edges import HELD_OUT
 
-HELD_OUT = "held_out.npz"
+EDGES = "edges.npz"
 
 
 def read(job: Job) -> Source:
@@ -85,7 +85,7 @@ def prepare_clouds(job: Job, source: Source, workers: Workers) -> CloudSet:
 
 def propose_edges(
     job: Job, number: int, source: Source, clouds: CloudSet, world_from_cam: Floats, measured: ViewGraph
-) -> Candidates:
+) -> Edges:
     """The pairs to register in round `number`, from the poses so far; measured ones are not registered again.
 
     Where the run starts from given poses a share of them is kept out, for its guard.
@@ -102,11 +102,10 @@ def propose_edges(
             candidates = without_measured(propose(source.frames, clouds, world_from_cam), measured)
             if job.given is not None:
                 out = is_held_out(candidates, job.recipe.guard.held_out, job.recipe.seed)
-                artifacts.save(folder.path / HELD_OUT, select(candidates, np.flatnonzero(out)))
-                candidates = select(candidates, np.flatnonzero(~out))
-            artifacts.save(folder.path / "candidates.npz", candidates)
+                candidates = candidates.put(out, status=HELD_OUT)
+            artifacts.save(folder.path / EDGES, candidates)
             advance(1)
-    return artifacts.load(job.path(name) / "candidates.npz", Candidates)
+    return artifacts.load(job.path(name) / EDGES, Edges)
 
 
 def _first_stage(job: Job) -> str:
@@ -126,56 +125,58 @@ def odometry(job: Job, source: Source, workers: Workers) -> Round:
             artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": found.world_from_cam})
             for note in found.notes:
                 job.note(note)
-    steps = artifacts.load(job.path("odometry") / "steps.npz", Registered)
+    steps = artifacts.load(job.path("odometry") / "steps.npz", Edges)
     poses = artifacts.load_arrays(job.path("odometry") / "poses.npz")["world_from_cam"]
-    return Round(steps.as_graph(vertex_ids(source), np.full(len(steps.pairs), "sequential")), poses)
+    return Round(steps, vertex_ids(source), poses)
 
 
-def register_edges(
-    job: Job, number: int, candidates: Candidates, world_from_cam: Floats, workers: Workers
-) -> Registered:
-    """The candidates of round `number` registered from the poses so far; a killed run goes on at its last block."""
-    name, total = f"register-{number}", len(candidates.pairs)
+def register_edges(job: Job, number: int, edges: Edges, world_from_cam: Floats, workers: Workers) -> Edges:
+    """The table of round `number` with its candidates registered from the poses so far, and accepted or rejected.
+
+    A killed run goes on at its last block.
+    """
+    held_out = edges.status == HELD_OUT
+    candidates = edges.select(~held_out)
     i, j = candidates.pairs.T
     guesses = se3.inverse(world_from_cam[i]) @ world_from_cam[j]
-    with job.stage(
-        name, f"registration, round {number}", total, job.recipe.registration, ("clouds", f"edges-{number}")
-    ) as (folder, advance):
+    name, title, inputs = f"register-{number}", f"registration, round {number}", ("clouds", f"edges-{number}")
+    with job.stage(name, title, len(candidates), job.recipe.registration, inputs) as (folder, advance):
         if not folder.finished:
             blocks = BlockStore(folder.path / "blocks")
             found = pair_stage.register_pairs(
-                job.path("clouds"), job.recipe.registration, candidates.pairs, guesses, workers, advance,
+                job.path("clouds"), job.recipe.registration, candidates, guesses, workers, advance,
                 finished=blocks.read(), on_block=blocks.write,
             )  # fmt: skip
-            artifacts.save(folder.path / "registered.npz", found)
+            artifacts.save(folder.path / EDGES, Edges.joined([found, edges.select(held_out)]))
             blocks.remove()
-    return artifacts.load(job.path(name) / "registered.npz", Registered)
+    return accepted(job, artifacts.load(job.path(name) / EDGES, Edges))
 
 
-def solve(
-    job: Job,
-    number: int,
-    source: Source,
-    candidates: Candidates,
-    registered: Registered,
-    start: Floats,
-    measured: ViewGraph,
-) -> Round:
+def solve(job: Job, number: int, source: Source, registered: Edges, start: Floats, measured: ViewGraph) -> Round:
     """Round `number`: the accepted and the measured edges, and the poses consistent with them from `start`."""
     name, options = f"solve-{number}", (job.recipe.acceptance, job.recipe.solver)
-    reasons = rejections(job, registered)
-    accepted = reasons == ""
-    graph = joined([registered.select(accepted).as_graph(vertex_ids(source), candidates.source[accepted]), measured])
+    edges, ids = Edges.joined([registered, Edges.measured(measured)]), vertex_ids(source)
     with job.stage(name, f"solve, round {number}", 1, options, (f"register-{number}",)) as (folder, advance):
         if not folder.finished:
-            solution = job.recipe.solver.solve(graph, start)
-            artifacts.save_solution(folder.path / "solution.npz", solution)
+            solution = job.recipe.solver.solve(edges.select(edges.counts).as_graph(ids), start)
+            save_round(folder.path, edges, ids, solution)
             for note in solution.notes:
                 job.note(f"round {number}: {note}")
             advance(1)
-    solution = artifacts.load_solution(job.path(name) / "solution.npz")
-    rejected = candidates.pairs[~accepted], reasons[~accepted]
-    return Round(graph, solution.world_from_cam, candidates, registered, solution, *rejected)
+    return load_round(job.path(name))
+
+
+def save_round(folder: Path, edges: Edges, vertex_ids: NDArray[np.generic], solution: Solution) -> None:
+    """Write what a solve found: its poses, and its edges with their weights and residuals."""
+    artifacts.save_solution(folder / "solution.npz", solution)
+    solved = with_residuals(edges, solution.world_from_cam, solution.weights)
+    artifacts.save_edges(folder / EDGES, solved, vertex_ids)
+
+
+def load_round(folder: Path) -> Round:
+    """The round that `save_round` wrote."""
+    solution = artifacts.load_solution(folder / "solution.npz")
+    return Round(*artifacts.load_edges(folder / EDGES), solution.world_from_cam, solution)
 
 
 def vertex_ids(source: Source) -> NDArray[np.generic]:
@@ -187,12 +188,10 @@ def judge_edges(job: Job, last: Round, number: int) -> Round:
     """Round `number`, the last, with the verdict of the diagnosis on each of its edges."""
     with job.stage("diagnose", "diagnosis", 1, job.recipe.diagnosis, (f"solve-{number}",)) as (folder, advance):
         if not folder.finished:
-            found = diagnose(last.graph, job.recipe.diagnosis)
-            artifacts.save(folder.path / "graph.npz", replace(last.graph, priors=None))
-            verdicts = Verdicts(found.verdict, found.probability, np.array(found.reason, dtype=np.str_))
-            artifacts.save(folder.path / "verdicts.npz", verdicts)
+            judged = diagnose(last.graph, job.recipe.diagnosis).put_into(last.edges)
+            artifacts.save_edges(folder.path / EDGES, judged, last.vertex_ids)
             advance(1)
-    return replace(last, verdicts=artifacts.load(job.path("diagnose") / "verdicts.npz", Verdicts))
+    return replace(last, edges=artifacts.load_edges(job.path("diagnose") / EDGES)[0])
 
 
 def fuse(job: Job, frames: Sequence[Frame], world_from_cam: Floats, number: int) -> dict[str, Path]:

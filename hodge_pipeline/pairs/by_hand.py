@@ -3,45 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline import steps
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.pairs.edits import DISABLED, ENABLED, REGISTERED, History, joining, read_history, vertex_rows
-from hodge_pipeline.pairs.more import MoreRound, Placed, register_more, with_more
-from hodge_pipeline.registration.acceptance import rejections
-from hodge_pipeline.registration.pairs import Registered
+from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, History, joining, read_history, vertex_rows
+from hodge_pipeline.pairs.more import MoreRound, Placed, register_more
+from hodge_pipeline.registration.acceptance import accepted
 from hodge_pipeline.rounds import Round
-from hodge_pipeline.sources.measured_edges import joined
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.start.unordered.pieces import laid_apart
-from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import Job
-from hodge_pipeline.types import Bools, Candidates, CloudSet, Floats, Source, ViewGraph
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Source, ViewGraph
+from hodge_pipeline.types.edges import DISABLED, HELD_OUT, REJECTED, USED
 
 ARM_M = 1.0
 """A residual rotation counts as its arc at this distance."""
 BY_HAND = "by_hand"
 NEXT = "hodge edit --list shows them, hodge edit --undo takes the last back"
-
-
-@dataclass(frozen=True)
-class _Edges:
-    """Every edge of a round and every pair that is none: `reasons (E,)` why, empty where it is one; `disabled (E,)`."""
-
-    graph: ViewGraph
-    reasons: NDArray[np.str_]
-    chosen: Bools
-    disabled: Bools
-
-    @property
-    def kept(self) -> ViewGraph:
-        """The edges that count."""
-        return self.graph.select(self.chosen & ~self.disabled)
 
 
 def edited_rounds(
@@ -55,33 +39,33 @@ def edited_rounds(
     """
     number, last = len(rounds), rounds[-1]
     history = read_history(job.workspace.folder)
-    if not history.switches or last.candidates is None or last.registered is None:
+    if not history.switches:
         return
-    edges = _edited(job, last.candidates, last.registered, measured, history)
-    candidates, registered, new = last.candidates, last.registered, last.registered.select(np.zeros(0, np.int64))
-    before, inputs = last.world_from_cam, [f"register-{number - 1}", f"solve-{number - 1}"]
+    ids, registered, before = last.vertex_ids, last.registered(measured), last.world_from_cam
+    edges, new = _edited(job, registered, measured, history), Edges.of([])
+    inputs: tuple[str, ...] = (f"register-{number - 1}", f"solve-{number - 1}")
     if history.registered:
-        placed = _placed(job, edges.kept)
-        before, pairs = placed.world_from_cam, vertex_rows(measured.vertex_ids, history.registered)
-        new = register_more(job, number, "registration, by hand", source, pairs, placed, workers, tuple(inputs))
-        candidates, registered = with_more(candidates, new.pairs, BY_HAND), Registered.joined([registered, new])
-        edges = _edited(job, candidates, registered, measured, history)
-        inputs.append(f"register-{number}")
-    _tell(job, edges, history)
-    graph, off = edges.graph.select(edges.chosen), edges.disabled[edges.chosen]
+        placed = _placed(job, edges.select(edges.counts).as_graph(ids))
+        before, pairs = placed.world_from_cam, vertex_rows(ids, history.registered)
+        title = "registration, by hand"
+        new = register_more(job, number, title, BY_HAND, source, pairs, placed, workers, inputs)
+        edges = _edited(job, Edges.joined([registered, new]), measured, history)
+        new = edges.select(np.arange(len(registered), len(registered) + len(new)))
+        inputs = (*inputs, f"register-{number}")
+    _tell(job, edges.select(edges.status != HELD_OUT), ids, history)
     options = (job.recipe.solver, history.switches)
-    with job.stage(f"solve-{number}", "solve, edited", 1, options, tuple(inputs)) as (folder, advance):
+    with job.stage(f"solve-{number}", "solve, edited", 1, options, inputs) as (folder, advance):
         if not folder.finished:
-            solution = job.recipe.solver.solve(edges.kept, _start(job, edges.kept, rounds))
-            weights = np.zeros(graph.edge_count)
-            weights[~off] = solution.weights
-            artifacts.save_solution(folder.path / "solution.npz", replace(solution, weights=weights))
+            kept = edges.select(edges.counts).as_graph(ids)
+            solution = job.recipe.solver.solve(kept, _start(job, kept, rounds))
+            weights = np.zeros(len(edges))
+            weights[edges.counts] = solution.weights
+            solution = replace(solution, weights=weights[edges.in_graph])
+            steps.save_round(folder.path, edges, ids, solution)
             for note in solution.notes:
                 job.note(f"edited: {note}")
             advance(1)
-    solution = artifacts.load_solution(job.path(f"solve-{number}") / "solution.npz")
-    rejected = edges.graph.edges[~edges.chosen], edges.reasons[~edges.chosen]
-    edited = Round(graph, solution.world_from_cam, candidates, registered, solution, *rejected, disabled=off)
+    edited = replace(steps.load_round(job.path(f"solve-{number}")), edited=True)
     yield MoreRound(edited, new, before)
 
 
@@ -107,30 +91,30 @@ def _start(job: Job, graph: ViewGraph, rounds: Sequence[Round]) -> Floats:
     return min(reversed(rounds), key=distance).world_from_cam
 
 
-def _edited(job: Job, candidates: Candidates, registered: Registered, measured: ViewGraph, history: History) -> _Edges:
-    graph = joined([registered.as_graph(measured.vertex_ids, candidates.source), measured])
-    reasons = rejections(job, registered)
-    reasons = np.concatenate([reasons, np.full(measured.edge_count, "", reasons.dtype)])
-    chosen = (reasons == "") | _any_joining(graph, history.enabled)
-    return _Edges(graph, reasons, chosen, _any_joining(graph, history.disabled))
+def _edited(job: Job, registered: Edges, measured: ViewGraph, history: History) -> Edges:
+    """Every pair of a round as its acceptance and then the edits have it."""
+    edges = Edges.joined([accepted(job, registered), Edges.measured(measured)])
+    let_in = (edges.status == REJECTED) & _any_joining(edges, measured.vertex_ids, history.enabled)
+    edges = edges.put(let_in, status=USED, why="")
+    off = edges.in_graph & _any_joining(edges, measured.vertex_ids, history.disabled)
+    return edges.put(off, status=DISABLED)
 
 
-def _any_joining(graph: ViewGraph, pairs: tuple[str, ...]) -> Bools:
-    found = np.zeros(graph.edge_count, bool)
+def _any_joining(edges: Edges, vertex_ids: NDArray[np.generic], pairs: tuple[str, ...]) -> Bools:
+    found = np.zeros(len(edges), bool)
     for pair in pairs:
-        found |= joining(graph, pair)
+        found |= joining(vertex_ids, edges.pairs, pair)
     return found
 
 
-def _tell(job: Job, edges: _Edges, history: History) -> None:
+def _tell(job: Job, edges: Edges, vertex_ids: NDArray[np.generic], history: History) -> None:
     for word in (DISABLED, ENABLED, REGISTERED):
         if pairs := [pair for pair, switch in history.switches.items() if switch == word]:
             job.note(f"edited by hand: {word} {', '.join(pairs)} ({NEXT})")
-    found = {pair: joining(edges.graph, pair) for pair in history.switches}
+    found = {pair: joining(vertex_ids, edges.pairs, pair) for pair in history.switches}
     if lost := [pair for pair, rows in found.items() if not rows.any()]:
         job.note(f"edits without effect, since the last round has no such edge: {', '.join(lost)}")
     for pair in history.registered:
-        rows = found[pair]
-        if rows.any() and not edges.chosen[rows].any():
-            reason = edges.reasons[rows][-1]
-            job.note(f"{pair} was registered and rejected, {reason}: --enable {pair} lets it in all the same")
+        rows = edges.select(found[pair])
+        if len(rows) and not rows.in_graph.any():
+            job.note(f"{pair} was registered and rejected, {rows.why[-1]}: --enable {pair} lets it in all the same")

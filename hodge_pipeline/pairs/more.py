@@ -10,7 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
-from hodge_pipeline.registration.pairs import Registered, register_pairs
+from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.rounds import Round
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.start.unordered.hypotheses import weigh
@@ -18,7 +18,7 @@ from hodge_pipeline.start.unordered.start import uses_images
 from hodge_pipeline.start.unordered.views import Views
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import Job
-from hodge_pipeline.types import Bools, Candidates, CloudSet, Floats, Ints, Source
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class MoreRound:
     """
 
     round: Round
-    registered: Registered
+    registered: Edges
     before: Floats
 
 
@@ -44,26 +44,17 @@ class Placed:
         return np.asarray(self.piece[pairs[:, 0]] != self.piece[pairs[:, 1]])
 
 
-def with_more(candidates: Candidates, pairs: Ints, source: str) -> Candidates:
-    """The candidates with more pairs at the end."""
-    count = len(pairs)
-    return Candidates(
-        np.concatenate([candidates.pairs, pairs]),
-        np.concatenate([candidates.source, np.full(count, source)]),
-        np.concatenate([candidates.overlap, np.full(count, np.nan)]),
-    )
-
-
 def register_more(
     job: Job,
     number: int,
     title: str,
+    proposed_by: str,
     source: Source,
     pairs: Ints,
     placed: Placed,
     workers: Workers,
     inputs: tuple[str, ...],
-) -> Registered:
+) -> Edges:
     """Stage `register-<number>`: the pairs (P, 2) registered as the recipe says, those of one piece first.
 
     A pair between two pieces is matched as by the recipe's `global_start`, then registered from the match; without a
@@ -76,15 +67,17 @@ def register_more(
         if not folder.finished:
             i, j = near.T
             guesses = se3.inverse(placed.world_from_cam[i]) @ placed.world_from_cam[j]
-            found = [register_pairs(job.path("clouds"), job.recipe.registration, near, guesses, workers, advance)]
+            clouds, registrar = job.path("clouds"), job.recipe.registration
+            found = [register_pairs(clouds, registrar, Edges.of(near), guesses, workers, advance)]
             if len(far):
                 found.append(_without_guess(job, source, far, folder.path / "scratch", workers))
                 advance(len(far))
-            artifacts.save(folder.path / "registered.npz", Registered.joined(found))
-    return artifacts.load(job.path(f"register-{number}") / "registered.npz", Registered)
+            table = Edges.joined(found).put(slice(None), proposed_by=proposed_by)
+            artifacts.save(folder.path / "edges.npz", table)
+    return artifacts.load(job.path(f"register-{number}") / "edges.npz", Edges)
 
 
-def _without_guess(job: Job, source: Source, pairs: Ints, scratch: Path, workers: Workers) -> Registered:
+def _without_guess(job: Job, source: Source, pairs: Ints, scratch: Path, workers: Workers) -> Edges:
     """Those of the pairs (P, 2) whose match is good enough to be judged with the other edges."""
     options, folder = job.recipe.global_start, job.path("clouds")
     by_image = uses_images(CloudSet.open(folder), options)

@@ -17,12 +17,11 @@ from hodge_pipeline.recipe import binding, yaml_file
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge_parts
 from hodge_pipeline.recording.recorder import APPLICATION, Recorder
-from hodge_pipeline.registration.acceptance import rejections
-from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.rounds import Round, has_truth, pose_sets, true_poses
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import RECORDING, Job, Unfinished, log
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Ints, Source
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source
+from hodge_pipeline.types.edges import HELD_OUT
 
 FILE = "recording.rrd"
 Notes = tuple[str, ...]
@@ -70,15 +69,15 @@ class Recording:
             first.name, (first.name,), lambda to: to.poses(first.name, first.world_from_cam, self._source.frames)
         )
 
-    def registration(self, number: int, registered: Registered, before: Floats, clouds: CloudSet) -> None:
+    def registration(self, number: int, registered: Edges, before: Floats, clouds: CloudSet) -> None:
         """What registration found in outer round `number`, from the poses before it."""
+        registered = registered.select(registered.status != HELD_OUT)
         i, j = registered.pairs.T
         guesses = se3.inverse(before[i]) @ before[j]
-        reasons = rejections(self._job, registered)
         self._part(
             f"registration-{number}",
             (f"register-{number}",),
-            lambda to: to.registration(number, registered, reasons, guesses, clouds),
+            lambda to: to.registration(number, registered, guesses, clouds),
             self._job.recipe.acceptance,
         )
 
@@ -90,15 +89,13 @@ class Recording:
 
     def diagnosis(self, last: Round) -> None:
         """The last round's edges with the verdict on each."""
-        verdicts = last.verdicts
-        if verdicts is not None:
-            self._rounds[-1] = last
-            graph, poses = last.graph, last.world_from_cam
-            self._part(
-                "diagnosis",
-                ("diagnose",),
-                lambda to: to.diagnosis(graph, poses, verdicts.verdict, verdicts.probability, verdicts.reason),
-            )
+        self._rounds[-1] = last
+        edges = last.graph_edges
+        self._part(
+            "diagnosis",
+            ("diagnose",),
+            lambda to: to.diagnosis(last.graph, last.world_from_cam, edges.verdict, edges.probability, edges.why),
+        )
 
     def scores(self, scores: ScoreTable | None) -> None:
         """The errors of the frames and the score tables."""
@@ -182,9 +179,8 @@ def _record_truth(recorder: Recorder, source: Source, rounds: Sequence[Round]) -
 def _record_round(recorder: Recorder, source: Source, rounds: Sequence[Round], number: int) -> Notes:
     before, this = rounds[number - 1], rounds[number]
     assert this.solution is not None
-    rejected = Candidates(this.rejected_pairs, this.rejected_reasons, np.full(len(this.rejected_pairs), np.nan))
     first = sum(1 + len(one.solution.history) for one in rounds[1:number] if one.solution is not None)
-    return recorder.edges(number, this.graph, before.world_from_cam, rejected=rejected) + recorder.solution(
+    return recorder.edges(number, this.graph, before.world_from_cam, rejected=this.rejected) + recorder.solution(
         number, this.graph, before.world_from_cam, this.solution, source.frames, first_iteration=first
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.types import Bools, Candidates
+from hodge_pipeline.types import Bools, Edges
 
 MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
@@ -27,7 +27,7 @@ class GuardOptions:
     force: bool = Field(default=False, description="write the result even where it is worse by its own measures")
 
 
-def is_held_out(candidates: Candidates, share: float, seed: int) -> Bools:
+def is_held_out(candidates: Edges, share: float, seed: int) -> Bools:
     """Where (P,) a pair is kept out: a share of those that no sequence needs, the same ones in every round.
 
     Of few pairs a larger share is kept out, up to `LARGEST_SHARE`: one or two pairs would judge nothing.
@@ -36,7 +36,7 @@ def is_held_out(candidates: Candidates, share: float, seed: int) -> Bools:
     key = (mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(7))) + np.uint64(seed) * MIXERS[2]
     key = (key ^ (key >> np.uint64(29))) * MIXERS[2]
     drawn = (key >> np.uint64(11)).astype(float) / float(1 << 53)
-    needed = np.array(["sequential" in str(source).split("+") for source in candidates.source], bool)
+    needed = np.array(["sequential" in str(source).split("+") for source in candidates.proposed_by], bool)
     optional = ~needed.reshape(drawn.shape)
     wanted = min(LARGEST_SHARE, FEWEST / max(1, int(optional.sum())))
     return np.asarray((drawn < max(share, wanted)) & optional)

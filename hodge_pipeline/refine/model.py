@@ -11,7 +11,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.refine.guard import Change, Decision, Measure, decide
-from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, joined_graphs, no_depth_edges
+from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, no_depth_edges
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
 from hodge_pipeline.refine.model_stages import NOTES, ModelStages, measured_edges
@@ -20,7 +20,7 @@ from hodge_pipeline.refine.scale import Scale, metric_scale
 from hodge_pipeline.refine.uncertainty import SIGMAS
 from hodge_pipeline.stages import TrackedModel, Workers
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import Floats
+from hodge_pipeline.types import Floats, ViewGraph
 
 ADJUSTMENTS = 2
 """Rounds of merging points and bundle adjustment: what the first brings together the second can merge."""
@@ -97,7 +97,7 @@ def _refine(
     nothing = np.zeros((2, 0))
     measured, left_out = measured_edges(start, stages)
     depth = depth_edges(start, options, stages, workers) if is_metric else no_depth_edges(start)
-    graph = joined_graphs(measured, depth.graph)
+    graph = ViewGraph.joined([measured, depth.graph])
     notes = (*left_out, *depth.notes)
     if not graph.edge_count:
         return _Found(start, start, None, np.full((1, 2), np.nan), nothing, (*notes, NO_EDGE))

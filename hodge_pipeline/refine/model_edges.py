@@ -14,10 +14,10 @@ from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_stages import NOTES, ModelStages
 from hodge_pipeline.registration.block_store import BlockStore
 from hodge_pipeline.registration.clouds import prepare_clouds
-from hodge_pipeline.registration.pairs import Registered, register_pairs
+from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.stages import TrackedModel, Workers
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, ViewGraph
 
 LEAST_HELD_OUT = 4
 
@@ -50,8 +50,9 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, stages: ModelStag
     between = body[candidates.pairs[:, 0]] != body[candidates.pairs[:, 1]]
     pairs = candidates.pairs[between]
     held = held_out(len(pairs), options.held_out_share, options.seed)
-    chosen = pairs[~held]
-    guesses = se3.inverse(poses[chosen[:, 0]]) @ poses[chosen[:, 1]]
+    chosen = Edges.of(pairs[~held], "depth")
+    i, j = chosen.pairs.T
+    guesses = se3.inverse(poses[i]) @ poses[j]
     registered = _registered(clouds, chosen, guesses, options, stages, workers)
     reasons = options.acceptance.reasons(registered)
     notes = (
@@ -60,7 +61,7 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, stages: ModelStag
     )
     accepted = registered.select(reasons == "")
     names = np.array([str(frame.frame_id) for frame in frames])
-    graph = accepted.as_graph(names, np.full(len(accepted.pairs), "depth"))
+    graph = accepted.as_graph(names)
     return DepthEdges(_between_bodies(model, graph, images), pairs[held], images, clouds, notes)
 
 
@@ -75,18 +76,18 @@ def _clouds(frames: Sequence[Frame], options: ModelRefinement, stages: ModelStag
 
 
 def _registered(
-    clouds: Path, pairs: Ints, guesses: Floats, options: ModelRefinement, stages: ModelStages, workers: Workers
-) -> Registered:
+    clouds: Path, edges: Edges, guesses: Floats, options: ModelRefinement, stages: ModelStages, workers: Workers
+) -> Edges:
     """The pairs registered; what was stopped goes on at its last block."""
     with stages.stage("registered") as folder:
         if not folder.finished:
             blocks = BlockStore(folder.path / "blocks")
             found = register_pairs(
-                clouds, options.registration, pairs, guesses, workers, finished=blocks.read(), on_block=blocks.write
+                clouds, options.registration, edges, guesses, workers, finished=blocks.read(), on_block=blocks.write
             )
-            artifacts.save(folder.path / "registered.npz", found)
+            artifacts.save(folder.path / "edges.npz", found)
             blocks.remove()
-    return artifacts.load(stages.path("registered") / "registered.npz", Registered)
+    return artifacts.load(stages.path("registered") / "edges.npz", Edges)
 
 
 def held_out(count: int, share: float, seed: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -110,20 +111,6 @@ def no_depth_edges(model: TrackedModel) -> DepthEdges:
     none = np.zeros((0, 2), np.int64)
     graph = ViewGraph.from_edges(np.array(model.body_names), none, np.zeros((0, 4, 4)))
     return DepthEdges(graph, none, none[:, 0], None, ())
-
-
-def joined_graphs(first: ViewGraph, second: ViewGraph) -> ViewGraph:
-    """The edges of both, over the same vertices."""
-    return replace(
-        first,
-        edges=np.concatenate([first.edges, second.edges]),
-        i_from_j=np.concatenate([first.i_from_j, second.i_from_j]),
-        information=np.concatenate([first.information, second.information]),
-        fitness=np.concatenate([first.fitness, second.fitness]),
-        rmse_m=np.concatenate([first.rmse_m, second.rmse_m]),
-        source=np.concatenate([first.source, second.source]),
-        correspondences=np.concatenate([first.correspondences, second.correspondences]),
-    )
 
 
 def _between_bodies(model: TrackedModel, graph: ViewGraph, images: Ints) -> ViewGraph:

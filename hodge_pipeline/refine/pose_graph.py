@@ -100,7 +100,7 @@ def disabled_edges(graph: ViewGraph, pairs: Sequence[str]) -> Bools:
     """
     found = np.zeros(graph.edge_count, bool)
     for pair in pairs:
-        hit = joining(graph, pair)
+        hit = joining(graph.vertex_ids, graph.edges, pair)
         if not hit.any():
             raise GraphError(
                 f"--disable {pair}: no edge joins these vertices: give two vertex ids of the file, as 12-87"

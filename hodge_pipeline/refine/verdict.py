@@ -20,10 +20,10 @@ from hodge_pipeline.report.contents import MeasureRow, RefinementSummary
 from hodge_pipeline.rounds import Round
 from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.stages import Workers
-from hodge_pipeline.steps import HELD_OUT
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import Job
-from hodge_pipeline.types import Candidates, Floats, Ints, Source, Trajectory
+from hodge_pipeline.types import Floats, Ints, Source, Trajectory
+from hodge_pipeline.types.edges import HELD_OUT
 
 CHI2_TOLERANCE = 0.02
 """Of the start's: the solver minimises a robust cost, not this one."""
@@ -86,7 +86,7 @@ def _decision(job: Job, rounds: Sequence[Round], before: Floats) -> Decision:
     if joined < LEAST_JOINED * last.graph.vertex_count:
         found = f"{joined} of {last.graph.vertex_count} key frames overlap with another one"
         return Decision("nothing", f"under the given poses only {found}: are they the poses of these frames?")
-    measures = [*_held_out(job, len(rounds) - 1, before, last.world_from_cam)]
+    measures = [*_held_out(job, rounds, before)]
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
     measures.append(chi2_measure(*chi2))
     moved = change(last.graph, last.solution, before)
@@ -100,14 +100,14 @@ def chi2_measure(before: float, after: float) -> Measure:
     return Measure("edge chi2, mean", before, after, tolerance=CHI2_TOLERANCE * before)
 
 
-def _held_out(job: Job, rounds: int, before: Floats, after: Floats) -> list[Measure]:
+def _held_out(job: Job, rounds: Sequence[Round], before: Floats) -> list[Measure]:
     """The score of the pairs kept out of every round; its tolerance is its own standard error."""
-    pairs = held_out_pairs(job)
+    pairs, after = held_out_pairs(rounds), rounds[-1].world_from_cam
     if not len(pairs):
         job.note("no overlapping pair was left to judge the result by: only the edges' own chi2 does")
         return []
     edges = (f"edges-{number}" for number in range(1, job.recipe.outer_iterations + 1))
-    inputs = ("clouds", f"solve-{rounds}", *edges)
+    inputs = ("clouds", f"solve-{len(rounds) - 1}", *edges)
     with job.stage("guard", "guard", 1, job.recipe.guard, inputs) as (folder, advance):
         if not folder.finished:
             with job.recipe.executor.open() as workers:
@@ -128,14 +128,13 @@ def _distances(job: Job, pairs: Ints, before: Floats, after: Floats, workers: Wo
     return edge_distances(job.path("clouds"), pairs, np.stack([before, after]), workers)
 
 
-def held_out_pairs(job: Job) -> Ints:
-    """The pairs (P, 2) that any round proposed and kept out, and that are not among the last round's edges."""
-    rounds = job.recipe.outer_iterations
-    files = [job.path(f"edges-{number}") / HELD_OUT for number in range(1, rounds + 1)]
-    kept = [artifacts.load(file, Candidates).pairs for file in files if file.is_file()]
-    pairs = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *kept]), axis=0)
-    solved = artifacts.load(job.path(f"edges-{rounds}") / "candidates.npz", Candidates).pairs
-    return np.array(sorted(set(map(tuple, pairs.tolist())) - set(map(tuple, solved.tolist()))), np.int64).reshape(-1, 2)
+def held_out_pairs(rounds: Sequence[Round]) -> Ints:
+    """The pairs (P, 2) that any round proposed and kept out, and that the last one did not register all the same."""
+    kept = [one.edges.pairs[one.edges.status == HELD_OUT].tolist() for one in rounds]
+    last = rounds[-1].edges
+    found = {tuple(pair) for pairs in kept for pair in pairs}
+    found -= set(map(tuple, last.pairs[last.status != HELD_OUT].tolist()))
+    return np.array(sorted(found), np.int64).reshape(-1, 2)
 
 
 def _spread(given: Given, times: Floats, poses: Floats, key_after: Floats) -> Floats:

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import Job
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Bools, Edges, Floats, Ints
+from hodge_pipeline.types.edges import HELD_OUT, REJECTED, USED
 
 ARM_M = 1.0
 """A rotation counts as the displacement that it causes at this distance."""
@@ -18,7 +18,14 @@ LEAST_WAY_M = 0.05
 """Added to every way: frames of a camera at rest differ by what a registration errs."""
 
 
-def rejections(job: Job, registered: Registered) -> NDArray[np.str_]:
+def accepted(job: Job, edges: Edges) -> Edges:
+    """The table with `status` and `why` of every registered pair: used, or rejected; those held out stay so."""
+    rows = np.flatnonzero(edges.status != HELD_OUT)
+    reasons = _rejections(job, edges.select(rows))
+    return edges.put(rows, status=np.where(reasons == "", USED, REJECTED), why=reasons)
+
+
+def _rejections(job: Job, registered: Edges) -> NDArray[np.str_]:
     """Why each pair (P,) is no edge, an empty word where it is one."""
     reasons = job.recipe.acceptance.reasons(registered)
     odometry = _odometry(job)
@@ -29,7 +36,7 @@ def rejections(job: Job, registered: Registered) -> NDArray[np.str_]:
     return reasons
 
 
-def strays(registered: Registered, world_from_cam: Floats, part: Ints, max_drift: float, scale: float = 1.0) -> Bools:
+def strays(registered: Edges, world_from_cam: Floats, part: Ints, max_drift: float, scale: float = 1.0) -> Bools:
     """Where (P,) a pair contradicts odometry, poses (N, 4, 4), by more than this share of the way between its frames.
 
     Odometry knows nothing of a pair across two parts (N,) that it left apart. Lengths are multiplied by `scale`.
@@ -50,7 +57,7 @@ def _odometry(job: Job) -> tuple[Floats, Ints] | None:
         return job.tracked.world_from_key, job.tracked.piece
     folder = job.path("odometry")
     poses = artifacts.load_arrays(folder / "poses.npz")["world_from_cam"]
-    return poses, connected_components(artifacts.load(folder / "steps.npz", Registered).pairs, len(poses))
+    return poses, connected_components(artifacts.load(folder / "steps.npz", Edges).pairs, len(poses))
 
 
 def _lengths(motions: Floats, arm_m: float) -> Floats:

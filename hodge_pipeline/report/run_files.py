@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -29,15 +27,11 @@ from hodge_pipeline.report.contents import (
 from hodge_pipeline.report.sides import four_sides, worst_pairs
 from hodge_pipeline.report.summary import graph_summary, trajectory_rows, worst_edges
 from hodge_pipeline.report.write import write_report
-from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.store import artifacts
+from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.job import Job, versions
-from hodge_pipeline.types import CloudSet, Floats, Ints, Solution, Source, Trajectory, ViewGraph
-
-EDGE_COLUMNS = (
-    "i", "j", "source", "status", "fitness", "rmse_m", "correspondences", "weight", "residual_m", "residual_deg",
-    "verdict", "probability", "why",
-)  # fmt: skip
+from hodge_pipeline.types import CloudSet, Floats, Ints, Solution, Source, Trajectory
 
 
 def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
@@ -59,56 +53,7 @@ def write_graph(folder: Path, source: Source, last: Round) -> None:
     trajectory = Trajectory(np.arange(graph.vertex_count, dtype=float), last.world_from_cam)
     whole = Source(source.name, source.path, trajectory=trajectory, graph=numbered)
     registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)
-    weights = np.ones(graph.edge_count) if last.solution is None else last.solution.weights
-    rejected = [
-        [graph.vertex_ids[i], graph.vertex_ids[j], reason, "rejected", *[""] * 9]
-        for (i, j), reason in zip(last.rejected_pairs, last.rejected_reasons, strict=True)
-    ]
-    artifacts.write_text(folder / "edges.csv", edge_table(graph, last.world_from_cam, weights, rejected, last))
-
-
-def edge_table(
-    graph: ViewGraph,
-    world_from_cam: Floats,
-    weights: Floats,
-    rejected: Sequence[Sequence[object]] = (),
-    judged: Round | None = None,
-) -> str:
-    """Every edge with its residual under the poses as CSV, then the pairs that became no edge; the round of a run adds
-    verdicts, and what was switched off by hand.
-    """
-    out = io.StringIO()
-    translation_m, angle_rad = edge_residuals(graph, world_from_cam)
-    table = csv.writer(out, lineterminator="\n")
-    table.writerow(EDGE_COLUMNS)
-    verdicts = None if judged is None else judged.verdicts
-    off = np.zeros(graph.edge_count, bool) if judged is None or judged.disabled is None else judged.disabled
-    for row, (i, j) in enumerate(graph.edges):
-        table.writerow(
-            [
-                graph.vertex_ids[i],
-                graph.vertex_ids[j],
-                graph.source[row],
-                "disabled" if off[row] else "used" if weights[row] > 0 else "ignored",
-                f"{graph.fitness[row]:.4f}",
-                f"{graph.rmse_m[row]:.5f}",
-                graph.correspondences[row],
-                f"{weights[row]:.4f}",
-                f"{translation_m[row]:.6f}",
-                f"{np.rad2deg(angle_rad[row]):.5f}",
-                *_verdict_cells(verdicts, row),
-            ]
-        )
-    table.writerows(rejected)
-    return out.getvalue()
-
-
-def _verdict_cells(verdicts: Verdicts | None, row: int) -> tuple[str, str, str]:
-    if verdicts is None:
-        return "", "", ""
-    probability = verdicts.probability[row]
-    known = "" if np.isnan(probability) else f"{probability:.6g}"
-    return str(verdicts.verdict[row]), known, str(verdicts.reason[row])
+    write_edges(folder / "edges.csv", last.edges, last.vertex_ids)
 
 
 def make_report(
@@ -119,8 +64,7 @@ def make_report(
     sets = pose_sets(rounds)
     assert last.solution is not None
     component = last.solution.component
-    verdict = None if last.verdicts is None else last.verdicts.verdict
-    worst = worst_edges(last.graph, last.world_from_cam, last.solution.weights, verdict=verdict)
+    worst = worst_edges(last.edges, last.vertex_ids)
     return Report(
         title=f"{source.name}",
         before=rounds[0].name,
@@ -138,7 +82,7 @@ def make_report(
         scores=scores,
         trajectories=_trajectories(job, source, sets, component),
         loops=_loop_rows(last.solution),
-        graph=graph_summary(last.graph, component, last.solution.weights, last.rejected_counts, verdict),
+        graph=graph_summary(last.edges, last.vertex_ids, component),
         worst_edges=worst,
         stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in job.costs()),
         notes=tuple(job.notes),
@@ -158,7 +102,7 @@ def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
     """How far the last round moved the positions (root mean square, aligned); None where it is the first to solve, or
     that of edits, which are meant to move them.
     """
-    if len(rounds) < 3 or rounds[-1].disabled is not None:
+    if len(rounds) < 3 or rounds[-1].edited:
         return None
     shift_m = absolute_error(rounds[-2].world_from_cam, rounds[-1].world_from_cam, component).rmse_m
     return float(shift_m) if np.isfinite(shift_m) else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView, free_directions_of, violation
 from hodge_pipeline.registration.global_pairs import Matches
-from hodge_pipeline.registration.pairs import Registered, register_pairs
+from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
 from hodge_pipeline.start.unordered.options import HypothesisLimits
-from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, ViewGraph
 
 POINTS_PROJECTED = 1500
 USUAL_VIOLATIONS = 8.0
@@ -39,7 +39,7 @@ class Hypotheses:
     pairs: Ints
     inliers: Ints
     matches: Ints
-    registered: Registered
+    registered: Edges
     overlap: Floats
     violation: Floats
     free: NDArray[np.str_]
@@ -57,8 +57,7 @@ class Hypotheses:
 
     def as_graph(self, vertex_ids: NDArray[np.generic], source: str) -> ViewGraph:
         """The accepted ones as a viewing graph."""
-        chosen = self.registered.select(self.accepted)
-        return chosen.as_graph(vertex_ids, np.full(len(chosen.pairs), source))
+        return self.registered.select(self.accepted).put(slice(None), proposed_by=source).as_graph(vertex_ids)
 
     @classmethod
     def joined(cls, first: Hypotheses, second: Hypotheses) -> Hypotheses:
@@ -68,7 +67,7 @@ class Hypotheses:
             for field in fields(cls)
             if field.name != "registered"
         }
-        return cls(registered=Registered.joined([first.registered, second.registered]), **columns)
+        return cls(registered=Edges.joined([first.registered, second.registered]), **columns)
 
 
 def weigh(
@@ -90,7 +89,7 @@ def weigh(
     worth = matches.inliers >= limits.min_inliers
     advance(int((~worth).sum()))
     chosen = matches.select(worth)
-    registered = register_pairs(folder, refine, chosen.pairs, chosen.i_from_j, workers, advance)
+    registered = register_pairs(folder, refine, Edges.of(chosen.pairs), chosen.i_from_j, workers, advance)
     sizes = clouds.sizes
     smaller = np.minimum(sizes[chosen.pairs[:, 0]], sizes[chosen.pairs[:, 1]])
     overlap = np.minimum(1.0, registered.fitness * sizes[chosen.pairs[:, 1]] / np.maximum(smaller, 1))
@@ -154,7 +153,7 @@ def _sampled(clouds: CloudSet, row: int) -> Floats:
 def _with_unworthy(
     matches: Matches,
     worth: Bools,
-    registered: Registered,
+    registered: Edges,
     overlap: Floats,
     seen_through: Floats,
     free: NDArray[np.str_],
@@ -163,10 +162,8 @@ def _with_unworthy(
     order = np.argsort(np.concatenate([np.flatnonzero(worth), np.flatnonzero(~worth)]), kind="stable")
     rest = matches.select(~worth)
     count = len(rest)
-    unrefined = Registered(
-        rest.pairs, rest.i_from_j, np.zeros((count, 6, 6)), np.zeros(count), np.full(count, np.nan),
-        np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, bool),
-    )  # fmt: skip
+    none = np.zeros((count, 6, 6))
+    unrefined = replace(Edges.of(rest.pairs), i_from_j=rest.i_from_j, information=none, fitness=np.zeros(count))
 
     def column(values: NDArray[np.generic], other: object) -> NDArray[np.generic]:
         return np.concatenate([values, np.full(count, other)])[order]
@@ -175,7 +172,7 @@ def _with_unworthy(
         pairs=matches.pairs,
         inliers=matches.inliers,
         matches=matches.matches,
-        registered=Registered.joined([registered, unrefined]).select(order),
+        registered=Edges.joined([registered, unrefined]).select(order),
         overlap=column(overlap, np.nan),  # type: ignore[arg-type]
         violation=column(seen_through, np.nan),  # type: ignore[arg-type]
         free=column(free, ""),  # type: ignore[arg-type]

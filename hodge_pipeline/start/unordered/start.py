@@ -14,7 +14,6 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
-from hodge_pipeline.start.unordered.graphs import joined_graph, without_wrong
 from hodge_pipeline.start.unordered.hypotheses import Hypotheses, weigh
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.pieces import laid_apart
@@ -66,11 +65,11 @@ def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Worke
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, not by_image, workers)
     notes.append(_tried(len(rows), pairs, hypotheses))
     measured = hypotheses.as_graph(scene.vertex_ids, "landmarks" if by_image else "features")
-    graph = measured if scene.given is None else joined_graph(scene.given, measured)
+    graph = measured if scene.given is None else ViewGraph.joined([scene.given, measured])
     found = diagnose(graph, options.diagnosis)
     notes += [f"{int((~found.kept).sum())} of {graph.edge_count} edges are distrusted"]
     given = int(found.kept[: graph.edge_count - measured.edge_count].sum())
-    pieces = Pieces(*without_wrong(graph, found))
+    pieces = Pieces.kept(graph, found)
     pieces = unfolded(clouds, pieces, given, views, options.limits, options.diagnosis)
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
