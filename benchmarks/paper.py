@@ -19,7 +19,7 @@ from hodge_pipeline.evaluation.scores import score_table
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.rounds import true_poses
+from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver

@@ -19,7 +19,7 @@ from hodge_pipeline.refine import verdict
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report import run_files
 from hodge_pipeline.report.contents import Report
-from hodge_pipeline.rounds import Round
+from hodge_pipeline.scene import Round
 from hodge_pipeline.start import first_poses, key_frames
 from hodge_pipeline.start.key_frames import Tracked
 from hodge_pipeline.store.job import Job, logging_to

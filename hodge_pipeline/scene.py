@@ -1,15 +1,65 @@
-"""What a run works on: the key frames of a source, their clouds, the first poses, and how all frames follow from them."""
+"""What a run works on and what it finds: key frames, their clouds, how all frames follow from them, and its rounds."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.se3 import spread_correction
-from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, Source
-from hodge_pipeline.rounds import Round, sequences_of
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, Trajectory, ViewGraph
+from hodge_pipeline.types.edges import REJECTED
+
+
+START = "start"
+"""The name of first poses that are not odometry's."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """One outer iteration: every pair that it knows of, and the poses (N, 4, 4) that its edges led to. Round 0 holds
+    the first poses, which `name` tells: odometry, or start where they were given.
+
+    The pairs that a round registered come first in `edges`, then those that came measured. A round is `edited` where a
+    person's edits made it.
+    """
+
+    edges: Edges
+    vertex_ids: NDArray[np.generic]
+    world_from_cam: Floats
+    solution: Solution | None = None
+    edited: bool = False
+    name: str = "odometry"
+
+    @cached_property
+    def graph_edges(self) -> Edges:
+        """The rows that are edges, in the order of `graph`: those that count, and those that are off by hand."""
+        return self.edges.select(self.edges.in_graph)
+
+    @cached_property
+    def graph(self) -> ViewGraph:
+        """The viewing graph."""
+        return self.graph_edges.as_graph(self.vertex_ids)
+
+    @property
+    def rejected(self) -> Edges:
+        """The pairs that were registered and are no edges."""
+        return self.edges.select(self.edges.status == REJECTED)
+
+    @property
+    def rejected_counts(self) -> Mapping[str, int]:
+        """How many pairs were rejected for each reason."""
+        return dict(sorted(Counter(self.rejected.why.tolist()).items()))
+
+    def registered(self, measured: ViewGraph) -> Edges:
+        """The rows without those that came measured."""
+        return self.edges.select(slice(len(self.edges) - measured.edge_count))
 
 
 @dataclass(frozen=True)
@@ -67,17 +117,30 @@ class KeyFrames:
 
 @dataclass(frozen=True)
 class Drift:
-    """What odometry says of the way between two frames: its poses (K, 4, 4), and the part (K,) that it held together."""
+    """What odometry says of the way between two frames: its poses (K, 4, 4), the part (K,) of each that it held together,
+    and the share of the way that it may err by.
+    """
 
     world_from_cam: Floats
     part: Ints
+    largest: float
+
+
+@dataclass(frozen=True)
+class GivenFile:
+    """A file of given poses, what it holds, and the moments (P,) of its poses on the clock of `KeyFrames.times`."""
+
+    path: Path
+    trajectory: Trajectory
+    pose_times: Floats
 
 
 @dataclass(frozen=True)
 class Scene:
     """The whole source, its key frames as a source of their own, their clouds, and the first round: edges and poses.
 
-    `drift`: None where the first poses are not odometry's.
+    `drift`: None where the first poses are not odometry's; `given`: the file that they come from, where there is one;
+    `in_order`: whether frames that follow each other in the source do so in time.
     """
 
     whole: Source
@@ -86,11 +149,19 @@ class Scene:
     clouds: CloudSet
     first: Round
     drift: Drift | None = None
+    is_given: bool = False
+    given: GivenFile | None = None
+    in_order: bool = True
 
 
 def key_source(whole: Source, rows: Ints) -> Source:
     """The frames of these rows alone."""
     return replace(whole, frames=tuple(whole.frames[row] for row in rows))
+
+
+def vertex_ids(source: Source) -> NDArray[np.generic]:
+    """The frames as the source names them: numbers, or words."""
+    return np.array([frame.frame_id for frame in source.frames])
 
 
 def stamps_of(source: Source) -> Floats:
@@ -123,3 +194,29 @@ def _filled(poses: Floats, found: Bools, times: Floats) -> Floats:
     out = poses.copy()
     out[missing] = se3.interpolate(poses[a], poses[b], share)
     return np.asarray(out)
+
+
+def pose_sets(rounds: Sequence[Round]) -> dict[str, Floats]:
+    """The poses by name: odometry (or start), round 1, …, result."""
+    names = [rounds[0].name, *(f"round {number}" for number in range(1, len(rounds) - 1)), "result"]
+    return {name: one.world_from_cam for name, one in zip(names, rounds, strict=True)}
+
+
+def true_poses(source: Source) -> Floats:
+    """The source's own poses (N, 4, 4), NaN where a frame has none."""
+    poses = np.full((len(source.frames), 4, 4), np.nan)
+    for row, frame in enumerate(source.frames):
+        if frame.world_from_cam is not None:
+            poses[row] = frame.world_from_cam
+    return poses
+
+
+def has_truth(source: Source) -> bool:
+    """Whether there are at least two poses of the source's own to compare with."""
+    return sum(frame.world_from_cam is not None for frame in source.frames) > 1
+
+
+def sequences_of(source: Source) -> dict[str, Ints]:
+    """The rows of each sequence, in the order of the source."""
+    names = np.array([frame.sequence for frame in source.frames])
+    return {str(name): np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())}

@@ -20,7 +20,7 @@ from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, frame_blocks, track_block
-from hodge_pipeline.rounds import Round
+from hodge_pipeline.scene import Round
 from hodge_pipeline.start import first_poses as starting
 from hodge_pipeline.start import key_frames as tracked
 from hodge_pipeline.start.key_frames import Tracked, tracking_options

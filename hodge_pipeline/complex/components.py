@@ -12,6 +12,8 @@ from hodge_pipeline.types import Bools, Ints
 
 MOST_PIECES_LISTED = 8
 
+MAX_RUNS_LISTED = 12
+
 
 def connected_components(edges: Ints, vertex_count: int) -> Ints:
     """The component (V,) of each vertex: 0 the largest; of equal ones, that with the first vertex comes first."""
@@ -54,3 +56,13 @@ def describe_components(component: Ints, vertex_ids: NDArray[np.generic]) -> tup
 
 def _describe_piece(number: int, names: NDArray[np.generic]) -> str:
     return f"piece {number}: {len(names)} vertices ({names[0]} … {names[-1]})"
+
+
+def in_runs(rows: Ints, vertex_ids: Ints | np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> str:
+    """Ascending rows in words, `0–120, 124, 130–131`, as the source names their frames."""
+    if not len(rows):
+        return "none"
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    words = [f"{vertex_ids[run[0]]}" + (f"–{vertex_ids[run[-1]]}" if len(run) > 1 else "") for run in runs]
+    more = f", and {len(runs) - MAX_RUNS_LISTED} more" if len(runs) > MAX_RUNS_LISTED else ""
+    return ", ".join(words[:MAX_RUNS_LISTED]) + more

@@ -17,7 +17,7 @@ from hodge_pipeline.recipe import binding, yaml_file
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge_parts
 from hodge_pipeline.recording.recorder import APPLICATION, Recorder
-from hodge_pipeline.rounds import Round, has_truth, pose_sets, true_poses
+from hodge_pipeline.scene import Round, has_truth, pose_sets, true_poses
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.job import RECORDING, Job, Unfinished, log
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source

@@ -17,7 +17,7 @@ from hodge_pipeline.refine.given_poses import Given
 from hodge_pipeline.refine.guard import Decision, Measure, decide
 from hodge_pipeline.refine.uncertainty import change, mean_chi2
 from hodge_pipeline.report.contents import MeasureRow, RefinementSummary
-from hodge_pipeline.rounds import Round
+from hodge_pipeline.scene import Round
 from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.store import artifacts

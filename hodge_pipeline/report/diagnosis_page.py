@@ -16,7 +16,7 @@ from hodge_pipeline.diagnosis.suggestions import Suggestions
 from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle
 from hodge_pipeline.report.page import STYLE
 from hodge_pipeline.report.plots import Plot
-from hodge_pipeline.report.summary import in_runs
+from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.report.tables import Table, number
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 

@@ -27,7 +27,7 @@ from hodge_pipeline.report.contents import (
 from hodge_pipeline.report.sides import four_sides, worst_pairs
 from hodge_pipeline.report.summary import graph_summary, trajectory_rows, worst_edges
 from hodge_pipeline.report.write import write_report
-from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.scene import Round, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.job import Job, versions

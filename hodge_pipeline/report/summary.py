@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
 from hodge_pipeline.report.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow
 from hodge_pipeline.types import Edges, Floats, Ints
@@ -15,7 +16,6 @@ from hodge_pipeline.types.edges import REJECTED, Words
 CENTIMETRES_PER_DEGREE = 1.0
 """How a residual's angle counts beside its translation when edges are ranked: a scene lies about 0.6 m away."""
 
-MAX_RUNS_LISTED = 12
 VERDICTS = ("consistent", "suspect", "wrong", "untestable")
 
 
@@ -98,16 +98,6 @@ def _verdicts(graph: Edges) -> dict[str, int]:
     if not (graph.verdict != "").any():
         return {}
     return {name: int((graph.verdict == name).sum()) for name in VERDICTS}
-
-
-def in_runs(rows: Ints, vertex_ids: Ints | np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> str:
-    """Ascending rows in words, `0–120, 124, 130–131`, as the source names their frames."""
-    if not len(rows):
-        return "none"
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-    words = [f"{vertex_ids[run[0]]}" + (f"–{vertex_ids[run[-1]]}" if len(run) > 1 else "") for run in runs]
-    more = f", and {len(runs) - MAX_RUNS_LISTED} more" if len(runs) > MAX_RUNS_LISTED else ""
-    return ", ".join(words[:MAX_RUNS_LISTED]) + more
 
 
 def worst_edges(edges: Edges, vertex_ids: NDArray[np.generic], count: int = 10) -> tuple[EdgeRow, ...]:

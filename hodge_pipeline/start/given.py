@@ -15,7 +15,7 @@ from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_po
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
-from hodge_pipeline.rounds import START, Round, sequences_of, vertex_ids
+from hodge_pipeline.scene import START, Round, sequences_of, vertex_ids
 from hodge_pipeline.scene import GivenFile, KeyFrames, Scene, key_source, sequence_numbers
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guess_reader

@@ -14,13 +14,13 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.evaluation.trajectory import in_runs
+from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
-from hodge_pipeline.rounds import sequences_of, vertex_ids
+from hodge_pipeline.scene import sequences_of, vertex_ids
 from hodge_pipeline.scene import KeyFrames, Scene, key_source, sequence_numbers, stamps_of
 from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart

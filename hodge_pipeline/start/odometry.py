@@ -14,7 +14,7 @@ from hodge_pipeline.registration import odometry as tracking
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.gaps import has_gap
 from hodge_pipeline.registration.odometry import Odometry, OdometryOptions
-from hodge_pipeline.rounds import Round, sequences_of, vertex_ids
+from hodge_pipeline.scene import Round, sequences_of, vertex_ids
 from hodge_pipeline.scene import Drift, KeyFrames, Scene, key_source
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import landmarks_for, make_clouds

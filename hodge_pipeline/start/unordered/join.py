@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.gaps import has_gap
-from hodge_pipeline.rounds import START, Round, sequences_of, vertex_ids
+from hodge_pipeline.scene import START, Round, sequences_of, vertex_ids
 from hodge_pipeline.scene import KeyFrames, Scene
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import landmarks_for, make_clouds

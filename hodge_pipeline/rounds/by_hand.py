@@ -15,7 +15,7 @@ from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, History, joining, read_history, vertex_rows
 from hodge_pipeline.pairs.more import MoreRound, Placed, register_more
 from hodge_pipeline.registration.acceptance import accepted
-from hodge_pipeline.rounds import Round
+from hodge_pipeline.scene import Round
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.store.job import Job

@@ -25,7 +25,7 @@ from hodge_pipeline.registration import pairs as pair_stage
 from hodge_pipeline.registration.acceptance import accepted
 from hodge_pipeline.registration.block_store import BlockStore
 from hodge_pipeline.registration.gaps import has_gap
-from hodge_pipeline.rounds import Round, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.scene import Round, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.sources.measured_edges import digest, measured_edges, without_measured
 from hodge_pipeline.sources.opening import open_source
 from hodge_pipeline.stages import Workers

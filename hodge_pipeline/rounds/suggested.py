@@ -14,7 +14,7 @@ from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.pairs.more import MoreRound, Placed, register_more
 from hodge_pipeline.refine.verdict import held_out_pairs
 from hodge_pipeline.registration.acceptance import accepted
-from hodge_pipeline.rounds import Round
+from hodge_pipeline.scene import Round
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.store import artifacts

@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.registration.pairs import register_pairs
-from hodge_pipeline.rounds import Round
+from hodge_pipeline.scene import Round
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.start.unordered.hypotheses import weigh
 from hodge_pipeline.start.unordered.start import uses_images

@@ -1,0 +1,146 @@
+"""One round: the pairs of an edge builder, registered from the poses so far, and the poses consistent with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.evaluation.residuals import with_residuals
+from hodge_pipeline.pairs.candidates import merge
+from hodge_pipeline.recipe.schema import Recipe
+from hodge_pipeline.refine.held_out import HeldOut
+from hodge_pipeline.registration.acceptance import accepted
+from hodge_pipeline.registration.block_store import BlockStore
+from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.scene import START, Round, Scene
+from hodge_pipeline.sources.measured_edges import without_measured
+from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Registrar, Step, Steps, Workers
+from hodge_pipeline.start.unordered.tour import propose_along_tour
+from hodge_pipeline.types import CloudSet, Edges, Floats, Source, ViewGraph
+from hodge_pipeline.types.edges import HELD_OUT
+
+
+@dataclass(frozen=True)
+class Work:
+    """What every round of a run needs: `measured` edges join each round's graph as they are."""
+
+    recipe: Recipe
+    steps: Steps
+    scene: Scene
+    measured: ViewGraph
+    workers: Workers
+
+    def propose(self, number: int, before: Round) -> Edges:
+        """The pairs to register in round `number` from the poses of the one before."""
+        scene, recipe = self.scene, self.recipe
+        held_out = HeldOut(recipe.guard.held_out, recipe.seed) if scene.is_given else None
+        proposed = self.steps.step(
+            propose_edges, recipe.edges, scene.source, scene.clouds, before.world_from_cam, self.measured, held_out,
+            scene.in_order, title=f"edges, round {number}",
+        )  # fmt: skip
+        return with_start_edges(proposed, scene.first)
+
+    def register(self, number: int, edges: Edges, world_from_cam: Floats) -> Edges:
+        """The table with its candidates registered from these poses, and accepted or rejected."""
+        registered = self.steps.step(
+            register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam,
+            title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
+        )  # fmt: skip
+        return self.accept(registered)
+
+    def accept(self, edges: Edges) -> Edges:
+        """The table with the status of every registered pair."""
+        scale = self.recipe.scale if isinstance(self.recipe.scale, float) else 1.0
+        return accepted(edges, self.recipe.acceptance, self.scene.drift, scale)
+
+    def solve(self, number: int, registered: Edges, start: Floats) -> Round:
+        """The accepted and the measured edges, and the poses consistent with them from `start`."""
+        edges, ids = Edges.joined([registered, Edges.measured(self.measured)]), self.scene.first.vertex_ids
+        title = f"solve, round {number}"
+        return self.steps.step(solve_edges, edges, ids, self.recipe.solver, start, title, title=title)
+
+    def judge(self, last: Round) -> Round:
+        """The last round, with the verdict of the diagnosis on each of its edges."""
+        return self.steps.step(judge_edges, last, self.recipe.diagnosis, title="diagnosis")
+
+
+def propose_edges(
+    builder: EdgeBuilder,
+    source: Source,
+    clouds: CloudSet,
+    world_from_cam: Floats,
+    measured: ViewGraph,
+    held_out: HeldOut | None,
+    in_order: bool,
+    *,
+    step: Step,
+) -> Edges:
+    """Step: the pairs to register, from the poses so far; measured ones are not registered again.
+
+    Where the run starts from given poses a share of them is kept out, for its guard.
+    """
+    if in_order:
+        candidates = builder.propose(source.frames, clouds, world_from_cam)
+    else:
+        candidates = propose_along_tour(builder, source.frames, clouds, world_from_cam)
+    candidates = without_measured(candidates, measured)
+    return candidates if held_out is None else candidates.put(held_out.of(candidates), status=HELD_OUT)
+
+
+def with_start_edges(candidates: Edges, first: Round) -> Edges:
+    """The candidates, and those edges of the start that join what the candidates leave apart.
+
+    Consecutive frames join nothing here: across a gap they have nothing in common.
+    """
+    if first.name != START:
+        return candidates
+    proven = candidates.pairs[~np.isin(candidates.proposed_by, ("sequential", "nearest"))]
+    component = connected_components(proven, len(first.vertex_ids))
+    joining = component[first.edges.pairs[:, 0]] != component[first.edges.pairs[:, 1]]
+    if not joining.any():
+        return candidates
+    pairs = np.unique(np.sort(first.edges.pairs[joining], axis=1), axis=0)
+    return merge([candidates, Edges.proposed(pairs, START)])[0]
+
+
+def register_edges(
+    edges: Edges, clouds: CloudSet, registrar: Registrar, world_from_cam: Floats, *, workers: Workers, step: Step
+) -> Edges:
+    """Step: the table with its candidates registered from these poses; a killed run goes on at its last block."""
+    assert clouds.folder is not None
+    held_out = edges.status == HELD_OUT
+    candidates = edges.select(~held_out)
+    i, j = candidates.pairs.T
+    guesses = se3.inverse(world_from_cam[i]) @ world_from_cam[j]
+    blocks = BlockStore(step.folder / "blocks")
+    found = register_pairs(
+        clouds.folder, registrar, candidates, guesses, workers, step.advance,
+        finished=blocks.read(), on_block=blocks.write,
+    )  # fmt: skip
+    blocks.remove()
+    return Edges.joined([found, edges.select(held_out)])
+
+
+def solve_edges(
+    edges: Edges, vertex_ids: NDArray[np.generic], solver: ConsistencySolver, start: Floats, name: str, *, step: Step
+) -> Round:
+    """Step: the round of these edges and the poses consistent with them; `name` begins the solver's notes."""
+    solution = solver.solve(edges.select(edges.counts).as_graph(vertex_ids), start)
+    weights = np.zeros(len(edges))
+    weights[edges.counts] = solution.weights
+    solution = replace(solution, weights=weights[edges.in_graph])
+    for note in solution.notes:
+        step.note(f"{name}: {note}")
+    solved = with_residuals(edges, solution.world_from_cam, solution.weights)
+    return Round(solved, vertex_ids, solution.world_from_cam, solution)
+
+
+def judge_edges(last: Round, options: DiagnosisOptions, *, step: Step) -> Round:
+    """Step: the round with the verdict of the diagnosis on each of its edges."""
+    return replace(last, edges=diagnose(last.graph, options).put_into(last.edges))
