@@ -26,6 +26,12 @@ class Document:
     data: dict[str, Any]
     origins: dict[Keys, str]
 
+    def where(self, keys: Keys) -> str:
+        """The origin of a key, or of the nearest key above it that was written."""
+        while keys and keys not in self.origins:
+            keys = keys[:-1]
+        return self.origins[keys]
+
 
 def read(path: Path) -> Document:
     """The mapping in a YAML file. Raises `RecipeError` with file and line."""
@@ -59,9 +65,9 @@ def parse(text: str, name: str) -> Document:
     return Document(data, origins)
 
 
-def parse_value(text: str, name: str) -> Any:
-    """The plain value of an override such as `--set a.b=[1, 2]`."""
-    return parse(f"value: {text}", name).data["value"]
+def parse_value(text: str, name: str) -> Document:
+    """The value of an override such as `--set a.b=[1, 2]`, under the key `value`."""
+    return parse(f"value: {text}", name)
 
 
 def dump(data: dict[str, Any]) -> str:

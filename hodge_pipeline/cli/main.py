@@ -10,6 +10,7 @@ from typing import Annotated, Optional
 import typer
 
 from hodge_pipeline.cli import refining
+from hodge_pipeline.cli.dask_option import Dask
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -82,6 +83,7 @@ def run(
     source: Annotated[Optional[Path], typer.Option(help="What to read; overrides source.path.")] = None,  # noqa: UP045
     overrides: Overrides = None,
     overwrite: Overwrite = False,
+    dask: Dask = None,
     live: Annotated[bool, typer.Option("--live", help="Show the run as it happens in a Rerun viewer.")] = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -89,15 +91,19 @@ def run(
     """Run a recipe on a source: poses, fused model, report and recording in --out."""
     from hodge_pipeline.cli import running
 
-    running.run(recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live)
+    running.run(
+        recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask
+    )
 
 
 @app.command()
-def demo(out: Out, overrides: Overrides = None, overwrite: Overwrite = False, quiet: Quiet = False) -> None:
+def demo(
+    out: Out, overrides: Overrides = None, overwrite: Overwrite = False, dask: Dask = None, quiet: Quiet = False
+) -> None:
     """Make a furnished room with Kinect-like noise and run the recipe `demo` on it."""
     from hodge_pipeline.cli import running
 
-    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet)
+    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet, dask=dask)
 
 
 @app.command()
@@ -128,6 +134,7 @@ def solve(
         Optional[Path],  # noqa: UP045
         typer.Option("--run", help="Folder for report, edges and recording."),
     ] = None,
+    dask: Dask = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -143,7 +150,7 @@ def solve(
         certificate=certificate,
         sesync_units=sesync_units,
     )
-    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json)
+    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json, dask=dask)
 
 
 @app.command()

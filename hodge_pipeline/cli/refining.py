@@ -7,6 +7,8 @@ from typing import Annotated, Optional
 
 import typer
 
+from hodge_pipeline.cli.dask_option import Dask
+
 HELP = """Make the poses of COLMAP or SLAM better, in their own format.
 
 The result is measured before it is written: where it is worse by its own measures the input is given back byte for
@@ -44,6 +46,7 @@ def trajectory(
         Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
         typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe."),
     ] = None,
+    dask: Dask = None,
     overwrite: Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
@@ -52,7 +55,17 @@ def trajectory(
     from hodge_pipeline.cli import refining_trajectory
 
     refining_trajectory.refine(
-        poses, frames, out, match, recipe, overrides or [], force=force, overwrite=overwrite, quiet=quiet, as_json=json
+        poses,
+        frames,
+        out,
+        match,
+        recipe,
+        overrides or [],
+        force=force,
+        overwrite=overwrite,
+        quiet=quiet,
+        as_json=json,
+        dask=dask,
     )
 
 
@@ -88,6 +101,7 @@ def colmap(
         Optional[list[str]],  # noqa: UP045
         typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe colmap-refine."),
     ] = None,
+    dask: Dask = None,
     overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
@@ -108,4 +122,5 @@ def colmap(
         overwrite=overwrite,
         quiet=quiet,
         as_json=json,
+        dask=dask,
     )
