@@ -9,16 +9,20 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
 from hodge_pipeline import yaml_file
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.errors import RecipeError, WorkerError
+from hodge_pipeline.errors import RecipeError, WorkerError, WorkspaceError
+from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.pipeline import Run, solve_again
 from hodge_pipeline.recipe import load_recipe
 from hodge_pipeline.refine.model_options import load_model_refinement
+from hodge_pipeline.registration.global_pairs import describe_clouds
+from hodge_pipeline.registration.global_registrars import FpfhConsensus
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
@@ -165,3 +169,29 @@ def test_a_run_goes_on_with_or_without_the_cluster(run_folder: Path, made: Run) 
     shutil.rmtree(run_folder / "stages" / "register-1")
     local = hodge_pipeline.run(again, run_folder)
     assert (local.result.world_from_cam == made.result.world_from_cam).all()
+
+
+@pytest.mark.parametrize("name", ["log.txt", "stages", "stages/clouds", "stages/solve-1/solution.npz"])
+def test_a_link_in_a_run_folder_is_not_written_through(run_folder: Path, tmp_path: Path, name: str) -> None:
+    theirs = run_folder / name
+    elsewhere = tmp_path / "elsewhere"
+    theirs.rename(elsewhere)
+    theirs.symlink_to(elsewhere)
+    before = elsewhere.read_bytes() if elsewhere.is_file() else sorted(elsewhere.rglob("*"))
+    for again in (
+        lambda: solve_again(run_folder),
+        lambda: hodge_pipeline.run(str(run_folder / "recipe.yaml"), run_folder),
+    ):
+        with pytest.raises(WorkspaceError, match=f"{theirs}: is a symbolic link"):
+            again()
+    assert before == (elsewhere.read_bytes() if elsewhere.is_file() else sorted(elsewhere.rglob("*")))
+
+
+def test_a_pickle_that_lies_in_a_run_folder_is_not_loaded(tmp_path: Path) -> None:
+    """Descriptions of clouds are pickles: those that a stranger left go before the first is made."""
+    theirs = tmp_path / "described" / "7.pickle"
+    theirs.parent.mkdir()
+    theirs.write_bytes(b"theirs")
+    with LocalExecutor(workers=0).open() as workers:
+        describe_clouds(tmp_path, FpfhConsensus(), np.zeros(0, np.int64), theirs.parent, workers)
+    assert not theirs.exists()

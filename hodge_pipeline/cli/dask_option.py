@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 Dask = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         "--dask",
         metavar="ADDRESS",

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -35,20 +35,20 @@ def default_data() -> Path:
 
 def papering(
     data: Annotated[
-        Optional[Path],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
+        Path | None,
         typer.Option(help="The folder with the sequences, or with seven_scenes/ and icl_nuim/. Default: HODGE_DATA."),
     ] = None,
     out: Annotated[Path, typer.Option(help="Where the runs and the tables go; goes on where it stopped.")] = Path(
         "runs/paper"
     ),
     peer: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(metavar="NAME=DIR", help="Another system's poses for the BF column, such as bundlefusion=DIR."),
     ] = None,
     frames: Annotated[int, typer.Option(min=10, help="Frames of a sequence at most; longer ones are thinned.")] = 250,
     dask: Dask = None,
     overrides: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the paper-* recipes."),
     ] = None,
     figure: Annotated[bool, typer.Option(help="Render GT, peer and ours side by side.")] = True,
