@@ -13,7 +13,8 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from hodge_pipeline.errors import RecipeError
 
-MAX_BYTES = 1_000_000
+MAX_BYTES = 100_000
+"""A recipe with every default written out has about 3 kB; what is this long takes up to 4 s to parse."""
 MAX_NODES = 20_000
 
 Keys = tuple[str | int, ...]
@@ -54,7 +55,7 @@ def parse(text: str, name: str) -> Document:
         line = mark.line + 1 if mark else 1
         raise RecipeError(f"{name}:{line}: {str(error.problem).splitlines()[0]}") from error
     except (YAMLError, ValueError, RecursionError) as error:
-        raise RecipeError(f"{name}: not YAML: {error}") from error
+        raise RecipeError(f"{name}: not YAML: {str(error).splitlines()[0]}") from error
     if root is None:
         root = CommentedMap()
     if not isinstance(root, CommentedMap):
@@ -93,7 +94,7 @@ def _plain(node: Any, path: Keys, line: int, name: str, origins: dict[Keys, str]
         raise RecipeError(f"{name}:{line}: the tag '{tag}' is not allowed: a recipe is data and constructs nothing")
     if isinstance(node, CommentedMap):
         return {
-            _key(key, name, line): _plain(value, (*path, str(key)), node.lc.key(key)[0] + 1, name, origins, budget)
+            _key(key, name, line): _plain(value, (*path, str(key)), _line(node, key, line), name, origins, budget)
             for key, value in node.items()
         }
     if isinstance(node, CommentedSeq):
@@ -104,6 +105,11 @@ def _plain(node: Any, path: Keys, line: int, name: str, origins: dict[Keys, str]
     return _scalar(node, name, line)
 
 
+def _line(node: CommentedMap, key: Any, line: int) -> int:
+    """The line of a key; of one that `<<` merges into the mapping, that of the mapping."""
+    return int(node.lc.data[key][0]) + 1 if key in (node.lc.data or {}) else line
+
+
 def _key(key: Any, name: str, line: int) -> str:
     if not isinstance(key, str):
         raise RecipeError(f"{name}:{line}: the key {key!r} is not a name")
@@ -111,6 +117,8 @@ def _key(key: Any, name: str, line: int) -> str:
 
 
 def _scalar(node: Any, name: str, line: int) -> Any:
+    if isinstance(node, str) and ("\0" in node or not node.isascii() and any("\ud800" <= c <= "\udfff" for c in node)):
+        raise RecipeError(f"{name}:{line}: {node!r} holds a character that no file can have")
     for kind in (bool, int, float, str):
         if isinstance(node, kind):
             return kind(node)
