@@ -18,11 +18,13 @@ from hodge_pipeline import yaml_file
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import RecipeError, WorkerError, WorkspaceError
 from hodge_pipeline.executors.local import LocalExecutor
+from hodge_pipeline.outputs import write_poses
 from hodge_pipeline.pipeline import Run, solve_again
 from hodge_pipeline.recipe import load_recipe
 from hodge_pipeline.refine.model_options import load_model_refinement
 from hodge_pipeline.registration.global_pairs import describe_clouds
 from hodge_pipeline.registration.global_registrars import FpfhConsensus
+from hodge_pipeline.types import Frame, Source
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
@@ -195,3 +197,14 @@ def test_a_pickle_that_lies_in_a_run_folder_is_not_loaded(tmp_path: Path) -> Non
     with LocalExecutor(workers=0).open() as workers:
         describe_clouds(tmp_path, FpfhConsensus(), np.zeros(0, np.int64), theirs.parent, workers)
     assert not theirs.exists()
+
+
+def test_sequences_named_by_folders_are_written_into_the_run_folder(tmp_path: Path) -> None:
+    """COLMAP's images name them: `rig/left/0001.png`, or anything else."""
+    folder = tmp_path / "run"
+    (folder / "poses-").mkdir(parents=True)
+    names = ("rig/left", "/../../outside")
+    frames = tuple(Frame(row, float(row), None, sequence=name) for row, name in enumerate(names))
+    write_poses(folder, Source("model", tmp_path, frames), np.tile(np.eye(4), (2, 1, 1)))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+    assert sorted(path.name for path in folder.glob("*.tum")) == ["poses-_.._.._outside.tum", "poses-rig_left.tum"]
