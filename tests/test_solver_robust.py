@@ -165,3 +165,16 @@ def test_vertices_in_two_components_have_no_relative_covariance():
     graph, truth = band(4, 1, 12)
     with pytest.raises(GraphError, match="two components"):
         relative_covariances(graph.select(np.array([0, 2])), truth, np.array([[0, 3]]))
+
+
+@pytest.mark.parametrize("kernel", ["truncated", "geman_mcclure"])
+def test_weights_are_those_of_the_last_solve(kernel):
+    graph, truth = band(20, 6, 4)
+    graph, _ = spoiled(graph, 0.2, 5)
+    confidence = np.random.default_rng(6).uniform(0.1, 1, graph.edge_count)
+    solution = solve_robust(graph, start=truth, kernel=kernel, confidence=confidence)
+    assert (solution.weights <= confidence).all()
+    assert int((solution.weights > 0).sum()) == solution.metrics["kept_edges"]
+    weighted = dataclasses.replace(graph, information=solution.weights[:, None, None] * graph.information)
+    again = solve(weighted, start=solution.world_from_cam)
+    np.testing.assert_allclose(again.metrics["chi2"], solution.metrics["chi2"], rtol=1e-8)
