@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.cycles import fundamental_loops, spanning_forest
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.confirmation import cycle_lengths
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
 from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
 from hodge_pipeline.solvers.hodge import solve
@@ -178,3 +180,49 @@ def test_weights_are_those_of_the_last_solve(kernel):
     weighted = dataclasses.replace(graph, information=solution.weights[:, None, None] * graph.information)
     again = solve(weighted, start=solution.world_from_cam)
     np.testing.assert_allclose(again.metrics["chi2"], solution.metrics["chi2"], rtol=1e-8)
+
+
+def random_edges(seed: int) -> ViewGraph:
+    """24 random motions between 8 to 12 vertices."""
+    rng, count = np.random.default_rng(seed), 8 + seed % 5
+    edges = np.array([rng.choice(count, 2, replace=False) for _ in range(24)])
+    motions = se3.exp(rng.normal(size=(24, 6)) * np.repeat([1.5, 2.0], 3))
+    information = np.diag(np.repeat([SIGMA_RAD**-2, SIGMA_M**-2], 3))
+    return ViewGraph.from_edges(np.arange(count), edges, motions, np.tile(information, (24, 1, 1)))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_tree_of_random_edges_is_not_confirmed(seed):
+    graph = random_edges(seed)
+    solution = RobustSolver().solve(graph, np.tile(np.eye(4), (graph.vertex_count, 1, 1)))
+    assert solution.confirmed is False
+    assert "nothing confirms" in solution.notes[0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_right_edges_with_loops_are_confirmed(seed, share):
+    graph, truth = band(12, 3, seed)
+    assert solve_robust(spoiled(graph, share, seed)[0], start=truth).confirmed is True
+
+
+def test_a_tree_is_tested_by_nothing_and_refuted_by_nothing():
+    graph, truth = band(12, 1, 3)
+    solution = solve_robust(graph, start=truth)
+    assert solution.confirmed is None
+    assert "nothing tests the edges" in solution.notes[-1]
+    wrong = ViewGraph.from_edges(
+        graph.vertex_ids,
+        np.concatenate([graph.edges, [(0, 6), (2, 9), (11, 4)]]),
+        np.concatenate([graph.i_from_j, se3.exp(np.random.default_rng(4).normal(size=(3, 6)))]),
+        np.concatenate([graph.information, graph.information[:3]]),
+    )
+    assert solve_robust(wrong, start=truth).confirmed is False
+
+
+def test_the_lengths_of_cycles_are_those_of_their_edges():
+    edges = random_edges(0).edges
+    forest = spanning_forest(np.concatenate([edges, edges + 10]), 20)
+    lengths = fundamental_loops(forest).lengths
+    assert cycle_lengths(forest, forest.chords).tolist() == lengths.tolist()
+    assert len(set(lengths.tolist())) > 2

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
+from hodge_pipeline.solvers.confirmation import confirmed
 from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
 from hodge_pipeline.solvers.hodge import ObjectiveName, solve
 from hodge_pipeline.solvers.minimise import descend_isotropic
@@ -64,7 +65,8 @@ def solve_robust(
     `threshold`: an edge is wrong where its χ² with isotropic weights exceeds this; None takes the 99 % quantile of
     right edges. `confidence (E,)`, above 0: what share of its information an edge weighs, and of its weight in the
     solution; the threshold is for its χ² with all of it. The graph's fixed vertices stay at their start. The
-    components are those of the edges that are kept.
+    components are those of the edges that are kept. `confirmed` is False where edges are left out and the cycles
+    of those kept close no better than by chance.
     """
     setup = prepare(graph, start, NO_ROWS if start is None else graph.fixed, dimension)
     limit = threshold or (CHI2_99_PLANAR if setup.dimension == 2 else CHI2_99_SPATIAL)
@@ -97,7 +99,20 @@ def solve_robust(
         *final.notes,
     )
     metrics = {**final.metrics, "kept_edges": float(len(kept)), "tested_edges": float(tested)}
-    return replace(final, weights=weights, notes=notes, metrics=metrics)
+    return _with_confirmation(graph, replace(final, weights=weights, notes=notes, metrics=metrics), setup)
+
+
+def _with_confirmation(graph: ViewGraph, solution: Solution, setup: Setup) -> Solution:
+    """The solution that says whether anything confirms it."""
+    left_out = int((setup.weights.used & (solution.weights == 0)).sum())
+    if confirmed(graph, np.flatnonzero(solution.weights)):
+        return replace(solution, confirmed=True)
+    if left_out:
+        why = f"{left_out} edges are left out, and the cycles of the others close no better than by chance"
+        note = f"{why}: nothing confirms the poses"
+        return replace(solution, confirmed=False, notes=(note, *solution.notes))
+    note = "no edge is left out, and no cycles close better than by chance: nothing tests the edges"
+    return replace(solution, notes=(*solution.notes, note))
 
 
 def _corruption(graph: ViewGraph, setup: Setup, limit: float) -> Floats:
