@@ -120,7 +120,12 @@ def solve(
     start: Annotated[
         str, typer.Option(help="chordal: from the edges alone; given: from the file's poses.")
     ] = "chordal",
-    robust: Annotated[bool, typer.Option("--robust", help="Find wrong edges and leave them out.")] = False,
+    robust: Annotated[
+        bool,
+        typer.Option(
+            "--robust", help="Find wrong edges and leave them out; exit code 3 where nothing confirms the rest."
+        ),
+    ] = False,
     certificate: Annotated[bool, typer.Option("--certificate", help="Prove the minimum global (isotropic).")] = False,
     sesync_units: Annotated[
         bool, typer.Option("--sesync-units", help="F as SE-Sync counts it: rotations weigh four times as much.")

@@ -116,7 +116,8 @@ def _lines(
     name = {"full": "chi2", "isotropic": "F"}[summary["objective"]]
     before = summary["cost_before"]
     ignored = f", {summary['edges_ignored']} ignored" if summary["edges_ignored"] else ""
-    lines = [
+    lines = [("result", "NOT CONFIRMED by any cycle of its edges")] if summary["confirmed"] is False else []
+    lines += [
         (
             "graph",
             f"{solved.source.name}, {summary['dimension']}-D: {summary['poses']} poses, {summary['edges']} edges",
@@ -140,6 +141,11 @@ def _lines(
 def _check(summary: dict[str, Any]) -> None:
     if summary["certified"] is False:
         raise CheckError("the result is not proven to be the global minimum: see the notes; try --start chordal")
+    if summary["confirmed"] is False:
+        raise CheckError(
+            "nothing confirms the result: edges are left out, and the cycles of the others close no better than by "
+            "chance; add edges between the same views, or see which are wrong with hodge diagnose"
+        )
     if not summary["converged"]:
         late = any("time limit" in note for note in summary["notes"])
         remedy = "raise --time-limit" if late else "if edges may be wrong, hodge diagnose names them, or add --robust"
