@@ -110,7 +110,7 @@ def _bridged(job: Job, source: Source, matched: Matched) -> Floats:
     stage = job.stage("bridge", "poses between the given ones", len(stamps), (clouds, options, given_key), ("source",))
     with stage as (folder, advance):
         if not folder.finished:
-            with job.recipe.executor.open() as workers:
+            with job.workers() as workers:
                 made, _ = cloud_stage.prepare_clouds(source.frames, clouds, workers)
                 made.save(folder.path)
                 sequences = list(sequences_of(source).values())

@@ -83,7 +83,7 @@ def key_frames(job: Job, source: Source) -> Source:
     options, count = tracking_options(recipe), len(source.frames)
     with job.stage(CLOUDS, "tracking", count, options, ("source",)) as (folder, advance):
         if not folder.finished:
-            with job.recipe.executor.open() as workers:
+            with job.workers() as workers:
                 tracked, notes = _track(source, options, folder.path, workers, advance)
             columns = {name: getattr(tracked, name) for name in COLUMNS}
             artifacts.save_arrays(folder.path / "tracked.npz", columns)
