@@ -52,11 +52,13 @@ def run(
     overwrite: bool = False,
     watcher: Watcher | None = None,
     live: str | None = None,
+    dask: str | None = None,
 ) -> Run:
     """Run a recipe (its name, its file or itself) into the folder `out`, going on where an earlier run stopped.
 
     A `source` may be opened already; a run of frames that are in memory cannot be resumed by another process.
-    `live` is the address of a Rerun viewer that shows the run as it happens.
+    `live` is the address of a Rerun viewer that shows the run as it happens; `dask` that of a Dask scheduler whose
+    workers see the same files, and which is trusted to run code here.
     Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     if isinstance(recipe, str):
@@ -69,19 +71,20 @@ def run(
         Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace,
         logging_to(folder / "log.txt"),
     ):
-        return _run(Job(recipe, workspace, watcher or Nobody(), live=live, opened=opened))
+        return _run(Job(recipe, workspace, watcher or Nobody(), live=live, dask=dask, opened=opened))
 
 
-def solve_again(folder: Path | str, *, watcher: Watcher | None = None) -> Run:
+def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str | None = None) -> Run:
     """Solve and fuse a finished run once more, with the edits in its folder, and bring all that it left up to date.
 
-    Nothing is registered and no score is measured again: `run` with the same recipe does that. Raises `HodgeError`.
+    Nothing is registered and no score is measured again: `run` with the same recipe does that. `dask` is as of `run`.
+    Raises `HodgeError`.
     """
     folder = Path(folder)
     listed_edges(folder)
     recipe = load_recipe(str(folder / RECIPE_FILE))
     with Workspace.reopen(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
-        return _run(Job(recipe, workspace, watcher or Nobody(), scoring=False))
+        return _run(Job(recipe, workspace, watcher or Nobody(), dask=dask, scoring=False))
 
 
 def _run(job: Job) -> Run:
@@ -103,7 +106,7 @@ def read(job: Job) -> Source:
 def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round], dict[str, Path], ScoreTable | None]:
     """The rounds, the models' files by name, the scores: every stage in order, each recorded once it is done."""
     measured = steps.measured(job, source)
-    with job.recipe.executor.open() as workers:
+    with job.workers() as workers:
         clouds = steps.prepare_clouds(job, source, workers)
         recording.clouds(clouds)
         rounds = [first_poses.first_poses(job, source, workers)]

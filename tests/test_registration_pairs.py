@@ -1,13 +1,13 @@
 """Pairs in blocks and odometry: the same on any workers, resumed or not; lost and empty frames are said."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.executors.dask import DaskExecutor
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
@@ -15,8 +15,9 @@ from hodge_pipeline.registration.gaps import has_gap, over_gap
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.registration.pairs import Acceptance, Registered, register_pairs
-from hodge_pipeline.stages import Executor
+from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import CloudSet, Floats, PointCloud
+from test_executors import dask_workers
 from test_registration import corner
 
 FRAMES = 12
@@ -81,11 +82,11 @@ def test_pairs_come_back_in_the_order_given_and_right(folder: Path) -> None:
     assert (graph.vertex_count, graph.edge_count) == (FRAMES, len(PAIRS))
 
 
-@pytest.mark.parametrize("make", [lambda: LocalExecutor(workers=2), lambda: DaskExecutor(workers=2)])
-def test_every_executor_gives_the_same_bits(folder: Path, make: Callable[[], Executor]) -> None:
+@pytest.mark.parametrize("make", [LocalExecutor(workers=2).open, dask_workers])
+def test_all_workers_give_the_same_bits(folder: Path, make: Callable[[], AbstractContextManager[Workers]]) -> None:
     with HERE.open() as workers:
         here = register_pairs(folder, Gicp(), PAIRS, guesses(), workers)
-    with make().open() as workers:
+    with make() as workers:
         elsewhere = register_pairs(folder, Gicp(), PAIRS, guesses(), workers)
     assert same_bits(here, elsewhere)
 

@@ -187,3 +187,13 @@ def test_covariances_know_what_is_fixed_and_what_priors_say():
     loose = marginal_covariances(known, solve(known).world_from_cam, np.arange(3))
     np.testing.assert_allclose(loose[0], 0.25 * np.eye(6), atol=1e-9)
     np.testing.assert_allclose(loose[1, 3, 3], 1.25, rtol=1e-6)
+
+
+def test_pieces_are_in_order_of_size_where_there_are_priors():
+    """0—1, 2—3—4—5, 6; priors on 0, 1 and 6 make a piece of three, which is four with the world."""
+    edges = np.array([(0, 1), (2, 3), (3, 4), (4, 5)])
+    graph = ViewGraph.from_edges(np.arange(7), edges, np.tile(np.eye(4), (4, 1, 1)))
+    for known, expected in (([0, 1, 6], [1, 1, 0, 0, 0, 0, 1]), ([6], [1, 1, 0, 0, 0, 0, 2])):
+        count = len(known)
+        priors = Priors(np.array(known), np.tile(np.eye(4), (count, 1, 1)), np.tile(np.eye(6), (count, 1, 1)))
+        assert solve(graph, priors=priors).component.tolist() == expected

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 from hodge_pipeline.cli import refine as refining
+from hodge_pipeline.cli.dask_option import Dask
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -61,12 +62,12 @@ def root(
 
 
 Overrides = Annotated[
-    Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
+    list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change an option, such as edges.max_edges_per_frame=6."),
 ]
-Reader = Annotated[Optional[str], typer.Option(help="The reader by name; none: the surest of the path.")]  # noqa: UP045
+Reader = Annotated[str | None, typer.Option(help="The reader by name; none: the surest of the path.")]
 ReaderSet = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option("--set", metavar="OPTION=VALUE", help="An option of the reader, such as tracks=false."),
 ]
 Out = Annotated[Path, typer.Option("--out", help="The run folder; the same command goes on where it stopped.")]
@@ -79,9 +80,10 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 def run(
     recipe: Annotated[str, typer.Argument(help="A recipe by name (see `hodge recipes`) or a .yaml file.")],
     out: Out,
-    source: Annotated[Optional[Path], typer.Option(help="What to read; overrides source.path.")] = None,  # noqa: UP045
+    source: Annotated[Path | None, typer.Option(help="What to read; overrides source.path.")] = None,
     overrides: Overrides = None,
     overwrite: Overwrite = False,
+    dask: Dask = None,
     live: Annotated[bool, typer.Option("--live", help="Show the run as it happens in a Rerun viewer.")] = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -89,45 +91,55 @@ def run(
     """Run a recipe on a source: poses, fused model, report and recording in --out."""
     from hodge_pipeline.cli import run as running
 
-    running.run(recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live)
+    running.run(
+        recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask
+    )
 
 
 @app.command()
-def demo(out: Out, overrides: Overrides = None, overwrite: Overwrite = False, quiet: Quiet = False) -> None:
+def demo(
+    out: Out, overrides: Overrides = None, overwrite: Overwrite = False, dask: Dask = None, quiet: Quiet = False
+) -> None:
     """Make a furnished room with Kinect-like noise and run the recipe `demo` on it."""
     from hodge_pipeline.cli import run as running
 
-    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet)
+    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet, dask=dask)
 
 
 @app.command()
 def solve(
     graph: Annotated[Path, typer.Argument(help="A pose graph (g2o, TORO, …) or a run folder.")],
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--out", help="The result: .g2o or .json (Open3D) with edges; .tum, .kitti, .csv, .log without."),
     ] = None,
     objective: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(help="full: g2o's chi2, the default; isotropic: SE-Sync's F, which can be certified."),
     ] = None,
     start: Annotated[
         str, typer.Option(help="chordal: from the edges alone; given: from the file's poses.")
     ] = "chordal",
-    robust: Annotated[bool, typer.Option("--robust", help="Find wrong edges and leave them out.")] = False,
+    robust: Annotated[
+        bool,
+        typer.Option(
+            "--robust", help="Find wrong edges and leave them out; exit code 3 where nothing confirms the rest."
+        ),
+    ] = False,
     certificate: Annotated[bool, typer.Option("--certificate", help="Prove the minimum global (isotropic).")] = False,
     sesync_units: Annotated[
         bool, typer.Option("--sesync-units", help="F as SE-Sync counts it: rotations weigh four times as much.")
     ] = False,
     disable: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(metavar="A-B", help="Leave out the edges between these vertex ids; may be repeated."),
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds after which the best so far is given.")] = float("inf"),
     run_folder: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--run", help="Folder for report, edges and recording."),
     ] = None,
+    dask: Dask = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -143,18 +155,18 @@ def solve(
         certificate=certificate,
         sesync_units=sesync_units,
     )
-    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json)
+    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json, dask=dask)
 
 
 @app.command()
 def diagnose(
     path: Annotated[Path, typer.Argument(help="A finished run, or a pose graph (g2o, TORO, Open3D, pair .log).")],
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--out", help="Folder for edges.csv, poses.tum, diagnosis.html and diagnosis.rrd."),
     ] = None,
     top: Annotated[
-        Optional[int],  # noqa: UP045
+        int | None,
         typer.Option(min=0, help="Edges to print; default: those that are not consistent, 20 at most."),
     ] = None,
     quiet: Quiet = False,
@@ -170,18 +182,18 @@ def diagnose(
 def edit(
     run_folder: Annotated[Path, typer.Argument(help="A finished run.")],
     disable: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             metavar="A-B",
             help="Switch the edges between two frames off; may be repeated, or A-B,C-D; `wrong`: all such.",
         ),
     ] = None,
     enable: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(metavar="A-B", help="Switch them on: disabled ones again, rejected ones in spite of the reason."),
     ] = None,
     register: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(metavar="A-B", help="Register a pair that is no edge, as `hodge diagnose` suggests some."),
     ] = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take the last edit back.")] = False,
@@ -208,7 +220,7 @@ def inspect(source: Path, reader: Reader = None, overrides: ReaderSet = None, js
 def convert(
     source: Path,
     out: Annotated[Path, typer.Argument(help="Its name means the format: .tum .kitti .csv .g2o .json .ply, a folder.")],
-    to: Annotated[Optional[str], typer.Option("--to", help="The writer by name (see `hodge stages writers`).")] = None,  # noqa: UP045
+    to: Annotated[str | None, typer.Option("--to", help="The writer by name (see `hodge stages writers`).")] = None,
     reader: Reader = None,
     overrides: ReaderSet = None,
 ) -> None:
@@ -220,7 +232,7 @@ def convert(
 
 @app.command()
 def stages(
-    kind: Annotated[Optional[str], typer.Argument(help="Only this kind, with every option.")] = None,  # noqa: UP045
+    kind: Annotated[str | None, typer.Argument(help="Only this kind, with every option.")] = None,
 ) -> None:
     """List the stages that are installed, and their options."""
     from hodge_pipeline.cli import list as listing
@@ -230,7 +242,7 @@ def stages(
 
 @app.command()
 def recipes(
-    name: Annotated[Optional[str], typer.Argument(help="Print this one, with every default.")] = None,  # noqa: UP045
+    name: Annotated[str | None, typer.Argument(help="Print this one, with every default.")] = None,
     schema: Annotated[bool, typer.Option("--schema", help="Print NAME's JSON schema for editors.")] = False,
 ) -> None:
     """List the recipes that come with the package."""
@@ -253,8 +265,8 @@ def view(
 @app.command()
 def record(
     run_folder: Path,
-    level: Annotated[Optional[str], typer.Option(help="summary, normal or full; default: as in the recipe.")] = None,  # noqa: UP045
-    max_megabytes: Annotated[Optional[float], typer.Option(help="Bound on the file; default: the recipe's.")] = None,  # noqa: UP045
+    level: Annotated[str | None, typer.Option(help="summary, normal or full; default: as in the recipe.")] = None,
+    max_megabytes: Annotated[float | None, typer.Option(help="Bound on the file; default: the recipe's.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Make the recording of a run again, at another size, without computing anything again."""
@@ -267,7 +279,7 @@ def record(
 def compare(
     first: Annotated[Path, typer.Argument(help="A run folder.")],
     second: Annotated[Path, typer.Argument(help="Another run folder, of the same frames or not.")],
-    out: Annotated[Optional[Path], typer.Option(help="Folder for compare.html and .rrd; default: the second.")] = None,  # noqa: UP045
+    out: Annotated[Path | None, typer.Option(help="Folder for compare.html and .rrd; default: the second.")] = None,
 ) -> None:
     """Compare two runs: numbers, options that differ, poses and models."""
     from hodge_pipeline.cli import record as recording

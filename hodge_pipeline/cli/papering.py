@@ -6,11 +6,12 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.cli.dask_option import Dask
 from hodge_pipeline.cli.paper_sequences import Found, find_sequences, peer_poses
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
 from hodge_pipeline.evaluation import paper_tables
@@ -34,19 +35,20 @@ def default_data() -> Path:
 
 def papering(
     data: Annotated[
-        Optional[Path],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
+        Path | None,
         typer.Option(help="The folder with the sequences, or with seven_scenes/ and icl_nuim/. Default: HODGE_DATA."),
     ] = None,
     out: Annotated[Path, typer.Option(help="Where the runs and the tables go; goes on where it stopped.")] = Path(
         "runs/paper"
     ),
     peer: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(metavar="NAME=DIR", help="Another system's poses for the BF column, such as bundlefusion=DIR."),
     ] = None,
     frames: Annotated[int, typer.Option(min=10, help="Frames of a sequence at most; longer ones are thinned.")] = 250,
+    dask: Dask = None,
     overrides: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the paper-* recipes."),
     ] = None,
     figure: Annotated[bool, typer.Option(help="Render GT, peer and ours side by side.")] = True,
@@ -66,7 +68,7 @@ def papering(
     pictures: dict[str, str] = {}
     for sequence in found:
         try:
-            runs = {kind: _run(sequence, kind, out, overrides or []) for kind in GRAPH_KINDS}
+            runs = {kind: _run(sequence, kind, out, overrides or [], dask) for kind in GRAPH_KINDS}
             poses, note = (None, "") if peer_folder is None else _peer(peer_folder, sequence, runs["distance"][0])
             measured[sequence.name] = {
                 kind: _measured(run, kind, wall_s, poses, note) for kind, (run, wall_s) in runs.items()
@@ -97,14 +99,14 @@ def _peer_of(option: str | None) -> tuple[str, Path | None]:
     return name, Path(folder)
 
 
-def _run(sequence: Found, kind: GraphKind, out: Path, overrides: list[str]) -> tuple[Run, float]:
+def _run(sequence: Found, kind: GraphKind, out: Path, overrides: list[str], dask: str | None) -> tuple[Run, float]:
     reader = f"source.reader={{stage: {sequence.reader}, every: {sequence.every}}}"
     fixed = [reader, f"outer_iterations={OUTER_ITERATIONS}", "recording.level=off", "fusion=[]"]
     recipe = load_recipe(f"paper-{kind}", [*fixed, *overrides], sequence.folder)
     begin = time.perf_counter()
     with Terminal(quiet=False) as terminal:
         terminal.say(f"{sequence.name}, {kind} graph: {sequence.folder}")
-        run = run_pipeline(recipe, out / f"{sequence.name}-{kind}", overwrite=True, watcher=terminal)
+        run = run_pipeline(recipe, out / f"{sequence.name}-{kind}", overwrite=True, watcher=terminal, dask=dask)
     return run, time.perf_counter() - begin
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
+
+from hodge_pipeline.cli.dask_option import Dask
 
 HELP = """Make the poses of COLMAP or SLAM better, in their own format.
 
@@ -41,9 +43,10 @@ def trajectory(
         str, typer.Option("--recipe", help="A recipe like slam-refine, which is the default; for TUM slam-refine-tum.")
     ] = "",
     overrides: Annotated[
-        Optional[list[str]],  # noqa: UP045 - typer reads Optional on Python 3.10 as well
+        list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe."),
     ] = None,
+    dask: Dask = None,
     overwrite: Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
@@ -52,7 +55,17 @@ def trajectory(
     from hodge_pipeline.cli import refine_trajectory as refining_trajectory
 
     refining_trajectory.refine(
-        poses, frames, out, match, recipe, overrides or [], force=force, overwrite=overwrite, quiet=quiet, as_json=json
+        poses,
+        frames,
+        out,
+        match,
+        recipe,
+        overrides or [],
+        force=force,
+        overwrite=overwrite,
+        quiet=quiet,
+        as_json=json,
+        dask=dask,
     )
 
 
@@ -63,31 +76,32 @@ def colmap(
         Path, typer.Option("--out", help="The run folder: sparse/0 (the model), report; it goes on where it stopped.")
     ],
     database: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--database", help="COLMAP's database.db; default: the one beside or above the model."),
     ] = None,
     images: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--images", help="Folder of the colour images; default: images/ beside or above the model."),
     ] = None,
     depth: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--depth", help="Folder of sensor depth, PNGs named as the images (or depth for color)."),
     ] = None,
     depth_scale: Annotated[
-        Optional[float],  # noqa: UP045
+        float | None,
         typer.Option("--depth-scale", help="Stored units of depth to the metre; default: the recipe's, 1000."),
     ] = None,
     depth_camera: Annotated[
-        Optional[tuple[float, float, float, float]],  # noqa: UP045
+        tuple[float, float, float, float] | None,
         typer.Option("--depth-camera", help="FX FY CX CY of depth that is not on the pixels of the colour images."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")] = False,
     recipe: Annotated[str, typer.Option("--recipe", help="A recipe like colmap-refine, by name or file.")] = "",
     overrides: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe colmap-refine."),
     ] = None,
+    dask: Dask = None,
     overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
@@ -108,4 +122,5 @@ def colmap(
         overwrite=overwrite,
         quiet=quiet,
         as_json=json,
+        dask=dask,
     )

@@ -21,12 +21,15 @@ def connected_components(edges: Ints, vertex_count: int) -> Ints:
     check_edges(edges, vertex_count)
     ones = np.ones(len(edges), np.int32)  # parallel edges are summed: 256 of them would be none in 8 bits
     adjacency = csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
-    count, label = csgraph_components(adjacency, directed=False)
-    _, first = np.unique(label, return_index=True)
-    order = np.lexsort((first, -np.bincount(label, minlength=count)))
-    rank = np.empty(count, np.int64)
-    rank[order] = np.arange(count)
-    return np.asarray(rank[label], np.int64)
+    return by_size(csgraph_components(adjacency, directed=False)[1])
+
+
+def by_size(label: Ints) -> Ints:
+    """Labels (V,) of components, renumbered: 0 the largest; of equal ones, that with the first vertex comes first."""
+    _, first, row, size = np.unique(label, return_index=True, return_inverse=True, return_counts=True)
+    rank = np.empty(len(size), np.int64)
+    rank[np.lexsort((first, -size))] = np.arange(len(size))
+    return np.asarray(rank[row.reshape(-1)], np.int64)
 
 
 def first_of_component(component: Ints) -> Bools:

@@ -14,7 +14,6 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.recipe import binding, recipe_file
-from hodge_pipeline.recipe.yaml_file import Document, Keys
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.refine.held_out import GuardOptions
 from hodge_pipeline.registration.clouds import CloudOptions
@@ -94,17 +93,10 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path |
     document = recipe_file.load(name_or_path, overrides)
     if "model" in document.data:
         raise RecipeError(f"recipe '{name_or_path}' refines a model: hodge refine colmap MODEL --recipe {name_or_path}")
-    recipe = binding.bind(Recipe, document.data, lambda keys: origin(document, keys))
+    recipe = binding.bind(Recipe, document.data, document.where)
     return recipe if source is None else with_source(recipe, source)
 
 
 def with_source(recipe: Recipe, path: Path) -> Recipe:
     """The recipe on another source."""
     return dataclasses.replace(recipe, source=dataclasses.replace(recipe.source, path=path))
-
-
-def origin(document: Document, keys: Keys) -> str:
-    """`file:line` of a key, or of the nearest key above it that was written."""
-    while keys not in document.origins:
-        keys = keys[:-1]
-    return document.origins[keys]

@@ -51,18 +51,20 @@ def refine_colmap(
     recipe: str = RECIPE,
     overrides: Sequence[str] = (),
     watcher: Watcher | None = None,
+    dask: str | None = None,
 ) -> RefinedColmap:
     """A COLMAP model with better poses: `model` is its folder, a `pycolmap.Reconstruction`, or a list of those.
 
     `depth`: folder of sensor depth images named as the colour images, `depth_scale` stored units to the metre. Without
     `out` nothing is written; with it a refinement that was stopped goes on (that of models in memory begins anew), and
-    another one is replaced where it may `overwrite`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
+    another one is replaced where it may `overwrite`. `dask` is as of `run`. Raises `HodgeError` (see `errors`) for
+    whatever the user can mend.
     """
     given = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale}
     sets = [f"model.{name}={value}" for name, value in given.items() if value is not None]
     options = load_model_refinement(recipe, [*sets, *overrides])
     folder = None if out is None else Path(out)
-    return run_refinement(model, options, out=folder, force=force, overwrite=overwrite, watcher=watcher)
+    return run_refinement(model, options, out=folder, force=force, overwrite=overwrite, watcher=watcher, dask=dask)
 
 
 def run_refinement(
@@ -73,6 +75,7 @@ def run_refinement(
     force: bool,
     overwrite: bool,
     watcher: Watcher | None = None,
+    dask: str | None = None,
 ) -> RefinedColmap:
     """The same with the options bound already."""
     watcher = watcher or Nobody()
@@ -83,7 +86,7 @@ def run_refinement(
         with Monitor().measure() as cost, watcher.stage("refine", 1):
             models = options.model.open_models(given)
             stages = ModelStages(workspace, models_key(models, binding.unbind(options), versions()))
-            results = refine_models(models, options, stages, force=force)
+            results = refine_models(models, options, stages, force=force, dask=dask)
         if out is not None:
             write_run_folder(out, results, options, cost)
     return RefinedColmap(results, out)

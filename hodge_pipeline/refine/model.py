@@ -10,6 +10,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import align
+from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.refine.guard import Change, Decision, Measure, decide
 from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, no_depth_edges
 from hodge_pipeline.refine.model_options import ModelRefinement
@@ -57,13 +58,18 @@ class RefinedModel:
 
 
 def refine_models(
-    models: Sequence[TrackedModel], options: ModelRefinement, stages: ModelStages, *, force: bool = False
+    models: Sequence[TrackedModel],
+    options: ModelRefinement,
+    stages: ModelStages,
+    *,
+    force: bool = False,
+    dask: str | None = None,
 ) -> tuple[RefinedModel, ...]:
     """Every model refined, those that measurements tie together as one. Nothing is written but the stages."""
     scales = [metric_scale(model.depth_ratios()) for model in models]
     metric = [in_metres(model, scale) for model, scale in zip(models, scales, strict=True)]
     out = []
-    with options.executor.open() as workers:
+    with open_workers(options.executor, dask) as workers:
         for number, joined in enumerate(options.model.join(metric)):
             parts = [row for row, model in enumerate(metric) if set(model.body_names) & set(joined.body_names)]
             is_metric = all(scales[row].is_observable for row in parts)

@@ -8,7 +8,6 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.recipe import binding, recipe_file
-from hodge_pipeline.recipe.yaml_file import Document, Keys
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, ModelReader, Registrar
@@ -56,10 +55,4 @@ def load_model_refinement(name_or_path: str = RECIPE, overrides: Sequence[str] =
     Raises `RecipeError`: `file:line: key: what was expected`.
     """
     document = recipe_file.load(name_or_path, overrides)
-    return binding.bind(ModelRefinement, document.data, lambda keys: _origin(document, keys))
-
-
-def _origin(document: Document, keys: Keys) -> str:
-    while keys and keys not in document.origins:
-        keys = keys[:-1]
-    return document.origins.get(keys, "recipe")
+    return binding.bind(ModelRefinement, document.data, document.where)

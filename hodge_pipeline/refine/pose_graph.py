@@ -70,6 +70,7 @@ class SolvedFile:
             "cost_after": metrics["objective"],
             "converged": bool(metrics["converged"]),
             "certified": bool(metrics["certified"]) if "certified" in metrics else None,
+            "confirmed": self.solution.confirmed,
             "gap_bound": metrics.get("gap_bound"),
             "newton_steps": int(metrics["iterations"]),
             "cg_steps": int(metrics["cg_steps"]),

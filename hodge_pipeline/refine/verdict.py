@@ -110,7 +110,7 @@ def _held_out(job: Job, rounds: Sequence[Round], before: Floats) -> list[Measure
     inputs = ("clouds", f"solve-{len(rounds) - 1}", *edges)
     with job.stage("guard", "guard", 1, job.recipe.guard, inputs) as (folder, advance):
         if not folder.finished:
-            with job.recipe.executor.open() as workers:
+            with job.workers() as workers:
                 found = _distances(job, pairs, before, after, workers)
             artifacts.save_arrays(folder.path / "distances.npz", {"distances_m": found})
             advance(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -35,12 +36,15 @@ from hodge_pipeline.types import CloudSet, Floats, Ints, Solution, Source, Traje
 
 
 def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
-    """`poses.tum` and `poses.kitti`; of several sequences `poses-<sequence>.*` each, since their stamps may repeat."""
+    """`poses.tum` and `poses.kitti`; of several sequences `poses-<sequence>.*` each, since their stamps may repeat.
+
+    A sequence named by folders, as a rig's cameras are, becomes one name: no file lies outside the folder.
+    """
     sequences = sequences_of(source)
     for name, rows in sequences.items():
         stamps = np.array([source.frames[row].stamp_s for row in rows])
         part = Source(source.name, source.path, trajectory=Trajectory(stamps, world_from_cam[rows]))
-        stem = "poses" if len(sequences) == 1 else f"poses-{name}"
+        stem = "poses" if len(sequences) == 1 else "poses-" + re.sub(r"[/\\]", "_", name)
         for writer in ("tum", "kitti"):
             registry.load("writers", writer)().write(folder / f"{stem}.{writer}", part)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline.complex.checks import check_motions
+from hodge_pipeline.complex.components import by_size
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, ViewGraph
 
@@ -60,12 +61,11 @@ def _unused(graph: ViewGraph) -> object:
 
 def without_world(solution: Solution, graph: ViewGraph) -> Solution:
     """The solution of the graph alone; the components are those that edges and priors together join."""
-    _, component = np.unique(solution.component[:-1], return_inverse=True)
     history = tuple(replace(step, world_from_cam=step.world_from_cam[:-1]) for step in solution.history)
     return replace(
         solution,
         world_from_cam=solution.world_from_cam[:-1],
-        component=component.reshape(-1).astype(np.int64),
+        component=by_size(solution.component[:-1]),
         weights=solution.weights[: graph.edge_count],
         history=history,
     )

@@ -120,6 +120,7 @@ def save_solution(path: Path, solution: Solution) -> None:
     text = {
         "metrics": dict(solution.metrics),
         "notes": list(solution.notes),
+        "confirmed": solution.confirmed,
         "history": [{"objective": step.objective, "metrics": dict(step.metrics)} for step in history],
     }
     poses = np.array([step.world_from_cam for step in history]).reshape(-1, *solution.world_from_cam.shape)
@@ -150,6 +151,7 @@ def load_solution(path: Path) -> Solution:
         ),
         metrics={name: _number(value) for name, value in text["metrics"].items()},
         notes=tuple(text["notes"]),
+        confirmed=text.get("confirmed"),
     )
 
 

@@ -6,17 +6,18 @@ import logging
 import os
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.given_poses import Given
-from hodge_pipeline.stages import Advance, no_progress
+from hodge_pipeline.stages import Advance, Workers, no_progress
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.cost import Cost, Monitor
 from hodge_pipeline.store.progress import Watcher
@@ -58,9 +59,9 @@ class Job:
 
     A job that does not compute reads finished stages only: one that is not raises `Unfinished`. Without `scoring` the
     score tables, the slowest part of the end, are left out. `live` is the address of a viewer that is shown the
-    recording as it grows. `given` are the poses that it starts from, where they are not its own odometry;
-    `opened` is the source where it needs no reader; `tracked` says how all frames move with the
-    key frames.
+    recording as it grows, `dask` that of a cluster which works in place of the recipe's executor. `given` are the poses
+    that it starts from, where they are not its own odometry; `opened` is the source where it needs no reader; `tracked`
+    says how all frames move with the key frames.
     """
 
     recipe: Recipe
@@ -68,6 +69,7 @@ class Job:
     watcher: Watcher
     computes: bool = True
     live: str | None = None
+    dask: str | None = None
     monitor: Monitor = field(default_factory=Monitor)
     keys: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -79,6 +81,10 @@ class Job:
     def path(self, stage: str) -> Path:
         """Where a stage's artifacts lie."""
         return self.workspace.path(stage)
+
+    def workers(self) -> AbstractContextManager[Workers]:
+        """Whoever registers the pairs: the cluster that the caller names, else the recipe's executor."""
+        return open_workers(self.recipe.executor, self.dask)
 
     def note(self, message: str) -> None:
         """Tell the user, the log and the report; a finished stage tells its notes again in every later run."""

@@ -74,8 +74,10 @@ class Workspace:
         """The run folder for this recipe, made if it is not there.
 
         Raises `WorkspaceError` where the folder is something else, belongs to another recipe (without `overwrite`;
-        `refusal` then says so, with the first `{change}`) or is in use.
+        `refusal` then says so, with the first `{change}`), holds a symbolic link or is in use.
         """
+        if (folder / RECIPE_FILE).exists():
+            _refuse_links(folder)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             lock = (folder / ".lock").open("a+")
@@ -153,6 +155,7 @@ class Workspace:
 @contextmanager
 def holding(folder: Path) -> Iterator[None]:
     """While the body runs no run uses the folder. Raises `WorkspaceError` where one does already."""
+    _refuse_links(folder)
     try:
         lock = (folder / ".lock").open("a+")
     except OSError as error:
@@ -160,6 +163,17 @@ def holding(folder: Path) -> Iterator[None]:
     with lock:
         _hold(lock, folder)
         yield
+
+
+def _refuse_links(folder: Path) -> None:
+    """A run folder may be a stranger's: through a link in it what is written, or emptied, would lie elsewhere."""
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            if os.path.islink(os.path.join(parent, name)):
+                raise WorkspaceError(
+                    f"{os.path.join(parent, name)}: is a symbolic link, which no run makes, and would be written "
+                    "through: remove it, or put what it leads to in its place"
+                )
 
 
 def _hold(lock: IO[str], folder: Path) -> None:

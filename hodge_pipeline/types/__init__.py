@@ -162,6 +162,8 @@ class Solution:
 
     - `component (V,)`: the connected component of each vertex, 0 the largest.
     - `weights (E,)`: the final weight of each edge relative to its own information, 0 for one that was ignored.
+    - `confirmed`: of a robust solve, whether cycles of the edges that it used close better than by chance. None where
+      it left none out and no cycle tells, as in a tree; and of other solves.
     """
 
     world_from_cam: Floats
@@ -170,6 +172,7 @@ class Solution:
     history: tuple[SolverIteration, ...] = ()
     metrics: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    confirmed: bool | None = None
 
 
 @dataclass(frozen=True)
