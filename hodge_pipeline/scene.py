@@ -16,7 +16,6 @@ from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
 
-
 START = "start"
 """The name of first poses that are not odometry's."""
 
@@ -26,14 +25,16 @@ class Round:
     """One outer iteration: every pair that it knows of, and the poses (N, 4, 4) that its edges led to. Round 0 holds
     the first poses, which `name` tells: odometry, or start where they were given.
 
-    The pairs that a round registered come first in `edges`, then those that came measured. A round is `edited` where a
-    person's edits made it.
+    The pairs that any round so far registered come first in `edges`, then those that came measured. This round itself
+    registered the rows `fresh (F,)` from the poses `before (N, 4, 4)`. It is `edited` where a person's edits made it.
     """
 
     edges: Edges
     vertex_ids: NDArray[np.generic]
     world_from_cam: Floats
     solution: Solution | None = None
+    fresh: Ints | None = None
+    before: Floats | None = None
     edited: bool = False
     name: str = "odometry"
 
@@ -69,6 +70,7 @@ class KeyFrames:
     `first (N, 4, 4)` are the first poses of all frames, `world_from_key (K, 4, 4)` those of the key frames; `part (N,)`
     is the part of the source that the start held together; `times (N,)` ascend within a part; `found (N,)` says which
     frames the start could place: the others lie between their neighbours by `stamps_s (N,)` in each `sequence (N,)`.
+    `key_of_frame (N,)` is the key frame, counted among the K, that each frame belongs to.
     """
 
     rows: Ints
@@ -79,6 +81,7 @@ class KeyFrames:
     found: Bools
     stamps_s: Floats
     sequence: Ints
+    key_of_frame: Ints
 
     @classmethod
     def all_of(cls, source: Source, world_from_cam: Floats) -> KeyFrames:
@@ -87,7 +90,7 @@ class KeyFrames:
         stamps = np.array([frame.stamp_s for frame in source.frames], float)
         every, zeros = np.arange(count), np.zeros(count, np.int64)
         ones = np.ones(count, bool)
-        return cls(every, world_from_cam, world_from_cam, zeros, every.astype(float), ones, stamps, zeros)
+        return cls(every, world_from_cam, world_from_cam, zeros, every.astype(float), ones, stamps, zeros, every)
 
     @property
     def are_all(self) -> bool:
@@ -117,8 +120,8 @@ class KeyFrames:
 
 @dataclass(frozen=True)
 class Drift:
-    """What odometry says of the way between two frames: its poses (K, 4, 4), the part (K,) of each that it held together,
-    and the share of the way that it may err by.
+    """What odometry says of the way between two frames: its poses (K, 4, 4), the part (K,) of each that it held
+    together, and the share of the way that it may err by.
     """
 
     world_from_cam: Floats

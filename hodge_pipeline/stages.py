@@ -58,7 +58,13 @@ class Steps(Protocol):
     """Remembers what was computed in a run folder."""
 
     def step(
-        self, function: Callable[..., Result], *inputs: Any, title: str, total: int = 1, name: str = "", **resources: Any
+        self,
+        function: Callable[..., Result],
+        *inputs: Any,
+        title: str,
+        total: int = 1,
+        name: str = "",
+        **resources: Any,
     ) -> Result:
         """What `function(*inputs, **resources, step=Step)` returns, computed once for these inputs and read back
         afterwards; its return type is the stored type. `resources`, such as workers, do not decide the result.

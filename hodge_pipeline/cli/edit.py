@@ -79,8 +79,14 @@ def _checked(folder: Path, listed: Listed, pairs: Pairs) -> Edit:
     on = listed.named(_words(pairs.enable))
     if both := set(off) & set(on):
         raise GraphError(f"{', '.join(sorted(both))}: is to be disabled and enabled at once: say one of them")
-    new = pairs_to_register(folder, _words(pairs.register)) if pairs.register else ()
-    return Edit(off, on, new)
+    return Edit(off, on, _to_register(folder, _words(pairs.register)) if pairs.register else ())
+
+
+def _to_register(folder: Path, words: Sequence[str]) -> tuple[str, ...]:
+    from hodge_pipeline.run_folder import Run
+
+    last = Run.load(folder).result
+    return pairs_to_register(last.edges, last.vertex_ids, words)
 
 
 def _verdicts_spelt_out(listed: Listed, words: Sequence[str]) -> list[str]:

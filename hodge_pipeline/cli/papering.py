@@ -17,9 +17,9 @@ from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
 from hodge_pipeline.evaluation import paper_tables
 from hodge_pipeline.evaluation.paper_tables import NAN, Measured, Results
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphKind, score_table
-from hodge_pipeline.pipeline import Run
 from hodge_pipeline.pipeline import run as run_pipeline
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import has_truth, true_poses
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Solution

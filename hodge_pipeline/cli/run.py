@@ -16,7 +16,7 @@ from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.recipe.schema import load_recipe
 
 if TYPE_CHECKING:
-    from hodge_pipeline.pipeline import Run
+    from hodge_pipeline.run_folder import Run
 
 
 def run(

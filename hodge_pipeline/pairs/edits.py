@@ -151,19 +151,15 @@ def named_edges(edges: Edges, vertex_ids: NDArray[np.generic], pairs: Sequence[s
     return [rows[pair] for pair in pairs]
 
 
-def pairs_to_register(folder: Path, pairs: Sequence[str]) -> tuple[str, ...]:
+def pairs_to_register(edges: Edges, vertex_ids: NDArray[np.generic], pairs: Sequence[str]) -> tuple[str, ...]:
     """The pairs, named as a run's frames are, each once. Raises `GraphError` for a pair that is an edge, or no pair."""
-    stored = folder / "stages" / "diagnose" / "edges.npz"
-    if not stored.is_file():
-        raise WorkspaceError(f"{folder}: is no run of frames: there is nothing to register")
-    edges, ids = artifacts.load_edges(stored)
-    found = np.sort(vertex_rows(ids, pairs), axis=1)
+    found = np.sort(vertex_rows(vertex_ids, pairs), axis=1)
     joined = {frozenset(edges.pairs[row].tolist()): row for row in np.flatnonzero(edges.in_graph)}
     for pair in found.tolist():
         if (row := joined.get(frozenset(pair))) is not None:
-            (name,) = pair_names(ids, edges.pairs[[row]])
+            (name,) = pair_names(vertex_ids, edges.pairs[[row]])
             raise GraphError(f"{name}: is an edge already ({edges.proposed_by[row]}, {edges.status[row]})")
-    return tuple(dict.fromkeys(pair_names(ids, found)))
+    return tuple(dict.fromkeys(pair_names(vertex_ids, found)))
 
 
 def joining(vertex_ids: NDArray[np.generic], pairs: Ints, pair: str) -> Bools:

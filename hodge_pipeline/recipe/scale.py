@@ -35,9 +35,10 @@ FULL = 0.5
 
 def with_scale(recipe: Recipe, source: Source, steps: Steps) -> Recipe:
     """The recipe with its `scale` on every length; auto: measured on the scans first, and reported."""
-    wanted = recipe.scale
-    if wanted == "auto":
+    if recipe.scale == "auto":
         wanted = steps.step(scale_of_scans, source, recipe.clouds.voxel_m, title="scale of the scans")
+    else:
+        wanted = recipe.scale
     return dataclasses.replace(scaled_recipe(recipe, wanted), scale=wanted)
 
 

@@ -19,7 +19,16 @@ from hodge_pipeline.refine.held_out import GuardOptions
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.sources.measured_edges import MeasuredOptions
-from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, FrameReader, Fuser, Refiner, Registrar, Start
+from hodge_pipeline.stages import (
+    ConsistencySolver,
+    EdgeBuilder,
+    Executor,
+    FrameReader,
+    Fuser,
+    Refiner,
+    Registrar,
+    Start,
+)
 from hodge_pipeline.start.key_frames import KeyFrameStart
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
@@ -66,7 +75,8 @@ class Recipe:
     )
     clouds: CloudOptions = CloudOptions()
     start: Start = Field(
-        default=KeyFrameStart(), description="where the first poses come from: consecutive frames, given poses, no order"
+        default=KeyFrameStart(),
+        description="where first poses come from: consecutive frames, given poses, no order",
     )
     guard: GuardOptions = GuardOptions()
     acceptance: Acceptance = Acceptance()

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hodge_pipeline import registry
 from hodge_pipeline.diagnosis.advice import advice, ranked
@@ -20,18 +19,19 @@ from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.pairs.edits import joining, pair_names, read_history
-from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
 from hodge_pipeline.report.diagnosis_page import PageContents, render
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
 from hodge_pipeline.report.edge_pictures import edge_pictures
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
-from hodge_pipeline.store.workspace import RECIPE_FILE, is_run_folder
+from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, Source, ViewGraph
-from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
+from hodge_pipeline.types.edges import DISABLED, USED
 
 PICTURED, LEAST_PICTURED = 6, 2
 SUGGESTED, REGISTERED = 12, 6
@@ -66,13 +66,8 @@ class Subject:
 
 def open_subject(path: Path) -> Subject:
     """The graph of a run's last round, or of a file that a reader knows. Raises `HodgeError` where there is none."""
-    stage = path / "stages" / "diagnose"
-    if (stage / "edges.npz").is_file():
-        return _run_subject(path, *artifacts.load_edges(stage / "edges.npz"))
     if is_run_folder(path):
-        raise WorkspaceError(
-            f"{path}: this run is not finished: run the same command again, it goes on where it stopped"
-        )
+        return _run_subject(path, Run.load(path))
     source = read_graph(path)
     assert source.graph is not None
     name = path.stem if path.is_file() else path.name
@@ -81,23 +76,22 @@ def open_subject(path: Path) -> Subject:
     )
 
 
-def _run_subject(path: Path, edges: Edges, vertex_ids: NDArray[np.generic]) -> Subject:
-    in_graph = edges.select(edges.in_graph)
-    graph = in_graph.as_graph(vertex_ids)
-    recipe = load_recipe(str(path / RECIPE_FILE))
+def _run_subject(path: Path, run: Run) -> Subject:
+    _ = run.report  # raises where the run has not ended
+    last, recipe = run.result, run.recipe
     frames, notes = _frames(recipe)
-    clouds = path / "stages" / "clouds"
+    known = len(frames) == len(run.source.frames)
     return Subject(
         path,
         path.resolve().name,
-        graph,
-        _edited(path, graph, in_graph),
+        last.graph,
+        _edited(path, last.graph, last.graph_edges),
         is_run=True,
         options=recipe.diagnosis,
         suggestions=recipe.suggestions,
-        tried=edges.pairs[edges.status == REJECTED],
-        frames=frames if len(frames) == graph.vertex_count else (),
-        clouds=CloudSet.open(clouds) if (clouds / "offsets.npy").is_file() else None,
+        tried=last.rejected.pairs,
+        frames=tuple(frames[row] for row in run.key_frames.rows) if known else (),
+        clouds=run.clouds,
         notes=notes,
     )
 

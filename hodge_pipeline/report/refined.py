@@ -21,7 +21,7 @@ from hodge_pipeline.report.contents import (
 )
 from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.store.cost import Cost
-from hodge_pipeline.store.job import versions
+from hodge_pipeline.store.store import versions
 
 NO_METRES = "There is no depth that tells the scale: lengths are in the model's own unit, called metres here."
 

@@ -14,6 +14,7 @@ from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.verdict import Refined, summary
 from hodge_pipeline.report.contents import (
     LoopRow,
@@ -28,11 +29,11 @@ from hodge_pipeline.report.contents import (
 from hodge_pipeline.report.sides import four_sides, worst_pairs
 from hodge_pipeline.report.summary import graph_summary, trajectory_rows, worst_edges
 from hodge_pipeline.report.write import write_report
-from hodge_pipeline.scene import Round, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.scene import Round, Scene, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
-from hodge_pipeline.store.job import Job, versions
-from hodge_pipeline.types import CloudSet, Floats, Ints, Solution, Source, Trajectory
+from hodge_pipeline.store.store import Store, versions
+from hodge_pipeline.types import Floats, Ints, Solution, Source, Trajectory
 
 
 def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
@@ -61,10 +62,15 @@ def write_graph(folder: Path, source: Source, last: Round) -> None:
 
 
 def make_report(
-    job: Job, source: Source, rounds: Sequence[Round], scores: ScoreTable | None, refined: Refined | None = None
+    recipe: Recipe,
+    store: Store,
+    scene: Scene,
+    rounds: Sequence[Round],
+    scores: ScoreTable | None,
+    refined: Refined | None,
 ) -> Report:
     """Everything that the run measured."""
-    last, whole = rounds[-1], _whole(job, source)
+    last, whole, source = rounds[-1], scene.whole, scene.source
     sets = pose_sets(rounds)
     assert last.solution is not None
     component = last.solution.component
@@ -77,25 +83,25 @@ def make_report(
             path=str(source.path),
             frames=len(whole.frames),
             frames_with_truth=sum(frame.world_from_cam is not None for frame in whole.frames),
-            key_frames=len(source.frames) if len(source.frames) < len(whole.frames) else None,
+            key_frames=None if scene.key_frames.are_all else len(source.frames),
             sequences=tuple(name for name in sequences_of(source) if name),
             notes=source.notes,
             kind="scans" if all(frame.read_depth is None for frame in source.frames) else "frames",
-            unordered=job.given is None and job.recipe.start == "global",
+            unordered=not scene.in_order,
         ),
         scores=scores,
-        trajectories=_trajectories(job, source, sets, component),
+        trajectories=_trajectories(recipe, scene, sets, component),
         loops=_loop_rows(last.solution),
         graph=graph_summary(last.edges, last.vertex_ids, component),
         worst_edges=worst,
-        stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in job.costs()),
-        notes=tuple(job.notes),
+        stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in store.costs()),
+        notes=tuple(store.notes),
         versions=versions(),
-        recipe=yaml_file.dump(binding.unbind(job.recipe)),
+        recipe=yaml_file.dump(binding.unbind(recipe)),
         last_shift_m=_last_shift(rounds, component),
         pictures=dataclasses.replace(
             _pictures(source, rounds, sets),
-            sides=four_sides(CloudSet.open(job.path("clouds")), sets[rounds[0].name], sets["result"], component),
+            sides=four_sides(scene.clouds, sets[rounds[0].name], sets["result"], component),
             worst_pairs=worst_pairs(source, worst),
         ),
         refinement=None if refined is None else summary(refined.decision),
@@ -112,23 +118,17 @@ def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
     return float(shift_m) if np.isfinite(shift_m) else None
 
 
-def _whole(job: Job, source: Source) -> Source:
-    """The source with all of its frames, where a run works on key frames alone."""
-    if job.tracked is not None:
-        return job.tracked.whole
-    return source if job.given is None else job.given.whole
-
-
-def _trajectories(job: Job, source: Source, sets: Mapping[str, Floats], component: Ints) -> tuple[TrajectoryRow, ...]:
+def _trajectories(
+    recipe: Recipe, scene: Scene, sets: Mapping[str, Floats], component: Ints
+) -> tuple[TrajectoryRow, ...]:
     """The errors of each set of poses, over all frames, those that are not key frames included."""
-    if job.tracked is not None:
-        source, component = job.tracked.whole, component[job.tracked.anchors]
-        sets = {name: job.tracked.all_poses(poses) for name, poses in sets.items()}
-    if not has_truth(source):
+    if not has_truth(scene.whole):
         return ()
-    sequences = [frame.sequence for frame in source.frames]
-    delta_frames = job.recipe.evaluation.rpe_delta_frames
-    return trajectory_rows(sets, true_poses(source), component, sequences, delta_frames=delta_frames)
+    every = {name: scene.key_frames.expand(poses) for name, poses in sets.items()}
+    sequences = [frame.sequence for frame in scene.whole.frames]
+    delta_frames = recipe.evaluation.rpe_delta_frames
+    component = component[scene.key_frames.key_of_frame]
+    return trajectory_rows(every, true_poses(scene.whole), component, sequences, delta_frames=delta_frames)
 
 
 def _loop_rows(solution: Solution) -> tuple[LoopRow, ...]:
@@ -162,10 +162,12 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
 
 
 def write(
-    job: Job,
-    source: Source,
+    folder: Path,
+    recipe: Recipe,
+    store: Store,
+    scene: Scene,
     rounds: Sequence[Round],
-    models: dict[str, Path],
+    models: Mapping[str, Path],
     scores: ScoreTable | None,
     refined: Refined | None = None,
 ) -> Report:
@@ -173,17 +175,13 @@ def write(
 
     Of a refinement the poses of all frames; where nothing could be refined the report alone.
     """
-    folder = job.workspace.folder
-    if job.tracked is not None:
-        write_poses(folder, job.tracked.whole, job.tracked.all_poses(rounds[-1].world_from_cam))
-    elif refined is None:
-        write_poses(folder, source, rounds[-1].world_from_cam)
-    elif job.given is not None and refined.decision.outcome != "nothing":
-        write_poses(folder, job.given.whole, refined.world_from_cam)
     if refined is None or refined.decision.outcome != "nothing":
-        write_graph(folder, source, rounds[-1])
+        last = rounds[-1]
+        poses = scene.key_frames.expand(last.world_from_cam) if refined is None else refined.world_from_cam
+        write_poses(folder, scene.whole, poses)
+        write_graph(folder, scene.source, last)
         for name, path in models.items():
             artifacts.link_or_copy(path, folder / f"{name}.ply")
-    report = make_report(job, source, rounds, scores, refined)
+    report = make_report(recipe, store, scene, rounds, scores, refined)
     write_report(folder, report)
     return report

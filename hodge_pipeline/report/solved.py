@@ -13,7 +13,7 @@ from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
-from hodge_pipeline.store.job import versions
+from hodge_pipeline.store.store import versions
 from hodge_pipeline.types import Edges, Floats
 
 SOLVED = "solved.json"

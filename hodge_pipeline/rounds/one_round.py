@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
@@ -16,14 +15,16 @@ from hodge_pipeline.pairs.candidates import merge
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.held_out import HeldOut
 from hodge_pipeline.registration.acceptance import accepted
-from hodge_pipeline.registration.block_store import BlockStore
-from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.scene import START, Round, Scene
 from hodge_pipeline.sources.measured_edges import without_measured
-from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Registrar, Step, Steps, Workers
+from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Step, Steps, Workers
 from hodge_pipeline.start.unordered.tour import propose_along_tour
-from hodge_pipeline.types import CloudSet, Edges, Floats, Source, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import HELD_OUT
+
+EDITED = "edited"
+"""The name of a round that a person's edits made."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,13 @@ class Work:
     scene: Scene
     measured: ViewGraph
     workers: Workers
+
+    def round(self, number: int, before: Round) -> Round:
+        """Round `number`: what the recipe's builder proposes from the poses of the round before, registered, solved."""
+        poses = before.world_from_cam
+        registered = self.register(number, self.propose(number, before), poses)
+        fresh = np.flatnonzero(registered.status != HELD_OUT)
+        return self.solve(number, registered, fresh, poses, poses)
 
     def propose(self, number: int, before: Round) -> Edges:
         """The pairs to register in round `number` from the poses of the one before."""
@@ -59,11 +67,13 @@ class Work:
         scale = self.recipe.scale if isinstance(self.recipe.scale, float) else 1.0
         return accepted(edges, self.recipe.acceptance, self.scene.drift, scale)
 
-    def solve(self, number: int, registered: Edges, start: Floats) -> Round:
-        """The accepted and the measured edges, and the poses consistent with them from `start`."""
+    def solve(self, number: int, registered: Edges, fresh: Ints, before: Floats, start: Floats) -> Round:
+        """The accepted and the measured edges, and the poses consistent with them from `start`; the rows `fresh` were
+        registered from the poses `before`.
+        """
         edges, ids = Edges.joined([registered, Edges.measured(self.measured)]), self.scene.first.vertex_ids
-        title = f"solve, round {number}"
-        return self.steps.step(solve_edges, edges, ids, self.recipe.solver, start, title, title=title)
+        name, title = f"round {number}", f"solve, round {number}"
+        return self.steps.step(solve_edges, edges, ids, self.recipe.solver, start, fresh, before, name, title=title)
 
     def judge(self, last: Round) -> Round:
         """The last round, with the verdict of the diagnosis on each of its edges."""
@@ -109,26 +119,16 @@ def with_start_edges(candidates: Edges, first: Round) -> Edges:
     return merge([candidates, Edges.proposed(pairs, START)])[0]
 
 
-def register_edges(
-    edges: Edges, clouds: CloudSet, registrar: Registrar, world_from_cam: Floats, *, workers: Workers, step: Step
-) -> Edges:
-    """Step: the table with its candidates registered from these poses; a killed run goes on at its last block."""
-    assert clouds.folder is not None
-    held_out = edges.status == HELD_OUT
-    candidates = edges.select(~held_out)
-    i, j = candidates.pairs.T
-    guesses = se3.inverse(world_from_cam[i]) @ world_from_cam[j]
-    blocks = BlockStore(step.folder / "blocks")
-    found = register_pairs(
-        clouds.folder, registrar, candidates, guesses, workers, step.advance,
-        finished=blocks.read(), on_block=blocks.write,
-    )  # fmt: skip
-    blocks.remove()
-    return Edges.joined([found, edges.select(held_out)])
-
-
 def solve_edges(
-    edges: Edges, vertex_ids: NDArray[np.generic], solver: ConsistencySolver, start: Floats, name: str, *, step: Step
+    edges: Edges,
+    vertex_ids: NDArray[np.generic],
+    solver: ConsistencySolver,
+    start: Floats,
+    fresh: Ints,
+    before: Floats,
+    name: str,
+    *,
+    step: Step,
 ) -> Round:
     """Step: the round of these edges and the poses consistent with them; `name` begins the solver's notes."""
     solution = solver.solve(edges.select(edges.counts).as_graph(vertex_ids), start)
@@ -138,7 +138,7 @@ def solve_edges(
     for note in solution.notes:
         step.note(f"{name}: {note}")
     solved = with_residuals(edges, solution.world_from_cam, solution.weights)
-    return Round(solved, vertex_ids, solution.world_from_cam, solution)
+    return Round(solved, vertex_ids, solution.world_from_cam, solution, fresh, before, edited=name == EDITED)
 
 
 def judge_edges(last: Round, options: DiagnosisOptions, *, step: Step) -> Round:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints
 

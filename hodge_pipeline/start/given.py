@@ -11,16 +11,25 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import RecipeError, SourceError
-from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_poses
-from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
-from hodge_pipeline.scene import START, Round, sequences_of, vertex_ids
-from hodge_pipeline.scene import GivenFile, KeyFrames, Scene, key_source, sequence_numbers
+from hodge_pipeline.scene import (
+    START,
+    GivenFile,
+    KeyFrames,
+    Round,
+    Scene,
+    key_source,
+    sequence_numbers,
+    sequences_of,
+    vertex_ids,
+)
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import Steps, Workers
+from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
+from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_poses
 from hodge_pipeline.start.odometry import OPTIONS, chain
 from hodge_pipeline.types import Edges, Floats, Source, Trajectory
 
@@ -88,12 +97,13 @@ class GivenStart:
             found=np.ones(count, bool),
             stamps_s=matched.frame_times,
             sequence=sequence_numbers(source),
+            key_of_frame=np.clip(np.searchsorted(rows, np.arange(count), side="right") - 1, 0, None),
         )
         keys = replace(key_source(whole, rows), graph=None)
         steps.remember(keys, steps.key([steps.key(source), rows, poses]))
         made = make_clouds(keys, clouds, steps, workers)
-        first = Round(vertex_ids(keys), Edges.of(np.zeros((0, 2), np.int64)), poses[rows], name=START)
-        return Scene(whole, keys, key_frames, made, first, given=file)
+        first = Round(Edges.of([]), vertex_ids(keys), poses[rows], name=START)
+        return Scene(whole, keys, key_frames, made, first, is_given=True, given=file)
 
     def _matched(self, source: Source, steps: Steps) -> tuple[Matched, GivenFile | None]:
         if self.poses == "frames":
@@ -116,7 +126,9 @@ class GivenStart:
         """
         known = np.flatnonzero(np.isfinite(matched.world_from_cam).all(axis=(1, 2)))
         times = np.arange(len(source.frames), dtype=float)
-        steps.note(f"{len(times) - len(known)} frames without a given pose are carried from the nearest ones by odometry")
+        steps.note(
+            f"{len(times) - len(known)} frames without a given pose are carried from the nearest ones by odometry"
+        )
         every = make_clouds(source, clouds, steps, workers)
         sequences, stamps = tuple(sequences_of(source).values()), np.array([f.stamp_s for f in source.frames])
         title = "poses between the given ones"

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.components import in_runs
+from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.odometry import Odometry, OdometryOptions, chained
+from hodge_pipeline.registration.odometry import Odometry, chained
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
-from hodge_pipeline.scene import sequences_of, vertex_ids
-from hodge_pipeline.scene import KeyFrames, Scene, key_source, sequence_numbers, stamps_of
+from hodge_pipeline.scene import KeyFrames, Scene, sequence_numbers, sequences_of, stamps_of, vertex_ids
 from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
@@ -98,6 +94,7 @@ def followers(source: Source, tracked: Tracked) -> KeyFrames:
         found=tracked.found,
         stamps_s=stamps_of(source),
         sequence=sequence_numbers(source),
+        key_of_frame=tracked.anchors,
     )
 
 
@@ -145,6 +142,8 @@ def _track_missing(
     for at, block in workers.map(partial(track_block, options), [cut[number] for number in missing]):
         blocks.write(missing[at], block)
         advance(len(block.rows))
+
+
 def _renumbered(rows: Ints, key_of_row: dict[int, int]) -> Ints:
     return np.array([key_of_row[row] for row in rows.ravel().tolist()], np.int64).reshape(rows.shape)
 

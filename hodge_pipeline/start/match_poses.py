@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
+
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guesses
-from hodge_pipeline.types import Floats, Frame, Ints, Source, Trajectory
+from hodge_pipeline.types import Floats, Frame, Trajectory
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
 SAME_STAMP_S = 1e-6
@@ -51,9 +52,7 @@ def own_poses(frames: Sequence[Frame]) -> Matched:
     return Matched(times, times[np.isfinite(poses).all(axis=(1, 2))], poses, "the frames' own")
 
 
-def match_poses(
-    trajectory: Trajectory, frames: Sequence[Frame], match: Match, max_gap_s: float, where: str
-) -> Matched:
+def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, max_gap_s: float, where: str) -> Matched:
     """The trajectory's poses on the frames.
 
     Raises `SourceError` where they have nothing in common, or `match` asks for what is not there.

@@ -14,8 +14,7 @@ from hodge_pipeline.registration import odometry as tracking
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.gaps import has_gap
 from hodge_pipeline.registration.odometry import Odometry, OdometryOptions
-from hodge_pipeline.scene import Round, sequences_of, vertex_ids
-from hodge_pipeline.scene import Drift, KeyFrames, Scene, key_source
+from hodge_pipeline.scene import Drift, KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import landmarks_for, make_clouds
 from hodge_pipeline.start.unordered.join import join_parts
@@ -62,7 +61,10 @@ class OdometryStart(OdometryOptions):
         """The scene of the key frames of `source`, its parts joined as `relocalise` says."""
         keys = key_source(source, key_frames.rows)
         part = connected_components(found.steps.pairs, len(found.world_from_cam))
-        drift, first = Drift(found.world_from_cam, part), Round(vertex_ids(keys), found.steps, found.world_from_cam)
+        drift, first = (
+            Drift(found.world_from_cam, part, self.max_drift),
+            Round(found.steps, vertex_ids(keys), found.world_from_cam),
+        )
         several = int((np.bincount(part) > 1).sum()) > 1
         if self.relocalise is True or (self.relocalise == "auto" and several):
             first = join_parts(keys, clouds, first, self.unordered, steps, workers)

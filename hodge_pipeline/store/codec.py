@@ -49,6 +49,9 @@ def _plain(folder: Path, value: Any, place: str, arrays: dict[str, NDArray[Any]]
     if isinstance(value, np.ndarray):
         arrays[place or "array"] = value
         return {"array": place or "array"}
+    if isinstance(value, bytes):
+        arrays[place or "bytes"] = np.frombuffer(value, np.uint8)
+        return {"bytes": place or "bytes"}
     if isinstance(value, CloudSet):
         own = folder / (place or "clouds")
         if value.folder is None or value.folder != own:
@@ -85,6 +88,8 @@ def _typed(folder: Path, plain: Any, kind: Any, arrays: Mapping[str, NDArray[Any
         return _typed(folder, plain, next(part for part in parts if part is not type(None)), arrays)
     if isinstance(plain, dict) and list(plain) == ["array"]:
         return arrays[plain["array"]]
+    if isinstance(plain, dict) and list(plain) == ["bytes"]:
+        return arrays[plain["bytes"]].tobytes()
     if isinstance(plain, dict) and list(plain) == ["float"]:
         return float(plain["float"])
     if kind is CloudSet:

@@ -113,6 +113,10 @@ class Store:
         if isinstance(value, np.ndarray):
             data = np.ascontiguousarray(value)
             return [str(data.dtype), list(data.shape), hashlib.sha256(data.tobytes()).hexdigest()]
+        if isinstance(value, bytes):
+            return hashlib.sha256(value).hexdigest()
+        if isinstance(value, Path):
+            return _facts(value) if value.is_file() else str(value)
         if isinstance(value, Mapping):
             return {str(name): self.key(item) for name, item in value.items()}
         if isinstance(value, (list, tuple)):
@@ -180,6 +184,14 @@ def stored(folder: Path, function: Callable[..., T]) -> list[T]:
         except (OSError, ValueError, KeyError) as error:
             raise WorkspaceError(f"{path}: {error}: the same hodge run computes it again") from error
     return found
+
+
+def stored_folders(folder: Path) -> list[Path]:
+    """The folders of the steps of the latest run, in order, as far as it came."""
+    try:
+        return [folder / entry["name"] for entry in artifacts.read_json(folder / INDEX)]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def _facts(path: Path) -> list[Any]:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,9 +22,9 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, N
 """What the system says when a file cannot be written; None is numpy's own short write."""
 
 
-def key_of(*parts: Any) -> str:
-    """The key of a stage: a hash of its resolved options, versions and the keys of its inputs."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
+def identity_of(folder: Path) -> str:
+    """A name of the run in a folder that stays the same when it is resumed."""
+    return hashlib.sha256((folder / RECIPE_FILE).read_bytes()).hexdigest()[:32]
 
 
 def is_run_folder(path: Path) -> bool:
@@ -35,26 +32,11 @@ def is_run_folder(path: Path) -> bool:
     return (path / RECIPE_FILE).is_file() and (path / RUN).is_dir()
 
 
-@dataclass(frozen=True)
-class StageFolder:
-    """Where one stage's artifacts lie. `finished`: read `path`; else write into `path`, which commits on leaving."""
-
-    path: Path
-    key: str
-    finished: bool
-
-    @property
-    def info(self) -> dict[str, Any]:
-        """What was noted of a finished stage (`Workspace.stage` writes the key, the caller may add its cost)."""
-        return dict(artifacts.read_json(self.path / KEY_FILE)) if self.finished else {}
-
-
 class Workspace:
     """One run folder, held by one process at a time.
 
-    `stages/<name>` holds a finished stage, `stages/<name>.part` one that was begun; a part is continued when its key
-    is still the same. Everything else in the folder is for people. `kind` is what `stages` is called: what runs and
-    what refines a model never share a folder.
+    Its steps lie in the folder `stages` (see `Store`); everything else is for people. `kind` is what `stages` is
+    called: what runs and what refines a model never share a folder.
     """
 
     def __init__(self, folder: Path, lock: IO[str], kind: str = RUN) -> None:
@@ -104,9 +86,9 @@ class Workspace:
         return cls.open(folder, recipe, refusal=refusal)
 
     @property
-    def identity(self) -> str:
-        """A name of this run that stays the same when it is resumed."""
-        return key_of((self.folder / RECIPE_FILE).read_text("utf-8"))
+    def steps(self) -> Path:
+        """The folder of the steps."""
+        return self.folder / self.kind
 
     def close(self) -> None:
         """Let another process have the folder."""
@@ -117,39 +99,6 @@ class Workspace:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def is_finished(self, name: str, key: str) -> bool:
-        """Whether the stage is there under its key."""
-        return _key_at(self.path(name)) == key
-
-    def path(self, name: str) -> Path:
-        """Where the artifacts of a finished stage lie."""
-        return self.folder / self.kind / name
-
-    @contextmanager
-    def stage(self, name: str, key: str) -> Iterator[StageFolder]:
-        """The folder of one stage under its key; what the body writes is committed when it leaves without an error.
-
-        A full disk raises `WorkspaceError`; what other stages finished stays.
-        """
-        path = self.path(name)
-        if _key_at(path) == key:
-            yield StageFolder(path, key, finished=True)
-            return
-        part = path.with_name(f"{name}.part")
-        with disk_errors(part):
-            if _key_at(part) != key:
-                shutil.rmtree(part, ignore_errors=True)
-                part.mkdir(parents=True)
-                artifacts.write_json(part / KEY_FILE, {"key": key})
-            yield StageFolder(part, key, finished=False)
-            shutil.rmtree(path, ignore_errors=True)
-            os.replace(part, path)
-
-    def note(self, name: str, info: dict[str, Any]) -> None:
-        """Add facts (cost, versions) to a finished stage."""
-        path = self.path(name) / KEY_FILE
-        artifacts.write_json(path, {**artifacts.read_json(path), **info})
 
 
 @contextmanager
@@ -226,14 +175,6 @@ def _first_change(old: Any, new: Any, key: str = "") -> str:
             if old.get(name) != new.get(name):
                 return _first_change(old.get(name), new.get(name), f"{key}.{name}" if key else name)
     return f"{key} was {old!r}, is {new!r}" if key else "formatting"
-
-
-def _key_at(path: Path) -> str | None:
-    """The key of a stage folder, None where there is none that can be read."""
-    try:
-        return str(artifacts.read_json(path / KEY_FILE)["key"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 @contextmanager

@@ -12,8 +12,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.gaps import has_gap
-from hodge_pipeline.scene import START, Round, sequences_of, vertex_ids
-from hodge_pipeline.scene import KeyFrames, Scene
+from hodge_pipeline.scene import START, KeyFrames, Round, Scene, sequences_of, vertex_ids
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import landmarks_for, make_clouds
 from hodge_pipeline.start.unordered.options import GlobalStart
@@ -49,7 +48,7 @@ def _round(
         start_without_guess, source, clouds, edges, poses, options,
         title="start without a guess", total=total, workers=workers,
     )  # fmt: skip
-    return Round(vertex_ids(source), found.edges, found.world_from_cam, name=START)
+    return Round(found.edges, vertex_ids(source), found.world_from_cam, name=START)
 
 
 def start_without_guess(

@@ -20,7 +20,7 @@ from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans
 from hodge_pipeline.start.unordered.similarity import LocalDescriptors, all_pairs, similar_pairs
 from hodge_pipeline.start.unordered.views import Views
-from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, ViewGraph
 
 DESCRIBED, VIEWS = "described", "views"
 
@@ -30,13 +30,13 @@ class Start:
     """The first poses (N, 4, 4), pieces laid apart; the edges that they rest on; the piece (N,) of each frame."""
 
     world_from_cam: Floats
-    graph: ViewGraph
+    edges: Edges
     piece: Ints
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Scene:
+class Frames:
     """What is to be joined: frames, their clouds (a folder), and edges and poses (N, 4, 4) that are known already, from
     odometry, or none.
     """
@@ -44,11 +44,11 @@ class Scene:
     frames: Sequence[Frame]
     clouds: Path
     vertex_ids: NDArray[np.generic]
-    given: ViewGraph | None = None
+    given: Edges | None = None
     drifted: Floats | None = None
 
 
-def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance) -> Start:
+def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance) -> Start:
     """Poses of all frames that the evidence joins; `advance` counts frames, once described and once placed.
 
     `scratch` is a folder for the descriptions. Frames that nothing joins are pieces of their own, and said.
@@ -65,7 +65,9 @@ def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Worke
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, not by_image, workers)
     notes.append(_tried(len(rows), pairs, hypotheses))
     measured = hypotheses.as_graph(scene.vertex_ids, "landmarks" if by_image else "features")
-    graph = measured if scene.given is None else ViewGraph.joined([scene.given, measured])
+    graph = measured
+    if scene.given is not None:
+        graph = ViewGraph.joined([scene.given.as_graph(scene.vertex_ids), measured])
     found = diagnose(graph, options.diagnosis)
     notes += [f"{int((~found.kept).sum())} of {graph.edge_count} edges are distrusted"]
     given = int(found.kept[: graph.edge_count - measured.edge_count].sum())
@@ -73,7 +75,8 @@ def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Worke
     pieces = unfolded(clouds, pieces, given, views, options.limits, options.diagnosis)
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
-    return Start(laid_apart(pieces.piece, pieces.poses, clouds), pieces.graph, pieces.piece, tuple(notes))
+    poses = laid_apart(pieces.piece, pieces.poses, clouds)
+    return Start(poses, Edges.measured(pieces.graph), pieces.piece, tuple(notes))
 
 
 def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
@@ -83,7 +86,7 @@ def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
     return int((np.diff(clouds.marks) >= options.limits.min_inliers).sum()) * 2 >= int((clouds.sizes > 0).sum())
 
 
-def propose(scene: Scene, clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart) -> Ints:
+def propose(scene: Frames, clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart) -> Ints:
     """The pairs (P, 2) to match: all of a few frames, else each with those most similar, or near by drifted poses."""
     if len(rows) <= options.all_pairs_up_to:
         return all_pairs(rows)
