@@ -40,15 +40,15 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "Recipe": "recipe",
-    "load_recipe": "recipe",
+    "Recipe": "recipe.schema",
+    "load_recipe": "recipe.schema",
     "Run": "pipeline",
     "run": "pipeline",
-    "refine_colmap": "refined_colmap",
-    "refine_trajectory": "refined_trajectory",
-    "frames_from_images": "refined_trajectory",
+    "refine_colmap": "refine.colmap",
+    "refine_trajectory": "refine.trajectory",
+    "frames_from_images": "refine.trajectory",
     "solve_pose_graph": "refine.open3d_objects",
-    "solve": "solvers.hodge",
+    "solve": "solvers.maximum_likelihood",
     "Solution": "types",
     "ViewGraph": "types",
 }
