@@ -59,7 +59,7 @@ def test_a_solver_gets_what_was_accepted_and_a_graph_keeps_what_is_off() -> None
     assert again.status.tolist() == ["used", "rejected", "disabled", "held_out"]
     one = Round(table, IDS, np.tile(np.eye(4), (4, 1, 1)))
     assert one.graph.edges.tolist() == [[0, 1], [1, 2]] and one.graph.source.tolist() == ["overlap"] * 2
-    assert one.rejected_counts == {"too little overlap": 1}
+    assert one.edges.rejected_counts == {"too little overlap": 1}
 
 
 def test_a_longer_word_is_not_cut_and_other_rows_stay() -> None:
@@ -101,8 +101,9 @@ def test_the_table_that_people_read_reads_back(tmp_path: Path) -> None:
             np.testing.assert_allclose(getattr(again, name), expected, rtol=1e-5)
         else:
             assert getattr(again, name).tolist() == expected.tolist()
-    edges, _ = listed_edges(tmp_path)
-    assert edges.status.tolist() == ["ignored", "used", "rejected"], "nobody switches a pair that judges the result"
+    assert listed_edges(tmp_path).edges.status.tolist() == ["ignored", "used", "rejected"], (
+        "nobody switches a pair that judges the result"
+    )
 
 
 def test_a_table_of_no_edges_reads_back_and_one_without_status_is_refused(tmp_path: Path) -> None:

@@ -14,13 +14,13 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
-from hodge_pipeline.start.unordered.hypotheses import Hypotheses, weigh
+from hodge_pipeline.start.unordered.hypotheses import weigh
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans
 from hodge_pipeline.start.unordered.similarity import LocalDescriptors, all_pairs, similar_pairs
 from hodge_pipeline.start.unordered.views import Views
-from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, ViewGraph
 
 DESCRIBED, VIEWS = "described", "views"
 
@@ -64,7 +64,8 @@ def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Worke
     views = Views.make(scene.frames, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, not by_image, workers)
     notes.append(_tried(len(rows), pairs, hypotheses))
-    measured = hypotheses.as_graph(scene.vertex_ids, "landmarks" if by_image else "features")
+    labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
+    measured = labelled.select(labelled.counts).as_graph(scene.vertex_ids)
     graph = measured if scene.given is None else ViewGraph.joined([scene.given, measured])
     found = diagnose(graph, options.diagnosis)
     notes += [f"{int((~found.kept).sum())} of {graph.edge_count} edges are distrusted"]
@@ -95,8 +96,8 @@ def propose(scene: Scene, clouds: CloudSet, rows: Ints, described: Path, options
     return np.unique(np.concatenate([pairs, near]), axis=0)
 
 
-def _tried(count: int, pairs: Ints, hypotheses: Hypotheses) -> str:
+def _tried(count: int, pairs: Ints, hypotheses: Edges) -> str:
     every = count * (count - 1) // 2
-    refused = ", ".join(f"{number} {reason}" for reason, number in hypotheses.counts.items())
-    text = f"{len(pairs)} of {every} pairs were matched, {int(hypotheses.accepted.sum())} may be edges"
+    refused = ", ".join(f"{number} {reason}" for reason, number in hypotheses.rejected_counts.items())
+    text = f"{len(pairs)} of {every} pairs were matched, {int(hypotheses.counts.sum())} may be edges"
     return f"{text} ({refused})" if refused else text
