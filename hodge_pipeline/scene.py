@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -52,11 +51,6 @@ class Round:
     def rejected(self) -> Edges:
         """The pairs that were registered and are no edges."""
         return self.edges.select(self.edges.status == REJECTED)
-
-    @property
-    def rejected_counts(self) -> Mapping[str, int]:
-        """How many pairs were rejected for each reason."""
-        return dict(sorted(Counter(self.rejected.why.tolist()).items()))
 
     def registered(self, measured: ViewGraph) -> Edges:
         """The rows without those that came measured."""

@@ -13,7 +13,7 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
-from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.evaluation.scores import GraphScores, ScoreTable
 from hodge_pipeline.report.contents import RefinementSummary
 from hodge_pipeline.report.difference import MEASURABLE, length, percent, sign_of
@@ -33,7 +33,7 @@ from hodge_pipeline.report.write import (
     as_json,
     write_report,
 )
-from hodge_pipeline.types import Floats, ViewGraph
+from hodge_pipeline.types import Edges, Floats, ViewGraph
 
 VOID = {"meta", "img", "br"}
 
@@ -73,6 +73,8 @@ def report() -> Report:
     graph = ring(truth)
     weights = np.ones(20)
     weights[3] = 0
+    edges = with_residuals(Edges.measured(graph), sets["result"], weights)
+    rejected = Edges.of([[0, 5]] * 5).put(slice(None), status="rejected", why="fitness below 0.3")
     return Report(
         title="A <ring> & its loop",
         source=SourceSummary(
@@ -81,8 +83,8 @@ def report() -> Report:
         scores=scored(0.010, 0.020, 0.012),
         trajectories=trajectory_rows(sets, truth),
         loops=(LoopRow("measured", 4, 2.0), LoopRow("step 1", 4, 1e-3)),
-        graph=graph_summary(graph, np.zeros(20, np.int64), weights, {"fitness below 0.3": 5}),
-        worst_edges=worst_edges(graph, sets["result"], weights, 3),
+        graph=graph_summary(Edges.joined([edges, rejected]), graph.vertex_ids, np.zeros(20, np.int64)),
+        worst_edges=worst_edges(edges, graph.vertex_ids, 3),
         stages=(StageRow("read", 1.0, 0.5, 100.0), StageRow("solve", 2.0, 3.5, 300.0)),
         notes=("2 pairs were tried twice",),
         versions={"hodge-pipeline": "0.1.0"},
@@ -290,7 +292,8 @@ def test_what_to_distrust_is_said(report: Report) -> None:
     #  0–…–9   10–…–18   19
     component = np.array([0] * 10 + [1] * 9 + [2])
     assert report.pictures.graph is not None
-    summary = graph_summary(report.pictures.graph, component, np.array([0.0] * 2 + [1.0] * 18))
+    edges = Edges.measured(report.pictures.graph).put(slice(None), weight=np.array([0.0] * 2 + [1.0] * 18))
+    summary = graph_summary(edges, report.pictures.graph.vertex_ids, component)
     said = "\n".join(suspicions(replace(report, graph=summary, scores=scored(0.01, 0.1, 0.01))))
     for expected in (
         "2 pairs were tried twice",
@@ -323,7 +326,8 @@ def test_an_ignored_edge_is_not_called_used(report: Report) -> None:
 def test_parts_are_listed_largest_first_as_the_source_names_them(report: Report) -> None:
     assert report.pictures.graph is not None
     component = np.array([1, 0, 0, 1, 0] + [0] * 15)
-    parts = graph_summary(report.pictures.graph, component).components
+    graph = report.pictures.graph
+    parts = graph_summary(Edges.measured(graph), graph.vertex_ids, component).components
     assert [(part.count, part.frames) for part in parts] == [(18, "101–102, 104–119"), (2, "100, 103")]
     assert in_runs(np.arange(0, 60, 2), np.arange(60)).endswith("20, 22, and 18 more")
     assert in_runs(np.zeros(0, np.int64), np.arange(3)) == "none"

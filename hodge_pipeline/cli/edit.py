@@ -14,8 +14,8 @@ from hodge_pipeline.pairs.edits import (
     REGISTERED,
     Edit,
     History,
+    Listed,
     listed_edges,
-    named_edges,
     pair_names,
     pairs_to_register,
     read_history,
@@ -23,7 +23,7 @@ from hodge_pipeline.pairs.edits import (
 )
 from hodge_pipeline.store.workspace import holding
 from hodge_pipeline.types import Edges
-from hodge_pipeline.types.edges import DISABLED, REJECTED, Words
+from hodge_pipeline.types.edges import DISABLED, REJECTED
 
 
 @dataclass(frozen=True)
@@ -38,29 +38,11 @@ class Pairs:
         return bool(self.disable or self.enable or self.register)
 
 
-@dataclass(frozen=True)
-class Listed:
-    """The edges of a run with the names of its vertices, as `edges.csv` has them."""
-
-    edges: Edges
-    vertex_ids: Words
-
-    @property
-    def names(self) -> list[str]:
-        """The name of each row: `12-87`."""
-        return pair_names(self.vertex_ids, self.edges.pairs)
-
-    def named(self, words: Sequence[str]) -> tuple[str, ...]:
-        """The edges that the words name in either direction, each once."""
-        names = self.names
-        return tuple(dict.fromkeys(names[row] for row in named_edges(self.edges, self.vertex_ids, words)))
-
-
 def edit(folder: Path, pairs: Pairs, *, undo: bool, listing: bool, quiet: bool, as_json: bool) -> None:
     """Add to the history of edits, or take the last back, and print what the edits now come to."""
     if undo and pairs:
         raise GraphError("--undo takes the last edit back: give it alone")
-    listed = Listed(*listed_edges(folder))
+    listed = listed_edges(folder)
     changed = bool(undo or pairs)
     with holding(folder):
         history = read_history(folder)

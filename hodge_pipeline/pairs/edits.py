@@ -116,11 +116,32 @@ def write_history(folder: Path, history: History) -> None:
     )
 
 
-def listed_edges(folder: Path) -> tuple[Edges, Words]:
-    """Every edge and rejected pair of a run, and the names of its vertices.
+@dataclass(frozen=True)
+class Listed:
+    """The edges of a run with the names of its vertices, as `edges.csv` has them."""
 
-    Raises `WorkspaceError` where the folder holds no finished run.
-    """
+    edges: Edges
+    vertex_ids: Words
+
+    @property
+    def names(self) -> list[str]:
+        """The name of each row: `12-87`."""
+        return pair_names(self.vertex_ids, self.edges.pairs)
+
+    def named(self, pairs: Sequence[str]) -> tuple[str, ...]:
+        """The pairs, given in either direction, as they are listed first, each once. Raises `GraphError` for others."""
+        known: dict[str, str] = {}
+        for name, backwards in zip(self.names, pair_names(self.vertex_ids, self.edges.pairs[:, ::-1]), strict=True):
+            known.setdefault(name, name)
+            known.setdefault(backwards, name)
+        for pair in pairs:
+            if pair not in known:
+                raise GraphError(f"{pair}: no edge joins these frames: give two ids of {EDGES}, as 12-87")
+        return tuple(dict.fromkeys(known[pair] for pair in pairs))
+
+
+def listed_edges(folder: Path) -> Listed:
+    """Every edge and rejected pair of a run. Raises `WorkspaceError` where the folder holds no finished run."""
     path = folder / EDGES
     if (folder / REFINEMENT).is_dir():
         raise WorkspaceError(
@@ -130,25 +151,12 @@ def listed_edges(folder: Path) -> tuple[Edges, Words]:
     if not path.is_file():
         raise WorkspaceError(f"{folder}: holds no finished run ({EDGES} is missing): run the recipe to its end first")
     edges, names = read_edges(path)
-    return edges.select(edges.status != HELD_OUT), names
+    return Listed(edges.select(edges.status != HELD_OUT), names)
 
 
 def pair_names(vertex_ids: NDArray[np.generic], pairs: Ints) -> list[str]:
     """Pairs (P, 2) of rows as they are written: `12-87`."""
     return [f"{i}-{j}" for i, j in vertex_ids[pairs].tolist()]
-
-
-def named_edges(edges: Edges, vertex_ids: NDArray[np.generic], pairs: Sequence[str]) -> list[int]:
-    """The row of the first edge of each pair, given in either direction. Raises `GraphError` for a pair without one."""
-    rows: dict[str, int] = {}
-    both = zip(pair_names(vertex_ids, edges.pairs), pair_names(vertex_ids, edges.pairs[:, ::-1]), strict=True)
-    for row, names in enumerate(both):
-        for name in names:
-            rows.setdefault(name, row)
-    for pair in pairs:
-        if pair not in rows:
-            raise GraphError(f"{pair}: no edge joins these frames: give two ids of {EDGES}, as 12-87")
-    return [rows[pair] for pair in pairs]
 
 
 def pairs_to_register(edges: Edges, vertex_ids: NDArray[np.generic], pairs: Sequence[str]) -> tuple[str, ...]:

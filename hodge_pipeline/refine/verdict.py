@@ -74,7 +74,7 @@ def summary(decision: Decision) -> RefinementSummary:
 def _decision(work: Work, rounds: Sequence[Round], before: Floats) -> Decision:
     last = rounds[-1]
     if not last.graph.edge_count or last.solution is None:
-        rejected = ", ".join(f"{count} {reason}" for reason, count in last.rejected_counts.items())
+        rejected = ", ".join(f"{count} {reason}" for reason, count in last.edges.rejected_counts.items())
         return Decision("nothing", f"no edge joins two frames ({rejected or 'no pair overlaps'}): nothing was refined")
     if not (last.solution.weights > 0).any():
         return Decision("nothing", f"the solver rejected all {last.graph.edge_count} edges: nothing was refined")

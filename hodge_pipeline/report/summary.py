@@ -11,7 +11,6 @@ from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
 from hodge_pipeline.report.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow
 from hodge_pipeline.types import Edges, Floats, Ints
-from hodge_pipeline.types.edges import REJECTED, Words
 
 CENTIMETRES_PER_DEGREE = 1.0
 """How a residual's angle counts beside its translation when edges are ranked: a scene lies about 0.6 m away."""
@@ -73,24 +72,21 @@ def _distinct(component: Ints | None, sequence: Sequence[str] | None, count: int
 
 def graph_summary(edges: Edges, vertex_ids: NDArray[np.generic], component: Ints) -> GraphSummary:
     """The viewing graph in numbers; `component (V,)` as the solution has it."""
-    graph, rejected = edges.select(edges.in_graph), edges.select(edges.status == REJECTED)
+    graph = edges.select(edges.in_graph)
+    sources, counts = np.unique(graph.proposed_by, return_counts=True)
     labels, sizes = np.unique(component, return_counts=True)
     largest_first = labels[np.argsort(-sizes, kind="stable")]
     rows = [np.flatnonzero(component == label) for label in largest_first]
     return GraphSummary(
         vertices=len(vertex_ids),
         edges=len(graph),
-        edges_by_source=_counted(graph.proposed_by),
+        edges_by_source=dict(zip(sources.tolist(), counts.tolist(), strict=True)),
         components=tuple(ComponentRow(len(row), in_runs(row, vertex_ids)) for row in rows),
         edges_ignored=int((graph.weight <= 0).sum()),
-        rejected=_counted(rejected.why),
+        rejected=edges.rejected_counts,
         verdicts=_verdicts(graph),
         verdicts_in_use=_verdicts(graph.select(graph.weight > 0)),
     )
-
-
-def _counted(words: Words) -> dict[str, int]:
-    return {str(name): int(count) for name, count in zip(*np.unique(words, return_counts=True), strict=True)}
 
 
 def _verdicts(graph: Edges) -> dict[str, int]:

@@ -95,7 +95,7 @@ def _without_guess(
         workers,
     )  # fmt: skip
     shutil.rmtree(scratch, ignore_errors=True)
-    if not found.accepted.all():
-        refused = ", ".join(f"{count} {reason}" for reason, count in found.counts.items())
-        step.note(f"{len(pairs)} pairs between pieces matched, {int(found.accepted.sum())} may be edges ({refused})")
-    return found.registered.select(found.accepted)
+    if not found.counts.all():
+        refused = ", ".join(f"{count} {reason}" for reason, count in found.rejected_counts.items())
+        step.note(f"{len(pairs)} pairs between pieces matched, {int(found.counts.sum())} may be edges ({refused})")
+    return found.select(found.counts)

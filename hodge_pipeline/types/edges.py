@@ -265,6 +265,12 @@ class Edges:
         """The rows (E,) that are edges, those that are off by hand included."""
         return np.isin(self.status, (USED, IGNORED, DISABLED))
 
+    @property
+    def rejected_counts(self) -> dict[str, int]:
+        """How many pairs were rejected for each reason."""
+        reasons, counts = np.unique(self.why[self.status == REJECTED], return_counts=True)
+        return dict(zip(reasons.tolist(), counts.tolist(), strict=True))
+
     def as_graph(self, vertex_ids: NDArray[np.generic]) -> ViewGraph:
         """The viewing graph of all rows, each of which has a motion: `select` first."""
         columns = {name: getattr(self, name) for name in MEASURED}

@@ -14,7 +14,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
-from hodge_pipeline.start.unordered.hypotheses import Hypotheses, weigh
+from hodge_pipeline.start.unordered.hypotheses import weigh
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans
@@ -64,7 +64,8 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     views = Views.make(scene.frames, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, not by_image, workers)
     notes.append(_tried(len(rows), pairs, hypotheses))
-    measured = hypotheses.as_graph(scene.vertex_ids, "landmarks" if by_image else "features")
+    labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
+    measured = labelled.select(labelled.counts).as_graph(scene.vertex_ids)
     graph = measured
     if scene.given is not None:
         graph = ViewGraph.joined([scene.given.as_graph(scene.vertex_ids), measured])
@@ -98,8 +99,8 @@ def propose(scene: Frames, clouds: CloudSet, rows: Ints, described: Path, option
     return np.unique(np.concatenate([pairs, near]), axis=0)
 
 
-def _tried(count: int, pairs: Ints, hypotheses: Hypotheses) -> str:
+def _tried(count: int, pairs: Ints, hypotheses: Edges) -> str:
     every = count * (count - 1) // 2
-    refused = ", ".join(f"{number} {reason}" for reason, number in hypotheses.counts.items())
-    text = f"{len(pairs)} of {every} pairs were matched, {int(hypotheses.accepted.sum())} may be edges"
+    refused = ", ".join(f"{number} {reason}" for reason, number in hypotheses.rejected_counts.items())
+    text = f"{len(pairs)} of {every} pairs were matched, {int(hypotheses.counts.sum())} may be edges"
     return f"{text} ({refused})" if refused else text
