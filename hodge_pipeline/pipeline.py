@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
+from hodge_pipeline.complex.parts import decompose, energies, one_form
 from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.evaluation.evaluate import score_rounds
 from hodge_pipeline.evaluation.scores import ScoreTable
@@ -22,7 +23,7 @@ from hodge_pipeline.refine import verdict
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report import run_files
 from hodge_pipeline.rounds.by_hand import edited_rounds
-from hodge_pipeline.rounds.one_round import Work
+from hodge_pipeline.rounds.one_round import Registered, Work
 from hodge_pipeline.rounds.suggested import suggested_rounds
 from hodge_pipeline.run_folder import Run, begin, check_layout, end, opening_of
 from hodge_pipeline.scene import Round, Scene
@@ -131,20 +132,30 @@ class _Job:
         return graph
 
     def compute(self, work: Work, recording: Recording) -> tuple[list[Round], ScoreTable | None]:
-        """The rounds and their scores."""
-        scene, rounds = work.scene, [work.scene.first]
-        recording.begin(scene.clouds, scene.first)
+        """The rounds and their scores: the paper's algorithm."""
+        rounds = [work.scene.first]
+        recording.begin(work.scene.clouds, rounds[0])
         for number in range(1, self.recipe.outer_iterations + 1):
-            rounds.append(work.round(number, rounds[-1]))
+            proposed = work.propose(number, rounds[-1])
+            registered = work.register(number, proposed, rounds[-1].world_from_cam)
+            rounds.append(self.consistent(work, registered))
             recording.round(number, rounds[-1])
         for more in chain(suggested_rounds(work, rounds), edited_rounds(work, self.workspace.folder, rounds)):
-            rounds.append(more)
-            recording.round(len(rounds) - 1, more)
+            rounds.append(self.consistent(work, more))
+            recording.round(len(rounds) - 1, rounds[-1])
         rounds[-1] = work.judge(rounds[-1])
         recording.diagnosis(rounds[-1])
         scores = self.score(work, rounds)
         recording.scores(scores)
         return rounds, scores
+
+    def consistent(self, work: Work, registered: Registered) -> Round:
+        """The poses consistent with a round's edges: the complex of their graph, ω on it, its parts, the solve."""
+        graph = registered.graph(work.scene.first.vertex_ids)
+        complex_ = self.recipe.complex.of(graph, work.scene.clouds, registered.start)
+        omega = one_form(graph, registered.start)
+        found = None if complex_ is None else energies(complex_, decompose(complex_, omega))
+        return work.solve(registered, graph, found)
 
     def score(self, work: Work, rounds: list[Round]) -> ScoreTable | None:
         """The scores of every round, where they are wished for."""

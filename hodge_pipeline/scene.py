@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.parts import Energies
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
@@ -25,7 +26,8 @@ class Round:
     the first poses, which `name` tells: odometry, or start where they were given.
 
     The pairs that any round so far registered come first in `edges`, then those that came measured. This round itself
-    registered the rows `fresh (F,)` from the poses `before (N, 4, 4)`. It is `edited` where a person's edits made it.
+    registered the rows `fresh (F,)` from the poses `before (N, 4, 4)`; `energies` are those of ω's parts at the poses
+    that the solve started from. It is `edited` where a person's edits made it.
     """
 
     edges: Edges
@@ -34,6 +36,7 @@ class Round:
     solution: Solution | None = None
     fresh: Ints | None = None
     before: Floats | None = None
+    energies: Energies | None = None
     edited: bool = False
     name: str = "odometry"
 

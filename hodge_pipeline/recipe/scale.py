@@ -19,6 +19,7 @@ SECTIONS = (
     "start",
     "edges",
     "registration",
+    "complex",
     "acceptance",
     "solver",
     "fusion",

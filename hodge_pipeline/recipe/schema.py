@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline.complex.parts import ComplexOptions
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.errors import RecipeError
@@ -78,6 +79,7 @@ class Recipe:
         default=KeyFrameStart(),
         description="where first poses come from: consecutive frames, given poses, no order",
     )
+    complex: ComplexOptions = ComplexOptions()
     guard: GuardOptions = GuardOptions()
     acceptance: Acceptance = Acceptance()
     measured: MeasuredOptions = MeasuredOptions()

@@ -73,6 +73,21 @@ class LoopRow:
 
 
 @dataclass(frozen=True)
+class EnergyRow:
+    """The parts of ω before the solve of a round: how many vertices, edges and triangles its complex has, and the shares
+    (rotation, translation) of the exact, co-exact and harmonic part in its energy.
+    """
+
+    round: str
+    simplices: tuple[int, ...]
+    exact: tuple[float, float]
+    coexact: tuple[float, float]
+    harmonic: tuple[float, float]
+    rotation_rad2: float
+    translation_m2: float
+
+
+@dataclass(frozen=True)
 class EdgeRow:
     """One measured edge and how far it is from the final poses; frames as the source names them."""
 
@@ -204,6 +219,7 @@ class Report:
     scores: ScoreTable | None = None
     trajectories: tuple[TrajectoryRow, ...] = ()
     loops: tuple[LoopRow, ...] = ()
+    energies: tuple[EnergyRow, ...] = ()
     graph: GraphSummary | None = None
     worst_edges: tuple[EdgeRow, ...] = ()
     stages: tuple[StageRow, ...] = ()

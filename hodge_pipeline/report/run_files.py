@@ -17,6 +17,7 @@ from hodge_pipeline.recipe import binding, yaml_file
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.verdict import Refined, summary
 from hodge_pipeline.report.contents import (
+    EnergyRow,
     LoopRow,
     Path3D,
     Pictures,
@@ -92,6 +93,7 @@ def make_report(
         scores=scores,
         trajectories=_trajectories(recipe, scene, sets, component),
         loops=_loop_rows(last.solution),
+        energies=_energy_rows(rounds),
         graph=graph_summary(last.edges, last.vertex_ids, component),
         worst_edges=worst,
         stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in store.costs()),
@@ -129,6 +131,22 @@ def _trajectories(
     delta_frames = recipe.evaluation.rpe_delta_frames
     component = component[scene.key_frames.key_of_frame]
     return trajectory_rows(every, true_poses(scene.whole), component, sequences, delta_frames=delta_frames)
+
+
+def _energy_rows(rounds: Sequence[Round]) -> tuple[EnergyRow, ...]:
+    found = []
+    for number, one in enumerate(rounds):
+        if one.energies is not None:
+            parts = one.energies.exact, one.energies.coexact, one.energies.harmonic
+            rotation, translation = np.sum(parts, axis=0).tolist()
+            shares = one.energies.shares
+            found.append(
+                EnergyRow(
+                    f"round {number}", one.energies.simplices, shares["exact"], shares["coexact"], shares["harmonic"],
+                    rotation, translation,
+                )
+            )  # fmt: skip
+    return tuple(found)
 
 
 def _loop_rows(solution: Solution) -> tuple[LoopRow, ...]:

@@ -61,6 +61,8 @@ def graph_tables(report: Report) -> Iterator[Table]:
             parts = tuple((str(n), str(part.count), part.frames) for n, part in enumerate(report.graph.components))
             header = ("part", report.source.vertex_name, "which")
             yield Table("Connected parts", header, parts, "Nothing measured joins two parts.", 3)
+    if report.energies:
+        yield _energies(report)
     if report.loops:
         yield _loops(report)
 
@@ -135,6 +137,20 @@ def _graph(report: Report) -> Table:
         *((f"pairs rejected: {reason}", str(count)) for reason, count in graph.rejected.items()),
     ]
     return Table("Viewing graph", ("what", "count"), tuple(rows), "An edge is a measured motion between two frames.")
+
+
+def _energies(report: Report) -> Table:
+    rows = tuple(
+        (row.round, str(row.simplices[2]), *(f"{100 * part[0]:.1f} / {100 * part[1]:.1f} %" for part in parts))
+        for row in report.energies
+        for parts in [(row.exact, row.coexact, row.harmonic)]
+    )
+    caption = (
+        "Helmholtz–Hodge parts of ω = log(T_i Z_ij T_j⁻¹) before the solve of each round, shares of the energy of rotation "
+        "/ translation. Exact: what moving the poses takes away; co-exact: triangles that do not close; harmonic: longer "
+        "loops that do not."
+    )
+    return Table("Decomposition", ("before", "triangles", "exact", "co-exact", "harmonic"), rows, caption, 5)
 
 
 def _loops(report: Report) -> Table:

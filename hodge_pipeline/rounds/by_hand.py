@@ -13,7 +13,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, History, joining, read_history, vertex_rows
 from hodge_pipeline.rounds.more import Placed, register_more
-from hodge_pipeline.rounds.one_round import EDITED, Work, solve_edges
+from hodge_pipeline.rounds.one_round import EDITED, Registered, Work
 from hodge_pipeline.scene import Round
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.types import Bools, Edges, Floats, ViewGraph
@@ -25,7 +25,7 @@ BY_HAND = "by_hand"
 NEXT = "hodge edit --list shows them, hodge edit --undo takes the last back"
 
 
-def edited_rounds(work: Work, folder: Path, rounds: Sequence[Round]) -> Iterator[Round]:
+def edited_rounds(work: Work, folder: Path, rounds: Sequence[Round]) -> Iterator[Registered]:
     """One more round, that of the edits in the run folder; nothing where there are none.
 
     It begins at the poses of the earlier round that its edges agree with best, since those after a wrong edge may be
@@ -44,9 +44,7 @@ def edited_rounds(work: Work, folder: Path, rounds: Sequence[Round]) -> Iterator
         fresh = np.arange(len(registered), len(registered) + len(new))
     _tell(work, edges.select(edges.status != HELD_OUT), ids, history)
     start = _start(work, edges.select(edges.counts).as_graph(ids), rounds)
-    yield work.steps.step(
-        solve_edges, edges, ids, work.recipe.solver, start, fresh, before, EDITED, title="solve, edited"
-    )
+    yield Registered(EDITED, edges, fresh, before, start)
 
 
 def _placed(work: Work, graph: ViewGraph) -> Placed:

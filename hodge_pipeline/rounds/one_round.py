@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.parts import Energies
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.evaluation.residuals import with_residuals
@@ -28,6 +29,28 @@ EDITED = "edited"
 
 
 @dataclass(frozen=True)
+class Registered:
+    """What a round is solved from: its pairs, measured ones last, of which it registered the rows `fresh (F,)` from the
+    poses `before (N, 4, 4)`; and the poses `start (N, 4, 4)` of the solve.
+    """
+
+    name: str
+    edges: Edges
+    fresh: Ints
+    before: Floats
+    start: Floats
+
+    def graph(self, vertex_ids: NDArray[np.generic]) -> ViewGraph:
+        """The viewing graph of the edges that count."""
+        return self.edges.select(self.edges.counts).as_graph(vertex_ids)
+
+    @property
+    def title(self) -> str:
+        """The title of its solve."""
+        return f"solve, {self.name}"
+
+
+@dataclass(frozen=True)
 class Work:
     """What every round of a run needs: `measured` edges join each round's graph as they are."""
 
@@ -36,13 +59,6 @@ class Work:
     scene: Scene
     measured: ViewGraph
     workers: Workers
-
-    def round(self, number: int, before: Round) -> Round:
-        """Round `number`: what the recipe's builder proposes from the poses of the round before, registered, solved."""
-        poses = before.world_from_cam
-        registered = self.register(number, self.propose(number, before), poses)
-        fresh = np.flatnonzero(registered.status != HELD_OUT)
-        return self.solve(number, registered, fresh, poses, poses)
 
     def propose(self, number: int, before: Round) -> Edges:
         """The pairs to register in round `number` from the poses of the one before."""
@@ -54,26 +70,28 @@ class Work:
         )  # fmt: skip
         return with_start_edges(proposed, scene.first)
 
-    def register(self, number: int, edges: Edges, world_from_cam: Floats) -> Edges:
-        """The table with its candidates registered from these poses, and accepted or rejected."""
+    def register(self, number: int, edges: Edges, world_from_cam: Floats) -> Registered:
+        """The candidates registered from these poses, and accepted or rejected."""
         registered = self.steps.step(
             register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam,
             title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
         )  # fmt: skip
-        return self.accept(registered)
+        fresh = np.flatnonzero(registered.status != HELD_OUT)
+        edges = self.with_measured(self.accept(registered))
+        return Registered(f"round {number}", edges, fresh, world_from_cam, world_from_cam)
 
     def accept(self, edges: Edges) -> Edges:
         """The table with the status of every registered pair."""
         scale = self.recipe.scale if isinstance(self.recipe.scale, float) else 1.0
         return accepted(edges, self.recipe.acceptance, self.scene.drift, scale)
 
-    def solve(self, number: int, registered: Edges, fresh: Ints, before: Floats, start: Floats) -> Round:
-        """The accepted and the measured edges, and the poses consistent with them from `start`; the rows `fresh` were
-        registered from the poses `before`.
-        """
-        edges, ids = Edges.joined([registered, Edges.measured(self.measured)]), self.scene.first.vertex_ids
-        name, title = f"round {number}", f"solve, round {number}"
-        return self.steps.step(solve_edges, edges, ids, self.recipe.solver, start, fresh, before, name, title=title)
+    def with_measured(self, edges: Edges) -> Edges:
+        """The table with the edges that came measured at its end."""
+        return Edges.joined([edges, Edges.measured(self.measured)])
+
+    def solve(self, registered: Registered, graph: ViewGraph, found: Energies | None) -> Round:
+        """The round of these edges, and the poses consistent with them, of which `graph` holds those that count."""
+        return self.steps.step(solve_edges, registered, graph, self.recipe.solver, found, title=registered.title)
 
     def judge(self, last: Round) -> Round:
         """The last round, with the verdict of the diagnosis on each of its edges."""
@@ -120,25 +138,19 @@ def with_start_edges(candidates: Edges, first: Round) -> Edges:
 
 
 def solve_edges(
-    edges: Edges,
-    vertex_ids: NDArray[np.generic],
-    solver: ConsistencySolver,
-    start: Floats,
-    fresh: Ints,
-    before: Floats,
-    name: str,
-    *,
-    step: Step,
+    registered: Registered, graph: ViewGraph, solver: ConsistencySolver, found: Energies | None, *, step: Step
 ) -> Round:
-    """Step: the round of these edges and the poses consistent with them; `name` begins the solver's notes."""
-    solution = solver.solve(edges.select(edges.counts).as_graph(vertex_ids), start)
+    """Step: the round of these edges and the poses consistent with them; `found` of ω at its start is kept."""
+    edges, solution = registered.edges, solver.solve(graph, registered.start)
     weights = np.zeros(len(edges))
     weights[edges.counts] = solution.weights
     solution = replace(solution, weights=weights[edges.in_graph])
     for note in solution.notes:
-        step.note(f"{name}: {note}")
-    solved = with_residuals(edges, solution.world_from_cam, solution.weights)
-    return Round(solved, vertex_ids, solution.world_from_cam, solution, fresh, before, edited=name == EDITED)
+        step.note(f"{registered.name}: {note}")
+    return Round(
+        with_residuals(edges, solution.world_from_cam, solution.weights), graph.vertex_ids, solution.world_from_cam,
+        solution, registered.fresh, registered.before, found, edited=registered.name == EDITED,
+    )  # fmt: skip
 
 
 def judge_edges(last: Round, options: DiagnosisOptions, *, step: Step) -> Round:

@@ -14,7 +14,7 @@ from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.refine.held_out import held_out_pairs
 from hodge_pipeline.rounds.more import Placed, register_more
-from hodge_pipeline.rounds.one_round import Work
+from hodge_pipeline.rounds.one_round import Registered, Work
 from hodge_pipeline.scene import Round
 from hodge_pipeline.stages import Step
 from hodge_pipeline.start.unordered.pieces import laid_apart
@@ -33,7 +33,7 @@ class Suggested:
     untestable: int
 
 
-def suggested_rounds(work: Work, rounds: Sequence[Round]) -> Iterator[Round]:
+def suggested_rounds(work: Work, rounds: Sequence[Round]) -> Iterator[Registered]:
     """As many rounds as the recipe's `suggestions` allow and are of use, each after the last of `rounds`, which the
     caller extends by it.
     """
@@ -52,12 +52,12 @@ def suggested_rounds(work: Work, rounds: Sequence[Round]) -> Iterator[Round]:
         edges = work.accept(Edges.joined([last.registered(work.measured), new]))
         rows = np.arange(len(edges) - len(new), len(edges))
         edges, start = _judged(work, last, edges, rows, found)
-        solved, new = work.solve(number, edges, rows, found.placed.world_from_cam, start), edges.select(rows)
+        new = edges.select(rows)
         work.steps.note(
             f"round {number}: of {len(found.pairs)} suggested pairs {int(new.counts.sum())} became edges; before it "
             f"{found.untestable} of {last.graph.edge_count} edges could not be tested"
         )
-        yield solved
+        yield Registered(f"round {number}", work.with_measured(edges), rows, found.placed.world_from_cam, start)
 
 
 def suggest_edges(
