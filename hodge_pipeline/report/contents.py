@@ -74,8 +74,8 @@ class LoopRow:
 
 @dataclass(frozen=True)
 class EnergyRow:
-    """The parts of ω before the solve of a round: how many vertices, edges and triangles its complex has, and the shares
-    (rotation, translation) of the exact, co-exact and harmonic part in its energy.
+    """The parts of ω before the solve of a round: how many vertices, edges and triangles its complex has, and the
+    shares (rotation, translation) of the exact, co-exact and harmonic part in its energy.
     """
 
     round: str

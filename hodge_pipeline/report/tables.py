@@ -146,9 +146,9 @@ def _energies(report: Report) -> Table:
         for parts in [(row.exact, row.coexact, row.harmonic)]
     )
     caption = (
-        "Helmholtz–Hodge parts of ω = log(T_i Z_ij T_j⁻¹) before the solve of each round, shares of the energy of rotation "
-        "/ translation. Exact: what moving the poses takes away; co-exact: triangles that do not close; harmonic: longer "
-        "loops that do not."
+        "Helmholtz–Hodge parts of ω = log(T_i Z_ij T_j⁻¹) before the solve of each round: shares of the energy of "
+        "rotation / translation. Exact: what moving the poses takes away; co-exact: triangles that do not close; "
+        "harmonic: longer loops that do not."
     )
     return Table("Decomposition", ("before", "triangles", "exact", "co-exact", "harmonic"), rows, caption, 5)
 
