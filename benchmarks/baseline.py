@@ -103,13 +103,16 @@ def poses(folder: Path) -> Floats:
 
 
 def edges(folder: Path) -> dict[str, int]:
-    """Every row of `edges*.csv` as `i-j source status verdict`, and how often it occurs."""
+    """Every row of `edges*.csv` as `i-j source status verdict`, and how often it occurs; of a rejected pair the reason
+    stands for the source.
+    """
     found: Counter[str] = Counter()
     for path in sorted(folder.glob("edges*.csv")):
         with path.open(newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file):
-                parts = (row.get(name, "") for name in ("source", "status", "verdict"))
-                found[" ".join([f"{row['i']}-{row['j']}", *parts])] += 1
+                status = row.get("status", "")
+                source = row.get("why") or row["source"] if status == "rejected" else row["source"]
+                found[f"{row['i']}-{row['j']} {source} {status} {row.get('verdict', '')}"] += 1
     return dict(found)
 
 

@@ -25,7 +25,7 @@ from hodge_pipeline.report import splat
 from hodge_pipeline.report.diagnosed import diagnose_subject, open_subject, write_diagnosed
 from hodge_pipeline.report.diagnosis_plots import draw
 from hodge_pipeline.report.edge_pictures import edge_pictures
-from hodge_pipeline.rounds import true_poses
+from hodge_pipeline.scene import true_poses
 from hodge_pipeline.types import CloudSet, Floats, ViewGraph
 
 PICTURES = Path(__file__).parent / "pictures"

@@ -26,11 +26,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hodge_pipeline.pipeline import Run, run
+    from hodge_pipeline.pipeline import run
     from hodge_pipeline.recipe.schema import Recipe, load_recipe
     from hodge_pipeline.refine.colmap import refine_colmap
     from hodge_pipeline.refine.open3d_objects import solve_pose_graph
     from hodge_pipeline.refine.trajectory import frames_from_images, refine_trajectory
+    from hodge_pipeline.run_folder import Run
     from hodge_pipeline.solvers.maximum_likelihood import solve
     from hodge_pipeline.types import Solution, ViewGraph
 
@@ -40,15 +41,15 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "Recipe": "recipe",
-    "load_recipe": "recipe",
-    "Run": "pipeline",
+    "Recipe": "recipe.schema",
+    "load_recipe": "recipe.schema",
+    "Run": "run_folder",
     "run": "pipeline",
-    "refine_colmap": "refined_colmap",
-    "refine_trajectory": "refined_trajectory",
-    "frames_from_images": "refined_trajectory",
+    "refine_colmap": "refine.colmap",
+    "refine_trajectory": "refine.trajectory",
+    "frames_from_images": "refine.trajectory",
     "solve_pose_graph": "refine.open3d_objects",
-    "solve": "solvers.hodge",
+    "solve": "solvers.maximum_likelihood",
     "Solution": "types",
     "ViewGraph": "types",
 }

@@ -1,47 +1,39 @@
-"""The method on one screen: read, register in sequence, then edges, registration and solve until consistent; fuse."""
+"""The method on one screen: start, then propose, register and solve until consistent; judge, refine, fuse."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from hodge_pipeline import steps
+from hodge_pipeline.complex.parts import decompose, energies, one_form
+from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.evaluation.evaluate import score_rounds
 from hodge_pipeline.evaluation.scores import ScoreTable
-from hodge_pipeline.pairs.by_hand import edited_rounds
+from hodge_pipeline.executors.dask import open_workers
+from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import listed_edges
-from hodge_pipeline.pairs.suggested import suggested_rounds
 from hodge_pipeline.recipe import binding
-from hodge_pipeline.recipe.scale import apply_scale
+from hodge_pipeline.recipe.scale import with_scale
 from hodge_pipeline.recipe.schema import Recipe, load_recipe, with_source
 from hodge_pipeline.recording.run import Recording
 from hodge_pipeline.refine import verdict
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report import run_files
-from hodge_pipeline.report.contents import Report
-from hodge_pipeline.rounds import Round
-from hodge_pipeline.start import first_poses, key_frames
-from hodge_pipeline.start.key_frames import Tracked
-from hodge_pipeline.store.job import Job, logging_to
-from hodge_pipeline.store.progress import Nobody, Watcher
+from hodge_pipeline.rounds.by_hand import edited_rounds
+from hodge_pipeline.rounds.one_round import Registered, Work
+from hodge_pipeline.rounds.suggested import suggested_rounds
+from hodge_pipeline.run_folder import Run, begin, check_layout, end, opening_of
+from hodge_pipeline.scene import Round, Scene
+from hodge_pipeline.sources.measured_edges import measured_edges
+from hodge_pipeline.sources.opening import open_source, remembered
+from hodge_pipeline.store.log import logging_to
+from hodge_pipeline.store.progress import Watcher
+from hodge_pipeline.store.store import Store
 from hodge_pipeline.store.workspace import RECIPE_FILE, Workspace
-from hodge_pipeline.types import Source
-
-
-@dataclass(frozen=True)
-class Run:
-    """A finished run: its folder, what was read, its last round (graph, solution, poses in frame order), the report.
-
-    Where it started from given poses the source holds the key frames, and `refined` the decision and all poses. Of a
-    long source it holds the key frames too, and `tracked.all_poses(result.world_from_cam)` are the poses of all frames.
-    """
-
-    folder: Path
-    source: Source
-    result: Round
-    report: Report
-    refined: Refined | None = None
-    tracked: Tracked | None = None
+from hodge_pipeline.types import Source, ViewGraph
 
 
 def run(
@@ -52,11 +44,13 @@ def run(
     overwrite: bool = False,
     watcher: Watcher | None = None,
     live: str | None = None,
+    dask: str | None = None,
 ) -> Run:
     """Run a recipe (its name, its file or itself) into the folder `out`, going on where an earlier run stopped.
 
     A `source` may be opened already; a run of frames that are in memory cannot be resumed by another process.
-    `live` is the address of a Rerun viewer that shows the run as it happens.
+    `live` is the address of a Rerun viewer that shows the run as it happens; `dask` that of a Dask scheduler whose
+    workers see the same files, and which is trusted to run code here.
     Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     if isinstance(recipe, str):
@@ -69,64 +63,123 @@ def run(
         Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace,
         logging_to(folder / "log.txt"),
     ):
-        return _run(Job(recipe, workspace, watcher or Nobody(), live=live, opened=opened))
+        return _Job(recipe, workspace, Store(workspace.steps, watcher), live, dask, opened).run()
 
 
-def solve_again(folder: Path | str, *, watcher: Watcher | None = None) -> Run:
+def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str | None = None) -> Run:
     """Solve and fuse a finished run once more, with the edits in its folder, and bring all that it left up to date.
 
-    Nothing is registered and no score is measured again: `run` with the same recipe does that. Raises `HodgeError`.
+    Nothing is registered and no score is measured again: `run` with the same recipe does that. `dask` is as of `run`.
+    Raises `HodgeError`.
     """
     folder = Path(folder)
     listed_edges(folder)
+    check_layout(folder)
     recipe = load_recipe(str(folder / RECIPE_FILE))
     with Workspace.reopen(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
-        return _run(Job(recipe, workspace, watcher or Nobody(), scoring=False))
+        return _Job(recipe, workspace, Store(workspace.steps, watcher), dask=dask, again=True).run()
 
 
-def _run(job: Job) -> Run:
-    source = read(job)
-    with Recording(job, source) as recording:
-        rounds, models, scores = compute(job, source, recording)
-    refined = None if job.given is None else verdict.finish(job, job.given, rounds)
-    report = run_files.write(job, source, rounds, models, scores, refined)
-    return Run(job.workspace.folder, source, rounds[-1], report, refined, job.tracked)
+@dataclass(frozen=True)
+class _Job:
+    """One run in progress; `again`: after an edit, when a person waits, without what takes long."""
 
+    recipe: Recipe
+    workspace: Workspace
+    store: Store
+    live: str | None = None
+    dask: str | None = None
+    opened: Source | None = None
+    again: bool = False
 
-def read(job: Job) -> Source:
-    """The source, of a long one its key frames; the recipe's lengths are those of its scene from here on."""
-    source = steps.read(job)
-    apply_scale(job, source)
-    return key_frames.key_frames(job, source)
+    def run(self) -> Run:
+        """The finished run."""
+        source = self.read()
+        job = _Job(**{**vars(self), "recipe": with_scale(self.recipe, source, self.store)})
+        with ExitStack() as pool:
+            workers = pool.enter_context(open_workers(job.recipe.executor, job.dask))
+            scene = job.recipe.start.begin(source, job.recipe.clouds, job.store, workers)
+            job.store.step(begin, *opening_of(scene), title="frames")
+            with Recording(job.store, job.workspace.folder, job.recipe, scene.source, job.live) as recording:
+                work = Work(job.recipe, job.store, scene, job.measured(scene), workers)
+                rounds, scores = job.compute(work, recording)
+                refined = verdict.finish(work, job.workspace.folder, rounds) if scene.is_given else None
+                pool.close()  # fusing needs their memory
+                keys_only, poses = job.again and rounds[-1].edited, rounds[-1].world_from_cam
+                models = fuse_all(job.recipe.fusion, scene, poses, job.store, keys_only=keys_only)
+                recording.models(models)
+        return job.finish(scene, rounds, models, scores, refined)
 
+    def read(self) -> Source:
+        """The source, opened; its images stay on disk."""
+        path = self.recipe.source.path
+        if path is None:
+            raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
+        source, reader = (self.opened, None) if self.opened else open_source(path, self.recipe.source.reader)
+        if not source.frames:
+            raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
+        for note in source.notes:
+            self.store.note(note)
+        if len(source.frames) == 1:
+            self.store.note(f"{path}: has a single frame: there is nothing to register, the model is that frame alone")
+        return remembered(source, reader, self.store)
 
-def compute(job: Job, source: Source, recording: Recording) -> tuple[list[Round], dict[str, Path], ScoreTable | None]:
-    """The rounds, the models' files by name, the scores: every stage in order, each recorded once it is done."""
-    measured = steps.measured(job, source)
-    with job.recipe.executor.open() as workers:
-        clouds = steps.prepare_clouds(job, source, workers)
-        recording.clouds(clouds)
-        rounds = [first_poses.first_poses(job, source, workers)]
-        recording.first_poses(rounds[0])
-        for number in range(1, job.recipe.outer_iterations + 1):
-            poses = rounds[-1].world_from_cam
-            proposed = steps.propose_edges(job, number, source, clouds, poses, measured)
-            candidates = first_poses.with_start_edges(proposed, rounds[0])
-            registered = steps.register_edges(job, number, candidates, poses, workers)
-            recording.registration(number, registered, poses, clouds)
-            rounds.append(steps.solve(job, number, source, candidates, registered, poses, measured))
+    def measured(self, scene: Scene) -> ViewGraph:
+        """The edges that come measured, over the key frames: they join every round's graph as they are."""
+        graph, notes = measured_edges(scene.source, self.recipe.measured)
+        for note in notes:
+            self.store.note(note)
+        return graph
+
+    def compute(self, work: Work, recording: Recording) -> tuple[list[Round], ScoreTable | None]:
+        """The rounds and their scores: the paper's algorithm."""
+        rounds = [work.scene.first]
+        recording.begin(work.scene.clouds, rounds[0])
+        for number in range(1, self.recipe.outer_iterations + 1):
+            proposed = work.propose(number, rounds[-1])
+            registered = work.register(number, proposed, rounds[-1].world_from_cam)
+            rounds.append(self.consistent(work, registered))
             recording.round(number, rounds[-1])
-        suggested = suggested_rounds(job, source, clouds, measured, rounds, workers)
-        for more in chain(suggested, edited_rounds(job, source, measured, rounds, workers)):
-            if len(more.registered.pairs):
-                recording.registration(len(rounds), more.registered, more.before, clouds)
-            rounds.append(more.round)
-            recording.round(len(rounds) - 1, more.round)
-        rounds[-1] = steps.judge_edges(job, rounds[-1], len(rounds) - 1)
+        for more in chain(suggested_rounds(work, rounds), edited_rounds(work, self.workspace.folder, rounds)):
+            rounds.append(self.consistent(work, more))
+            recording.round(len(rounds) - 1, rounds[-1])
+        rounds[-1] = work.judge(rounds[-1])
         recording.diagnosis(rounds[-1])
-        scores = steps.evaluate(job, source, rounds, workers)
+        scores = self.score(work, rounds)
         recording.scores(scores)
-    frames, poses = key_frames.frames_to_fuse(job, source, rounds[-1])
-    models = steps.fuse(job, frames, poses, len(rounds) - 1)
-    recording.models(models)
-    return rounds, models, scores
+        return rounds, scores
+
+    def consistent(self, work: Work, registered: Registered) -> Round:
+        """The poses consistent with a round's edges: the complex of their graph, ω on it, its parts, the solve."""
+        graph = registered.graph(work.scene.first.vertex_ids)
+        complex_ = self.recipe.complex.of(graph, work.scene.clouds, registered.start)
+        omega = one_form(graph, registered.start)
+        found = None if complex_ is None else energies(complex_, decompose(complex_, omega))
+        return work.solve(registered, graph, found)
+
+    def score(self, work: Work, rounds: list[Round]) -> ScoreTable | None:
+        """The scores of every round, where they are wished for."""
+        if not self.recipe.evaluation.tables:
+            return None
+        if self.again:
+            self.store.note("the scores are not measured again after an edit: hodge run, as before, measures them")
+            return None
+        scale = float(self.recipe.scale)
+        return score_rounds(work.scene.source, work.scene.clouds, rounds, scale, self.store, work.workers)
+
+    def finish(
+        self,
+        scene: Scene,
+        rounds: list[Round],
+        models: Mapping[str, Path],
+        scores: ScoreTable | None,
+        refined: Refined | None,
+    ) -> Run:
+        """What the run leaves in its folder."""
+        poses = scene.key_frames.expand(rounds[-1].world_from_cam) if refined is None else refined.world_from_cam
+        report = run_files.write(self.workspace.folder, self.recipe, self.store, scene, rounds, models, scores, refined)
+        ending = self.store.step(end, poses, report, refined, title="report")
+        return Run(
+            self.workspace.folder, scene.whole, scene.key_frames, scene.clouds, tuple(rounds), poses, models, scores,
+            ending,
+        )  # fmt: skip

@@ -30,6 +30,7 @@ KINDS = {
     kind.name: kind
     for kind in (
         Kind("readers", stages.FrameReader, "open a path of one format"),
+        Kind("start", stages.Start, "find the first poses"),
         Kind("edges", stages.EdgeBuilder, "propose pairs of frames to register"),
         Kind("registration", stages.Registrar, "register one pair"),
         Kind("global_registration", stages.GlobalRegistrar, "find where one cloud lies in another, with no guess"),

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from hodge_pipeline.scene import Scene
 from hodge_pipeline.types import (
-    Candidates,
     CloudSet,
+    Edges,
     Floats,
     Frame,
     Ints,
@@ -38,6 +39,51 @@ Advance = Callable[[int], None]
 
 def no_progress(done: int) -> None:
     """Where nobody watches."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a step's function is given beside its inputs: where it may write, whom it tells of progress and oddities.
+
+    `folder` survives a kill, so a function may go on from what it left there; a `Path` or `CloudSet` that it returns
+    lies in it. What the function writes and does not return it removes.
+    """
+
+    folder: Path
+    advance: Advance
+    note: Callable[[str], None]
+
+
+class Steps(Protocol):
+    """Remembers what was computed in a run folder."""
+
+    def step(
+        self,
+        function: Callable[..., Result],
+        *inputs: Any,
+        title: str,
+        total: int = 1,
+        name: str = "",
+        **resources: Any,
+    ) -> Result:
+        """What `function(*inputs, **resources, step=Step)` returns, computed once for these inputs and read back
+        afterwards; its return type is the stored type. `resources`, such as workers, do not decide the result.
+
+        A step's name is its function's, or `name`, with the number of its call. `total` is how far `advance` counts.
+        """
+        ...
+
+    def remember(self, value: object, key: str) -> None:
+        """Let `value`, this very object, stand for `key` wherever it is an input."""
+        ...
+
+    def key(self, value: Any) -> str:
+        """The key of an input: of the step that made it, else of its contents."""
+        ...
+
+    def note(self, message: str) -> None:
+        """Tell the user, the log and the report, once."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -66,10 +112,21 @@ class FrameReader(Protocol):
 
 
 @runtime_checkable
+class Start(Protocol):
+    """Finds first poses."""
+
+    def begin(self, source: Source, clouds: Any, steps: Steps, workers: Workers) -> Scene:
+        """The frames to register with their clouds (`clouds`: `registration.clouds.CloudOptions`) and first poses, and
+        how all frames follow from them. What costs time is computed by `steps`, so that it is computed once.
+        """
+        ...
+
+
+@runtime_checkable
 class EdgeBuilder(Protocol):
     """Proposes pairs of frames to register."""
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs, given the current poses (N, 4, 4). Frames without points get none."""
         ...
 
@@ -126,7 +183,11 @@ class ConsistencySolver(Protocol):
     """Makes the poses consistent with all edges at once."""
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
-        """Poses from the start (V, 4, 4); each connected component keeps its own gauge."""
+        """Poses from the start (V, 4, 4); each connected component keeps its own gauge.
+
+        The graph's fixed vertices stay at their start and its priors count, or a `GraphError` refuses them. See
+        `hodge_pipeline.testing.check_solver`.
+        """
         ...
 
 

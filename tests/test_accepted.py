@@ -7,17 +7,16 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.acceptance import strays
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.types import Floats, Registration
+from hodge_pipeline.types import Edges, Floats, Registration
 
 POSES = se3.exp(np.arange(8)[:, None] * np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.0]))  # 0.12 of way a step
 ONE = np.zeros(8, np.int64)
 
 
-def registered(pairs: list[list[int]], errors: Floats) -> Registered:
+def registered(pairs: list[list[int]], errors: Floats) -> Edges:
     i, j = np.array(pairs).T
     motions = se3.inverse(POSES[i]) @ POSES[j] @ se3.exp(errors)
-    return Registered.of(np.array(pairs), [Registration(m, np.eye(6), 1.0, 0.01, 100, 1, True) for m in motions])
+    return Edges.of(pairs).with_registrations([Registration(m, np.eye(6), 1.0, 0.01, 100, 1, True) for m in motions])
 
 
 def shifted(*metres: float) -> Floats:
@@ -48,5 +47,7 @@ def test_the_unit_of_length_does_not_matter(scale: float) -> None:
     poses, motions = POSES.copy(), found.i_from_j.copy()
     poses[:, :3, 3] *= scale
     motions[:, :3, 3] *= scale
-    larger = Registered.of(found.pairs, [Registration(m, np.eye(6), 1.0, 0.01, 100, 1, True) for m in motions])
+    larger = Edges.of(found.pairs).with_registrations(
+        [Registration(m, np.eye(6), 1.0, 0.01, 100, 1, True) for m in motions]
+    )
     assert strays(larger, poses, ONE, 0.3, scale).tolist() == [False, True]

@@ -47,7 +47,7 @@ def test_ctrl_c_before_the_command_has_begun(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_stages_and_recipes_are_listed() -> None:
     stages, recipes = hodge("stages"), hodge("recipes")
-    for name in ("tum", "overlap", "gicp", "poisson", "tsdf", "dask"):
+    for name in ("tum", "overlap", "gicp", "poisson", "tsdf", "local"):
         assert name in stages.stdout
     assert {line.split()[0] for line in recipes.stdout.splitlines()} >= {"demo", "seven_scenes", "tum"}
     options = hodge("stages", "edges").stdout

@@ -77,7 +77,7 @@ def test_the_files_say_the_same(wrong_edge: tuple[Path, str, ViewGraph]) -> None
     folder, _, graph = wrong_edge
     with (folder / "why/edges.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0])[:4] == ["i", "j", "verdict", "probability"]
+    assert list(rows[0])[:4] == ["i", "j", "source", "status"]
     assert [[int(row["i"]), int(row["j"])] for row in rows] == graph.vertex_ids[graph.edges].tolist()
     assert [n for n, row in enumerate(rows) if row["verdict"] != "consistent"] == [17]
     poses = parse_tum(folder / "why/poses.tum").trajectory
@@ -239,10 +239,9 @@ def test_a_run_is_diagnosed_with_pictures(tiny_sequence: Path, tmp_path: Path) -
     settings = ["clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1", "fusion=[]"]
     recipe = load_recipe("demo", [*settings, "evaluation.tables=false"], tiny_sequence)
     run = hodge_pipeline.run(recipe, tmp_path / "run")
-    assert run.result.verdicts is not None
     answer = json.loads(hodge(tmp_path / "run", "--out", tmp_path / "why", "--json"))
     assert sum(answer["counts"].values()) == run.result.graph.edge_count
-    assert answer["counts"]["consistent"] == (run.result.verdicts.verdict == "consistent").sum()
+    assert answer["counts"]["consistent"] == (run.result.edges.verdict == "consistent").sum()
     assert all(source["source"] in run.result.graph.source for source in answer["edges"])
     page = (tmp_path / "why/diagnosis.html").read_text()
     bad = sum(count for verdict, count in answer["counts"].items() if verdict != "consistent")

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
+import numpy as np
+import pytest
+
+from diagnosis_graphs import SIGMA, measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
@@ -10,6 +13,7 @@ from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.diagnosis.solver import DiagnosedSolver
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import ViewGraph
 
@@ -78,3 +82,26 @@ def test_pieces_are_suggested_to_be_joined_and_nothing_needs_nothing() -> None:
     assert "joins two pieces" in suggestions.reason[0]
     whole = measured(poses_on_a_ring(3), np.array([[0, 1], [1, 2], [0, 2]]))
     assert len(suggest_pairs(whole, diagnose(whole, QUICK)).pairs) == 0
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 1.0])
+def test_an_edge_of_six_sigma_is_left_out_however_unlikely_it_is(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gate is for the edge's own residual; weights are what the information is multiplied by in the last solve."""
+    graph = measured(poses_on_a_ring(20), near_pairs(20, 4))
+    motion = graph.i_from_j.copy()
+    motion[7] = motion[7] @ se3.exp(6.5 * SIGMA * np.array([1.0, 0, 0, 0, 0, 0]))
+    information = np.tile(np.diag(SIGMA**-2), (graph.edge_count, 1, 1))
+    graph = replace(graph, i_from_j=motion, information=information)
+    found = diagnose(graph, QUICK)
+    probability = np.full(graph.edge_count, 0.9)
+    probability[7] = share
+    everything = np.ones(graph.edge_count, bool)
+    known = replace(found, probability=probability, kept=everything, verdict=np.full(graph.edge_count, "consistent"))
+    monkeypatch.setattr("hodge_pipeline.diagnosis.solver.diagnose", lambda *_: known)
+    solution = DiagnosedSolver(diagnosis=QUICK).solve(graph, poses_on_a_ring(20))
+    assert solution.weights[7] == 0
+    others = np.delete(solution.weights, 7)
+    assert set(others.tolist()) <= {0.0, 0.9} and (others > 0).mean() > 0.9
+    weighted = replace(graph, information=solution.weights[:, None, None] * graph.information)
+    again = solve(weighted, start=solution.world_from_cam)
+    np.testing.assert_allclose(again.metrics["chi2"], solution.metrics["chi2"], rtol=1e-8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from hodge_pipeline.pairs.combined import CombinedEdges
 from hodge_pipeline.pairs.overlap import OverlapEdges, pairwise_iou
 from hodge_pipeline.pairs.sequential import SequentialEdges
 from hodge_pipeline.stages import EdgeBuilder
-from hodge_pipeline.types import Candidates, CloudSet, Frame, PointCloud
+from hodge_pipeline.types import CloudSet, Edges, Frame, PointCloud
 
 
 def frames_of(*sequences: str) -> list[Frame]:
@@ -39,7 +40,7 @@ def poses_at(*x: float) -> np.ndarray:
 POINT = [[0.05, 0.05, 0.05]]
 
 
-def as_list(candidates: Candidates) -> list[tuple[int, int]]:
+def as_list(candidates: Edges) -> list[tuple[int, int]]:
     return [(int(i), int(j)) for i, j in candidates.pairs]
 
 
@@ -49,7 +50,7 @@ def test_sequential_bridges_empty_clouds_and_stays_in_its_sequence() -> None:
     frames = frames_of("a", "b", "a", "a", "a", "b")
     one = SequentialEdges().propose(frames, clouds, poses_at(*[0] * 6))
     assert as_list(one) == [(0, 2), (1, 5), (2, 4)]
-    assert set(one.source) == {"sequential"} and np.isnan(one.overlap).all()
+    assert set(one.proposed_by) == {"sequential"} and np.isnan(one.overlap).all()
     assert as_list(SequentialEdges(reach=9).propose(frames, clouds, poses_at(*[0] * 6))) == [
         (0, 2),
         (0, 4),
@@ -141,7 +142,7 @@ LINE_CLOUDS = clouds_of(*[POINT] * 5)
 def test_combined_joins_reasons() -> None:
     builders = (SequentialEdges(), OverlapEdges(voxel_m=0.15), CentroidEdges(max_distance_m=0.11))
     found = CombinedEdges(builders=builders).propose(LINE_FRAMES, LINE_CLOUDS, LINE)
-    assert dict(zip(as_list(found), found.source.tolist(), strict=True)) == {
+    assert dict(zip(as_list(found), found.proposed_by.tolist(), strict=True)) == {
         (0, 1): "sequential+centroid",
         (0, 4): "overlap+centroid",
         (1, 2): "sequential+overlap+centroid",
@@ -177,11 +178,11 @@ def test_combined_nests_and_rejects_what_is_no_builder() -> None:
 
 
 def test_merge_of_a_union_keeps_the_best_overlap() -> None:
-    a = Candidates(np.array([[0, 1], [0, 2]]), np.array(["x", "x"]), np.array([0.2, np.nan]))
-    b = Candidates(np.array([[0, 1], [1, 2]]), np.array(["y", "x"]), np.array([0.7, 0.1]))
+    a = Edges.proposed(np.array([[0, 1], [0, 2]]), "x", np.array([0.2, np.nan]))
+    b = replace(Edges.of([[0, 1], [1, 2]], np.array(["y", "x"])), overlap=np.array([0.7, 0.1]))
     merged, votes = merge([a, b])
     assert as_list(merged) == [(0, 1), (0, 2), (1, 2)]
-    assert merged.source.tolist() == ["x+y", "x", "x"]
+    assert merged.proposed_by.tolist() == ["x+y", "x", "x"]
     assert merged.overlap.tolist() == pytest.approx([0.7, np.nan, 0.1], nan_ok=True)
     assert votes.tolist() == [[True, True], [True, False], [False, True]]
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hodge_pipeline.pairs.budget import spread, thinning_order
-from hodge_pipeline.types import Candidates
+from hodge_pipeline.types import Edges
 
 
-def candidates(pairs: np.ndarray, overlap: np.ndarray) -> Candidates:
-    return Candidates(pairs, np.full(len(pairs), "overlap"), overlap)
+def candidates(pairs: np.ndarray, overlap: np.ndarray) -> Edges:
+    return replace(Edges.of(pairs, "overlap"), overlap=overlap)
 
 
-def loop_candidates(count: int = 120) -> Candidates:
+def loop_candidates(count: int = 120) -> Edges:
     """Two laps of a circle: a frame overlaps with those near it in the circle, in both laps."""
     i, j = np.triu_indices(count, 1)
     turn = 4 * np.pi / count * (j - i)

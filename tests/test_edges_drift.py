@@ -55,7 +55,7 @@ def test_a_loop_is_found_in_poses_that_drifted_past_overlap() -> None:
     found = DriftEdges().propose(frames(), clouds, poses)
     assert closes(found.pairs) >= 15  # of 20 frames that come by again
     assert len(found.pairs) <= 6 * COUNT and (found.pairs[:, 0] < found.pairs[:, 1]).all()
-    assert (found.overlap > 0.2).all() and set(found.source.tolist()) == {"drift"}
+    assert (found.overlap > 0.2).all() and set(found.proposed_by.tolist()) == {"drift"}
     again = DriftEdges().propose(frames(), clouds, poses)
     assert np.array_equal(found.pairs, again.pairs)
 

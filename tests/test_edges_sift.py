@@ -94,7 +94,7 @@ def test_frames_of_one_wall_are_joined_and_those_of_two_walls_are_not() -> None:
     assert (wall[found.pairs[:, 0]] == wall[found.pairs[:, 1]]).all()
     assert {(0, 1), (2, 3), (0, 4), (3, 5)} <= set(map(tuple, found.pairs.tolist()))
     assert ((found.overlap > 0) & (found.overlap <= 1)).all()
-    assert set(found.source) == {"sift"}
+    assert set(found.proposed_by) == {"sift"}
 
 
 def test_the_same_frames_are_matched_once_and_the_same_again() -> None:

@@ -5,8 +5,8 @@ import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -14,9 +14,9 @@ import psutil
 import pytest
 
 from hodge_pipeline.errors import SourceError, WorkerError
-from hodge_pipeline.executors.dask import DaskExecutor
+from hodge_pipeline.executors.dask import cluster_workers
 from hodge_pipeline.executors.local import LocalExecutor
-from hodge_pipeline.stages import Executor
+from hodge_pipeline.stages import Workers
 
 PATIENCE_S = 600
 """No result depends on it: it only keeps a child that hangs from holding the tests for ever."""
@@ -55,33 +55,47 @@ def die_always(number: int) -> int:
     return number
 
 
-EXECUTORS: dict[str, Callable[[], Executor]] = {
-    "in process": lambda: LocalExecutor(workers=0),
-    "spawned": lambda: LocalExecutor(workers=2),
-    "dask": lambda: DaskExecutor(workers=2),
+@contextmanager
+def dask_workers() -> Iterator[Workers]:
+    """Those of a cluster of two, which dies as often as the executor `local` allows."""
+    import dask
+    from distributed import LocalCluster
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 2}),
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        cluster_workers(cluster.scheduler_address) as workers,
+    ):
+        yield workers
+
+
+WORKERS: dict[str, Callable[[], AbstractContextManager[Workers]]] = {
+    "in process": LocalExecutor(workers=0).open,
+    "spawned": LocalExecutor(workers=2).open,
+    "dask": dask_workers,
 }
 
 
-@pytest.fixture(params=list(EXECUTORS))
-def executor(request: pytest.FixtureRequest) -> Executor:
-    return EXECUTORS[request.param]()
+@pytest.fixture(params=list(WORKERS))
+def workers(request: pytest.FixtureRequest) -> Iterator[Workers]:
+    with WORKERS[request.param]() as opened:
+        yield opened
 
 
-def test_every_block_comes_back_once_and_workers_serve_again(executor: Executor) -> None:
-    with executor.open() as workers:
-        assert sorted(workers.map(square, range(7))) == [(k, k * k) for k in range(7)]
-        assert sorted(workers.map(square, [])) == []
-        assert sorted(workers.map(square, [5])) == [(0, 25)]
+def test_every_block_comes_back_once_and_workers_serve_again(workers: Workers) -> None:
+    assert sorted(workers.map(square, range(7))) == [(k, k * k) for k in range(7)]
+    assert sorted(workers.map(square, [])) == []
+    assert sorted(workers.map(square, [5])) == [(0, 25)]
 
 
-def test_an_error_in_a_task_is_raised_here(executor: Executor) -> None:
-    with executor.open() as workers, pytest.raises(SourceError, match="frame 3"):
+def test_an_error_in_a_task_is_raised_here(workers: Workers) -> None:
+    with pytest.raises(SourceError, match="frame 3"):
         list(workers.map(fail_on_three, range(6)))
 
 
 @pytest.mark.parametrize("name", ["spawned", "dask"])
 def test_a_worker_that_dies_costs_a_retry(name: str, tmp_path: Path) -> None:
-    with EXECUTORS[name]().open() as workers:
+    with WORKERS[name]() as workers:
         results = sorted(workers.map(partial(die_once, tmp_path), range(8)))
     assert results == [(k, k) for k in range(8)]
     assert (tmp_path / "died").exists()
@@ -89,7 +103,7 @@ def test_a_worker_that_dies_costs_a_retry(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("name", "line"), [("spawned", "block 1 lost its"), ("dask", r"block \d lost its Dask")])
 def test_a_block_that_always_kills_ends_in_one_line(name: str, line: str) -> None:
-    with EXECUTORS[name]().open() as workers, pytest.raises(WorkerError, match=line):
+    with WORKERS[name]() as workers, pytest.raises(WorkerError, match=line):
         list(workers.map(die_always, range(8)))
 
 
@@ -170,9 +184,8 @@ def test_a_script_without_a_main_guard_runs(tmp_path: Path) -> None:
     assert done.stdout.strip() == "(8, 40320)"
 
 
-def test_a_scheduler_that_is_not_there_is_one_line() -> None:
-    with (
-        pytest.raises(WorkerError, match="no Dask scheduler answers"),
-        DaskExecutor(address="tcp://127.0.0.1:9", timeout_s=0.5).open(),
-    ):
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://x", ""])
+def test_a_scheduler_that_is_not_there_is_one_line(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hodge_pipeline.executors.dask.TIMEOUT_S", 0.5)
+    with pytest.raises(WorkerError, match=f"no Dask scheduler answers at '{address}'"), cluster_workers(address):
         raise AssertionError

@@ -227,6 +227,14 @@ def test_a_prior_that_makes_no_sense_is_one_line(tmp_path, line, message):
         load_g2o(write(tmp_path / "a.g2o", *VERTICES, EDGE, line))
 
 
+def test_a_fixed_vertex_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(SourceError, match="FIX names vertex 8, which no vertex or edge line names"):
+        load_g2o(write(tmp_path / "a.g2o", EDGE, "FIX 3 8"))
+    source = load_g2o(write(tmp_path / "a.g2o", EDGE, "VERTEX_TRACKXYZ 8 0 0 0", "FIX 3 8"))
+    assert source.graph.vertex_ids[source.graph.fixed].tolist() == [3]
+    assert "1 FIX lines name vertices that are not read, 8 first: ignored" in source.notes
+
+
 def test_priors_pull_the_poses_to_where_they_are_known(tmp_path):
     path = write(
         tmp_path / "a.g2o",

@@ -15,8 +15,8 @@ from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.sources.measured_edges import GraphFile, MeasuredOptions, joined, measured_edges, without_measured
-from hodge_pipeline.types import Candidates, Frame, Source, Trajectory, ViewGraph
+from hodge_pipeline.sources.measured_edges import GraphFile, MeasuredOptions, measured_edges, without_measured
+from hodge_pipeline.types import Edges, Frame, Priors, Source, Trajectory, ViewGraph
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 
@@ -55,6 +55,14 @@ def test_they_can_be_left_out_and_weighed() -> None:
     np.testing.assert_array_equal(weighed.information, 4 * np.eye(6)[None])
 
 
+def test_fixed_vertices_and_priors_have_no_part_in_a_run_and_a_note_says_so() -> None:
+    priors = Priors(np.array([0]), np.eye(4)[None], np.eye(6)[None])
+    own = replace(graph([0, 1], [(0, 1)]), fixed=np.array([0, 1]), priors=priors)
+    found, notes = measured_edges(Source("s", Path("s"), frames(0, 1), graph=own), MeasuredOptions())
+    assert not len(found.fixed) and found.priors is None
+    assert notes[0] == "s: its 2 fixed vertices and 1 priors have no part in a run: hodge solve heeds them"
+
+
 def test_files_of_fragments_begin_at_their_first_frame(tmp_path: Path) -> None:
     part = Source("part", tmp_path, graph=graph([0, 1, 2], [(0, 1), (1, 2), (0, 2)]))
     Open3dPoseGraphWriter().write(tmp_path / "part.json", part)
@@ -76,10 +84,10 @@ def test_a_file_without_edges_is_refused(tmp_path: Path) -> None:
 
 
 def test_measured_pairs_are_no_candidates_in_either_direction() -> None:
-    candidates = Candidates(np.array([[0, 1], [0, 2], [1, 2]]), np.array(["a", "b", "c"]), np.array([0.1, 0.2, 0.3]))
+    candidates = Edges.of([[0, 1], [0, 2], [1, 2]], np.array(["a", "b", "c"]))
     left = without_measured(candidates, graph([0, 1, 2], [(1, 0), (1, 2)]))
-    assert left.pairs.tolist() == [[0, 2]] and left.source.tolist() == ["b"] and left.overlap.tolist() == [0.2]
-    both = joined([graph([0, 1, 2], [(0, 1)]), graph([0, 1, 2], [(1, 2), (0, 2)], seed=1)])
+    assert left.pairs.tolist() == [[0, 2]] and left.proposed_by.tolist() == ["b"]
+    both = ViewGraph.joined([graph([0, 1, 2], [(0, 1)]), graph([0, 1, 2], [(1, 2), (0, 2)], seed=1)])
     assert both.edges.tolist() == [[0, 1], [1, 2], [0, 2]] and both.i_from_j.shape == (3, 4, 4)
 
 
@@ -104,6 +112,7 @@ def test_a_run_takes_them_as_they_are(tiny_sequence: Path, tmp_path: Path) -> No
     run = hodge_pipeline.run(replace(recipe, measured=MeasuredOptions(files=files)), tmp_path / "run")
     measured = run.result.graph.source == "g2o"
     np.testing.assert_array_equal(run.result.graph.edges[measured], edges)
-    assert run.result.candidates is not None and (run.result.candidates.pairs[:, 0] > 0).all()
+    registered = run.result.edges.select(run.result.edges.proposed_by != "g2o")
+    assert (registered.pairs[:, 0] > 0).all()
     assert (~measured).any() and run.report.trajectories[-1].ate_rmse_m < 1e-4
     assert (tmp_path / "run/edges.csv").read_text().count(",g2o,used,") == len(edges)

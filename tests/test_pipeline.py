@@ -72,16 +72,15 @@ def test_the_result_is_near_the_truth(run: Run) -> None:
 
 
 def test_every_edge_has_a_verdict_in_the_table_and_the_report(run: Run) -> None:
-    verdicts = run.result.verdicts
-    assert verdicts is not None
+    edges = run.result.graph_edges
     with (run.folder / "edges.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["status"] != "rejected"]
-    assert [row["verdict"] for row in rows] == verdicts.verdict.tolist()
-    assert [row["probability"] == "" for row in rows] == np.isnan(verdicts.probability).tolist()
+    assert [row["verdict"] for row in rows] == edges.verdict.tolist()
+    assert [row["probability"] == "" for row in rows] == np.isnan(edges.probability).tolist()
     assert all(row["why"] for row in rows)
     counts = json.loads((run.folder / "report.json").read_text())["graph"]["verdicts"]
     assert sum(counts.values()) == len(rows)
-    assert counts["consistent"] == (verdicts.verdict == "consistent").sum() > 0.9 * len(rows)
+    assert counts["consistent"] == (edges.verdict == "consistent").sum() > 0.9 * len(rows)
 
 
 def test_loop_deviation_falls(run: Run) -> None:

@@ -26,8 +26,8 @@ from hodge_pipeline.recording.options import SHARES, RecordingOptions
 from hodge_pipeline.recording.recorder import Recorder
 from hodge_pipeline.types import (
     Camera,
-    Candidates,
     CloudSet,
+    Edges,
     EncodedImage,
     Frame,
     Model,
@@ -228,7 +228,7 @@ def test_a_trajectory_breaks_between_sequences() -> None:
 def test_edges_coloured_by_residual(tmp_path: Path) -> None:
     poses = circle()
     graph = ring_graph(poses)
-    failed = Candidates(np.array([[0, 5], [1, 6]]), np.array(["overlap"] * 2), np.array([0.5, 0.6]))
+    failed = Edges.of([[0, 5], [1, 6]]).put(slice(None), why="too little overlap")
     record(tmp_path).edges(1, graph, poses, verdicts=["fine"] * graph.edge_count, rejected=failed)
     part = tmp_path / "010-edges-1.rrd"
     (lines,) = rows(part, layout.edges(1), "LineStrips3D:strips")

@@ -22,9 +22,8 @@ from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recording import binary, layout, shapes
 from hodge_pipeline.recording.replay import record_again
-from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.store.artifacts import load, load_arrays, load_solution
-from hodge_pipeline.types import CloudSet
+from hodge_pipeline.types import CloudSet, Edges
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_pipeline import SMALL, Log, small_recipe
 from test_recording import rgb, rows
@@ -184,7 +183,7 @@ def test_reader_and_odometry_read_back(run: Run) -> None:
 
 def test_registration_and_edges_read_back(run: Run) -> None:
     path = run.folder / "recording.rrd"
-    registered = load(run.folder / "stages/register-2/registered.npz", Registered)
+    registered = load(run.folder / "stages/register-2/edges.npz", Edges)
     columns = layout.registration(2)
     np.testing.assert_array_equal(np.float32(rows(path, columns, "fitness")[0]), np.float32(registered.fitness))
     np.testing.assert_array_equal(np.float32(rows(path, columns, "rmse_m")[0]), np.float32(registered.rmse_m))
@@ -224,11 +223,10 @@ def test_solver_reads_back_iteration_by_iteration(run: Run) -> None:
 
 
 def test_verdicts_model_and_errors_read_back(run: Run) -> None:
-    path, verdicts = run.folder / "recording.rrd", run.result.verdicts
-    assert verdicts is not None
-    for name in np.unique(verdicts.verdict):
+    path, edges = run.folder / "recording.rrd", run.result.graph_edges
+    for name in np.unique(edges.verdict):
         (lines,) = rows(path, layout.verdict(str(name)), "LineStrips3D:strips")
-        assert len(lines) == np.count_nonzero(verdicts.verdict == name)
+        assert len(lines) == np.count_nonzero(edges.verdict == name)
     (points,) = rows(path, layout.MODEL, "Points3D:positions")
     np.testing.assert_array_equal(np.float32(points), read_ply(run.folder / "cloud.ply").points_in_world)
     grown = sum(

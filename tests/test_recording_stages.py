@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,16 @@ from hodge_pipeline.recording.curl import triangle_curl_m
 from hodge_pipeline.recording.growth import first_frame
 from hodge_pipeline.recording.merge import find_parts, with_pairs
 from hodge_pipeline.recording.registration import chosen_pairs, moved_m
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.types import CloudSet, Model, PointCloud, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Model, PointCloud, ViewGraph
 from test_recording import circle, make_solution, record, rgb, ring_graph, rows
 
 
-def registered(count: int = 4) -> tuple[Registered, np.ndarray]:
+def registered(count: int = 4) -> tuple[Edges, np.ndarray]:
     """Pairs (0, k), guessed at the identity, moved by 0.1 k m; the last has least fitness."""
     motions = np.tile(np.eye(4), (count, 1, 1))
     motions[:, 0, 3] = 0.1 * np.arange(count)
+    pairs = np.stack([np.zeros(count, int), np.arange(1, count + 1)], axis=1)
     columns: dict[str, Any] = {
-        "pairs": np.stack([np.zeros(count, int), np.arange(1, count + 1)], axis=1),
         "i_from_j": motions,
         "information": np.tile(np.eye(6), (count, 1, 1)),
         "fitness": np.linspace(0.9, 0.2, count),
@@ -34,7 +34,7 @@ def registered(count: int = 4) -> tuple[Registered, np.ndarray]:
         "iterations": np.arange(count) + 5,
         "converged": np.ones(count, bool),
     }
-    return Registered(**columns), np.tile(np.eye(4), (count, 1, 1))
+    return replace(Edges.of(pairs), status=np.full(count, "used"), **columns), np.tile(np.eye(4), (count, 1, 1))
 
 
 def clouds(count: int = 5) -> CloudSet:
@@ -44,17 +44,17 @@ def clouds(count: int = 5) -> CloudSet:
 
 def test_registration_reads_back_with_the_clouds_of_chosen_pairs(tmp_path: Path) -> None:
     found, guesses = registered()
-    why = np.array(["", "", "", "too little overlap"])
-    assert chosen_pairs(found, why, guesses) == {"moved_most": 2, "least_fitness": 2, "rejected": 3}
+    found = found.put([3], status="rejected", why="too little overlap")
+    assert chosen_pairs(found, guesses) == {"moved_most": 2, "least_fitness": 2, "rejected": 3}
     np.testing.assert_allclose(moved_m(found, guesses), [0, 0.1, 0.2, 0.3])
     seen = clouds()
-    record(tmp_path).registration(1, found, why, guesses, seen)
+    record(tmp_path).registration(1, found, guesses, seen)
     part = tmp_path / "012-registration-1.rrd"
     columns = layout.registration(1)
     np.testing.assert_array_equal(np.float32(rows(part, columns, "fitness")[0]), np.float32(found.fitness))
     np.testing.assert_array_equal(np.float32(rows(part, columns, "rmse_m")[0]), np.float32(found.rmse_m))
     assert rows(part, columns, "iterations")[0] == found.iterations.tolist()
-    assert rows(part, columns, "rejected")[0] == why.tolist()
+    assert rows(part, columns, "rejected")[0] == found.why.tolist()
     pair = layout.pair("rejected")
     (after,) = rows(part, f"{pair}/after", "Points3D:positions")
     moved = np.asarray(seen[4].points_in_cam, float) + [0.3, 0, 0]
@@ -66,8 +66,7 @@ def test_registration_reads_back_with_the_clouds_of_chosen_pairs(tmp_path: Path)
 
 
 def test_no_pairs_at_all(tmp_path: Path) -> None:
-    none = Registered.of(np.zeros((0, 2), np.int64), [])
-    record(tmp_path).registration(1, none, np.zeros(0, "U1"), np.zeros((0, 4, 4)), clouds())
+    record(tmp_path).registration(1, Edges.of([]), np.zeros((0, 4, 4)), clouds())
     assert not rows(tmp_path / "012-registration-1.rrd", layout.registration(1), "fitness")
 
 

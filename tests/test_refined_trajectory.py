@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
+from hodge_pipeline.refine.given_poses import GivenOptions, match_poses
+from hodge_pipeline.refine.key_frames import KeyFrameOptions, choose_key_frames
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,9 +18,7 @@ from hodge_pipeline import registry, se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.refine.correction import spread_correction
-from hodge_pipeline.refine.given_poses import GivenOptions, match_poses
-from hodge_pipeline.refine.key_frames import KeyFrameOptions, choose_key_frames
+from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.types import Floats, Frame, Source, Trajectory
 

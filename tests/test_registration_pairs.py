@@ -1,22 +1,23 @@
 """Pairs in blocks and odometry: the same on any workers, resumed or not; lost and empty frames are said."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.executors.dask import DaskExecutor
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
 from hodge_pipeline.registration.gaps import has_gap, over_gap
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
-from hodge_pipeline.registration.pairs import Acceptance, Registered, register_pairs
-from hodge_pipeline.stages import Executor
-from hodge_pipeline.types import CloudSet, Floats, PointCloud
+from hodge_pipeline.registration.pairs import Acceptance, register_pairs
+from hodge_pipeline.stages import Workers
+from hodge_pipeline.types import CloudSet, Edges, Floats, PointCloud
+from test_executors import dask_workers
 from test_registration import corner
 
 FRAMES = 12
@@ -62,14 +63,14 @@ def guesses() -> Floats:
     return se3.inverse(poses[PAIRS[:, 0]]) @ poses[PAIRS[:, 1]] @ se3.exp(np.full(6, 0.01))
 
 
-def same_bits(a: Registered, b: Registered) -> bool:
+def same_bits(a: Edges, b: Edges) -> bool:
     return all(getattr(a, name).tobytes() == getattr(b, name).tobytes() for name in vars(a))
 
 
 def test_pairs_come_back_in_the_order_given_and_right(folder: Path) -> None:
     done: list[int] = []
     with HERE.open() as workers:
-        found = register_pairs(folder, Gicp(), PAIRS, guesses(), workers, done.append)
+        found = register_pairs(folder, Gicp(), Edges.of(PAIRS), guesses(), workers, done.append)
     truth = path_of(FRAMES)
     i, j = found.pairs.T
     errors = se3.log(se3.inverse(se3.inverse(truth[i]) @ truth[j]) @ found.i_from_j)
@@ -77,41 +78,43 @@ def test_pairs_come_back_in_the_order_given_and_right(folder: Path) -> None:
     assert np.abs(errors).max() < 0.01
     assert sum(done) == len(PAIRS)
     assert (Acceptance().reasons(found) == "").all()
-    graph = found.as_graph(np.arange(FRAMES), np.full(len(PAIRS), "overlap"))
+    graph = found.as_graph(np.arange(FRAMES))
     assert (graph.vertex_count, graph.edge_count) == (FRAMES, len(PAIRS))
 
 
-@pytest.mark.parametrize("make", [lambda: LocalExecutor(workers=2), lambda: DaskExecutor(workers=2)])
-def test_every_executor_gives_the_same_bits(folder: Path, make: Callable[[], Executor]) -> None:
+@pytest.mark.parametrize("make", [LocalExecutor(workers=2).open, dask_workers])
+def test_all_workers_give_the_same_bits(folder: Path, make: Callable[[], AbstractContextManager[Workers]]) -> None:
     with HERE.open() as workers:
-        here = register_pairs(folder, Gicp(), PAIRS, guesses(), workers)
-    with make().open() as workers:
-        elsewhere = register_pairs(folder, Gicp(), PAIRS, guesses(), workers)
+        here = register_pairs(folder, Gicp(), Edges.of(PAIRS), guesses(), workers)
+    with make() as workers:
+        elsewhere = register_pairs(folder, Gicp(), Edges.of(PAIRS), guesses(), workers)
     assert same_bits(here, elsewhere)
 
 
 def test_finished_blocks_are_not_registered_again(folder: Path) -> None:
-    kept: dict[int, Registered] = {}
+    kept: dict[int, Edges] = {}
     with HERE.open() as workers:
-        whole = register_pairs(folder, Gicp(), PAIRS, guesses(), workers, on_block=kept.__setitem__)
+        whole = register_pairs(folder, Gicp(), Edges.of(PAIRS), guesses(), workers, on_block=kept.__setitem__)
         assert sorted(kept) == list(range(6))
         some = {block: kept[block] for block in (0, 3, 4)}
-        again: dict[int, Registered] = {}
-        resumed = register_pairs(folder, Gicp(), PAIRS, guesses(), workers, finished=some, on_block=again.__setitem__)
+        again: dict[int, Edges] = {}
+        resumed = register_pairs(
+            folder, Gicp(), Edges.of(PAIRS), guesses(), workers, finished=some, on_block=again.__setitem__
+        )
     assert sorted(again) == [1, 2, 5]
     assert same_bits(whole, resumed)
 
 
 def test_no_pairs_are_no_edges(folder: Path) -> None:
     with HERE.open() as workers:
-        none = register_pairs(folder, Gicp(), np.zeros((0, 2), np.int64), np.zeros((0, 4, 4)), workers)
-    assert none.as_graph(np.arange(FRAMES), np.zeros(0, str)).edge_count == 0
+        none = register_pairs(folder, Gicp(), Edges.of([]), np.zeros((0, 4, 4)), workers)
+    assert none.as_graph(np.arange(FRAMES)).edge_count == 0
 
 
 def test_rejected_pairs_say_why(folder: Path) -> None:
     far = np.stack([np.eye(4), se3.exp(np.array([0, 0, 0, 90.0, 0, 0]))])
     with HERE.open() as workers:
-        found = register_pairs(folder, Gicp(), np.array([[0, 1], [0, 2]]), far, workers)
+        found = register_pairs(folder, Gicp(), Edges.of([[0, 1], [0, 2]]), far, workers)
     assert Acceptance().reasons(found).tolist() == ["", "nothing in common"]
     assert Acceptance(min_fitness=1.0, max_rmse_m=1e-6).reasons(found)[0] != ""
     assert Acceptance(min_fitness=0.0, max_rmse_m=1e-6).reasons(found)[0] == "points too far apart"
@@ -123,7 +126,7 @@ def test_pairs_that_see_one_bare_wall_slide_and_are_no_edges(tmp_path: Path) -> 
     ahead = np.tile(np.float32([0, 0, -1]), (4000, 1))
     clouds = [PointCloud((flat + rng.normal(0, 0.002, flat.shape)).astype(np.float32), ahead) for _ in range(3)]
     with HERE.open() as workers:
-        pairs = np.array([[0, 1], [1, 2], [0, 2]])
+        pairs = Edges.of([[0, 1], [1, 2], [0, 2]])
         found = register_pairs(saved(tmp_path, clouds), Gicp(), pairs, np.tile(np.eye(4), (3, 1, 1)), workers)
     said = Acceptance().reasons(found).tolist()
     assert said == ["", "", "what they share lets them slide"], "consecutive frames are held all the same"

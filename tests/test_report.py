@@ -13,11 +13,13 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
-from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.evaluation.scores import GraphScores, ScoreTable
+from hodge_pipeline.report.contents import RefinementSummary
+from hodge_pipeline.report.difference import MEASURABLE, length, percent, sign_of
 from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows, worst_edges
 from hodge_pipeline.report.tables import score_tables, summary_lines
-from hodge_pipeline.report.verdict import judge, length, percent, suspicions
+from hodge_pipeline.report.verdict import judge, suspicions
 from hodge_pipeline.report.write import (
     EdgeRow,
     LoopRow,
@@ -27,10 +29,11 @@ from hodge_pipeline.report.write import (
     Residuals,
     SourceSummary,
     StageRow,
+    TrajectoryRow,
     as_json,
     write_report,
 )
-from hodge_pipeline.types import Floats, ViewGraph
+from hodge_pipeline.types import Edges, Floats, ViewGraph
 
 VOID = {"meta", "img", "br"}
 
@@ -70,6 +73,8 @@ def report() -> Report:
     graph = ring(truth)
     weights = np.ones(20)
     weights[3] = 0
+    edges = with_residuals(Edges.measured(graph), sets["result"], weights)
+    rejected = Edges.of([[0, 5]] * 5).put(slice(None), status="rejected", why="fitness below 0.3")
     return Report(
         title="A <ring> & its loop",
         source=SourceSummary(
@@ -78,8 +83,8 @@ def report() -> Report:
         scores=scored(0.010, 0.020, 0.012),
         trajectories=trajectory_rows(sets, truth),
         loops=(LoopRow("measured", 4, 2.0), LoopRow("step 1", 4, 1e-3)),
-        graph=graph_summary(graph, np.zeros(20, np.int64), weights, {"fitness below 0.3": 5}),
-        worst_edges=worst_edges(graph, sets["result"], weights, 3),
+        graph=graph_summary(Edges.joined([edges, rejected]), graph.vertex_ids, np.zeros(20, np.int64)),
+        worst_edges=worst_edges(edges, graph.vertex_ids, 3),
         stages=(StageRow("read", 1.0, 0.5, 100.0), StageRow("solve", 2.0, 3.5, 300.0)),
         notes=("2 pairs were tried twice",),
         versions={"hodge-pipeline": "0.1.0"},
@@ -197,7 +202,82 @@ def test_the_verdict_follows_the_scores(before_m: float, after_m: float, outcome
 def test_errors_that_disagree_are_mixed(report: Report) -> None:
     verdict = judge(replace(report, scores=scored(0.01, 0.01, 0.02)))
     assert verdict.outcome == "mixed"
-    assert [change.sign for change in verdict.changes] == [-1, -1, 1]
+    best, bad = verdict.headline.split(", but ")
+    assert best == "Mixed against odometry: RPE of the rotation 4.43° → 0.443° and 2 more better"
+    assert bad.startswith("distance of clouds (near-centroid pairs) 10 mm → 20 mm, distance of clouds (overlapping")
+    assert [change.sign for change in verdict.changes] == [-1, -1, 1, 1, 1]
+
+
+def told(before_m: tuple[float, float], after_m: tuple[float, float], extent_m: float = 4.0) -> Report:
+    """A report of ATE and RPE before and after alone, along a path of this extent."""
+    rows = tuple(
+        TrajectoryRow(name, 20, 0, ate, ate, ate, rpe, 0.2)
+        for name, (ate, rpe) in (("odometry", before_m), ("result", after_m))
+    )
+    path = Path3D("result", np.array([[0.0, 0, 0], [extent_m, 0, 0]]))
+    return Report("r", SourceSummary("tum", "x", 20), trajectories=rows, pictures=Pictures(paths=(path,)))
+
+
+def test_a_measure_that_got_worse_is_named_in_the_headline() -> None:
+    verdict = judge(told((0.5, 0.017), (0.4, 0.020)))
+    assert verdict.outcome == "mixed"
+    assert verdict.headline == "Mixed against odometry: ATE 50 cm → 40 cm, but RPE 17 mm → 20 mm"
+    assert "the error of the motion from frame to frame (RPE) rose from 17 mm to 20 mm (+18 %)" in verdict.details
+
+
+def test_a_difference_below_what_was_measured_is_none(tmp_path: Path) -> None:
+    report = told((1e-17, 3e-18), (3e-17, 1e-17))
+    verdict = judge(report)
+    assert verdict.outcome == "unchanged" and verdict.headline == "Unchanged against odometry"
+    assert [change.share for change in verdict.changes] == [0, 0, 0]
+    assert "(ATE) is unchanged at < 0.004 mm" in verdict.sentence, "a millionth of 4 m"
+    page, numbers = write_report(tmp_path, report)
+    assert not re.search(r"e-1\d", read_page(page)[0] + verdict.sentence)
+    assert json.loads(numbers.read_text("utf-8"))["verdict"]["outcome"] == "unchanged"
+
+
+def test_what_can_be_measured_goes_by_the_extent_of_the_scene() -> None:
+    assert judge(told((2e-6, 1.0), (3e-6, 1.0), extent_m=4.0)).outcome == "unchanged"
+    assert judge(told((2e-6, 1.0), (3e-6, 1.0), extent_m=0.4)).outcome == "worse"
+    assert judge(told((1e-17, 1.0), (0.003, 1.0))).details.startswith(
+        "the error of the trajectory (ATE) rose from < 0.004 mm to 3 mm;"
+    ), "no share of nothing"
+    assert sign_of(1.0, 1.0 + MEASURABLE, 2 * MEASURABLE) == 0
+
+
+@pytest.mark.parametrize(
+    ("component", "unordered", "headline"),
+    [
+        ([0] * 12 + [1] * 8, False, "In 2 pieces (12, 8 of 20 frames): improved against odometry"),
+        ([0] * 12 + [1] * 3 + [2] * 3 + [3] * 2, False, "In 4 pieces (12, 3, 3, … of 20 frames): improved against"),
+        ([0] * 19 + [1], False, "19 of 20 frames in one piece: improved against odometry"),
+        ([0] * 20, False, "Improved against odometry"),
+        ([0] * 20, True, "20 of 20 scans in one piece: improved against odometry"),
+        (list(range(20)), True, "No two of 20 scans joined: improved against odometry"),
+    ],
+)
+def test_pieces_come_first_in_the_headline(
+    report: Report, tmp_path: Path, component: list[int], unordered: bool, headline: str
+) -> None:
+    assert report.pictures.graph is not None
+    graph = graph_summary(report.pictures.graph, np.array(component))
+    source = replace(report.source, unordered=unordered, kind="scans" if unordered else "frames")
+    shown = replace(report, graph=graph, source=source)
+    verdict = judge(shown)
+    assert verdict.headline.startswith(headline) and verdict.outcome == "improved"
+    several = "pieces" in headline
+    assert (verdict.pieces > 1) == several and verdict.mark == ("mixed" if several else "improved")
+    page, numbers = write_report(tmp_path, shown)
+    assert headline in read_page(page)[0]
+    assert json.loads(numbers.read_text("utf-8"))["verdict"]["sentence"].startswith(headline)
+    assert dict(reversed(summary_lines(shown)))["verdict"].startswith(headline), "the terminal says the same"
+
+
+def test_a_refinement_whose_error_against_the_truth_rose_is_mixed() -> None:
+    refinement = RefinementSummary("refined", "Better than the poses given", "edge chi2 2 -> 1")
+    verdict = judge(replace(told((0.5, 0.017), (0.6, 0.017)), refinement=refinement))
+    assert verdict.outcome == "mixed"
+    assert verdict.headline == "Better than the poses given, but ATE 50 cm → 60 cm"
 
 
 def test_the_worst_edge_is_the_wrong_one(report: Report) -> None:
@@ -212,7 +292,8 @@ def test_what_to_distrust_is_said(report: Report) -> None:
     #  0–…–9   10–…–18   19
     component = np.array([0] * 10 + [1] * 9 + [2])
     assert report.pictures.graph is not None
-    summary = graph_summary(report.pictures.graph, component, np.array([0.0] * 2 + [1.0] * 18))
+    edges = Edges.measured(report.pictures.graph).put(slice(None), weight=np.array([0.0] * 2 + [1.0] * 18))
+    summary = graph_summary(edges, report.pictures.graph.vertex_ids, component)
     said = "\n".join(suspicions(replace(report, graph=summary, scores=scored(0.01, 0.1, 0.01))))
     for expected in (
         "2 pairs were tried twice",
@@ -245,7 +326,8 @@ def test_an_ignored_edge_is_not_called_used(report: Report) -> None:
 def test_parts_are_listed_largest_first_as_the_source_names_them(report: Report) -> None:
     assert report.pictures.graph is not None
     component = np.array([1, 0, 0, 1, 0] + [0] * 15)
-    parts = graph_summary(report.pictures.graph, component).components
+    graph = report.pictures.graph
+    parts = graph_summary(Edges.measured(graph), graph.vertex_ids, component).components
     assert [(part.count, part.frames) for part in parts] == [(18, "101–102, 104–119"), (2, "100, 103")]
     assert in_runs(np.arange(0, 60, 2), np.arange(60)).endswith("20, 22, and 18 more")
     assert in_runs(np.zeros(0, np.int64), np.arange(3)) == "none"

@@ -130,6 +130,7 @@ def test_wrong_edges_are_left_out(tmp_path):
         (["--start", "odometry"], RecipeError, "expected given or chordal"),
         (["--certificate", "--objective", "full"], RecipeError, "add --objective isotropic"),
         (["--time-limit", "0"], RecipeError, "above zero"),
+        (["--time-limit", "nan"], RecipeError, "--time-limit nan: expected seconds above zero"),
         (["--out", "nowhere/a.g2o"], RecipeError, "make it first"),
         (["--time-limit", "1e-9"], CheckError, "stopped before it converged"),
     ],
@@ -172,3 +173,21 @@ def test_toro_files_are_solved_in_the_plane(tmp_path):
     assert answer["dimension"] == 2
     assert math.isfinite(answer["cost_after"])
     assert "VERTEX_SE2 2 " in (tmp_path / "a.g2o").read_text()
+
+
+def test_what_nothing_confirms_is_said_first_and_fails(tmp_path):
+    rng = np.random.default_rng(0)
+    edges = np.array([rng.choice(8, 2, replace=False) for _ in range(24)])
+    graph = ViewGraph.from_edges(
+        np.arange(8), edges, se3.exp(2 * rng.normal(size=(24, 6))), np.tile(1e4 * np.eye(6), (24, 1, 1))
+    )
+    write_g2o(tmp_path / "random.g2o", graph)
+    done = CliRunner().invoke(app, ["solve", str(tmp_path / "random.g2o"), "--robust"])
+    assert isinstance(done.exception, CheckError) and done.exception.exit_code == 3
+    assert "nothing confirms the result" in str(done.exception)
+    assert done.stdout.startswith("result      NOT CONFIRMED by any cycle of its edges\n")
+    plain = json.loads(CliRunner().invoke(app, ["solve", str(tmp_path / "random.g2o"), "--robust", "--json"]).stdout)
+    assert plain["confirmed"] is False
+    tree = graph.select(np.array([0]))
+    write_g2o(tmp_path / "tree.g2o", tree)
+    assert json.loads(hodge(tmp_path / "tree.g2o", "--robust", "--json"))["confirmed"] is None

@@ -6,11 +6,16 @@ import itertools
 import numpy as np
 import pytest
 
-from hodge_pipeline import se3
+from hodge_pipeline import registry, se3
 from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.solver import DiagnosedSolver
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.covariance import marginal_covariances
+from hodge_pipeline.solvers.editing import GraphEditor
 from hodge_pipeline.solvers.maximum_likelihood import HodgeSolver, solve
-from hodge_pipeline.types import ViewGraph
+from hodge_pipeline.solvers.robust import RobustSolver, solve_robust
+from hodge_pipeline.types import Priors, ViewGraph
 from solver_graphs import ladder
 
 
@@ -74,6 +79,28 @@ def test_no_edges_and_one_pose():
         solution = HodgeSolver().solve(graph, start)
         np.testing.assert_allclose(solution.world_from_cam, start, atol=1e-12)
         assert solution.metrics["objective"] == 0
+
+
+def without_usable_edges(what: str) -> ViewGraph:
+    if what == "self-loops":
+        return ViewGraph.from_edges(np.arange(3), [[1, 1], [2, 2]], np.tile(np.eye(4), (2, 1, 1)))
+    if what == "zero information":
+        motions = se3.exp(np.random.default_rng(0).normal(size=(3, 6)))
+        return ViewGraph.from_edges(np.arange(3), [[0, 1], [1, 2], [2, 0]], motions, np.zeros((3, 6, 6)))
+    count = {"one vertex": 1, "isolated vertices": 4}[what]
+    return ViewGraph.from_edges(np.arange(count), np.zeros((0, 2)), np.zeros((0, 4, 4)))
+
+
+@pytest.mark.parametrize("what", ["one vertex", "isolated vertices", "self-loops", "zero information"])
+@pytest.mark.parametrize("solver", [HodgeSolver(), RobustSolver(), RobustSolver("geman_mcclure"), DiagnosedSolver()])
+def test_without_usable_edges_the_poses_are_as_given_and_a_note_says_so(solver, what):
+    graph = without_usable_edges(what)
+    start = se3.exp(np.random.default_rng(1).normal(size=(graph.vertex_count, 6)))
+    solution = solver.solve(graph, start)
+    np.testing.assert_allclose(solution.world_from_cam, start, atol=1e-12)
+    assert solution.weights.tolist() == [0] * graph.edge_count
+    assert any("every pose is as it was at the start" in note for note in solution.notes)
+    assert diagnose(graph).piece.shape == (graph.vertex_count,)
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e4, 1e9])
@@ -141,6 +168,112 @@ def spoil(what: str) -> ViewGraph:
 def test_numbers_that_cannot_be_used_are_named(what):
     with pytest.raises(GraphError, match=f"edge 2.*{what}"):
         solve(spoil(what))
+
+
+def spoiled(what: str) -> np.ndarray:
+    """The ladder's motions with each, or the third, no rigid motion."""
+    motion = ladder(0.1)[0].i_from_j.copy()
+    if what == "transposed":
+        return np.ascontiguousarray(np.swapaxes(motion, 1, 2))
+    if what == "mirrored":
+        motion[2, :3, 0] *= -1
+    elif what == "rigid":
+        motion[2, :3, :3] *= 1.1
+    else:
+        motion[2, 1, 1] = np.inf
+    return motion
+
+
+READERS_OF_MOTIONS = {
+    "solve": solve,
+    "robust": solve_robust,
+    "editor": GraphEditor,
+    "covariance": lambda graph: marginal_covariances(graph, ladder(0.1)[1], np.array([3])),
+    "diagnosis": diagnose,
+    **{
+        name: lambda graph, name=name: registry.load("solvers", name)().solve(graph, ladder(0.1)[1])
+        for name in registry.names("solvers")
+    },
+}
+
+
+@pytest.mark.parametrize("what", ["transposed", "mirrored", "rigid", "finite"])
+@pytest.mark.parametrize("reader", READERS_OF_MOTIONS)
+def test_motions_that_are_not_rigid_are_refused_with_the_edge(reader, what):
+    graph = dataclasses.replace(ladder(0.1)[0], i_from_j=spoiled(what))
+    row, count = (0, 16) if what == "transposed" else (2, 1)
+    i, j = graph.edges[row]
+    edge = rf"edge {row} \(vertices {i}, {j}\)"
+    with pytest.raises(GraphError, match=rf"^{edge}: its measurement i_from_j .*{what}.*\({count} such edges\)$"):
+        READERS_OF_MOTIONS[reader](graph)
+
+
+def test_rotations_as_inexact_as_those_of_real_files_are_taken():
+    """7-Scenes' poses have determinants down to 0.9995."""
+    graph, truth = ladder(0.0)
+    motion = graph.i_from_j.copy()
+    motion[:, :3, :3] *= 0.9995 ** (1 / 3)
+    inexact = dataclasses.replace(graph, i_from_j=motion)
+    np.testing.assert_allclose(solve(inexact).world_from_cam, truth, atol=1e-6)
+    np.testing.assert_allclose(solve_robust(inexact).world_from_cam, truth, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "fault"),
+    [(np.diag([-1.0, 1, 1, 1]), "is mirrored"), (se3.exp(np.ones(6)).T, "looks transposed"), (2 * np.eye(4), "rigid")],
+)
+def test_start_poses_and_priors_that_are_not_rigid_are_refused(matrix, fault):
+    graph, truth = ladder(0.1)
+    start = truth.copy()
+    start[7] = matrix
+    with pytest.raises(GraphError, match=f"the start pose of vertex 7 .*{fault}"):
+        solve(graph, start=start)
+    priors = Priors(np.array([2, 5]), np.stack([np.eye(4), matrix]), np.tile(np.eye(6), (2, 1, 1)))
+    with pytest.raises(GraphError, match=rf"prior 1 \(vertex 5\) .*{fault}"):
+        solve(graph, priors=priors)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"objective": "ful"}, r"objective 'ful' does not exist: take 'isotropic' or 'full'"),
+        ({"initial": "odometry"}, r"initial 'odometry' does not exist: take 'chordal' or 'given'"),
+        ({"backend": "petsc"}, r"backend 'petsc' does not exist: take 'auto' or 'superlu' or "),
+        ({"dimension": 4}, r"dimension 4 does not exist: take 2 or 3 or None"),
+        ({"time_limit_s": float("nan")}, "time_limit_s is nan: expected seconds above zero"),
+        ({"time_limit_s": -1.0}, "time_limit_s is -1: expected seconds above zero"),
+        ({"fixed": [0, 12]}, "fixed names vertex row 12, but the graph has 12 vertices"),
+        ({"fixed": [-1]}, "fixed names vertex row -1"),
+        ({"fixed": np.ones(12, bool)}, "fixed is a mask"),
+    ],
+)
+def test_options_that_do_not_exist_are_refused(options, message):
+    graph, truth = ladder(0.1)
+    with pytest.raises(GraphError, match=message):
+        solve(graph, start=truth, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"kernel": "huber"}, "kernel 'huber' does not exist: take 'truncated' or 'geman_mcclure'"),
+        ({"objective": "ful"}, "objective 'ful' does not exist"),
+        ({"threshold": float("nan")}, "threshold is nan: expected χ² above zero"),
+    ],
+)
+def test_robust_options_that_do_not_exist_are_refused(options, message):
+    with pytest.raises(GraphError, match=message):
+        solve_robust(ladder(0.1)[0], **options)
+
+
+def test_fixed_vertices_of_the_graph_must_be_there():
+    graph, truth = ladder(0.1)
+    priors = Priors(np.array([0]), np.eye(4)[None], np.eye(6)[None])
+    for known in (None, priors):
+        wrong = dataclasses.replace(graph, fixed=np.array([12]), priors=known)
+        for reader in (solve, solve_robust, diagnose):
+            with pytest.raises(GraphError, match="fixed names vertex row 12"):
+                reader(wrong) if reader is diagnose else reader(wrong, start=truth)
 
 
 def test_contradictory_edges_still_have_a_minimum():

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.cycles import fundamental_loops, spanning_forest
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.confirmation import cycle_lengths
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
 from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -165,3 +167,71 @@ def test_vertices_in_two_components_have_no_relative_covariance():
     graph, truth = band(4, 1, 12)
     with pytest.raises(GraphError, match="two components"):
         relative_covariances(graph.select(np.array([0, 2])), truth, np.array([[0, 3]]))
+
+
+def test_fixed_vertices_without_a_start_hold_nothing_and_a_note_says_so():
+    """They were held where the rounds before the last solve had put them."""
+    graph, _ = band(16, 3, 0)
+    free = solve_robust(graph)
+    held = solve_robust(dataclasses.replace(graph, fixed=np.array([0, 7, 15])))
+    np.testing.assert_allclose(held.world_from_cam, free.world_from_cam, atol=1e-9)
+    assert any("3 fixed vertices have no pose" in note for note in held.notes)
+
+
+@pytest.mark.parametrize("kernel", ["truncated", "geman_mcclure"])
+def test_weights_are_those_of_the_last_solve(kernel):
+    graph, truth = band(20, 6, 4)
+    graph, _ = spoiled(graph, 0.2, 5)
+    confidence = np.random.default_rng(6).uniform(0.1, 1, graph.edge_count)
+    solution = solve_robust(graph, start=truth, kernel=kernel, confidence=confidence)
+    assert (solution.weights <= confidence).all()
+    assert int((solution.weights > 0).sum()) == solution.metrics["kept_edges"]
+    weighted = dataclasses.replace(graph, information=solution.weights[:, None, None] * graph.information)
+    again = solve(weighted, start=solution.world_from_cam)
+    np.testing.assert_allclose(again.metrics["chi2"], solution.metrics["chi2"], rtol=1e-8)
+
+
+def random_edges(seed: int) -> ViewGraph:
+    """24 random motions between 8 to 12 vertices."""
+    rng, count = np.random.default_rng(seed), 8 + seed % 5
+    edges = np.array([rng.choice(count, 2, replace=False) for _ in range(24)])
+    motions = se3.exp(rng.normal(size=(24, 6)) * np.repeat([1.5, 2.0], 3))
+    information = np.diag(np.repeat([SIGMA_RAD**-2, SIGMA_M**-2], 3))
+    return ViewGraph.from_edges(np.arange(count), edges, motions, np.tile(information, (24, 1, 1)))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_tree_of_random_edges_is_not_confirmed(seed):
+    graph = random_edges(seed)
+    solution = RobustSolver().solve(graph, np.tile(np.eye(4), (graph.vertex_count, 1, 1)))
+    assert solution.confirmed is False
+    assert "nothing confirms" in solution.notes[0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_right_edges_with_loops_are_confirmed(seed, share):
+    graph, truth = band(12, 3, seed)
+    assert solve_robust(spoiled(graph, share, seed)[0], start=truth).confirmed is True
+
+
+def test_a_tree_is_tested_by_nothing_and_refuted_by_nothing():
+    graph, truth = band(12, 1, 3)
+    solution = solve_robust(graph, start=truth)
+    assert solution.confirmed is None
+    assert "nothing tests the edges" in solution.notes[-1]
+    wrong = ViewGraph.from_edges(
+        graph.vertex_ids,
+        np.concatenate([graph.edges, [(0, 6), (2, 9), (11, 4)]]),
+        np.concatenate([graph.i_from_j, se3.exp(np.random.default_rng(4).normal(size=(3, 6)))]),
+        np.concatenate([graph.information, graph.information[:3]]),
+    )
+    assert solve_robust(wrong, start=truth).confirmed is False
+
+
+def test_the_lengths_of_cycles_are_those_of_their_edges():
+    edges = random_edges(0).edges
+    forest = spanning_forest(np.concatenate([edges, edges + 10]), 20)
+    lengths = fundamental_loops(forest).lengths
+    assert cycle_lengths(forest, forest.chords).tolist() == lengths.tolist()
+    assert len(set(lengths.tolist())) > 2

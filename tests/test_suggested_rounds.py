@@ -92,7 +92,7 @@ def test_a_pair_that_sees_nothing_in_common_is_registered_rejected_and_said(run:
     again = solve_again(run.folder)
     hodge("edit", run.folder, "--undo")
     solve_again(run.folder)
-    row = next(row for row in again.result.rejected_pairs.tolist() if row == [0, 12])
+    row = next(row for row in again.result.rejected.pairs.tolist() if row == [0, 12])
     assert row and any("0-12 was registered and rejected" in note for note in again.report.notes)
 
 

@@ -20,12 +20,12 @@ from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, frame_blocks, track_block
-from hodge_pipeline.rounds import Round
+from hodge_pipeline.scene import Round
 from hodge_pipeline.start import first_poses as starting
 from hodge_pipeline.start import key_frames as tracked
 from hodge_pipeline.start.key_frames import Tracked, tracking_options
 from hodge_pipeline.start.unordered.start import Start
-from hodge_pipeline.types import CloudSet, Floats32, Frame, Source, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats32, Frame, Source, ViewGraph
 
 FRAMES = 64
 SMALL = (
@@ -152,7 +152,9 @@ def test_frames_without_depth_are_bridged_and_said(sequence: Path, tmp_path: Pat
 )
 def test_relocalisation_is_automatic_where_odometry_left_parts(edges: list[list[int]], apart: bool) -> None:
     graph = ViewGraph.from_edges(np.arange(4), np.array(edges), np.broadcast_to(np.eye(4), (len(edges), 4, 4)))
-    assert starting._apart(Round(graph, np.broadcast_to(np.eye(4), (4, 4, 4)))) == apart
+    assert (
+        starting._apart(Round(Edges.measured(graph), graph.vertex_ids, np.broadcast_to(np.eye(4), (4, 4, 4)))) == apart
+    )
 
 
 def source_at(stamps_s: list[float]) -> Source:
@@ -162,7 +164,7 @@ def source_at(stamps_s: list[float]) -> Source:
 def test_parts_that_nothing_joins_stay_where_they_are_guessed_to_be_unless_over_a_hole() -> None:
     edges, poses = np.array([[0, 1], [2, 3]]), np.broadcast_to(np.eye(4), (4, 4, 4))
     graph = ViewGraph.from_edges(np.arange(4), edges, poses[:2])
-    known = Round(graph, poses)
+    known = Round(Edges.measured(graph), graph.vertex_ids, poses)
     apart = Start(poses, graph, np.array([0, 0, 1, 1]), ())
     joined = Start(poses, graph, np.zeros(4, np.int64), ())
     steady, hole = source_at([0, 1, 2, 3]), source_at([0, 1, 2, 30])

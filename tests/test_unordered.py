@@ -160,7 +160,7 @@ def test_a_tour_takes_the_nearest_and_pairs_come_back_to_their_rows() -> None:
     frames = [scan(int(k), np.zeros((1, 3))) for k in shuffled]
     clouds = CloudSet.from_clouds([read(np.ones((20, 3)))] * 12)
     found = propose_along_tour(SequentialEdges(), frames, clouds, poses)
-    assert (found.pairs[:, 0] < found.pairs[:, 1]).all() and set(found.source.tolist()) == {"nearest"}
+    assert (found.pairs[:, 0] < found.pairs[:, 1]).all() and set(found.proposed_by.tolist()) == {"nearest"}
     assert sorted(np.abs(shuffled[found.pairs[:, 0]] - shuffled[found.pairs[:, 1]]).tolist()) == sorted(steps.tolist())
 
 

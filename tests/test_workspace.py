@@ -151,10 +151,11 @@ def test_graph_round_trip(tmp_path: Path) -> None:
 def test_solution_round_trip(tmp_path: Path) -> None:
     poses = np.stack([np.eye(4)] * 3)
     step = SolverIteration(poses, 0.5, {"mean_deviation": float("nan"), "step": 1e-9})
-    solution = Solution(poses, np.zeros(3, np.int64), np.ones(2), (step, step), {"cost": 1.0}, ("one piece",))
+    solution = Solution(poses, np.zeros(3, np.int64), np.ones(2), (step, step), {"cost": 1.0}, ("one piece",), False)
     artifacts.save_solution(tmp_path / "solution.npz", solution)
     again = artifacts.load_solution(tmp_path / "solution.npz")
     np.testing.assert_array_equal(again.history[1].world_from_cam, poses)
     assert again.notes == ("one piece",)
+    assert again.confirmed is False
     assert again.history[0].metrics["step"] == 1e-9
     assert np.isnan(again.history[0].metrics["mean_deviation"])

@@ -26,6 +26,10 @@ def test_plain_values_and_their_lines() -> None:
         ("- 1", "a recipe is a mapping"),
         ("1: 2", "the key 1 is not a name"),
         ("a: 2026-01-01", "a value of type date"),
+        ("a: \0", "bad.yaml: not YAML: unacceptable character"),
+        ('x: 1\na: "b\\0c"', "bad.yaml:2: 'b\\x00c' holds a character that no file can have"),
+        ('a: "\\ud800"', "bad.yaml:1: '\\ud800' holds a character"),
+        ("a: " + "[" * 3000 + "]" * 3000, "bad.yaml: not YAML: maximum recursion depth"),
     ],
 )
 def test_what_is_not_plain_data_is_refused(text: str, expected: str) -> None:
@@ -39,6 +43,12 @@ def test_aliases_cannot_multiply_without_bound() -> None:
     levels = "".join(f"{chr(98 + k)}: &{chr(98 + k)} [{', '.join([f'*{chr(97 + k)}'] * 9)}]\n" for k in range(9))
     with pytest.raises(RecipeError, match="this is no recipe"):
         yaml_file.parse("a: &a [1, 2, 3]\n" + levels, "bomb.yaml")
+
+
+def test_a_merge_key_is_read_and_cannot_multiply() -> None:
+    document = yaml_file.parse("a: &a {x: 1}\nb: {<<: *a}\nc:\n  <<: *a\n  y: 2\n", "x.yaml")
+    assert document.data == {"a": {"x": 1}, "b": {"x": 1}, "c": {"x": 1, "y": 2}}
+    assert (document.origins["b", "x"], document.origins["c", "y"]) == ("x.yaml:2", "x.yaml:5")
 
 
 def test_a_huge_file_is_not_read(tmp_path: Path) -> None:

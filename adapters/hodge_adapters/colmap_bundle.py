@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_adapters.colmap_bodies import Bodies
+from hodge_adapters.colmap_reprojection import update_errors
 from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PositionPriors
@@ -32,9 +33,9 @@ def adjust(reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: Posi
             reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
         for key, point in part.points3D.items():
             reconstruction.points3D[key].xyz = point.xyz
-        reconstruction.update_point_3d_errors()
     else:
         _adjust(reconstruction, bodies, priors)
+    update_errors(reconstruction)
 
 
 def _adjust(reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors | None) -> None:
@@ -54,7 +55,6 @@ def _adjust(reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: Pos
             reconstruction.points3D[key].xyz = before[key]
             if not config.has_constant_point(key):
                 config.add_constant_point(key)
-    reconstruction.update_point_3d_errors()
 
 
 def _adjuster(

@@ -21,6 +21,7 @@ from hodge_adapters.colmap_edges import covisible_pairs, measured_graph
 from hodge_adapters.colmap_files import load_model
 from hodge_adapters.colmap_points import points_of_rays
 from hodge_adapters.colmap_records import Model
+from hodge_adapters.colmap_reprojection import error_cap, reprojection_errors, update_errors
 from hodge_adapters.colmap_scale import depth_ratios
 from hodge_adapters.colmap_ties import merge_matched_points
 from hodge_adapters.colmap_uncertainty import standard_errors
@@ -116,14 +117,15 @@ class ColmapModel:
     @cached_property
     def quality(self) -> ModelQuality:
         """Errors are computed anew: what a file says of them may be older than its poses."""
-        current = self._copy()
-        current.update_point_3d_errors()
+        keypoints, errors_px = reprojection_errors(self.records)
         return ModelQuality(
-            images=current.num_reg_images(),
-            points=current.num_points3D(),
-            observations=current.compute_num_observations(),
-            mean_reprojection_px=float(current.compute_mean_reprojection_error()),
-            mean_track_length=float(current.compute_mean_track_length()),
+            images=self.reconstruction.num_reg_images(),
+            points=self.reconstruction.num_points3D(),
+            mean_track_length=float(self.reconstruction.compute_mean_track_length()),
+            image_names=tuple(image.name for image in self.records.images),
+            keypoints=keypoints,
+            errors_px=errors_px,
+            cap_px=error_cap(errors_px),
         )
 
     def depth_ratios(self) -> Sequence[Floats]:
@@ -163,7 +165,7 @@ class ColmapModel:
         if self.edges.database is not None:
             merged = merge_matched_points(copy, self.edges.database, self.edges.min_shared)
             notes = (*notes, f"{merged} pairs of points that a match calls one were merged") if merged else notes
-        copy.update_point_3d_errors()
+        update_errors(copy)
         return replace(self, reconstruction=copy, files=(), notes=notes)
 
     def adjusted(self, priors: PositionPriors | None = None) -> tuple[ColmapModel, Floats]:

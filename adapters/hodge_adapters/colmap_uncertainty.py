@@ -9,6 +9,7 @@ import numpy as np
 from hodge_adapters.colmap_bodies import Bodies
 from hodge_adapters.colmap_cameras import colmap_camera
 from hodge_adapters.colmap_records import Model
+from hodge_adapters.colmap_reprojection import error_cap
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints
 
@@ -33,7 +34,8 @@ class _Rows:
 def standard_errors(model: Model, bodies: Bodies) -> Floats:
     """Standard errors (B, 2) of each body's rotation (rad) and position (units): roots of the mean variance of 3 axes.
 
-    From the size of the residuals; in the gauge in which the bodies as a whole stay where they are. NaN without tracks.
+    From the size of the residuals, wrong observations left out (see `error_cap`); in the gauge in which the bodies as a
+    whole stay where they are. NaN without tracks.
     """
     rows = _rows(model, bodies)
     count = len(bodies.frame_ids)
@@ -118,4 +120,7 @@ def _rows(model: Model, bodies: Bodies) -> _Rows:
             owner[here],
         )
         parts.append([column[good] for column in rows])
-    return _Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    errors_px = np.linalg.norm(columns[0], axis=1)
+    right = errors_px <= error_cap(errors_px)
+    return _Rows(*(column[right] for column in columns))

@@ -218,7 +218,15 @@ def load_g2o(path: Path | str) -> Source:
     notes = skipped({**other, **strange})
     for tag, what in (("VERTEX_SE3:QUAT", "vertices"), ("EDGE_SE3:QUAT", "edges")):
         notes += length_notes(records[tag].values[:, 3:7], what)
-    return as_source(path, half, "g2o", records["FIX"].keys.reshape(-1), dimension, notes)
+    fixed_keys = records["FIX"].keys.reshape(-1)
+    absent = np.setdiff1d(fixed_keys, np.concatenate([half.vertex_keys, half.edge_keys.reshape(-1)]))
+    if len(absent):
+        if not any(tag.startswith("VERTEX") for tag in {**other, **strange}):
+            raise SourceError(
+                f"{path}: FIX names vertex {absent[0]}, which no vertex or edge line names: mend that line"
+            )
+        notes.append(f"{len(absent)} FIX lines name vertices that are not read, {absent[0]} first: ignored")
+    return as_source(path, half, "g2o", fixed_keys, dimension, notes)
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

@@ -14,12 +14,13 @@ from benchmarks.paper import tables as paper_tables
 from benchmarks.paper.sequences import Found, find_sequences, peer_poses
 from benchmarks.paper.tables import NAN, Measured, Results
 from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.cli.options import Dask
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphKind, score_table
-from hodge_pipeline.pipeline import Run
 from hodge_pipeline.pipeline import run as run_pipeline
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.rounds import has_truth, true_poses
+from hodge_pipeline.run_folder import Run
+from hodge_pipeline.scene import has_truth, true_poses
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Solution
 
@@ -45,6 +46,7 @@ def paper(
         typer.Option(metavar="NAME=DIR", help="Another system's poses for the BF column, such as bundlefusion=DIR."),
     ] = None,
     frames: Annotated[int, typer.Option(min=10, help="Frames of a sequence at most; longer ones are thinned.")] = 250,
+    dask: Dask = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the paper-* recipes."),
@@ -66,7 +68,7 @@ def paper(
     pictures: dict[str, str] = {}
     for sequence in found:
         try:
-            runs = {kind: _run(sequence, kind, out, overrides or []) for kind in GRAPH_KINDS}
+            runs = {kind: _run(sequence, kind, out, overrides or [], dask) for kind in GRAPH_KINDS}
             poses, note = (None, "") if peer_folder is None else _peer(peer_folder, sequence, runs["distance"][0])
             measured[sequence.name] = {
                 kind: _measured(run, kind, wall_s, poses, note) for kind, (run, wall_s) in runs.items()
@@ -97,14 +99,14 @@ def _peer_of(option: str | None) -> tuple[str, Path | None]:
     return name, Path(folder)
 
 
-def _run(sequence: Found, kind: GraphKind, out: Path, overrides: list[str]) -> tuple[Run, float]:
+def _run(sequence: Found, kind: GraphKind, out: Path, overrides: list[str], dask: str | None) -> tuple[Run, float]:
     reader = f"source.reader={{stage: {sequence.reader}, every: {sequence.every}}}"
     fixed = [reader, f"outer_iterations={OUTER_ITERATIONS}", "recording.level=off", "fusion=[]"]
     recipe = load_recipe(f"paper-{kind}", [*fixed, *overrides], sequence.folder)
     begin = time.perf_counter()
     with Terminal(quiet=False) as terminal:
         terminal.say(f"{sequence.name}, {kind} graph: {sequence.folder}")
-        run = run_pipeline(recipe, out / f"{sequence.name}-{kind}", overwrite=True, watcher=terminal)
+        run = run_pipeline(recipe, out / f"{sequence.name}-{kind}", overwrite=True, watcher=terminal, dask=dask)
     return run, time.perf_counter() - begin
 
 

@@ -18,8 +18,7 @@ import numpy as np
 from hodge_pipeline.evaluation.scores import score_table
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.rounds import true_poses
+from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver
@@ -46,15 +45,12 @@ def read_problem(run: Path, round_number: int) -> Problem:
     assert recipe.source.path is not None and recipe.source.reader is not None
     source = recipe.source.reader.open(recipe.source.path)
     stages = run / "stages"
-    found = artifacts.load(stages / f"register-{round_number}" / "registered.npz", Registered)
-    found = found.select(recipe.acceptance.reasons(found) == "")
-    ids = np.array([frame.frame_id for frame in source.frames])
+    edges, ids = artifacts.load_edges(stages / f"solve-{round_number}" / "edges.npz")
     if round_number == 1:
         start = artifacts.load_arrays(stages / "odometry" / "poses.npz")["world_from_cam"]
     else:
         start = artifacts.load_solution(stages / f"solve-{round_number - 1}" / "solution.npz").world_from_cam
-    graph = found.as_graph(ids, np.full(len(found.pairs), "run"))
-    return Problem(graph, start, true_poses(source), stages / "clouds")
+    return Problem(edges.select(edges.counts).as_graph(ids), start, true_poses(source), stages / "clouds")
 
 
 def solve_all(problem: Problem, make: Callable[[int], ConsistencySolver], seeds: int) -> tuple[list[Solution], float]:

@@ -6,21 +6,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import (
-    DISABLED,
     REGISTERED,
     Edit,
     History,
-    ListedEdge,
+    Listed,
     listed_edges,
-    named_edges,
+    pair_names,
     pairs_to_register,
     read_history,
     write_history,
 )
 from hodge_pipeline.store.workspace import holding
+from hodge_pipeline.types import Edges
+from hodge_pipeline.types.edges import DISABLED, REJECTED
 
 
 @dataclass(frozen=True)
@@ -39,42 +42,44 @@ def edit(folder: Path, pairs: Pairs, *, undo: bool, listing: bool, quiet: bool, 
     """Add to the history of edits, or take the last back, and print what the edits now come to."""
     if undo and pairs:
         raise GraphError("--undo takes the last edit back: give it alone")
-    edges = listed_edges(folder)
+    listed = listed_edges(folder)
     changed = bool(undo or pairs)
     with holding(folder):
         history = read_history(folder)
         if changed:
-            history = history.undo() if undo else history.added(_checked(folder, edges, pairs))
+            history = history.undo() if undo else history.added(_checked(folder, listed, pairs))
             write_history(folder, history)
     if as_json:
         _print_json(folder, history)
     elif not quiet:
-        _print(folder, history, edges, changed=changed, listing=listing or not changed)
+        _print(folder, history, listed, changed=changed, listing=listing or not changed)
 
 
-def _checked(folder: Path, edges: Sequence[ListedEdge], pairs: Pairs) -> Edit:
+def _checked(folder: Path, listed: Listed, pairs: Pairs) -> Edit:
     """The edit with its pairs as they are written in `edges.csv`, each once."""
-    off = _named(edges, _verdicts_spelt_out(edges, _words(pairs.disable)))
-    on = _named(edges, _words(pairs.enable))
+    off = listed.named(_verdicts_spelt_out(listed, _words(pairs.disable)))
+    on = listed.named(_words(pairs.enable))
     if both := set(off) & set(on):
         raise GraphError(f"{', '.join(sorted(both))}: is to be disabled and enabled at once: say one of them")
-    new = pairs_to_register(folder, edges, _words(pairs.register)) if pairs.register else ()
-    return Edit(off, on, new)
+    return Edit(off, on, _to_register(folder, _words(pairs.register)) if pairs.register else ())
 
 
-def _named(edges: Sequence[ListedEdge], words: Sequence[str]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(edge.name for edge in named_edges(edges, words)))
+def _to_register(folder: Path, words: Sequence[str]) -> tuple[str, ...]:
+    from hodge_pipeline.run_folder import Run
+
+    last = Run.load(folder).result
+    return pairs_to_register(last.edges, last.vertex_ids, words)
 
 
-def _verdicts_spelt_out(edges: Sequence[ListedEdge], words: Sequence[str]) -> list[str]:
+def _verdicts_spelt_out(listed: Listed, words: Sequence[str]) -> list[str]:
     """The pairs with the word `wrong` or `suspect` as all edges of that verdict that the solver has."""
     out: list[str] = []
     for word in words:
         if word in (SUSPECT, WRONG):
-            named = [edge.name for edge in edges if edge.verdict == word and edge.status != DISABLED]
-            if not named:
+            rows = np.flatnonzero((listed.edges.verdict == word) & (listed.edges.status != DISABLED))
+            if not len(rows):
                 raise GraphError(f"{word}: no edge that counts is {word}: hodge diagnose shows the verdicts")
-            out += named
+            out += pair_names(listed.vertex_ids, listed.edges.pairs[rows])
         else:
             out.append(word)
     return out
@@ -85,25 +90,27 @@ def _words(pairs: Sequence[str]) -> list[str]:
     return [word.strip() for pair in pairs for word in pair.split(",") if word.strip()]
 
 
-def _print(folder: Path, history: History, edges: Sequence[ListedEdge], *, changed: bool, listing: bool) -> None:
+def _print(folder: Path, history: History, listed: Listed, *, changed: bool, listing: bool) -> None:
     if listing:
         for number, one in enumerate(history.edits, start=1):
             print(f"{number:>3}  {one}")
         if not history.edits:
             print("no edits")
-    by_name = {edge.name: edge for edge in reversed(edges)}
+    by_name = {name: row for row, name in reversed(list(enumerate(listed.names)))}
     for pair, switch in history.switches.items():
-        print(f"{switch:<10} {pair}{_facts(by_name.get(pair), switch)}")
+        print(f"{switch:<10} {pair}{_facts(listed.edges, by_name.get(pair), switch)}")
     if changed:
         registers = "registers, " if history.registered else ""
         print(f"next       hodge solve {folder}     ({registers}solves and fuses again)")
 
 
-def _facts(edge: ListedEdge | None, switch: str) -> str:
-    if edge is None:
+def _facts(edges: Edges, row: int | None, switch: str) -> str:
+    if row is None:
         return "  (no edge yet)" if switch == REGISTERED else "  (not an edge of the last round)"
-    words = [edge.source, edge.verdict, f"probability {float(edge.probability):.2f}" if edge.probability else ""]
-    return "  (" + ", ".join(word for word in words if word) + ")"
+    probability = float(edges.probability[row])
+    right = f"probability {probability:.2f}" if np.isfinite(probability) else ""
+    why = edges.why[row] if edges.status[row] == REJECTED else ""
+    return "  (" + ", ".join(word for word in (edges.proposed_by[row], why, edges.verdict[row], right) if word) + ")"
 
 
 def _print_json(folder: Path, history: History) -> None:

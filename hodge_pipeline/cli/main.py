@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hodge_pipeline.cli import refine as refining
-from hodge_pipeline.cli.options import Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet
+from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -68,6 +68,7 @@ def run(
     source: Annotated[Path | None, typer.Option(help="What to read; overrides source.path.")] = None,
     overrides: Overrides = None,
     overwrite: Overwrite = False,
+    dask: Dask = None,
     live: Annotated[bool, typer.Option("--live", help="Show the run as it happens in a Rerun viewer.")] = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -75,15 +76,19 @@ def run(
     """Run a recipe on a source: poses, fused model, report and recording in --out."""
     from hodge_pipeline.cli import run as running
 
-    running.run(recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live)
+    running.run(
+        recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask
+    )
 
 
 @app.command()
-def demo(out: Out, overrides: Overrides = None, overwrite: Overwrite = False, quiet: Quiet = False) -> None:
+def demo(
+    out: Out, overrides: Overrides = None, overwrite: Overwrite = False, dask: Dask = None, quiet: Quiet = False
+) -> None:
     """Make a furnished room with Kinect-like noise and run the recipe `demo` on it."""
     from hodge_pipeline.cli import run as running
 
-    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet)
+    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet, dask=dask)
 
 
 @app.command()
@@ -99,7 +104,12 @@ def solve(
     start: Annotated[
         str, typer.Option(help="chordal: from the edges alone; given: from the file's poses.")
     ] = "chordal",
-    robust: Annotated[bool, typer.Option("--robust", help="Find wrong edges and leave them out.")] = False,
+    robust: Annotated[
+        bool,
+        typer.Option(
+            "--robust", help="Find wrong edges and leave them out; exit code 3 where nothing confirms the rest."
+        ),
+    ] = False,
     certificate: Annotated[bool, typer.Option("--certificate", help="Prove the minimum global (isotropic).")] = False,
     sesync_units: Annotated[
         bool, typer.Option("--sesync-units", help="F as SE-Sync counts it: rotations weigh four times as much.")
@@ -110,6 +120,7 @@ def solve(
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds after which the best so far is given.")] = float("inf"),
     run_folder: Annotated[Path | None, typer.Option("--run", help="Folder for report, edges and recording.")] = None,
+    dask: Dask = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -125,7 +136,7 @@ def solve(
         certificate=certificate,
         sesync_units=sesync_units,
     )
-    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json)
+    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json, dask=dask)
 
 
 @app.command()

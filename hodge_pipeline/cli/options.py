@@ -21,3 +21,12 @@ Overwrite = Annotated[bool, typer.Option(help="Replace the run of another recipe
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")]
+Dask = Annotated[
+    str | None,
+    typer.Option(
+        "--dask",
+        metavar="ADDRESS",
+        envvar="HODGE_DASK_ADDRESS",
+        help="Register on the Dask cluster at tcp://HOST:8786, which is trusted to run code here.",
+    ),
+]

@@ -25,6 +25,6 @@ def choose_reader(path: Path, name: str | None, settings: Sequence[str]) -> Fram
         key, equals, text = setting.partition("=")
         if not equals or not key.strip():
             raise RecipeError(f"--set {setting}: expected OPTION=VALUE, an option of the reader")
-        options[key.strip()] = yaml_file.parse_value(text, f"--set {setting}")
+        options[key.strip()] = yaml_file.parse_value(text, f"--set {setting}").data["value"]
     reader: FrameReader = binding.bind(cls, options, lambda keys: "--set")
     return reader

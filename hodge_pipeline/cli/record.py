@@ -23,13 +23,13 @@ def record(run_folder: Path, level: str | None, max_megabytes: float | None, *, 
 
     given: dict[str, Any] = {"level": level, "max_megabytes": max_megabytes}
     with Terminal(quiet) as terminal:
-        path, missing = record_again(
+        path, is_whole = record_again(
             run_folder, {name: value for name, value in given.items() if value is not None}, terminal
         )
     if not quiet:
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
-        if missing:
-            print(f"the run is not finished: it is recorded up to the stage '{missing}'")
+        if not is_whole:
+            print("the run is not finished: it is recorded as far as it came")
 
 
 def view(run_folder: Path, *, web: bool) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hodge_pipeline.cli.options import Force, Json, Overrides, Overwrite, Quiet
+from hodge_pipeline.cli.options import Dask, Force, Json, Overrides, Overwrite, Quiet
 
 HELP = """Make the poses of COLMAP or SLAM better, in their own format.
 
@@ -43,6 +43,7 @@ def trajectory(
         str, typer.Option("--recipe", help="A recipe like slam-refine, which is the default; for TUM slam-refine-tum.")
     ] = "",
     overrides: Overrides = None,
+    dask: Dask = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -51,7 +52,17 @@ def trajectory(
     from hodge_pipeline.cli import refine_trajectory as refining_trajectory
 
     refining_trajectory.refine(
-        poses, frames, out, match, recipe, overrides or [], force=force, overwrite=overwrite, quiet=quiet, as_json=json
+        poses,
+        frames,
+        out,
+        match,
+        recipe,
+        overrides or [],
+        force=force,
+        overwrite=overwrite,
+        quiet=quiet,
+        as_json=json,
+        dask=dask,
     )
 
 
@@ -84,6 +95,7 @@ def colmap(
     force: Force = False,
     recipe: Annotated[str, typer.Option("--recipe", help="A recipe like colmap-refine, by name or file.")] = "",
     overrides: Overrides = None,
+    dask: Dask = None,
     overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -104,4 +116,5 @@ def colmap(
         overwrite=overwrite,
         quiet=quiet,
         as_json=json,
+        dask=dask,
     )

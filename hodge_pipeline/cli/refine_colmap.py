@@ -25,13 +25,14 @@ def refine(
     overwrite: bool,
     quiet: bool,
     as_json: bool,
+    dask: str | None,
 ) -> None:
     """Refine a model into a run folder. Raises `CheckError` (exit code 3) where the guard kept the input as worse."""
     options = load_model_refinement(recipe or RECIPE, overrides)
     from hodge_pipeline.refine.colmap import run_refinement
 
     with resumable(out), Terminal(quiet or as_json) as terminal:
-        done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal)
+        done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal, dask=dask)
     if as_json:
         print((out / "report.json").read_text("utf-8"), end="")
     elif not quiet:

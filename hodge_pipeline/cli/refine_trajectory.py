@@ -23,10 +23,11 @@ def refine(
     overwrite: bool,
     quiet: bool,
     as_json: bool,
+    dask: str | None,
 ) -> None:
     """Run the recipe and print what came out; `CheckError`, exit code 3, where the poses given are kept as better."""
     if not poses.exists():
         raise SourceError(f"{poses}: no such file or folder: give the poses to refine")
     ours = [f"given.path={json.dumps(str(poses))}", f"given.match={match}", f"guard.force={str(force).lower()}"]
     chosen = recipe or recipe_for(frames)
-    running.run(chosen, frames, out, [*ours, *overrides], overwrite=overwrite, quiet=quiet, as_json=as_json)
+    running.run(chosen, frames, out, [*ours, *overrides], overwrite=overwrite, quiet=quiet, as_json=as_json, dask=dask)

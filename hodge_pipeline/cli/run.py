@@ -16,7 +16,7 @@ from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.recipe.schema import load_recipe
 
 if TYPE_CHECKING:
-    from hodge_pipeline.pipeline import Run
+    from hodge_pipeline.run_folder import Run
 
 
 def run(
@@ -29,6 +29,7 @@ def run(
     quiet: bool,
     as_json: bool,
     live: bool = False,
+    dask: str | None = None,
 ) -> None:
     """Run a recipe and print what came out."""
     loaded = load_recipe(recipe, overrides, source)
@@ -37,7 +38,7 @@ def run(
     from hodge_pipeline.pipeline import run as run_pipeline
 
     with resumable(out), Terminal(quiet or as_json) as terminal, _viewer(live, terminal) as address:
-        result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal, live=address)
+        result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal, live=address, dask=dask)
     print_result(result, quiet=quiet, as_json=as_json)
     if result.refined is not None and result.refined.decision.exit_code:
         raise CheckError(result.refined.decision.reason)
@@ -90,14 +91,14 @@ def resumable(out: Path) -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def demo(out: Path, overrides: Sequence[str], *, overwrite: bool, quiet: bool) -> None:
+def demo(out: Path, overrides: Sequence[str], *, overwrite: bool, quiet: bool, dask: str | None) -> None:
     """Make the demo sequence, or find it in the cache, and run the recipe `demo` on it."""
     from hodge_pipeline.demo.sequence import DemoOptions, demo_source
 
     options = DemoOptions()
     with Terminal(quiet) as terminal, terminal.stage("render the demo room", options.frames) as advance:
         folder = demo_source(options=options, advance=advance)
-    run("demo", folder, out, overrides, overwrite=overwrite, quiet=quiet, as_json=False)
+    run("demo", folder, out, overrides, overwrite=overwrite, quiet=quiet, as_json=False, dask=dask)
 
 
 def _print_summary(result: Run) -> None:

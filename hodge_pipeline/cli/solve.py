@@ -41,7 +41,7 @@ def choices(
             raise RecipeError(f"{option} {value}: expected {' or '.join(known)}")
     if named == "full" and (certificate or sesync_units):
         raise RecipeError("--certificate and --sesync-units are for the isotropic objective: add --objective isotropic")
-    if time_limit_s <= 0:
+    if not time_limit_s > 0:
         raise RecipeError(f"--time-limit {time_limit_s:g}: expected seconds above zero")
     initial: InitialName = "given" if start == "given" else "chordal"
     chosen: ObjectiveName = "isotropic" if named == "isotropic" else "full"
@@ -49,14 +49,21 @@ def choices(
 
 
 def solve(
-    path: Path, options: Choices, *, out: Path | None, run_folder: Path | None, quiet: bool, as_json: bool
+    path: Path,
+    options: Choices,
+    *,
+    out: Path | None,
+    run_folder: Path | None,
+    quiet: bool,
+    as_json: bool,
+    dask: str | None,
 ) -> None:
     """Solve a file, write what was asked for, print a summary; `CheckError` where the result fails its own checks.
 
     A run folder given alone is solved and fused again, with its edits, and brought up to date.
     """
     if out is None and run_folder is None and options == Choices() and (path / RECIPE_FILE).is_file():
-        _solve_run(path, quiet=quiet, as_json=as_json)
+        _solve_run(path, quiet=quiet, as_json=as_json, dask=dask)
         return
     if path.is_dir() and (history := read_history(path)).edits:
         options = replace(options, disable=(*options.disable, *history.disabled))
@@ -93,12 +100,12 @@ def _writer(out: Path, source: Source) -> str:
     return writer_name(out, source) if out.suffix.lower() in KNOWN_ENDINGS else "g2o"
 
 
-def _solve_run(folder: Path, *, quiet: bool, as_json: bool) -> None:
+def _solve_run(folder: Path, *, quiet: bool, as_json: bool, dask: str | None) -> None:
     from hodge_pipeline.cli.run import print_result
     from hodge_pipeline.pipeline import solve_again
 
     with Terminal(quiet or as_json) as terminal:
-        result = solve_again(folder, watcher=terminal)
+        result = solve_again(folder, watcher=terminal, dask=dask)
     print_result(result, quiet=quiet, as_json=as_json)
 
 
@@ -109,7 +116,8 @@ def _lines(
     name = {"full": "chi2", "isotropic": "F"}[summary["objective"]]
     before = summary["cost_before"]
     ignored = f", {summary['edges_ignored']} ignored" if summary["edges_ignored"] else ""
-    lines = [
+    lines = [("result", "NOT CONFIRMED by any cycle of its edges")] if summary["confirmed"] is False else []
+    lines += [
         (
             "graph",
             f"{solved.source.name}, {summary['dimension']}-D: {summary['poses']} poses, {summary['edges']} edges",
@@ -133,6 +141,11 @@ def _lines(
 def _check(summary: dict[str, Any]) -> None:
     if summary["certified"] is False:
         raise CheckError("the result is not proven to be the global minimum: see the notes; try --start chordal")
+    if summary["confirmed"] is False:
+        raise CheckError(
+            "nothing confirms the result: edges are left out, and the cycles of the others close no better than by "
+            "chance; add edges between the same views, or see which are wrong with hodge diagnose"
+        )
     if not summary["converged"]:
         late = any("time limit" in note for note in summary["notes"])
         remedy = "raise --time-limit" if late else "if edges may be wrong, hodge diagnose names them, or add --robust"

@@ -12,6 +12,8 @@ from hodge_pipeline.types import Bools, Ints
 
 MOST_PIECES_LISTED = 8
 
+MAX_RUNS_LISTED = 12
+
 
 def connected_components(edges: Ints, vertex_count: int) -> Ints:
     """The component (V,) of each vertex: 0 the largest; of equal ones, that with the first vertex comes first."""
@@ -19,12 +21,15 @@ def connected_components(edges: Ints, vertex_count: int) -> Ints:
     check_edges(edges, vertex_count)
     ones = np.ones(len(edges), np.int32)  # parallel edges are summed: 256 of them would be none in 8 bits
     adjacency = csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
-    count, label = csgraph_components(adjacency, directed=False)
-    _, first = np.unique(label, return_index=True)
-    order = np.lexsort((first, -np.bincount(label, minlength=count)))
-    rank = np.empty(count, np.int64)
-    rank[order] = np.arange(count)
-    return np.asarray(rank[label], np.int64)
+    return by_size(csgraph_components(adjacency, directed=False)[1])
+
+
+def by_size(label: Ints) -> Ints:
+    """Labels (V,) of components, renumbered: 0 the largest; of equal ones, that with the first vertex comes first."""
+    _, first, row, size = np.unique(label, return_index=True, return_inverse=True, return_counts=True)
+    rank = np.empty(len(size), np.int64)
+    rank[np.lexsort((first, -size))] = np.arange(len(size))
+    return np.asarray(rank[row.reshape(-1)], np.int64)
 
 
 def first_of_component(component: Ints) -> Bools:
@@ -54,3 +59,13 @@ def describe_components(component: Ints, vertex_ids: NDArray[np.generic]) -> tup
 
 def _describe_piece(number: int, names: NDArray[np.generic]) -> str:
     return f"piece {number}: {len(names)} vertices ({names[0]} … {names[-1]})"
+
+
+def in_runs(rows: Ints, vertex_ids: Ints | np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> str:
+    """Ascending rows in words, `0–120, 124, 130–131`, as the source names their frames."""
+    if not len(rows):
+        return "none"
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    words = [f"{vertex_ids[run[0]]}" + (f"–{vertex_ids[run[-1]]}" if len(run) > 1 else "") for run in runs]
+    more = f", and {len(runs) - MAX_RUNS_LISTED} more" if len(runs) > MAX_RUNS_LISTED else ""
+    return ", ".join(words[:MAX_RUNS_LISTED]) + more

@@ -168,14 +168,15 @@ def root_from_vertex(forest: SpanningForest, i_from_j: Floats) -> Floats:
     return motion
 
 
-def fundamental_products(forest: SpanningForest, i_from_j: Floats) -> Floats:
+def fundamental_products(forest: SpanningForest, i_from_j: Floats, chords: Ints | None = None) -> Floats:
     """The motion (C, 4, 4) around each fundamental loop from its base vertex: `Z_ij · j_from_root · root_from_i`.
 
     What lies above the meeting point of the two tree paths cancels, so the cost does not grow with the loops' length.
     """
+    chords = forest.chords if chords is None else np.asarray(chords, np.int64)
     root_from = root_from_vertex(forest, i_from_j)
-    i, j = forest.edges[forest.chords].T
-    return np.asarray(i_from_j[forest.chords] @ se3.inverse(root_from[j]) @ root_from[i])
+    i, j = forest.edges[chords].T
+    return np.asarray(i_from_j[chords] @ se3.inverse(root_from[j]) @ root_from[i])
 
 
 def loop_products(loops: Loops, i_from_j: Floats) -> Floats:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.diagnosis.consensus import find_consensus
 from hodge_pipeline.diagnosis.evidence import Evidence
@@ -28,7 +29,6 @@ from hodge_pipeline.diagnosis.testing_cycles import (
 )
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.diagnosis.working_point import recentred, working_point
-from hodge_pipeline.solvers.weights import check_graph
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from numpy import str_
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.cycles import Loops
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Bools, Edges, Floats, Ints
 
 CONSISTENT, SUSPECT, WRONG, UNTESTABLE = "consistent", "suspect", "wrong", "untestable"
 WITNESSES = 3
@@ -55,3 +56,13 @@ class Diagnosis:
     piece: Ints
     world_from_cam: Floats
     notes: tuple[str, ...]
+
+    def put_into(self, edges: Edges) -> Edges:
+        """The table with the verdict on each edge of its graph, and why."""
+        return edges.put(
+            edges.in_graph,
+            verdict=self.verdict,
+            probability=self.probability,
+            leverage=self.leverage,
+            why=np.array(self.reason, dtype=np.str_),
+        )

@@ -70,14 +70,13 @@ def _attempt(
     graph: ViewGraph, found: Diagnosis, share: Floats, rows: Ints, start: Floats, objective: ObjectiveName
 ) -> _Attempt:
     chosen = graph.select(rows)
-    chosen = replace(chosen, information=share[rows, None, None] * chosen.information)
     # information is often right in its proportions alone: the gate is set in units of what the kept edges show
     size = 2 if graph.dimension == 2 else 3
     usual = _chi2(graph, found.world_from_cam, found.piece)
     known = usual[rows][np.isfinite(usual[rows])]
     scale = max(float(np.median(known)) / MEDIAN_CHI2[size], 1e-12) if len(known) else 1.0
     limit = TAILS * (CHI2_99_PLANAR if size == 2 else CHI2_99_SPATIAL) * scale
-    solution = solve_robust(chosen, start=start, threshold=limit, objective=objective)
+    solution = solve_robust(chosen, start=start, confidence=share[rows], threshold=limit, objective=objective)
     chi2 = _chi2(graph, solution.world_from_cam, solution.component)
     return _Attempt(rows, solution, chi2, limit)
 

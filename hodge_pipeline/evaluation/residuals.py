@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.types import Floats, ViewGraph
+from hodge_pipeline.types import Edges, Floats, ViewGraph
+from hodge_pipeline.types.edges import DISABLED, IGNORED, USED
 
 
 def edge_residuals(graph: ViewGraph, world_from_cam: Floats) -> tuple[Floats, Floats]:
@@ -20,3 +21,13 @@ def edge_residuals(graph: ViewGraph, world_from_cam: Floats) -> tuple[Floats, Fl
     translation_m[known] = np.linalg.norm(left_over[known, :3, 3], axis=-1)
     angle_rad[known] = np.linalg.norm(se3.so3_log(left_over[known, :3, :3]), axis=-1)
     return translation_m, angle_rad
+
+
+def with_residuals(edges: Edges, world_from_cam: Floats, weights: Floats) -> Edges:
+    """The table with weight, residual and status of the edges of its graph, whose `weights (G,)` a solver gave them."""
+    rows = np.flatnonzero(edges.in_graph)
+    graph = edges.select(rows)
+    translation_m, angle_rad = edge_residuals(graph.as_graph(np.arange(len(world_from_cam))), world_from_cam)
+    status = np.where(graph.status == DISABLED, DISABLED, np.where(weights > 0, USED, IGNORED))
+    unsolved = edges.put(slice(None), weight=np.nan, residual_m=np.nan, residual_rad=np.nan)
+    return unsolved.put(rows, weight=weights, residual_m=translation_m, residual_rad=angle_rad, status=status)

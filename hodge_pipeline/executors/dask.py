@@ -1,49 +1,49 @@
-"""Workers of a Dask cluster: an existing one by address, or a local one (optional extra `dask`)."""
+"""The workers of a Dask cluster (optional extra `dask`).
+
+Whoever answers at a scheduler's address runs code in this process, since Dask pickles: the address comes from the
+caller, that is from the command line or the environment, and no recipe can name it. So this is no stage.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, TypeVar
 
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass
-
 from hodge_pipeline.errors import WorkerError
-from hodge_pipeline.stages import Workers
+from hodge_pipeline.stages import Executor, Workers
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
+TIMEOUT_S = 30.0
+"""Seconds to wait for the scheduler: Dask's own default."""
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class DaskExecutor:
-    """Runs blocks on a Dask cluster whose workers see the same files under the same paths."""
 
-    address: str | None = Field(None, description="of an existing scheduler, tcp://host:8786; none: a local cluster")
-    workers: int = Field(2, ge=1, description="processes of the local cluster, one thread each")
-    retries: int = Field(
-        2, ge=0, description="how often a block is tried again whose worker died; an existing scheduler has its own"
-    )
-    timeout_s: float = Field(30.0, gt=0, description="seconds to wait for the scheduler")
+def open_workers(executor: Executor, dask: str | None) -> AbstractContextManager[Workers]:
+    """The workers of the Dask scheduler at an address such as tcp://host:8786, without one the executor's own."""
+    return executor.open() if dask is None else cluster_workers(dask)
 
-    @contextmanager
-    def open(self) -> Iterator[Workers]:
-        """The cluster's workers; a local cluster ends when the block is left, another one stays."""
-        try:
-            import dask
-            import distributed
-        except ImportError as error:
-            raise WorkerError("the executor 'dask' needs the extra: pip install 'hodge-pipeline[dask]'") from error
-        local = {"n_workers": self.workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
-        options: dict[str, Any] = local if self.address is None else {"address": self.address}
-        with dask.config.set({"distributed.scheduler.allowed-failures": self.retries}):
-            try:
-                client = distributed.Client(timeout=self.timeout_s, **options)
-            except (OSError, ValueError) as error:
-                raise WorkerError(f"no Dask scheduler answers at {self.address}: {error}") from error
-            with client:
-                yield ClusterWorkers(client)
+
+@contextmanager
+def cluster_workers(address: str) -> Iterator[Workers]:
+    """The workers of a running cluster, which see the same files under the same paths. It is left as it is.
+
+    Raises `WorkerError` where the extra is missing, or nothing answers.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        raise WorkerError("a Dask cluster needs the extra: pip install 'hodge-pipeline[dask]'") from error
+    try:
+        client = distributed.Client(address, timeout=TIMEOUT_S)
+    except (OSError, ValueError) as error:
+        reason = str(error) or type(error).__name__
+        raise WorkerError(
+            f"no Dask scheduler answers at '{address}' ({reason}): start one there, or leave out --dask"
+        ) from error
+    with client:
+        yield ClusterWorkers(client)
 
 
 class ClusterWorkers:
@@ -53,7 +53,7 @@ class ClusterWorkers:
         self._client = client
 
     def map(self, task: Callable[[Task], Result], blocks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
-        """(index, result) of each block as it finishes; a block of a worker that died is tried again."""
+        """(index, result) of each block as it finishes; the scheduler has a block of a worker that died tried again."""
         import distributed
 
         futures = [self._client.submit(task, block, pure=False) for block in blocks]

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hodge_pipeline.pairs.candidates import select
-from hodge_pipeline.types import Bools, Candidates, Floats, Ints
+from hodge_pipeline.types import Bools, Edges, Floats, Ints
 
 
-def spread(candidates: Candidates, frame_count: int, max_edges_per_frame: float, always: Bools) -> Candidates:
+def spread(candidates: Edges, frame_count: int, max_edges_per_frame: float, always: Bools) -> Edges:
     """At most `max_edges_per_frame · frame_count` of the candidates (P,), but all that `always` (P,) marks.
 
     Each frame's best pair of every loop length (an octave of j − i) comes before any second-best, so that no frame is
@@ -27,7 +26,7 @@ def spread(candidates: Candidates, frame_count: int, max_edges_per_frame: float,
     order = thinning_order(pairs, np.nan_to_num(candidates.overlap[optional], nan=0.0))
     turn = first_turn(pairs[order])
     taken = optional[order[np.argsort(turn, kind="stable")[: max(0, room)]]]
-    return select(candidates, np.sort(np.concatenate([np.flatnonzero(always), taken])))
+    return candidates.select(np.sort(np.concatenate([np.flatnonzero(always), taken])))
 
 
 def thinning_order(pairs: Ints, scores: Floats) -> Ints:

@@ -1,13 +1,14 @@
-"""What every edge builder shares: which frames can have an edge, and pairs in the order that `Candidates` promises."""
+"""What every edge builder shares: which frames can have an edge, and their proposals as one."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.types import Bools, Candidates, CloudSet, Floats, Ints
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
 
 
 def usable_rows(clouds: CloudSet, world_from_cam: Floats | None = None) -> Ints:
@@ -18,26 +19,13 @@ def usable_rows(clouds: CloudSet, world_from_cam: Floats | None = None) -> Ints:
     return np.flatnonzero(usable).astype(np.int64)
 
 
-def labelled(pairs: Ints, source: str, overlap: Floats | None = None) -> Candidates:
-    """Unique pairs (P, 2) as candidates of one reason: each turned to i < j, all sorted."""
-    pairs = np.sort(np.asarray(pairs, np.int64).reshape(-1, 2), axis=1)
-    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
-    scores = np.full(len(pairs), np.nan) if overlap is None else np.asarray(overlap, float)
-    return Candidates(pairs[order], np.full(len(pairs), source), scores[order])
-
-
-def select(candidates: Candidates, rows: Ints) -> Candidates:
-    """These rows of the candidates; ascending rows keep the order."""
-    return Candidates(candidates.pairs[rows], candidates.source[rows], candidates.overlap[rows])
-
-
-def has_reason(candidates: Candidates, reason: str) -> Bools:
+def has_reason(candidates: Edges, reason: str) -> Bools:
     """Where (P,) this reason is among those of a pair."""
-    labels, which = np.unique(candidates.source, return_inverse=True)
+    labels, which = np.unique(candidates.proposed_by, return_inverse=True)
     return np.array([reason in label.split("+") for label in labels], bool)[which]
 
 
-def merge(proposals: Sequence[Candidates]) -> tuple[Candidates, Bools]:
+def merge(proposals: Sequence[Edges]) -> tuple[Edges, Bools]:
     """The union of proposals, and (P, B) who proposed each pair.
 
     The reasons of a pair are joined by "+" in the order of the proposals; its overlap is the best that one gave.
@@ -51,12 +39,12 @@ def merge(proposals: Sequence[Candidates]) -> tuple[Candidates, Bools]:
     for k, (proposal, own) in enumerate(zip(proposals, rows, strict=True)):
         votes[own, k] = True
         overlap[own] = np.fmax(overlap[own], proposal.overlap)
-    return Candidates(pairs, _joined(proposals, rows, len(pairs)), overlap), votes
+    return replace(Edges.of(pairs, _joined(proposals, rows, len(pairs))), overlap=overlap), votes
 
 
-def _joined(proposals: Sequence[Candidates], rows: Sequence[Ints], count: int) -> NDArray[np.str_]:
+def _joined(proposals: Sequence[Edges], rows: Sequence[Ints], count: int) -> NDArray[np.str_]:
     # Of one proposal the longest label goes first: it shows the order of a nested builder's reasons.
-    labels = [label for p in proposals for label in sorted(np.unique(p.source), key=len, reverse=True)]
+    labels = [label for p in proposals for label in sorted(np.unique(p.proposed_by), key=len, reverse=True)]
     reasons = list(dict.fromkeys(reason for label in labels for reason in label.split("+")))
     given = np.zeros((count, len(reasons)), bool)
     for proposal, own in zip(proposals, rows, strict=True):

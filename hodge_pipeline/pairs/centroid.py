@@ -10,8 +10,8 @@ from pydantic.dataclasses import dataclass
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
-from hodge_pipeline.pairs.candidates import labelled, usable_rows
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Ints
+from hodge_pipeline.pairs.candidates import usable_rows
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
 
 
 def centroids_in_world(clouds: CloudSet, world_from_cam: Floats, rows: Ints) -> Floats:
@@ -28,10 +28,10 @@ class CentroidEdges:
         0.2, gt=0, description="metres between the two centroids in the world frame; 0.2 is the paper's"
     )
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs of centroids less than `max_distance_m` apart; none for frames without points or a finite pose."""
         rows = usable_rows(clouds, world_from_cam)
         if len(rows) < 2:
-            return labelled(np.zeros((0, 2), np.int64), "centroid")
+            return Edges.proposed(np.zeros((0, 2), np.int64), "centroid")
         tree = cKDTree(centroids_in_world(clouds, world_from_cam, rows))
-        return labelled(rows[tree.query_pairs(self.max_distance_m, output_type="ndarray")], "centroid")
+        return Edges.proposed(rows[tree.query_pairs(self.max_distance_m, output_type="ndarray")], "centroid")

@@ -10,10 +10,10 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.pairs.budget import spread
-from hodge_pipeline.pairs.candidates import has_reason, merge, select
+from hodge_pipeline.pairs.candidates import has_reason, merge
 from hodge_pipeline.pairs.sequential import SequentialEdges
 from hodge_pipeline.stages import EdgeBuilder
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
@@ -35,7 +35,7 @@ class CombinedEdges:
         "first, the others are spread over loops of every length (9 serves a room of 250 frames); null keeps all",
     )
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs with their reasons joined by "+", as `sequential+overlap`, and the best overlap that a builder gave."""
         merged, votes = merge([builder.propose(frames, clouds, world_from_cam) for builder in self.builders])
         always = has_reason(merged, "sequential")
@@ -43,7 +43,7 @@ class CombinedEdges:
             voters = [k for k, builder in enumerate(self.builders) if not isinstance(builder, SequentialEdges)]
             agreed = votes[:, voters].all(axis=1) if voters else np.zeros(len(votes), bool)
             rows = np.flatnonzero(always | agreed)
-            merged, always = select(merged, rows), always[rows]
+            merged, always = merged.select(rows), always[rows]
         if self.max_edges_per_frame is None:
             return merged
         return spread(merged, len(frames), self.max_edges_per_frame, always)

@@ -9,9 +9,9 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
-from hodge_pipeline.pairs.candidates import labelled, usable_rows
+from hodge_pipeline.pairs.candidates import usable_rows
 from hodge_pipeline.pairs.overlap import pairwise_iou
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
 
 OCTAVES = 8
 FRAMES_LOOKED_AT = 50
@@ -51,7 +51,7 @@ class DriftEdges:
         "joined them",
     )
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs of one sequence, with their IoU; between sequences the poses say nothing."""
         names = np.array([frame.sequence for frame in frames], dtype=np.str_)
         usable = usable_rows(clouds, world_from_cam)
@@ -59,7 +59,7 @@ class DriftEdges:
             self._of_one(usable[names[usable] == name], clouds, world_from_cam) for name in np.unique(names[usable])
         ]
         pairs = np.concatenate([NOTHING, *(pairs for pairs, _ in found)])
-        return labelled(pairs, "drift", np.concatenate([np.zeros(0), *(overlap for _, overlap in found)]))
+        return Edges.proposed(pairs, "drift", np.concatenate([np.zeros(0), *(overlap for _, overlap in found)]))
 
     def _of_one(self, rows: Ints, clouds: CloudSet, world_from_cam: Floats) -> tuple[Ints, Floats]:
         """The pairs of one sequence's rows, in their order, and their IoU."""

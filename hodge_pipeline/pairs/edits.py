@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,15 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.errors import GraphError, WorkspaceError
 from hodge_pipeline.store import artifacts
+from hodge_pipeline.store.edge_table import read_edges
 from hodge_pipeline.store.workspace import REFINEMENT
-from hodge_pipeline.types import Bools, Ints, ViewGraph
+from hodge_pipeline.types import Bools, Edges, Ints
+from hodge_pipeline.types.edges import DISABLED, HELD_OUT, Words
 
 FILE = "edits.json"
 EDGES = "edges.csv"
 FORMAT_VERSION = 1
-ENABLED, DISABLED, REGISTERED, REJECTED = "enabled", "disabled", "registered", "rejected"
+ENABLED, REGISTERED = "enabled", "registered"
 
 
 @dataclass(frozen=True)
@@ -116,25 +117,30 @@ def write_history(folder: Path, history: History) -> None:
 
 
 @dataclass(frozen=True)
-class ListedEdge:
-    """A row of a run's `edges.csv`: its ends as written there, its status (used, ignored, disabled, rejected), and
-    what the diagnosis says.
-    """
+class Listed:
+    """The edges of a run with the names of its vertices, as `edges.csv` has them."""
 
-    i: str
-    j: str
-    source: str
-    status: str
-    verdict: str = ""
-    probability: str = ""
+    edges: Edges
+    vertex_ids: Words
 
     @property
-    def name(self) -> str:
-        """The pair as it is written: `12-87`."""
-        return f"{self.i}-{self.j}"
+    def names(self) -> list[str]:
+        """The name of each row: `12-87`."""
+        return pair_names(self.vertex_ids, self.edges.pairs)
+
+    def named(self, pairs: Sequence[str]) -> tuple[str, ...]:
+        """The pairs, given in either direction, as they are listed first, each once. Raises `GraphError` for others."""
+        known: dict[str, str] = {}
+        for name, backwards in zip(self.names, pair_names(self.vertex_ids, self.edges.pairs[:, ::-1]), strict=True):
+            known.setdefault(name, name)
+            known.setdefault(backwards, name)
+        for pair in pairs:
+            if pair not in known:
+                raise GraphError(f"{pair}: no edge joins these frames: give two ids of {EDGES}, as 12-87")
+        return tuple(dict.fromkeys(known[pair] for pair in pairs))
 
 
-def listed_edges(folder: Path) -> list[ListedEdge]:
+def listed_edges(folder: Path) -> Listed:
     """Every edge and rejected pair of a run. Raises `WorkspaceError` where the folder holds no finished run."""
     path = folder / EDGES
     if (folder / REFINEMENT).is_dir():
@@ -144,48 +150,31 @@ def listed_edges(folder: Path) -> list[ListedEdge]:
         )
     if not path.is_file():
         raise WorkspaceError(f"{folder}: holds no finished run ({EDGES} is missing): run the recipe to its end first")
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    try:
-        return [
-            ListedEdge(r["i"], r["j"], r["source"], r["status"], r.get("verdict") or "", r.get("probability") or "")
-            for r in rows
-        ]
-    except KeyError as error:
-        raise WorkspaceError(f"{path}: has no column {error}: run the same recipe again") from error
+    edges, names = read_edges(path)
+    return Listed(edges.select(edges.status != HELD_OUT), names)
 
 
-def named_edges(edges: Iterable[ListedEdge], pairs: Sequence[str]) -> list[ListedEdge]:
-    """The first listed edge of each pair, given in either direction. Raises `GraphError` for a pair without one."""
-    by_name: dict[str, ListedEdge] = {}
-    for edge in edges:
-        by_name.setdefault(edge.name, edge)
-        by_name.setdefault(f"{edge.j}-{edge.i}", edge)
-    for pair in pairs:
-        if pair not in by_name:
-            raise GraphError(f"{pair}: no edge joins these frames: give two ids of {EDGES}, as 12-87")
-    return [by_name[pair] for pair in pairs]
+def pair_names(vertex_ids: NDArray[np.generic], pairs: Ints) -> list[str]:
+    """Pairs (P, 2) of rows as they are written: `12-87`."""
+    return [f"{i}-{j}" for i, j in vertex_ids[pairs].tolist()]
 
 
-def pairs_to_register(folder: Path, edges: Sequence[ListedEdge], pairs: Sequence[str]) -> tuple[str, ...]:
+def pairs_to_register(edges: Edges, vertex_ids: NDArray[np.generic], pairs: Sequence[str]) -> tuple[str, ...]:
     """The pairs, named as a run's frames are, each once. Raises `GraphError` for a pair that is an edge, or no pair."""
-    stored = folder / "stages" / "diagnose" / "graph.npz"
-    if not stored.is_file():
-        raise WorkspaceError(f"{folder}: is no run of frames: there is nothing to register")
-    ids = artifacts.load_arrays(stored)["vertex_ids"]
-    names = tuple(dict.fromkeys(f"{ids[i]}-{ids[j]}" for i, j in np.sort(vertex_rows(ids, pairs), axis=1)))
-    joined = {frozenset((edge.i, edge.j)): edge for edge in edges if edge.status != REJECTED}
-    for i, j in vertex_rows(ids, names):
-        if edge := joined.get(frozenset((str(ids[i]), str(ids[j])))):
-            raise GraphError(f"{edge.name}: is an edge already ({edge.source}, {edge.status})")
-    return names
+    found = np.sort(vertex_rows(vertex_ids, pairs), axis=1)
+    joined = {frozenset(edges.pairs[row].tolist()): row for row in np.flatnonzero(edges.in_graph)}
+    for pair in found.tolist():
+        if (row := joined.get(frozenset(pair))) is not None:
+            (name,) = pair_names(vertex_ids, edges.pairs[[row]])
+            raise GraphError(f"{name}: is an edge already ({edges.proposed_by[row]}, {edges.status[row]})")
+    return tuple(dict.fromkeys(pair_names(vertex_ids, found)))
 
 
-def joining(graph: ViewGraph, pair: str) -> Bools:
-    """Where (E,) an edge joins the vertex ids `a-b`, in either direction; parallel ones all."""
-    names = graph.vertex_ids[graph.edges].astype(str)
+def joining(vertex_ids: NDArray[np.generic], pairs: Ints, pair: str) -> Bools:
+    """Where (P,) pairs of rows are the vertex ids `a-b`, in either direction; parallel ones all."""
+    names = vertex_ids[pairs].astype(str)
     hits = [((names == [a, b]) | (names == [b, a])).all(axis=1) for a, b in _cuts(pair)]
-    return np.asarray(np.any(hits, axis=0) if hits else np.zeros(graph.edge_count, bool))
+    return np.asarray(np.any(hits, axis=0) if hits else np.zeros(len(pairs), bool))
 
 
 def vertex_rows(vertex_ids: NDArray[np.generic], pairs: Sequence[str]) -> Ints:

@@ -11,8 +11,8 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.pairs.candidates import labelled, usable_rows
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Ints, PointCloud
+from hodge_pipeline.pairs.candidates import usable_rows
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, PointCloud
 
 AXIS_BITS = 21
 BLOCK_ENTRIES = 4_000_000
@@ -96,9 +96,9 @@ class OverlapEdges:
         "with 11 cm of drift in a room, 0.1 finds half of the pairs whose true IoU exceeds 0.3, and 0.3 finds 97 %",
     )
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs whose IoU exceeds `min_iou`, with it; none for frames without points or a finite pose."""
         if len(usable_rows(clouds, world_from_cam)) < 2:
-            return labelled(np.zeros((0, 2), np.int64), "overlap")
+            return Edges.proposed(np.zeros((0, 2), np.int64), "overlap")
         iou = pairwise_iou(clouds, world_from_cam, self.voxel_m, above=self.min_iou).tocoo()
-        return labelled(np.stack([iou.row, iou.col], axis=1), "overlap", iou.data)
+        return Edges.proposed(np.stack([iou.row, iou.col], axis=1), "overlap", iou.data)

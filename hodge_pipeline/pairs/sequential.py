@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.pairs.candidates import labelled, usable_rows
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame
+from hodge_pipeline.pairs.candidates import usable_rows
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -23,7 +23,7 @@ class SequentialEdges:
         "points; 1 gives the chain alone",
     )
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs at most `reach` apart among the frames of one sequence that have points: empty frames are bridged."""
         rows = usable_rows(clouds)
         names = np.array([frames[row].sequence for row in rows], dtype=np.str_)
@@ -32,4 +32,4 @@ class SequentialEdges:
             (chain[:-step], chain[step:]) for chain in chains for step in range(1, min(self.reach, len(chain)) + 1)
         ]
         pairs = [np.stack(step, axis=1) for step in steps]
-        return labelled(np.concatenate([np.zeros((0, 2), np.int64), *pairs]), "sequential")
+        return Edges.proposed(np.concatenate([np.zeros((0, 2), np.int64), *pairs]), "sequential")

@@ -11,13 +11,13 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.pairs.candidates import labelled, usable_rows
+from hodge_pipeline.pairs.candidates import usable_rows
 from hodge_pipeline.pairs.sequential import SequentialEdges
 from hodge_pipeline.pairs.sift_features import Features
 from hodge_pipeline.pairs.sift_matching import count_inliers
 from hodge_pipeline.pairs.sift_similarity import global_descriptors, most_similar, vocabulary
 from hodge_pipeline.registration.descriptors import match
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
 
 log = logging.getLogger("hodge_pipeline")
 
@@ -51,7 +51,7 @@ class SiftEdges:
     max_error_px: float = Field(1.5, gt=0, description="pixels from the epipolar line, for a match to be an inlier")
     seed: int = Field(0, ge=0, description="of the vocabulary's sample; the same seed gives the same pairs")
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Verified pairs; `overlap` is the share of the poorer frame's features that are inliers.
 
         None for frames without points, or whose image is missing or cannot be read, which the log lists. Raises
@@ -59,7 +59,7 @@ class SiftEdges:
         """
         rows = usable_rows(clouds)
         if len(rows) < 2:
-            return labelled(np.zeros((0, 2), np.int64), "sift")
+            return Edges.proposed(np.zeros((0, 2), np.int64), "sift")
         neighbours = SequentialEdges(reach=self.reach).propose(frames, clouds, world_from_cam).pairs
         return _verified(self, _Same(frames, rows, neighbours))
 
@@ -83,7 +83,7 @@ class _Same:
 
 
 @lru_cache(maxsize=1)  # the next outer iteration asks again
-def _verified(options: SiftEdges, same: _Same) -> Candidates:
+def _verified(options: SiftEdges, same: _Same) -> Edges:
     features = Features(same.frames, same.rows, options.max_features)
     try:
         return _matched(options, same, features)
@@ -91,7 +91,7 @@ def _verified(options: SiftEdges, same: _Same) -> Candidates:
         features.close()
 
 
-def _matched(options: SiftEdges, same: _Same, features: Features) -> Candidates:
+def _matched(options: SiftEdges, same: _Same, features: Features) -> Edges:
     for complaint in features.complaints:
         log.warning("%s", complaint)
     rows = np.array([row for row in same.rows.tolist() if features.count(row)], np.int64)
@@ -121,7 +121,7 @@ def _matched(options: SiftEdges, same: _Same, features: Features) -> Candidates:
             kept.append(np.array([[i, j]]))
             shares.append(inliers / min(features.count(i), features.count(j)))
     log.info("sift: %d of %d proposed pairs have more than %d matches", len(shares), len(proposed), options.min_inliers)
-    return labelled(np.concatenate(kept), "sift", np.array(shares))
+    return Edges.proposed(np.concatenate(kept), "sift", np.array(shares))
 
 
 def _proposed(options: SiftEdges, same: _Same, features: Features, rows: Ints) -> Ints:

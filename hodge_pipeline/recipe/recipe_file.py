@@ -47,7 +47,21 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> Document:
     document = _extended(find(name_or_path), depth=0)
     for override in overrides:
         document = _overridden(document, override)
+    _refuse_cluster(document)
     return document
+
+
+def _refuse_cluster(document: Document) -> None:
+    """Recipes come from anybody, and who answers at the address of a cluster runs code here: no recipe names one."""
+    executor = document.data.get("executor")
+    options = executor if isinstance(executor, dict) else {"stage": executor}
+    named = "address" if "address" in options else "stage" if options.get("stage") == "dask" else None
+    if named is not None:
+        key = ("executor", named) if isinstance(executor, dict) else ("executor",)
+        raise RecipeError(
+            f"{document.where(key)}: {'.'.join(key)}: a recipe names no cluster, since who answers there runs code "
+            "here: write `executor: local`, and give the cluster that you trust as --dask ADDRESS"
+        )
 
 
 def _extended(path: Path, depth: int) -> Document:
@@ -85,11 +99,13 @@ def _overridden(document: Document, override: str) -> Document:
     keys = path.strip().split(".")
     if not equals or not all(keys):
         raise RecipeError(f"{name}: expected a.b=value")
-    value = yaml_file.parse_value(text, name)
+    given = yaml_file.parse_value(text, name)
+    value = given.data["value"]
     typed, change = _typed(keys), _nested(document.data, keys, value, name)
     merges = isinstance(value, dict)
     kept = {key: line for key, line in document.origins.items() if merges or key[: len(typed)] != typed}
-    return Document(change, {**{typed[:end]: name for end in range(1, len(typed))}, **kept, typed: name})
+    new = {(*typed, *inside[1:]): name for inside in given.origins if inside}
+    return Document(change, {**{typed[:end]: name for end in range(1, len(typed))}, **kept, **new})
 
 
 def _typed(keys: list[str]) -> Keys:

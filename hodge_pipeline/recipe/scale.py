@@ -10,18 +10,16 @@ import numpy as np
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.schema import Recipe
-from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.job import Job
+from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.types import Floats, Frame, Source
 
 T = TypeVar("T")
 SECTIONS = (
     "clouds",
-    "odometry",
-    "key_frames",
-    "global_start",
+    "start",
     "edges",
     "registration",
+    "complex",
     "acceptance",
     "solver",
     "fusion",
@@ -36,20 +34,21 @@ FULL = 0.5
 """Voxels over points, from which smaller voxels show nothing more."""
 
 
-def apply_scale(job: Job, source: Source) -> None:
-    """Put the recipe's `scale` on every length of the job's recipe, and say so; auto: measured on the scans first."""
-    wanted = job.recipe.scale
-    if wanted == "auto":
-        options = ("scale", job.recipe.clouds.voxel_m)
-        with job.stage("scale", "scale of the scans", 1, options, ("source",)) as (folder, advance):
-            if not folder.finished:
-                factor = measured_scale(source.frames, job.recipe.clouds.voxel_m)
-                artifacts.save_arrays(folder.path / "scale.npz", {"scale": np.array(factor)})
-                if factor != 1.0:
-                    job.note(_said(factor, job.recipe.clouds.voxel_m))
-                advance(1)
-        wanted = float(artifacts.load_arrays(job.path("scale") / "scale.npz")["scale"])
-    job.recipe = dataclasses.replace(scaled_recipe(job.recipe, wanted), scale=wanted)
+def with_scale(recipe: Recipe, source: Source, steps: Steps) -> Recipe:
+    """The recipe with its `scale` on every length; auto: measured on the scans first, and reported."""
+    if recipe.scale == "auto":
+        wanted = steps.step(scale_of_scans, source, recipe.clouds.voxel_m, title="scale of the scans")
+    else:
+        wanted = recipe.scale
+    return dataclasses.replace(scaled_recipe(recipe, wanted), scale=wanted)
+
+
+def scale_of_scans(source: Source, voxel_m: float, *, step: Step) -> float:
+    """Step: the factor on lengths that suits the scans of a source."""
+    factor = measured_scale(source.frames, voxel_m)
+    if factor != 1.0:
+        step.note(_said(factor, voxel_m))
+    return factor
 
 
 def scaled_recipe(recipe: Recipe, factor: float) -> Recipe:

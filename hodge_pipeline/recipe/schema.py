@@ -10,21 +10,27 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline.complex.parts import ComplexOptions
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.recipe import binding, recipe_file
-from hodge_pipeline.recipe.yaml_file import Document, Keys
 from hodge_pipeline.recording.options import RecordingOptions
-from hodge_pipeline.refine.given_poses import GivenOptions
 from hodge_pipeline.refine.held_out import GuardOptions
-from hodge_pipeline.refine.key_frames import KeyFrameOptions
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.sources.measured_edges import MeasuredOptions
-from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, FrameReader, Fuser, Registrar
-from hodge_pipeline.start.unordered.options import GlobalStart
+from hodge_pipeline.stages import (
+    ConsistencySolver,
+    EdgeBuilder,
+    Executor,
+    FrameReader,
+    Fuser,
+    Refiner,
+    Registrar,
+    Start,
+)
+from hodge_pipeline.start.key_frames import KeyFrameStart
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
@@ -64,24 +70,16 @@ class Recipe:
     source: SourceOptions = SourceOptions()
     scale: Annotated[float, Field(gt=0)] | Literal["auto"] = Field(
         default=1.0,
-        description="factor on every length (`…_m`) of clouds, odometry, start, edges, registration, acceptance, "
+        description="factor on every length (`…_m`) of clouds, start, edges, registration, acceptance, "
         "solver and fusion, which are written for rooms; auto: such that most scans have 1500 to 40,000 voxels of "
         "`clouds.voxel_m`, so 1 for rooms",
     )
     clouds: CloudOptions = CloudOptions()
-    start: Literal["odometry", "global"] = Field(
-        default="odometry",
-        description="where the first poses come from: consecutive frames, or `global_start` for frames in no order",
+    start: Start = Field(
+        default=KeyFrameStart(),
+        description="where first poses come from: consecutive frames, given poses, no order",
     )
-    odometry: OdometryOptions = OdometryOptions()
-    relocalise: bool | Literal["auto"] = Field(
-        default=False,
-        description="join what odometry leaves apart, by `global_start`: after lost tracking, or several sequences; "
-        "auto: only where it left something apart, true: always, which closes loops that have drifted too far as well",
-    )
-    global_start: GlobalStart = GlobalStart()
-    given: GivenOptions = GivenOptions()
-    key_frames: KeyFrameOptions = KeyFrameOptions()
+    complex: ComplexOptions = ComplexOptions()
     guard: GuardOptions = GuardOptions()
     acceptance: Acceptance = Acceptance()
     measured: MeasuredOptions = MeasuredOptions()
@@ -93,6 +91,7 @@ class Recipe:
     )
     diagnosis: DiagnosisOptions = DiagnosisOptions()
     suggestions: SuggestionOptions = SuggestionOptions()
+    refiner: Refiner | None = Field(default=None, description="improves the poses of all frames after the last solve")
     fusion: tuple[Fuser, ...] = Field(default=(), description="each makes one model from the final poses")
     evaluation: EvaluationOptions = EvaluationOptions()
     recording: RecordingOptions = RecordingOptions()
@@ -106,29 +105,10 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path |
     document = recipe_file.load(name_or_path, overrides)
     if "model" in document.data:
         raise RecipeError(f"recipe '{name_or_path}' refines a model: hodge refine colmap MODEL --recipe {name_or_path}")
-    recipe = binding.bind(Recipe, document.data, lambda keys: origin(document, keys))
+    recipe = binding.bind(Recipe, document.data, document.where)
     return recipe if source is None else with_source(recipe, source)
-
-
-def cloud_options(recipe: Recipe, apart: bool = False) -> CloudOptions:
-    """The recipe's clouds, with landmarks where a start without a guess matches frames by them.
-
-    `apart`: whether such a start is likely where it is automatic.
-    """
-    relocalises = apart if recipe.relocalise == "auto" else recipe.relocalise
-    matched = (recipe.start == "global" or relocalises) and recipe.global_start.use != "geometry"
-    if not matched or recipe.clouds.landmarks:
-        return recipe.clouds
-    return dataclasses.replace(recipe.clouds, landmarks=recipe.global_start.landmarks)
 
 
 def with_source(recipe: Recipe, path: Path) -> Recipe:
     """The recipe on another source."""
     return dataclasses.replace(recipe, source=dataclasses.replace(recipe.source, path=path))
-
-
-def origin(document: Document, keys: Keys) -> str:
-    """`file:line` of a key, or of the nearest key above it that was written."""
-    while keys not in document.origins:
-        keys = keys[:-1]
-    return document.origins[keys]

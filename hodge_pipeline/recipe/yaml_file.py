@@ -13,7 +13,8 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from hodge_pipeline.errors import RecipeError
 
-MAX_BYTES = 1_000_000
+MAX_BYTES = 100_000
+"""A recipe with every default written out has about 3 kB; what is this long takes up to 4 s to parse."""
 MAX_NODES = 20_000
 
 Keys = tuple[str | int, ...]
@@ -25,6 +26,12 @@ class Document:
 
     data: dict[str, Any]
     origins: dict[Keys, str]
+
+    def where(self, keys: Keys) -> str:
+        """The origin of a key, or of the nearest key above it that was written."""
+        while keys and keys not in self.origins:
+            keys = keys[:-1]
+        return self.origins[keys]
 
 
 def read(path: Path) -> Document:
@@ -48,7 +55,7 @@ def parse(text: str, name: str) -> Document:
         line = mark.line + 1 if mark else 1
         raise RecipeError(f"{name}:{line}: {str(error.problem).splitlines()[0]}") from error
     except (YAMLError, ValueError, RecursionError) as error:
-        raise RecipeError(f"{name}: not YAML: {error}") from error
+        raise RecipeError(f"{name}: not YAML: {str(error).splitlines()[0]}") from error
     if root is None:
         root = CommentedMap()
     if not isinstance(root, CommentedMap):
@@ -59,9 +66,9 @@ def parse(text: str, name: str) -> Document:
     return Document(data, origins)
 
 
-def parse_value(text: str, name: str) -> Any:
-    """The plain value of an override such as `--set a.b=[1, 2]`."""
-    return parse(f"value: {text}", name).data["value"]
+def parse_value(text: str, name: str) -> Document:
+    """The value of an override such as `--set a.b=[1, 2]`, under the key `value`."""
+    return parse(f"value: {text}", name)
 
 
 def dump(data: dict[str, Any]) -> str:
@@ -87,7 +94,7 @@ def _plain(node: Any, path: Keys, line: int, name: str, origins: dict[Keys, str]
         raise RecipeError(f"{name}:{line}: the tag '{tag}' is not allowed: a recipe is data and constructs nothing")
     if isinstance(node, CommentedMap):
         return {
-            _key(key, name, line): _plain(value, (*path, str(key)), node.lc.key(key)[0] + 1, name, origins, budget)
+            _key(key, name, line): _plain(value, (*path, str(key)), _line(node, key, line), name, origins, budget)
             for key, value in node.items()
         }
     if isinstance(node, CommentedSeq):
@@ -98,6 +105,11 @@ def _plain(node: Any, path: Keys, line: int, name: str, origins: dict[Keys, str]
     return _scalar(node, name, line)
 
 
+def _line(node: CommentedMap, key: Any, line: int) -> int:
+    """The line of a key; of one that `<<` merges into the mapping, that of the mapping."""
+    return int(node.lc.data[key][0]) + 1 if key in (node.lc.data or {}) else line
+
+
 def _key(key: Any, name: str, line: int) -> str:
     if not isinstance(key, str):
         raise RecipeError(f"{name}:{line}: the key {key!r} is not a name")
@@ -105,6 +117,8 @@ def _key(key: Any, name: str, line: int) -> str:
 
 
 def _scalar(node: Any, name: str, line: int) -> Any:
+    if isinstance(node, str) and ("\0" in node or not node.isascii() and any("\ud800" <= c <= "\udfff" for c in node)):
+        raise RecipeError(f"{name}:{line}: {node!r} holds a character that no file can have")
     for kind in (bool, int, float, str):
         if isinstance(node, kind):
             return kind(node)

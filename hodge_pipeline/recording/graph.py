@@ -11,7 +11,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_columns
-from hodge_pipeline.types import Candidates, Floats, Frame, Ints, Solution, ViewGraph
+from hodge_pipeline.types import Edges, Floats, Frame, Ints, Solution, ViewGraph
 
 LINE_BYTES = 40
 """One edge of the film: two points, a colour, two list offsets."""
@@ -57,7 +57,7 @@ def log_edges(
     world_from_cam: Floats,
     residual_m: Floats | None,
     verdicts: Sequence[str] | None,
-    rejected: Candidates | None,
+    rejected: Edges | None,
     options: RecordingOptions,
     max_bytes: float,
 ) -> tuple[str, ...]:
@@ -72,7 +72,7 @@ def log_edges(
         kept = options.count(options.edge_lines, len(rejected.pairs), LINE_BYTES, max_bytes / 4)
         pairs = rejected.pairs[shapes.evenly(len(rejected.pairs), kept)]
         grey = np.full((len(pairs), 3), shapes.REJECTED_COLOUR, np.uint8)
-        why = rejected.source[shapes.evenly(len(rejected.pairs), kept)]
+        why = rejected.why[shapes.evenly(len(rejected.pairs), kept)]
         named = zip(graph.vertex_ids[pairs[:, 0]], graph.vertex_ids[pairs[:, 1]], why, strict=True)
         labels = [f"{i} – {j}: rejected, {reason}" for i, j, reason in named]
         _log_lines(stream, layout.rejected(outer), world_from_cam, pairs, grey, labels)
@@ -138,7 +138,7 @@ def iteration_columns(outer: int, count: int, first_iteration: int, rows: Ints) 
     ]
 
 
-def graph_summary(outer: int, graph: ViewGraph, residual_m: Floats, rejected: Candidates | None) -> str:
+def graph_summary(outer: int, graph: ViewGraph, residual_m: Floats, rejected: Edges | None) -> str:
     """The viewing graph's counts as Markdown."""
     degree = np.bincount(graph.edges.ravel(), minlength=graph.vertex_count)
     names, counts = np.unique(graph.source, return_counts=True)

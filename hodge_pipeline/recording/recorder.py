@@ -19,8 +19,7 @@ from hodge_pipeline.recording.merge import Merged, merge
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.registration import log_registration
 from hodge_pipeline.recording.stream import writing
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Model, Solution, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Model, Solution, ViewGraph
 
 Notes = tuple[str, ...]
 APPLICATION = "hodge-pipeline"
@@ -60,15 +59,13 @@ class Recorder:
             2, "poses", name, lambda s: graph_log.log_poses(s, name, world_from_cam, frames, self.options)
         )
 
-    def registration(
-        self, outer: int, registered: Registered, rejected: NDArray[np.str_], guesses: Floats, clouds: CloudSet
-    ) -> Notes:
+    def registration(self, outer: int, registered: Edges, guesses: Floats, clouds: CloudSet) -> Notes:
         """What registration found for every pair (P,) of an outer round, and why it was rejected, if it was."""
         return self._part(
             layout.outer_number(outer, 2),
             "registration",
             str(outer),
-            lambda s: log_registration(s, outer, registered, rejected, guesses, clouds, self.options),
+            lambda s: log_registration(s, outer, registered, guesses, clouds, self.options),
         )
 
     def edges(
@@ -79,7 +76,7 @@ class Recorder:
         *,
         residual_m: Floats | None = None,
         verdicts: Sequence[str] | None = None,
-        rejected: Candidates | None = None,
+        rejected: Edges | None = None,
     ) -> Notes:
         """The viewing graph of an outer round under the poses it was made with, and the candidates that failed.
 

@@ -6,15 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.shapes import evenly
 from hodge_pipeline.recording.stream import log_markdown
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.types import CloudSet, Floats, Floats32
+from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32
 
 POINTS_SHOWN = 6_000
 TARGET_COLOUR, BEFORE_COLOUR, AFTER_COLOUR = (86, 180, 233), (230, 130, 0), (240, 228, 66)
@@ -26,29 +24,27 @@ POINT_RADIUS = -1.0
 def log_registration(
     stream: rr.RecordingStream,
     outer: int,
-    registered: Registered,
-    rejected: NDArray[np.str_],
+    registered: Edges,
     guesses: Floats,
     clouds: CloudSet,
     options: RecordingOptions,
 ) -> tuple[str, ...]:
     """Nothing to remark; histograms and columns of all pairs (P,), the clouds of the chosen ones in i's axes.
 
-    `rejected (P,)` says why a pair became no edge, an empty word where it is one; `guesses (P, 4, 4)` is `i_from_j`
-    as registration began.
+    `guesses (P, 4, 4)` is `i_from_j` as registration began.
     """
-    log_columns(stream, outer, registered, rejected)
+    log_columns(stream, outer, registered)
     for name, values in (("fitness", registered.fitness), ("rmse_mm", registered.rmse_m * 1000)):
         _log_histogram(stream, layout.under(layout.BARS, f"{name}_round_{outer}"), values)
     if options.has_images:
-        chosen = chosen_pairs(registered, rejected, guesses)
+        chosen = chosen_pairs(registered, guesses)
         for name, row in chosen.items():
             _log_pair(stream, name, registered, row, guesses, clouds)
-        log_markdown(stream, layout.PAIRS_TEXT, _text(registered, rejected, guesses, chosen))
+        log_markdown(stream, layout.PAIRS_TEXT, _text(registered, guesses, chosen))
     return ()
 
 
-def log_columns(stream: rr.RecordingStream, outer: int, registered: Registered, rejected: NDArray[np.str_]) -> None:
+def log_columns(stream: rr.RecordingStream, outer: int, registered: Edges) -> None:
     """Every pair's numbers, one row each, as components that a program reads back."""
     if not len(registered.pairs):
         return
@@ -61,15 +57,15 @@ def log_columns(stream: rr.RecordingStream, outer: int, registered: Registered, 
             rmse_m=registered.rmse_m.astype(np.float32),
             iterations=registered.iterations,
             correspondences=registered.correspondences,
-            rejected=rejected.tolist(),
+            rejected=registered.why.tolist(),
         ),
         static=True,
     )
 
 
-def chosen_pairs(registered: Registered, rejected: NDArray[np.str_], guesses: Floats) -> Mapping[str, int]:
+def chosen_pairs(registered: Edges, guesses: Floats) -> Mapping[str, int]:
     """Rows by name: the edge that registration moved most, the edge of least fitness, the fittest pair rejected."""
-    edges, others = np.flatnonzero(rejected == ""), np.flatnonzero(rejected != "")
+    edges, others = np.flatnonzero(registered.counts), np.flatnonzero(~registered.counts)
     found: dict[str, int] = {}
     if len(edges):
         found["moved_most"] = int(edges[np.argmax(moved_m(registered, guesses)[edges])])
@@ -79,14 +75,14 @@ def chosen_pairs(registered: Registered, rejected: NDArray[np.str_], guesses: Fl
     return found
 
 
-def moved_m(registered: Registered, guesses: Floats) -> Floats:
+def moved_m(registered: Edges, guesses: Floats) -> Floats:
     """How far registration moved each pair (P,) from its guess, a rotation as its arc at 1 m; 0 where unknown."""
     motion = se3.log(se3.inverse(guesses) @ registered.i_from_j)
     return np.asarray(np.nan_to_num(np.linalg.norm(motion, axis=1)))
 
 
 def _log_pair(
-    stream: rr.RecordingStream, name: str, registered: Registered, row: int, guesses: Floats, clouds: CloudSet
+    stream: rr.RecordingStream, name: str, registered: Edges, row: int, guesses: Floats, clouds: CloudSet
 ) -> None:
     i, j = registered.pairs[row]
     source = np.asarray(_thinned(clouds, int(j)), float)
@@ -113,9 +109,9 @@ def _log_histogram(stream: rr.RecordingStream, path: str, values: Floats) -> Non
         stream.log(path, rr.BarChart(counts, abscissa=middles, widths=widths), static=True)
 
 
-def _text(registered: Registered, rejected: NDArray[np.str_], guesses: Floats, chosen: Mapping[str, int]) -> str:
+def _text(registered: Edges, guesses: Floats, chosen: Mapping[str, int]) -> str:
     moved = moved_m(registered, guesses)
-    reasons, counts = np.unique(rejected, return_counts=True)
+    reasons, counts = np.unique(registered.why, return_counts=True)
     lines = ["# Registration", "", "| outcome | pairs |", "|---|---|"]
     lines += [f"| {reason or 'edge'} | {count} |" for reason, count in zip(reasons, counts, strict=True)]
     lines += ["", "Blue: frame i. Orange: frame j as guessed. Yellow: frame j as registered.", ""]

@@ -1,64 +1,73 @@
-"""A run walked again without computing: what its folder holds is recorded, or read."""
+"""The recording of a run made again, with other options, from what its folder holds."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hodge_pipeline import registry
-from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.pipeline import compute, read
+from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.recipe import binding
-from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.run import FILE, Recording
-from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.job import Job, Unfinished, log, logging_to
-from hodge_pipeline.store.progress import Nobody, Watcher
-from hodge_pipeline.store.workspace import RECIPE_FILE, Workspace
+from hodge_pipeline.run_folder import Run, check_layout
+from hodge_pipeline.scene import key_source
+from hodge_pipeline.sources.opening import open_source, remembered
+from hodge_pipeline.store.log import log, logging_to
+from hodge_pipeline.store.progress import Watcher
+from hodge_pipeline.store.store import Store
+from hodge_pipeline.store.workspace import Workspace
+from hodge_pipeline.types import Source
+
+PARTS = "recording"
+"""The folder of the parts, which depend on the level and are not those that the run made."""
 
 
-def recipe_of(folder: Path) -> Recipe:
-    """The recipe of a run folder. Raises `WorkspaceError` where it is none."""
-    if not (folder / RECIPE_FILE).is_file():
-        raise WorkspaceError(f"{folder}: is no run folder: there is no {RECIPE_FILE} in it")
-    return load_recipe(str(folder / RECIPE_FILE))
+def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | None = None) -> tuple[Path, bool]:
+    """The recording of a run made again with other options (see `RecordingOptions`): where it lies, and whether the run
+    had ended. A run that was killed is recorded as far as it came.
 
-
-def _solved_without_scores(folder: Path) -> bool:
-    """Whether the run ended without scores, as it does when it is solved again after an edit."""
-    report = folder / "report.json"
-    return report.is_file() and artifacts.read_json(report)["scores"] is None
-
-
-def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | None = None) -> tuple[Path, str]:
-    """The recording of a run made again with other options (see `RecordingOptions`); where it lies, and the title of
-    the first stage that the run has not finished, empty where it is complete.
-
-    Nothing is computed again, so a run that was killed is recorded as far as it came.
+    Nothing is computed again. Images are recorded where the source is still there.
     """
-    recipe = recipe_of(folder)
-    changed = dataclasses.replace(
-        recipe,
-        recording=dataclasses.replace(recipe.recording, **options),
-        executor=registry.load("executors", "local")(workers=0),
-    )
+    check_layout(folder)
+    run = Run.load(folder)
+    recipe = run.recipe
+    changed = replace(recipe, recording=replace(recipe.recording, **options))
     if changed.recording.level == "off":
         raise WorkspaceError(f"{folder}: its recipe records nothing: add --level normal")
-    with Workspace.reopen(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
-        job = Job(changed, workspace, watcher or Nobody(), computes=False, scoring=not _solved_without_scores(folder))
+    with Workspace.reopen(folder, binding.unbind(recipe)), logging_to(folder / "log.txt"):
         log.info("recording made again from the run folder")
-        missing = ""
+        (folder / PARTS).mkdir(exist_ok=True)
+        store = Store(folder / PARTS, watcher)
+        source = _with_images(run, recipe, store)
+        with Recording(store, folder, changed, source) as recording:
+            _record(run, recording)
+    return folder / FILE, run.ending is not None
+
+
+def _with_images(run: Run, recipe: Recipe, store: Store) -> Source:
+    """The key frames of the run, with their images where the source that they came from is still what it was."""
+    source = run.source
+    if recipe.source.path is not None:
         try:
-            source = read(job)
-            with Recording(job, source) as recording:
-                compute(job, source, recording)
-        except Unfinished as unfinished:
-            missing = str(unfinished)
-            if unfinished.stale:
-                raise WorkspaceError(
-                    f"{folder}: the stage '{missing}' was {unfinished.stale}: run the recipe again, "
-                    "or record it where it was made"
-                ) from unfinished
-    return folder / FILE, missing
+            opened, reader = open_source(recipe.source.path, recipe.source.reader)
+            if [frame.frame_id for frame in opened.frames] == [frame.frame_id for frame in source.frames]:
+                source = remembered(opened, reader, store)
+            else:
+                store.note(f"{opened.path}: holds other frames by now: recorded without images")
+        except (HodgeError, OSError) as error:
+            store.note(f"recorded without images: {error}")
+    keys = source if run.key_frames.are_all else key_source(source, run.key_frames.rows)
+    store.remember(keys, store.key([store.key(source), run.key_frames.rows]))
+    return keys
+
+
+def _record(run: Run, recording: Recording) -> None:
+    recording.begin(run.clouds, run.rounds[0])
+    for number, one in enumerate(run.rounds[1:], start=1):
+        recording.round(number, one)
+    if (run.result.edges.verdict != "").any():
+        recording.diagnosis(run.result)
+        recording.scores(run.scores)
+    recording.models(run.models)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -14,160 +15,171 @@ from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge_parts
+from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.recorder import APPLICATION, Recorder
-from hodge_pipeline.registration.acceptance import rejections
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.rounds import Round, has_truth, pose_sets, true_poses
+from hodge_pipeline.scene import Round, has_truth, pose_sets, true_poses
+from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.job import RECORDING, Job, Unfinished, log
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Ints, Source
+from hodge_pipeline.store.log import log
+from hodge_pipeline.store.workspace import identity_of
+from hodge_pipeline.types import CloudSet, Floats, Ints, Source
 
 FILE = "recording.rrd"
+RECORDING = "recording"
+"""The title of every step that only records."""
 Notes = tuple[str, ...]
 
 
 class Recording:
     """The recording of a run in progress: a context that ends with `recording.rrd` in the run folder.
 
-    Each method records one stage, under a key of its own: a resumed run records only what it computes again. Where the
-    run is stopped or fails, what was recorded so far is merged and the error goes on. With the level `off` nothing is
+    Each method records one part, as a step of its own: a resumed run records only what it computes again. Where the run
+    is stopped or fails, what was recorded so far is merged and the error goes on. With the level `off` nothing is
     written.
     """
 
-    def __init__(self, job: Job, source: Source) -> None:
-        self._job, self._source = job, source
-        self._stages: list[str] = []
+    def __init__(self, steps: Steps, folder: Path, recipe: Recipe, source: Source, live: str | None = None) -> None:
+        self._steps, self._folder, self._recipe, self._source = steps, folder, recipe, source
+        self._parts: list[Path] = []
         self._rounds: list[Round] = []
-        self._live = None if job.live is None else Live(job.live, APPLICATION, job.workspace.identity)
+        self._clouds: CloudSet | None = None
+        self._identity = identity_of(folder)
+        self._live = None if live is None else Live(live, APPLICATION, self._identity)
 
     def __enter__(self) -> Recording:
         source = self._source
-        self._part("frames", ("source",), lambda to: to.frames(source.name, source.frames, source.notes))
+        self._part("frames", (source,), lambda to: to.frames(source.name, source.frames, source.notes))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._job.recipe.recording.level == "off":
+        if self._recipe.recording.level == "off":
             return
         if error is None:
             self._finish()
-        elif not (isinstance(error, Unfinished) and error.stale):
+        else:
             self._rescue()
         if self._live is not None:
             self._live.close()
 
-    def clouds(self, clouds: CloudSet) -> None:
-        """The frames' clouds."""
-        self._part("clouds", ("clouds",), lambda to: to.clouds(self._source.frames, clouds))
+    def begin(self, clouds: CloudSet, first: Round) -> None:
+        """The frames' clouds, and the poses that the run starts from."""
+        self._clouds, self._rounds, frames = clouds, [first], self._source.frames
+        self._part("clouds", (self._source, clouds), lambda to: to.clouds(frames, clouds))
+        name, poses = first.name, first.world_from_cam
+        self._part("first_poses", (self._source, name, poses), lambda to: to.poses(name, poses, frames))
 
-    def first_poses(self, first: Round) -> None:
-        """The poses that the run starts from."""
-        self._rounds = [first]
-        self._part(
-            first.name, (first.name,), lambda to: to.poses(first.name, first.world_from_cam, self._source.frames)
-        )
-
-    def registration(self, number: int, registered: Registered, before: Floats, clouds: CloudSet) -> None:
+    def _registration(self, number: int, this: Round) -> None:
         """What registration found in outer round `number`, from the poses before it."""
+        if self._clouds is None or this.fresh is None or this.before is None or not len(this.fresh):
+            return
+        registered, before, clouds = this.edges.select(this.fresh), this.before, self._clouds
         i, j = registered.pairs.T
         guesses = se3.inverse(before[i]) @ before[j]
-        reasons = rejections(self._job, registered)
-        self._part(
-            f"registration-{number}",
-            (f"register-{number}",),
-            lambda to: to.registration(number, registered, reasons, guesses, clouds),
-            self._job.recipe.acceptance,
-        )
+        inputs = (number, registered, guesses, clouds)
+        self._part("registration", inputs, lambda to: to.registration(number, registered, guesses, clouds))
 
     def round(self, number: int, this: Round) -> None:
-        """The edges of outer round `number`, the pairs that became none, and the solve."""
+        """The registrations of outer round `number`, its edges, the pairs that became none, and the solve."""
+        self._registration(number, this)
         self._rounds.append(this)
         rounds = tuple(self._rounds)
-        self._part(f"round-{number}", (f"solve-{number}",), lambda to: _record_round(to, self._source, rounds, number))
+        inputs = (self._source, number, this, rounds[number - 1])
+        self._part("round", inputs, lambda to: _record_round(to, self._source, rounds, number))
 
     def diagnosis(self, last: Round) -> None:
         """The last round's edges with the verdict on each."""
-        verdicts = last.verdicts
-        if verdicts is not None:
-            self._rounds[-1] = last
-            graph, poses = last.graph, last.world_from_cam
-            self._part(
-                "diagnosis",
-                ("diagnose",),
-                lambda to: to.diagnosis(graph, poses, verdicts.verdict, verdicts.probability, verdicts.reason),
-            )
+        self._rounds[-1] = last
+        graph, poses, edges = last.graph, last.world_from_cam, last.graph_edges
+        self._part(
+            "diagnosis",
+            (graph, poses, edges.verdict, edges.probability, edges.why),
+            lambda to: to.diagnosis(graph, poses, edges.verdict, edges.probability, edges.why),
+        )
 
     def scores(self, scores: ScoreTable | None) -> None:
         """The errors of the frames and the score tables."""
-        inputs = (f"solve-{len(self._rounds) - 1}", *(["evaluate"] if scores is not None else []))
         rounds = tuple(self._rounds)
+        inputs = (self._source, [one.world_from_cam for one in rounds], scores)
         self._part("evaluation", inputs, lambda to: _record_evaluation(to, self._source, rounds, scores))
 
-    def models(self, models: dict[str, Path]) -> None:
+    def models(self, models: Mapping[str, Path]) -> None:
         """The fused models; of several the last is seen."""
-        inputs = tuple(f"fuse-{row}" for row in range(len(models)))
+        assert self._clouds is not None
+        clouds, poses = self._clouds, self._rounds[-1].world_from_cam
         if models:
-            poses = self._rounds[-1].world_from_cam
-            clouds = CloudSet.open(self._job.path("clouds"))
+            inputs = (list(models.values()), clouds, poses)
             self._part(
                 "model",
                 inputs,
                 lambda to: tuple(n for path in models.values() for n in to.model(read_ply(path), clouds, poses)),
             )
 
-    def _part(self, name: str, inputs: tuple[str, ...], write: Callable[[Recorder], Notes], *options: object) -> None:
-        job, stage = self._job, f"record-{name}"
-        if job.recipe.recording.level == "off":
+    def _part(self, name: str, inputs: tuple[Any, ...], write: Callable[[Recorder], Notes]) -> None:
+        options = self._recipe.recording
+        if options.level == "off":
             return
-        with job.stage(stage, RECORDING, 1, (job.recipe.recording, *options), inputs) as (folder, advance):
-            if not folder.finished:
-                for note in write(self._recorder(folder.path)):
-                    job.note(note)
-                advance(1)
-        self._stages.append(stage)
+        self._parts += self._steps.step(
+            record_part, inputs, options, title=RECORDING, name=f"record_{name}", write=write, recorder=self._recorder
+        )
         if self._live is not None:
-            self._live.show(self._parts())
+            self._live.show(self._parts)
 
     def _recorder(self, folder: Path) -> Recorder:
-        job = self._job
-        rounds = job.recipe.outer_iterations + job.recipe.suggestions.rounds
-        return Recorder(folder, job.workspace.identity, options=job.recipe.recording, rounds=rounds)
+        rounds = self._recipe.outer_iterations + self._recipe.suggestions.rounds
+        return Recorder(folder, self._identity, options=self._recipe.recording, rounds=rounds)
 
     def _finish(self) -> None:
-        job = self._job
-        with job.stage("record", RECORDING, 1, job.recipe.recording, tuple(self._stages)) as (folder, advance):
-            if not folder.finished:
-                for note in self._merge(folder.path, folder.path / FILE):
-                    job.note(note)
-                advance(1)
-        artifacts.link_or_copy(job.path("record") / FILE, job.workspace.folder / FILE)
+        merged = self._steps.step(
+            merge_recording, self._parts, self._recipe.recording, title=RECORDING, merge=self._merge
+        )
+        artifacts.link_or_copy(merged, self._folder / FILE)
 
     def _rescue(self) -> None:
         """Merge what there is; an error of this is logged, so that the one that stopped the run is seen."""
-        folder = self._job.workspace.folder
         try:
-            with tempfile.TemporaryDirectory(dir=folder, prefix=".recording-") as scratch:
-                self._merge(Path(scratch), folder / FILE)
+            with tempfile.TemporaryDirectory(dir=self._folder, prefix=".recording-") as scratch:
+                self._merge(Path(scratch), self._folder / FILE)
         except Exception as error:
             log.warning("the recording could not be merged: %s", error)
 
     def _merge(self, folder: Path, out: Path) -> Notes:
         """Truth, recipe and log, which belong to the run as a whole, then all parts as one file."""
-        job, recorder = self._job, self._recorder(folder)
+        recorder = self._recorder(folder)
         notes = _record_truth(recorder, self._source, self._rounds)
-        lines = (job.workspace.folder / "log.txt").read_text("utf-8").splitlines()
-        recorder.text(yaml_file.dump(binding.unbind(job.recipe)), lines)
-        parts = self._parts(folder)
+        lines = (self._folder / "log.txt").read_text("utf-8").splitlines()
+        recorder.text(yaml_file.dump(binding.unbind(self._recipe)), lines)
+        parts = [*self._parts, *find_parts(folder)]
         if self._live is not None:
             self._live.show(parts)
-        return notes + merge_parts(parts, out, APPLICATION, job.workspace.identity).notes
+        return notes + merge_parts(parts, out, APPLICATION, self._identity).notes
 
-    def _parts(self, *others: Path) -> list[Path]:
-        folders = [*(self._job.path(stage) for stage in self._stages), *others]
-        return [part for folder in folders for part in find_parts(folder)]
+
+def record_part(
+    inputs: tuple[Any, ...],
+    options: RecordingOptions,
+    *,
+    write: Callable[[Recorder], Notes],
+    recorder: Callable[[Path], Recorder],
+    step: Step,
+) -> tuple[Path, ...]:
+    """Step: the files of one part of the recording, which `inputs` and `options` decide and `write` writes."""
+    for note in write(recorder(step.folder)):
+        step.note(note)
+    return tuple(find_parts(step.folder))
+
+
+def merge_recording(
+    parts: list[Path], options: RecordingOptions, *, merge: Callable[[Path, Path], Notes], step: Step
+) -> Path:
+    """Step: all parts as one file."""
+    for note in merge(step.folder, step.folder / FILE):
+        step.note(note)
+    return step.folder / FILE
 
 
 def _record_truth(recorder: Recorder, source: Source, rounds: Sequence[Round]) -> Notes:
@@ -182,9 +194,8 @@ def _record_truth(recorder: Recorder, source: Source, rounds: Sequence[Round]) -
 def _record_round(recorder: Recorder, source: Source, rounds: Sequence[Round], number: int) -> Notes:
     before, this = rounds[number - 1], rounds[number]
     assert this.solution is not None
-    rejected = Candidates(this.rejected_pairs, this.rejected_reasons, np.full(len(this.rejected_pairs), np.nan))
     first = sum(1 + len(one.solution.history) for one in rounds[1:number] if one.solution is not None)
-    return recorder.edges(number, this.graph, before.world_from_cam, rejected=rejected) + recorder.solution(
+    return recorder.edges(number, this.graph, before.world_from_cam, rejected=this.rejected) + recorder.solution(
         number, this.graph, before.world_from_cam, this.solution, source.frames, first_iteration=first
     )
 

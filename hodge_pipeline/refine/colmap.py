@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from hodge_pipeline.recipe import binding
 from hodge_pipeline.refine.model import RefinedModel, refine_models
 from hodge_pipeline.refine.model_folder import model_workspace, write_run_folder
 from hodge_pipeline.refine.model_options import RECIPE, ModelRefinement, load_model_refinement
-from hodge_pipeline.refine.model_stages import ModelStages, models_key
+from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.store.cost import Monitor
-from hodge_pipeline.store.job import versions
 from hodge_pipeline.store.progress import Nobody, Watcher
+from hodge_pipeline.store.store import Store
 
 
 @dataclass(frozen=True)
@@ -51,18 +52,20 @@ def refine_colmap(
     recipe: str = RECIPE,
     overrides: Sequence[str] = (),
     watcher: Watcher | None = None,
+    dask: str | None = None,
 ) -> RefinedColmap:
     """A COLMAP model with better poses: `model` is its folder, a `pycolmap.Reconstruction`, or a list of those.
 
     `depth`: folder of sensor depth images named as the colour images, `depth_scale` stored units to the metre. Without
     `out` nothing is written; with it a refinement that was stopped goes on (that of models in memory begins anew), and
-    another one is replaced where it may `overwrite`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
+    another one is replaced where it may `overwrite`. `dask` is as of `run`. Raises `HodgeError` (see `errors`) for
+    whatever the user can mend.
     """
     given = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale}
     sets = [f"model.{name}={value}" for name, value in given.items() if value is not None]
     options = load_model_refinement(recipe, [*sets, *overrides])
     folder = None if out is None else Path(out)
-    return run_refinement(model, options, out=folder, force=force, overwrite=overwrite, watcher=watcher)
+    return run_refinement(model, options, out=folder, force=force, overwrite=overwrite, watcher=watcher, dask=dask)
 
 
 def run_refinement(
@@ -73,6 +76,7 @@ def run_refinement(
     force: bool,
     overwrite: bool,
     watcher: Watcher | None = None,
+    dask: str | None = None,
 ) -> RefinedColmap:
     """The same with the options bound already."""
     watcher = watcher or Nobody()
@@ -82,8 +86,19 @@ def run_refinement(
     with model_workspace(out, options, overwrite=overwrite) as workspace:
         with Monitor().measure() as cost, watcher.stage("refine", 1):
             models = options.model.open_models(given)
-            stages = ModelStages(workspace, models_key(models, binding.unbind(options), versions()))
-            results = refine_models(models, options, stages, force=force)
+            steps = Store(workspace.steps)
+            results = refine_models(models, options, steps, models_key(models, options, steps), force=force, dask=dask)
         if out is not None:
             write_run_folder(out, results, options, cost)
     return RefinedColmap(results, out)
+
+
+def models_key(models: Sequence[TrackedModel], options: ModelRefinement, steps: Store) -> str:
+    """The key of models under these options: name, size and time of every file; of models in memory, one that no other
+    has.
+    """
+    if not all(model.files for model in models):
+        return uuid.uuid4().hex
+    files = [file for model in models for file in (*model.files, *model.measurements)]
+    status = [(str(file.absolute()), os.stat(file)) for file in files]
+    return steps.key([[[path, found.st_size, found.st_mtime_ns] for path, found in status], options])

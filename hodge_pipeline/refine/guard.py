@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
+from hodge_pipeline.report.difference import Better, sign_of
+
 Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "nothing"]
 
 
@@ -20,16 +22,14 @@ class Measure:
     name: str
     before: float
     after: float
-    better: Literal["lower", "higher"] = "lower"
+    better: Better = "lower"
     tolerance: float = 0.0
     unit: str = ""
 
     @property
     def is_worse(self) -> bool:
         """Whether it got worse by more than the tolerance; a measure that is lost (NaN) is worse."""
-        gain = self.before - self.after if self.better == "lower" else self.after - self.before
-        known_before = self.before == self.before
-        return known_before and not gain >= -self.tolerance
+        return sign_of(self.before, self.after, self.tolerance, self.better) < 0
 
     def __str__(self) -> str:
         return f"{self.name} {self.before:.4g} -> {self.after:.4g}{self.unit and ' '}{self.unit}"

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass as plain_dataclass
+
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.types import Bools, Candidates
+from hodge_pipeline.scene import Round
+from hodge_pipeline.types import Bools, Edges, Ints
+from hodge_pipeline.types.edges import HELD_OUT
 
 MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
@@ -27,16 +32,32 @@ class GuardOptions:
     force: bool = Field(default=False, description="write the result even where it is worse by its own measures")
 
 
-def is_held_out(candidates: Candidates, share: float, seed: int) -> Bools:
-    """Where (P,) a pair is kept out: a share of those that no sequence needs, the same ones in every round.
+@plain_dataclass(frozen=True)
+class HeldOut:
+    """The share of pairs to keep out, and the seed that draws them."""
 
-    Of few pairs a larger share is kept out, up to `LARGEST_SHARE`: one or two pairs would judge nothing.
-    """
-    mixed = candidates.pairs.astype(np.uint64) * MIXERS[:2]
-    key = (mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(7))) + np.uint64(seed) * MIXERS[2]
-    key = (key ^ (key >> np.uint64(29))) * MIXERS[2]
-    drawn = (key >> np.uint64(11)).astype(float) / float(1 << 53)
-    needed = np.array(["sequential" in str(source).split("+") for source in candidates.source], bool)
-    optional = ~needed.reshape(drawn.shape)
-    wanted = min(LARGEST_SHARE, FEWEST / max(1, int(optional.sum())))
-    return np.asarray((drawn < max(share, wanted)) & optional)
+    share: float
+    seed: int
+
+    def of(self, candidates: Edges) -> Bools:
+        """Where (P,) a pair is kept out: a share of those that no sequence needs, the same ones in every round.
+
+        Of few pairs a larger share is kept out, up to `LARGEST_SHARE`: one or two pairs would judge nothing.
+        """
+        mixed = candidates.pairs.astype(np.uint64) * MIXERS[:2]
+        key = (mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(7))) + np.uint64(self.seed) * MIXERS[2]
+        key = (key ^ (key >> np.uint64(29))) * MIXERS[2]
+        drawn = (key >> np.uint64(11)).astype(float) / float(1 << 53)
+        needed = np.array(["sequential" in str(source).split("+") for source in candidates.proposed_by], bool)
+        optional = ~needed.reshape(drawn.shape)
+        wanted = min(LARGEST_SHARE, FEWEST / max(1, int(optional.sum())))
+        return np.asarray((drawn < max(self.share, wanted)) & optional)
+
+
+def held_out_pairs(rounds: Sequence[Round]) -> Ints:
+    """The pairs (P, 2) that any round proposed and kept out, and that the last one did not register all the same."""
+    kept = [one.edges.pairs[one.edges.status == HELD_OUT].tolist() for one in rounds]
+    last = rounds[-1].edges
+    found = {tuple(pair) for pairs in kept for pair in pairs}
+    found -= set(map(tuple, last.pairs[last.status != HELD_OUT].tolist()))
+    return np.array(sorted(found), np.int64).reshape(-1, 2)

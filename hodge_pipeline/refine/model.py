@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import align
+from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.refine.guard import Change, Decision, Measure, decide
-from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, joined_graphs, no_depth_edges
+from hodge_pipeline.refine.model_edges import depth_edges, held_out_distances, no_depth_edges
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
-from hodge_pipeline.refine.model_stages import NOTES, ModelStages, measured_edges
+from hodge_pipeline.refine.reprojection import reprojection_measures
 from hodge_pipeline.refine.scale import Scale, metric_scale
 from hodge_pipeline.refine.uncertainty import SIGMAS
-from hodge_pipeline.stages import TrackedModel, Workers
-from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import Floats
+from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
+from hodge_pipeline.types import Floats, ViewGraph
 
 ADJUSTMENTS = 2
 """Rounds of merging points and bundle adjustment: what the first brings together the second can merge."""
@@ -56,17 +57,27 @@ class RefinedModel:
 
 
 def refine_models(
-    models: Sequence[TrackedModel], options: ModelRefinement, stages: ModelStages, *, force: bool = False
+    models: Sequence[TrackedModel],
+    options: ModelRefinement,
+    steps: Steps,
+    key: str,
+    *,
+    force: bool = False,
+    dask: str | None = None,
 ) -> tuple[RefinedModel, ...]:
-    """Every model refined, those that measurements tie together as one. Nothing is written but the stages."""
+    """Every model refined, those that measurements tie together as one. Nothing is written but the steps.
+
+    `key` stands for the models and the options that open them.
+    """
     scales = [metric_scale(model.depth_ratios()) for model in models]
     metric = [in_metres(model, scale) for model, scale in zip(models, scales, strict=True)]
     out = []
-    with options.executor.open() as workers:
+    with open_workers(options.executor, dask) as workers:
         for number, joined in enumerate(options.model.join(metric)):
             parts = [row for row, model in enumerate(metric) if set(model.body_names) & set(joined.body_names)]
             is_metric = all(scales[row].is_observable for row in parts)
-            found = _refine(joined, options, replace(stages, number=number), workers, is_metric)
+            steps.remember(joined, f"{key}-{number}")
+            found = _refine(joined, options, steps, workers, is_metric)
             inputs = tuple(models[row] for row in parts)
             out.append(_judged(inputs, tuple(scales[row] for row in parts), found, options, force))
     return tuple(out)
@@ -89,14 +100,12 @@ class _Found:
     notes: tuple[str, ...]
 
 
-def _refine(
-    start: TrackedModel, options: ModelRefinement, stages: ModelStages, workers: Workers, is_metric: bool
-) -> _Found:
+def _refine(start: TrackedModel, options: ModelRefinement, steps: Steps, workers: Workers, is_metric: bool) -> _Found:
     """Depth takes part where the model is in metres: else its clouds are in another unit, or not of these images."""
     nothing = np.zeros((2, 0))
-    measured, left_out = measured_edges(start, stages)
-    depth = depth_edges(start, options, stages, workers) if is_metric else no_depth_edges(start)
-    graph = joined_graphs(measured, depth.graph)
+    measured, left_out = steps.step(measured_edges, start, title="edges")
+    depth = depth_edges(start, options, steps, workers) if is_metric else no_depth_edges(start)
+    graph = ViewGraph.joined([measured, depth.graph])
     notes = (*left_out, *depth.notes)
     if not graph.edge_count:
         return _Found(start, start, None, np.full((1, 2), np.nan), nothing, (*notes, NO_EDGE))
@@ -104,27 +113,44 @@ def _refine(
     notes = (*notes, *solved.solution.notes)
     if not solved.kept.any():
         return _Found(start, start, solved, np.full((1, 2), np.nan), nothing, (*notes, NO_EDGE_LEFT))
-    model, errors = _adjusted(start, solved, options, stages)
+    model, errors = _adjusted(start, solved, options, steps)
     if not is_metric:
         model, errors = _in_the_scale_of(start, model, errors)
     distances = held_out_distances(depth, np.array([_image_poses(start), _image_poses(model)]), workers)
     return _Found(start, model, solved, errors, distances, notes)
 
 
+def measured_edges(model: TrackedModel, *, step: Step) -> tuple[ViewGraph, tuple[str, ...]]:
+    """Step: the model's edges from what its images share, and what was left out."""
+    return model.measured()
+
+
 def _adjusted(
-    start: TrackedModel, solved: Solved, options: ModelRefinement, stages: ModelStages
+    start: TrackedModel, solved: Solved, options: ModelRefinement, steps: Steps
 ) -> tuple[TrackedModel, Floats]:
     """The bundle adjustment, read back where it was done before."""
-    with stages.stage("adjusted") as folder:
-        if not folder.finished:
-            with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
-            model, errors = _adjust(start, solved, options.depth_weight if with_depth else 0.0)
-            (folder.path / MODEL).mkdir(exist_ok=True)
-            model.write(folder.path / MODEL)
-            artifacts.save_arrays(folder.path / "errors.npz", {"errors": errors})
-            artifacts.write_json(folder.path / NOTES, model.notes)
-    path = stages.path("adjusted")
-    return start.read_back(path / MODEL, stages.notes("adjusted")), artifacts.load_arrays(path / "errors.npz")["errors"]
+    with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
+    weight = options.depth_weight if with_depth else 0.0
+    found = steps.step(adjusted_model, start, solved, weight, title="bundle adjustment")
+    return start.read_back(found.folder, found.notes), found.errors
+
+
+@dataclass(frozen=True)
+class AdjustedModel:
+    """A folder with what bundle adjustment wrote, the standard errors (B, 2) of its bodies, and remarks."""
+
+    folder: Path
+    errors: Floats
+    notes: tuple[str, ...]
+
+
+def adjusted_model(start: TrackedModel, solved: Solved, weight: float, *, step: Step) -> AdjustedModel:
+    """Step: the bundle adjustment from the solved poses, which are priors of this weight."""
+    model, errors = _adjust(start, solved, weight)
+    folder = step.folder / MODEL
+    folder.mkdir(exist_ok=True)
+    model.write(folder)
+    return AdjustedModel(folder, errors, tuple(model.notes))
 
 
 def _adjust(start: TrackedModel, solved: Solved, weight: float) -> tuple[TrackedModel, Floats]:
@@ -180,13 +206,11 @@ def _measures(
     inputs: tuple[TrackedModel, ...], found: _Found, model: TrackedModel, options: ModelRefinement
 ) -> Sequence[Measure]:
     qualities = [one.quality for one in inputs]
-    count = sum(quality.observations for quality in qualities)
-    before_px = sum(quality.mean_reprojection_px * quality.observations for quality in qualities) / max(count, 1)
+    count = sum(len(quality.errors_px) for quality in qualities)
     length = count / max(sum(quality.points for quality in qualities), 1)
     after = model.quality
-    tolerance = options.reprojection_tolerance * before_px
     out = [
-        Measure("mean reprojection error", before_px, after.mean_reprojection_px, "lower", tolerance, "px"),
+        *reprojection_measures(qualities, after, options.reprojection_tolerance),
         Measure("mean track length", length, after.mean_track_length, "higher", 0.01 * length, "images"),
     ]
     assert found.solved is not None

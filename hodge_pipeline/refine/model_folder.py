@@ -19,11 +19,10 @@ from hodge_pipeline.recording.solved import record_graph
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.report.refined import model_report
-from hodge_pipeline.report.run_files import edge_table
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.stages import TrackedModel
-from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.cost import Cost
+from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.workspace import REFINEMENT, Workspace
 from hodge_pipeline.types import Source, Trajectory
 
@@ -109,5 +108,5 @@ def _write_tables(out: Path, results: Sequence[RefinedModel]) -> None:
         source = Source(result.model.name, out, trajectory=trajectory)
         registry.load("writers", "tum")().write(out / f"poses{suffix}.tum", source)
         assert result.solved is not None
-        table = edge_table(result.solved.graph, result.model.world_from_body, result.solved.solution.weights)
-        artifacts.write_text(out / f"edges{suffix}.csv", table)
+        edges = result.solved.edges(result.model.world_from_body)
+        write_edges(out / f"edges{suffix}.csv", edges, result.solved.graph.vertex_ids)

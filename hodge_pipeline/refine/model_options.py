@@ -8,7 +8,6 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.recipe import binding, recipe_file
-from hodge_pipeline.recipe.yaml_file import Document, Keys
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, ModelReader, Registrar
@@ -44,7 +43,9 @@ class ModelRefinement:
         "where depth took part in the solve, since tracks know all that edges from the same images know",
     )
     reprojection_tolerance: float = Field(
-        default=0.005, ge=0, description="relative: a mean reprojection error larger by more than this is worse"
+        default=0.005,
+        ge=0,
+        description="relative: a capped mean reprojection error that grows by more is worse",
     )
 
 
@@ -54,10 +55,4 @@ def load_model_refinement(name_or_path: str = RECIPE, overrides: Sequence[str] =
     Raises `RecipeError`: `file:line: key: what was expected`.
     """
     document = recipe_file.load(name_or_path, overrides)
-    return binding.bind(ModelRefinement, document.data, lambda keys: _origin(document, keys))
-
-
-def _origin(document: Document, keys: Keys) -> str:
-    while keys and keys not in document.origins:
-        keys = keys[:-1]
-    return document.origins.get(keys, "recipe")
+    return binding.bind(ModelRefinement, document.data, document.where)

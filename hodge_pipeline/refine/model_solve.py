@@ -8,9 +8,10 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.types import Floats, PositionPriors, Solution, ViewGraph
+from hodge_pipeline.types import Edges, Floats, PositionPriors, Solution, ViewGraph
 
 MEDIAN_CHI2 = 5.348
 """Of χ² with six degrees of freedom."""
@@ -31,6 +32,10 @@ class Solved:
     def kept(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
         """The edges (E,) that agree with the poses."""
         return np.asarray(self.solution.weights > KEPT)
+
+    def edges(self, world_from_body: Floats) -> Edges:
+        """The edges with what they miss the poses (B, 4, 4) by."""
+        return with_residuals(Edges.measured(self.graph), world_from_body, self.solution.weights)
 
     def chi2(self, world_from_body: Floats) -> float:
         """The mean over all edges of χ² per degree of freedom, an outlier's cut off where the solver cuts it."""

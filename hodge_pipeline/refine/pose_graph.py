@@ -70,6 +70,7 @@ class SolvedFile:
             "cost_after": metrics["objective"],
             "converged": bool(metrics["converged"]),
             "certified": bool(metrics["certified"]) if "certified" in metrics else None,
+            "confirmed": self.solution.confirmed,
             "gap_bound": metrics.get("gap_bound"),
             "newton_steps": int(metrics["iterations"]),
             "cg_steps": int(metrics["cg_steps"]),
@@ -100,7 +101,7 @@ def disabled_edges(graph: ViewGraph, pairs: Sequence[str]) -> Bools:
     """
     found = np.zeros(graph.edge_count, bool)
     for pair in pairs:
-        hit = joining(graph, pair)
+        hit = joining(graph.vertex_ids, graph.edges, pair)
         if not hit.any():
             raise GraphError(
                 f"--disable {pair}: no edge joins these vertices: give two vertex ids of the file, as 12-87"

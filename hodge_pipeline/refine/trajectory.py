@@ -75,13 +75,14 @@ def refine_trajectory(
     recipe: str = "",
     overrides: Sequence[str] = (),
     watcher: Watcher | None = None,
+    dask: str | None = None,
 ) -> RefinedTrajectory:
     """Poses made better by the frames they belong to, one pose for each frame.
 
     `poses`: world_from_cam (N, 4, 4), or an `open3d.camera.PinholeCameraTrajectory`. `frames`: a path that a reader
     opens, or frames (see `frames_from_images`). `recipe`: slam-refine, or slam-refine-tum for TUM's folders. `out`
-    keeps the run folder with report and recording. Files of poses go to `hodge refine trajectory`. Raises `HodgeError`
-    (see `errors`) for whatever the user can mend.
+    keeps the run folder with report and recording; `dask` is as of `run`. Files of poses go to `hodge refine
+    trajectory`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     open3d = not isinstance(poses, (np.ndarray, list, tuple))
     given = poses_of(poses) if open3d else np.asarray(poses, float)
@@ -90,7 +91,7 @@ def refine_trajectory(
     loaded = load_recipe(chosen, ["given.poses=frames", f"guard.force={str(force).lower()}", *overrides])
     with tempfile.TemporaryDirectory(prefix="hodge-refine-") as scratch:
         folder = Path(scratch) / "run" if out is None else Path(out)
-        run = pipeline.run(loaded, folder, source=source, watcher=watcher)
+        run = pipeline.run(loaded, folder, source=source, watcher=watcher, dask=dask)
     assert run.refined is not None
     decision = run.refined.decision
     if decision.keeps_input:

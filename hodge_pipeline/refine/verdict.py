@@ -12,18 +12,16 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
-from hodge_pipeline.refine.correction import spread_correction
-from hodge_pipeline.refine.given_poses import Given
 from hodge_pipeline.refine.guard import Decision, Measure, decide
+from hodge_pipeline.refine.held_out import held_out_pairs
 from hodge_pipeline.refine.uncertainty import change, mean_chi2
 from hodge_pipeline.report.contents import MeasureRow, RefinementSummary
-from hodge_pipeline.rounds import Round
+from hodge_pipeline.rounds.one_round import Work
+from hodge_pipeline.scene import GivenFile, Round
+from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guesses
-from hodge_pipeline.stages import Workers
-from hodge_pipeline.steps import HELD_OUT
-from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.job import Job
-from hodge_pipeline.types import Candidates, Floats, Ints, Source, Trajectory
+from hodge_pipeline.stages import Step, Workers
+from hodge_pipeline.types import CloudSet, Floats, Ints, Source, Trajectory
 
 CHI2_TOLERANCE = 0.02
 """Of the start's: the solver minimises a robust cost, not this one."""
@@ -53,18 +51,16 @@ class Refined:
     file: Path | None
 
 
-def finish(job: Job, given: Given, rounds: Sequence[Round]) -> Refined:
-    """The decision on the last round's poses, and `refined.<suffix>` beside the report.
+def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
+    """The decision on the last round's poses, and `refined.<suffix>` in the run folder.
 
     Without an edge there is nothing to decide: nothing is written but the report.
     """
-    last, before = rounds[-1], given.world_from_cam[given.key_rows]
-    decision = _decision(job, rounds, before)
-    job.note(decision.reason)
-    poses = given.world_from_cam
-    if not decision.keeps_input:
-        poses = _spread(given, given.frame_times, poses, last.world_from_cam)
-    file = None if decision.outcome == "nothing" else _write(job, given, decision, last)
+    last, key_frames = rounds[-1], work.scene.key_frames
+    decision = _decision(work, rounds, key_frames.world_from_key)
+    work.steps.note(decision.reason)
+    poses = key_frames.first if decision.keeps_input else key_frames.expand(last.world_from_cam)
+    file = None if decision.outcome == "nothing" else _write(work, folder, decision, last)
     return Refined(decision, poses, file)
 
 
@@ -75,10 +71,10 @@ def summary(decision: Decision) -> RefinementSummary:
     return RefinementSummary(decision.outcome, HEADLINES[decision.outcome], decision.reason, rows, change)
 
 
-def _decision(job: Job, rounds: Sequence[Round], before: Floats) -> Decision:
+def _decision(work: Work, rounds: Sequence[Round], before: Floats) -> Decision:
     last = rounds[-1]
     if not last.graph.edge_count or last.solution is None:
-        rejected = ", ".join(f"{count} {reason}" for reason, count in last.rejected_counts.items())
+        rejected = ", ".join(f"{count} {reason}" for reason, count in last.edges.rejected_counts.items())
         return Decision("nothing", f"no edge joins two frames ({rejected or 'no pair overlaps'}): nothing was refined")
     if not (last.solution.weights > 0).any():
         return Decision("nothing", f"the solver rejected all {last.graph.edge_count} edges: nothing was refined")
@@ -86,13 +82,13 @@ def _decision(job: Job, rounds: Sequence[Round], before: Floats) -> Decision:
     if joined < LEAST_JOINED * last.graph.vertex_count:
         found = f"{joined} of {last.graph.vertex_count} key frames overlap with another one"
         return Decision("nothing", f"under the given poses only {found}: are they the poses of these frames?")
-    measures = [*_held_out(job, len(rounds) - 1, before, last.world_from_cam)]
+    measures = [*_held_out(work, rounds, before)]
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
     measures.append(chi2_measure(*chi2))
     moved = change(last.graph, last.solution, before)
     # Where edges hardly fix the poses any change is below its uncertainty; what the measures see counts first then.
     judged = None if any(measure.is_worse for measure in measures) else moved
-    return replace(decide(measures, judged, force=job.recipe.guard.force), change=moved)
+    return replace(decide(measures, judged, force=work.recipe.guard.force), change=moved)
 
 
 def chi2_measure(before: float, after: float) -> Measure:
@@ -100,54 +96,43 @@ def chi2_measure(before: float, after: float) -> Measure:
     return Measure("edge chi2, mean", before, after, tolerance=CHI2_TOLERANCE * before)
 
 
-def _held_out(job: Job, rounds: int, before: Floats, after: Floats) -> list[Measure]:
+def _held_out(work: Work, rounds: Sequence[Round], before: Floats) -> list[Measure]:
     """The score of the pairs kept out of every round; its tolerance is its own standard error."""
-    pairs = held_out_pairs(job)
+    pairs, after = held_out_pairs(rounds), rounds[-1].world_from_cam
     if not len(pairs):
-        job.note("no overlapping pair was left to judge the result by: only the edges' own chi2 does")
+        work.steps.note("no overlapping pair was left to judge the result by: only the edges' own chi2 does")
         return []
-    edges = (f"edges-{number}" for number in range(1, job.recipe.outer_iterations + 1))
-    inputs = ("clouds", f"solve-{rounds}", *edges)
-    with job.stage("guard", "guard", 1, job.recipe.guard, inputs) as (folder, advance):
-        if not folder.finished:
-            with job.recipe.executor.open() as workers:
-                found = _distances(job, pairs, before, after, workers)
-            artifacts.save_arrays(folder.path / "distances.npz", {"distances_m": found})
-            advance(1)
-    distances = artifacts.load_arrays(job.path("guard") / "distances.npz")["distances_m"]
+    distances = work.steps.step(
+        held_out_distances, work.scene.clouds, pairs, np.stack([before, after]), title="guard", workers=work.workers
+    )
     scores = np.exp(-distances / SIGMA_M)
     error = float((scores[1] - scores[0]).std() / np.sqrt(len(pairs)))
     tolerance = max(SIGMAS * error, LEAST_TOLERANCE)
     mean_m, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_m[0]:.3g} mm apart before, {mean_m[1]:.3g} mm after"
-    job.note(f"{len(pairs)} overlapping pairs were kept out of the solve: clouds there {apart}")
+    work.steps.note(f"{len(pairs)} overlapping pairs were kept out of the solve: clouds there {apart}")
     return [Measure("score of held-out edges", float(mean[0]), float(mean[1]), "higher", tolerance)]
 
 
-def _distances(job: Job, pairs: Ints, before: Floats, after: Floats, workers: Workers) -> Floats:
-    return edge_distances(job.path("clouds"), pairs, np.stack([before, after]), workers)
+def held_out_distances(clouds: CloudSet, pairs: Ints, pose_sets: Floats, *, workers: Workers, step: Step) -> Floats:
+    """Step: how far apart (S, P) in metres the clouds of pairs lie, under sets of poses (S, K, 4, 4)."""
+    assert clouds.folder is not None
+    return edge_distances(clouds.folder, pairs, pose_sets, workers)
 
 
-def held_out_pairs(job: Job) -> Ints:
-    """The pairs (P, 2) that any round proposed and kept out, and that are not among the last round's edges."""
-    rounds = job.recipe.outer_iterations
-    files = [job.path(f"edges-{number}") / HELD_OUT for number in range(1, rounds + 1)]
-    kept = [artifacts.load(file, Candidates).pairs for file in files if file.is_file()]
-    pairs = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *kept]), axis=0)
-    solved = artifacts.load(job.path(f"edges-{rounds}") / "candidates.npz", Candidates).pairs
-    return np.array(sorted(set(map(tuple, pairs.tolist())) - set(map(tuple, solved.tolist()))), np.int64).reshape(-1, 2)
+def _spread(work: Work, given: GivenFile, key_after: Floats) -> Floats:
+    """The poses (P, 4, 4) of the file, corrected as the key frames were."""
+    keys = work.scene.key_frames
+    times, poses = keys.times[keys.rows], given.trajectory.world_from_cam
+    return spread_correction(given.pose_times, poses, times, keys.world_from_key, key_after)
 
 
-def _spread(given: Given, times: Floats, poses: Floats, key_after: Floats) -> Floats:
-    key_times, key_before = given.frame_times[given.key_rows], given.world_from_cam[given.key_rows]
-    return spread_correction(times, poses, key_times, key_before, key_after)
-
-
-def _write(job: Job, given: Given, decision: Decision, last: Round) -> Path | None:
+def _write(work: Work, folder: Path, decision: Decision, last: Round) -> Path | None:
     """`refined.<suffix>`: the input's own bytes where it is kept, else its form with the refined poses."""
-    if given.path is None or given.trajectory is None:
+    given = work.scene.given
+    if given is None:
         return None
-    folder, original = job.workspace.folder, given.path
+    original = given.path
     reader = guesses(original)[0].name
     try:
         rewriter = registry.load("rewriters", reader)()
@@ -159,10 +144,10 @@ def _write(job: Job, given: Given, decision: Decision, last: Round) -> Path | No
         out = folder / f"refined{original.suffix}"
         shutil.copyfile(original, out)
         return out
-    moved = _spread(given, given.pose_times, given.trajectory.world_from_cam, last.world_from_cam)
+    moved = _spread(work, given, last.world_from_cam)
     refined = Trajectory(given.trajectory.stamps_s, moved)
     if rewriter is not None:
         return Path(rewriter.rewrite(folder, original, refined))
-    job.note(f"poses are not written back into {original.suffix or 'a folder'}: refined.tum holds them")
+    work.steps.note(f"poses are not written back into {original.suffix or 'a folder'}: refined.tum holds them")
     registry.load("writers", "tum")().write(folder / "refined.tum", Source("refined", original, trajectory=refined))
     return folder / "refined.tum"

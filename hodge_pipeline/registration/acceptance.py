@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.job import Job
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.registration.pairs import Acceptance
+from hodge_pipeline.scene import Drift
+from hodge_pipeline.types import Bools, Edges, Floats
+from hodge_pipeline.types.edges import HELD_OUT, REJECTED, USED
 
 ARM_M = 1.0
 """A rotation counts as the displacement that it causes at this distance."""
@@ -18,39 +16,32 @@ LEAST_WAY_M = 0.05
 """Added to every way: frames of a camera at rest differ by what a registration errs."""
 
 
-def rejections(job: Job, registered: Registered) -> NDArray[np.str_]:
-    """Why each pair (P,) is no edge, an empty word where it is one."""
-    reasons = job.recipe.acceptance.reasons(registered)
-    odometry = _odometry(job)
-    if odometry is not None:
-        scale = job.recipe.scale if isinstance(job.recipe.scale, float) else 1.0
-        far = strays(registered, *odometry, job.recipe.odometry.max_drift, scale)
-        reasons[(reasons == "") & far] = "farther off than odometry drifts"
-    return reasons
+def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, scale: float = 1.0) -> Edges:
+    """The table with `status` and `why` of every registered pair: used, or rejected; those held out stay so.
 
-
-def strays(registered: Registered, world_from_cam: Floats, part: Ints, max_drift: float, scale: float = 1.0) -> Bools:
-    """Where (P,) a pair contradicts odometry, poses (N, 4, 4), by more than this share of the way between its frames.
-
-    Odometry knows nothing of a pair across two parts (N,) that it left apart. Lengths are multiplied by `scale`.
+    `drift`: what odometry says of the way between two frames, None where it says nothing. `scale` multiplies lengths.
     """
+    rows = np.flatnonzero(edges.status != HELD_OUT)
+    registered = edges.select(rows)
+    reasons = acceptance.reasons(registered)
+    if drift is not None:
+        far = strays(registered, drift, scale)
+        reasons[(reasons == "") & far] = "farther off than odometry drifts"
+    return edges.put(rows, status=np.where(reasons == "", USED, REJECTED), why=reasons)
+
+
+def strays(registered: Edges, drift: Drift, scale: float = 1.0) -> Bools:
+    """Where (P,) a pair contradicts odometry by more than the share of the way between its frames that this may err by.
+
+    Odometry knows nothing of a pair across two parts that it left apart. Lengths are multiplied by `scale`.
+    """
+    world_from_cam, part = drift.world_from_cam, drift.part
     i, j = registered.pairs.T
     steps = _lengths(se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:], ARM_M * scale)
     gone = np.concatenate([[0.0], np.cumsum(steps)])
     moved = se3.inverse(se3.inverse(world_from_cam[i]) @ world_from_cam[j]) @ registered.i_from_j
-    allowed = max_drift * (LEAST_WAY_M * scale + np.abs(gone[j] - gone[i]))
+    allowed = drift.largest * (LEAST_WAY_M * scale + np.abs(gone[j] - gone[i]))
     return np.asarray((part[i] == part[j]) & (_lengths(moved, ARM_M * scale) > allowed))
-
-
-def _odometry(job: Job) -> tuple[Floats, Ints] | None:
-    """The poses (N, 4, 4) that odometry or tracking led to, and the part (N,) of each frame that it held together."""
-    if job.given is not None or "odometry" not in job.keys:
-        return None
-    if job.tracked is not None:
-        return job.tracked.world_from_key, job.tracked.piece
-    folder = job.path("odometry")
-    poses = artifacts.load_arrays(folder / "poses.npz")["world_from_cam"]
-    return poses, connected_components(artifacts.load(folder / "steps.npz", Registered).pairs, len(poses))
 
 
 def _lengths(motions: Floats, arm_m: float) -> Floats:

@@ -6,8 +6,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.store import artifacts
+from hodge_pipeline.types import Edges
 
 
 @dataclass(frozen=True)
@@ -16,11 +16,11 @@ class BlockStore:
 
     folder: Path
 
-    def read(self) -> dict[int, Registered]:
+    def read(self) -> dict[int, Edges]:
         """The blocks that are there, by number."""
-        return {int(path.stem): artifacts.load(path, Registered) for path in sorted(self.folder.glob("[0-9]*.npz"))}
+        return {int(path.stem): artifacts.load(path, Edges) for path in sorted(self.folder.glob("[0-9]*.npz"))}
 
-    def write(self, block: int, result: Registered) -> None:
+    def write(self, block: int, result: Edges) -> None:
         """Keep one block."""
         self.folder.mkdir(exist_ok=True)
         artifacts.save(self.folder / f"{block:06d}.npz", result)

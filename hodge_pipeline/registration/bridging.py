@@ -9,9 +9,9 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.odometry import OdometryOptions
-from hodge_pipeline.registration.pairs import Registered, register_pairs
+from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.stages import Workers
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Edges, Floats, Ints
 
 REACH = 3
 """Key frames on either side of a break."""
@@ -20,11 +20,11 @@ REACH = 3
 def bridge(
     clouds: Path,
     sequences: Sequence[Ints],
-    steps: Registered,
+    steps: Edges,
     poses: Floats,
     options: OdometryOptions,
     workers: Workers,
-) -> tuple[Registered, Floats]:
+) -> tuple[Edges, Floats]:
     """The good steps with the bridges that were found, and the poses (K, 4, 4) moved accordingly, of K key frames.
 
     A step of less than `options.min_fitness` is a break. The bridge over it is the fittest registration of one of the
@@ -37,7 +37,7 @@ def bridge(
     pairs = np.concatenate([_across(pair, rows) for rows in sequences for pair in breaks if np.isin(pair, rows).all()])
     pairs = np.unique(pairs, axis=0)
     guesses = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
-    found = register_pairs(clouds, options.registration, pairs, guesses, workers)
+    found = register_pairs(clouds, options.registration, Edges.of(pairs, "sequential"), guesses, workers)
     bridges, moved = [], poses.copy()
     for i, j in breaks.tolist():
         over = np.flatnonzero(
@@ -52,7 +52,7 @@ def bridge(
             moved[behind] = change @ moved[behind]
             bridges.append(best)
     chosen = found.select(np.unique(np.array(bridges, np.int64)))
-    return Registered.joined([steps.select(good), chosen]), moved
+    return Edges.joined([steps.select(good), chosen]), moved
 
 
 def _across(pair: Ints, rows: Ints) -> Ints:

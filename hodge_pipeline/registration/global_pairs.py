@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache, partial
@@ -57,7 +58,11 @@ class Matches:
 def describe_clouds(
     clouds: Path, registrar: GlobalRegistrar, rows: Ints, out: Path, workers: Workers, advance: Advance = no_progress
 ) -> None:
-    """Describe these rows of the clouds in a folder, each into a file of the folder `out`; `advance` counts clouds."""
+    """Describe these rows of the clouds in a folder, each into a file of the folder `out`; `advance` counts clouds.
+
+    What lies in `out` goes first: descriptions are pickles, and none is loaded that was not made here and now.
+    """
+    shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True, exist_ok=True)
     blocks = [rows[start : start + CLOUDS_IN_BLOCK] for start in range(0, len(rows), CLOUDS_IN_BLOCK)]
     for _, count in workers.map(partial(_describe_block, clouds, registrar, out), blocks):

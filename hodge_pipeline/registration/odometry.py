@@ -14,9 +14,9 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline import se3
 from hodge_pipeline.registration.gaps import over_gap
 from hodge_pipeline.registration.gicp import Gicp
-from hodge_pipeline.registration.pairs import Registered, prepared_clouds
+from hodge_pipeline.registration.pairs import prepared_clouds
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
-from hodge_pipeline.types import CloudSet, Floats, Ints, Registration
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
 STEPS_IN_BLOCK = 32
 WARM_UP_STEPS = 2
@@ -55,7 +55,7 @@ class Odometry:
     """The first poses (N, 4, 4), the steps that led to them, and what went wrong, one line each."""
 
     world_from_cam: Floats
-    steps: Registered
+    steps: Edges
     notes: tuple[str, ...]
 
 
@@ -84,11 +84,11 @@ def odometry(
     """
     sizes = CloudSet.open(folder).sizes
     blocks = [block for rows in sequences for block in _blocks(rows[sizes[rows] > 0], stamps_s)]
-    results: dict[int, Registered] = {}
+    results: dict[int, Edges] = {}
     for number, result in workers.map(partial(_run_block, folder, options), blocks):
         results[number] = result
         advance(len(result.pairs))
-    steps = Registered.joined([results[number] for number in range(len(blocks))])
+    steps = Edges.joined([results[number] for number in range(len(blocks))])
     gap = over_gap(steps.pairs, sequences, stamps_s)
     lost = ~(steps.fitness >= np.where(gap, max(options.sure_fitness, options.min_fitness), options.min_fitness))
     poses = chained(len(sizes), sequences, steps)
@@ -109,7 +109,7 @@ def _blocks(rows: Ints, stamps_s: Floats) -> list[_Block]:
     return out
 
 
-def _run_block(folder: Path, options: OdometryOptions, block: _Block) -> Registered:
+def _run_block(folder: Path, options: OdometryOptions, block: _Block) -> Edges:
     """The steps of one block, without its warm-up."""
     prepared = prepared_clouds(folder, options.registration)
     durations = _durations(block.stamps_s)
@@ -122,7 +122,7 @@ def _run_block(folder: Path, options: OdometryOptions, block: _Block) -> Registe
             step = Registration(se3.exp(velocity * duration), np.zeros((6, 6)), step.fitness, step.rmse_m, 0, 0, False)
         velocity = se3.log(step.i_from_j) / duration
         found.append(step)
-    return Registered.of(_steps(block.rows)[block.warm_up :], found[block.warm_up :])
+    return Edges.of(_steps(block.rows)[block.warm_up :], "sequential").with_registrations(found[block.warm_up :])
 
 
 def _fitness(step: Registration) -> float:
@@ -139,7 +139,7 @@ def _durations(stamps_s: Floats) -> Floats:
     return np.where((durations > 0).all(), durations, 1.0)
 
 
-def chained(count: int, sequences: Sequence[Ints], steps: Registered) -> Floats:
+def chained(count: int, sequences: Sequence[Ints], steps: Edges) -> Floats:
     """Poses (count, 4, 4) that steps between rows of each sequence lead to; a sequence begins beside the one before."""
     motion_to = {int(j): (int(i), motion) for (i, j), motion in zip(steps.pairs, steps.i_from_j, strict=True)}
     poses: Floats = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()

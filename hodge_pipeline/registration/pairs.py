@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass as plain_dataclass
-from dataclasses import fields
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
@@ -16,67 +14,12 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
-from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, Registration, ViewGraph
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats
 
 PAIRS_IN_BLOCK = 64
 """About half a second: long against sending a block, short enough to share the work and to lose little of it."""
 CLOUDS_KEPT = 32
 """Prepared clouds that a worker keeps, 2 to 4 MB each."""
-
-
-@plain_dataclass(frozen=True)
-class Registered:
-    """Registrations in columns, in the order of their pairs (P, 2); see `Registration` for each field."""
-
-    pairs: Ints
-    i_from_j: Floats
-    information: Floats
-    fitness: Floats
-    rmse_m: Floats
-    correspondences: Ints
-    iterations: Ints
-    converged: Bools
-
-    @classmethod
-    def of(cls, pairs: Ints, registrations: list[Registration]) -> Registered:
-        """The columns of these registrations."""
-
-        def column(name: str, shape: tuple[int, ...], kind: type) -> NDArray[Any]:
-            return np.array([getattr(one, name) for one in registrations], kind).reshape(-1, *shape)
-
-        return cls(
-            pairs=np.asarray(pairs, np.int64).reshape(-1, 2),
-            i_from_j=column("i_from_j", (4, 4), float),
-            information=column("information", (6, 6), float),
-            fitness=column("fitness", (), float),
-            rmse_m=column("rmse_m", (), float),
-            correspondences=column("correspondences", (), np.int64),
-            iterations=column("iterations", (), np.int64),
-            converged=column("converged", (), np.bool_),
-        )
-
-    @classmethod
-    def joined(cls, parts: list[Registered]) -> Registered:
-        """These columns one after the other."""
-        parts = [cls.of(np.zeros((0, 2), np.int64), []), *parts]
-        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
-
-    def select(self, rows: Ints | Bools) -> Registered:
-        """These rows only."""
-        return Registered(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    def as_graph(self, vertex_ids: NDArray[np.generic], source: NDArray[np.str_]) -> ViewGraph:
-        """The viewing graph of these edges; `source (P,)` says where each comes from."""
-        return ViewGraph(
-            vertex_ids=vertex_ids,
-            edges=self.pairs,
-            i_from_j=self.i_from_j,
-            information=self.information,
-            fitness=self.fitness,
-            rmse_m=self.rmse_m,
-            source=source,
-            correspondences=self.correspondences,
-        )
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -103,7 +46,7 @@ class Acceptance:
         "wrong. 0.02: normals within 8° of each other. Consecutive frames, whose guess is near, are held all the same",
     )
 
-    def reasons(self, registered: Registered) -> NDArray[np.str_]:
+    def reasons(self, registered: Edges) -> NDArray[np.str_]:
         """Why each pair (P,) is rejected by itself, an empty word where it is accepted."""
         out = np.full(len(registered.pairs), "", "U64")
         out[_slides(registered, self.min_spread)] = "what they share lets them slide"
@@ -113,7 +56,7 @@ class Acceptance:
         return out
 
 
-def _slides(registered: Registered, min_spread: float) -> Bools:
+def _slides(registered: Edges, min_spread: float) -> Bools:
     """Where (P,) translation is hardly known in some direction, for pairs that are not next to each other."""
     values = np.linalg.eigvalsh(np.nan_to_num(registered.information[:, 3:, 3:]))
     rank = np.searchsorted(np.unique(registered.pairs), registered.pairs)
@@ -125,39 +68,39 @@ def _slides(registered: Registered, min_spread: float) -> Bools:
 def register_pairs(
     folder: Path,
     registrar: Registrar,
-    pairs: Ints,
+    edges: Edges,
     guesses: Floats,
     workers: Workers,
     advance: Advance = no_progress,
     *,
-    finished: Mapping[int, Registered] | None = None,
-    on_block: Callable[[int, Registered], None] = lambda block, result: None,
-) -> Registered:
-    """Every pair (P, 2) registered from its guess `i_from_j (P, 4, 4)`, in the order given.
+    finished: Mapping[int, Edges] | None = None,
+    on_block: Callable[[int, Edges], None] = lambda block, result: None,
+) -> Edges:
+    """The table with every pair (P, 2) registered from its guess `i_from_j (P, 4, 4)`.
 
     `folder` holds the clouds (`CloudSet.save`). The blocks depend on the pairs alone, so `finished` blocks of an
     earlier run can be given; `on_block` is called with each new one, to be kept. `advance` counts pairs.
     """
-    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    order = np.lexsort((edges.pairs[:, 1], edges.pairs[:, 0]))
     cuts = [order[start : start + PAIRS_IN_BLOCK] for start in range(0, len(order), PAIRS_IN_BLOCK)]
     results = dict(finished or {})
     advance(sum(len(cuts[block]) for block in results))
     missing = [block for block in range(len(cuts)) if block not in results]
     task = partial(_register_block, folder, registrar)
-    for row, result in workers.map(task, [(pairs[cuts[block]], guesses[cuts[block]]) for block in missing]):
+    for row, result in workers.map(task, [(edges.select(cuts[block]), guesses[cuts[block]]) for block in missing]):
         block = missing[row]
         results[block] = result
         on_block(block, result)
         advance(len(cuts[block]))
-    in_blocks = Registered.joined([results[block] for block in range(len(cuts))])
+    in_blocks = Edges.joined([results[block] for block in range(len(cuts))])
     return in_blocks.select(np.argsort(order))
 
 
-def _register_block(folder: Path, registrar: Registrar, block: tuple[Ints, Floats]) -> Registered:
-    pairs, guesses = block
+def _register_block(folder: Path, registrar: Registrar, block: tuple[Edges, Floats]) -> Edges:
+    edges, guesses = block
     prepared = prepared_clouds(folder, registrar)
-    found = [registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in zip(pairs, guesses, strict=True)]
-    return Registered.of(pairs, found)
+    pairs = zip(edges.pairs, guesses, strict=True)
+    return edges.with_registrations([registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in pairs])
 
 
 def prepared_clouds(folder: Path, registrar: Registrar) -> PreparedClouds:

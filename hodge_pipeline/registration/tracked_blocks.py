@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.registration.pairs import Registered
 from hodge_pipeline.registration.tracking import TrackedBlock
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import CloudSet, Floats, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 
 STEP, CLOUD = "step_", "cloud_"
 
@@ -24,7 +23,7 @@ class BlockRows:
     """A `TrackedBlock` without its clouds."""
 
     keys: Ints
-    steps: Registered
+    steps: Edges
     rows: Ints
     anchors: Ints
     key_from_row: Floats
@@ -48,14 +47,14 @@ class TrackedBlocks:
         clouds = CloudSet.from_clouds(block.clouds)
         arrays = {name: getattr(block, name) for name in ("keys", "rows", "anchors", "key_from_row", "fitness")}
         arrays["notes"] = np.array(block.notes, dtype=np.str_)
-        arrays |= {STEP + field.name: getattr(block.steps, field.name) for field in fields(Registered)}
+        arrays |= {STEP + field.name: getattr(block.steps, field.name) for field in fields(Edges)}
         arrays |= {CLOUD + name: getattr(clouds, name) for name in CloudSet.FILES}
         artifacts.save_arrays(self._path(number), arrays)
 
     def rows(self, number: int) -> BlockRows:
         """What became of the rows of one block."""
         with np.load(self._path(number)) as stored:
-            steps = Registered(*(stored[STEP + field.name] for field in fields(Registered)))
+            steps = Edges(*(stored[STEP + field.name] for field in fields(Edges)))
             columns = {name: stored[name] for name in ("keys", "rows", "anchors", "key_from_row", "fitness")}
             return BlockRows(steps=steps, notes=tuple(stored["notes"].tolist()), **columns)
 

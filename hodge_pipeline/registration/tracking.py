@@ -15,8 +15,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, with_landmarks
 from hodge_pipeline.registration.odometry import OdometryOptions
-from hodge_pipeline.registration.pairs import Registered
-from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Registration
+from hodge_pipeline.types import Edges, Floats, Frame, Ints, PointCloud, Registration
 
 FRAMES_IN_BLOCK = 48
 """About three seconds of work; the first and the last frame of a block are key frames, however little they moved."""
@@ -60,7 +59,7 @@ class TrackedBlock:
 
     keys: Ints
     clouds: tuple[PointCloud, ...]
-    steps: Registered
+    steps: Edges
     rows: Ints
     anchors: Ints
     key_from_row: Floats
@@ -122,7 +121,7 @@ class _Tracker:
         return TrackedBlock(
             keys=rows[[key.place for key in self._keys]],
             clouds=tuple(key.cloud for key in self._keys),
-            steps=Registered.of(pairs, [step for _, _, step in self._steps]),
+            steps=Edges.of(pairs, "sequential").with_registrations([step for _, _, step in self._steps]),
             rows=rows[first:],
             anchors=rows[list(anchors)],
             key_from_row=np.array(motions),

@@ -86,7 +86,7 @@ def _whitened(
 ) -> tuple[Floats, Floats]:
     """Inverse covariances (M, 3, 3) of the residuals, and the residuals (M, 3) in i's axes."""
     turn = i_from_j[:3, :3]
-    weight = np.linalg.inv(errors_i + turn @ errors_j @ turn.T)
+    weight = np.asarray(np.linalg.inv(errors_i + turn @ errors_j @ turn.T), np.float64)
     return weight, points_i - se3.transform(i_from_j, points_j)
 
 

@@ -13,8 +13,9 @@ from hodge_pipeline import registry, se3
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe import yaml_file
+from hodge_pipeline.report.difference import floor_of, length, percent, sign_of
 from hodge_pipeline.report.tables import Table
-from hodge_pipeline.report.verdict import GRAPH_NAMES, length, percent
+from hodge_pipeline.report.verdict import GRAPH_NAMES
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.workspace import RECIPE_FILE, is_run_folder
 from hodge_pipeline.types import Floats
@@ -22,6 +23,7 @@ from hodge_pipeline.types import Floats
 REPORT = "report.json"
 FEWEST_SHARED = 3
 SAME = 0.005
+"""A relative difference that a whole per cent does not show."""
 NOTHING_M = 1e-6
 MODELS = ("mesh.ply", "cloud.ply")
 
@@ -109,11 +111,14 @@ def tables(comparison: Comparison) -> tuple[Table, ...]:
 
 def _measured(comparison: Comparison) -> Iterator[tuple[str, ...]]:
     a, b = comparison.a.report, comparison.b.report
+    floor_m = floor_of(*(run.world_from_cam[:, :3, 3] for run in (comparison.a, comparison.b)))
     yield "frames", str(a["source"]["frames"]), str(b["source"]["frames"]), ""
     for label, getter, is_length in _MEASURES:
         values = [getter(report) for report in (a, b)]
         if any(value is not None for value in values):
-            yield (label, *(_value(value, is_length) for value in values), _change(*values))
+            floor = floor_m if is_length else 0.0
+            cells = (_value(value, is_length, floor) for value in values)
+            yield label, *cells, _change(values[0], values[1], floor)
     if len(comparison.apart_m):
         apart = comparison.apart_m
         yield "poses apart, mean of the shared frames", "", _apart(float(np.nanmean(apart))), ""
@@ -157,21 +162,22 @@ _MEASURES: tuple[tuple[str, Any, bool], ...] = (
 )  # fmt: skip
 
 
-def _value(value: float | None, is_length: bool) -> str:
+def _value(value: float | None, is_length: bool, floor: float) -> str:
     if value is None:
         return "–"
-    return length(value) if is_length else f"{value:.4g}" if isinstance(value, float) else str(value)
+    return length(value, floor_m=floor) if is_length else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _apart(metres: float) -> str:
     return "0" if metres < NOTHING_M else length(metres)
 
 
-def _change(a: float | None, b: float | None) -> str:
-    if a is None or b is None or (a == 0 and b != 0):
+def _change(a: float | None, b: float | None, floor: float) -> str:
+    if a is None or b is None:
         return ""
-    share = (b - a) / a if a else 0.0
-    return "same" if abs(share) < SAME else percent(share)
+    if not sign_of(a, b, max(SAME * abs(a), floor)):
+        return "same"
+    return percent((b - a) / a) if a > floor else ""
 
 
 def _changed_options(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -15,7 +16,8 @@ from hodge_pipeline.types import Floats, Ints, ViewGraph
 class SourceSummary:
     """What was read: how many frames, how many of them with a true pose, and what the reader remarked.
 
-    `key_frames` is None where every frame is a vertex of the graph.
+    `key_frames` is None where every frame is a vertex of the graph. `kind` says what a frame is, `unordered` that all
+    were joined from nothing.
     """
 
     name: str
@@ -25,12 +27,19 @@ class SourceSummary:
     sequences: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     key_frames: int | None = None
+    kind: Literal["frames", "scans"] = "frames"
+    unordered: bool = False
 
     @property
     def counted(self) -> str:
         """`600 frames`, or `600 frames, 54 of them key frames`."""
         keys = "" if self.key_frames is None else f", {self.key_frames} of them key frames"
-        return f"{self.frames} frames{keys}"
+        return f"{self.frames} {self.kind}{keys}"
+
+    @property
+    def vertex_name(self) -> str:
+        """What the vertices of the viewing graph are."""
+        return self.kind if self.key_frames is None else "key frames"
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,21 @@ class LoopRow:
     def mean(self) -> float:
         """D of one loop on average, NaN without loops."""
         return self.total / self.loops if self.loops else float("nan")
+
+
+@dataclass(frozen=True)
+class EnergyRow:
+    """The parts of ω before the solve of a round: how many vertices, edges and triangles its complex has, and the
+    shares (rotation, translation) of the exact, co-exact and harmonic part in its energy.
+    """
+
+    round: str
+    simplices: tuple[int, ...]
+    exact: tuple[float, float]
+    coexact: tuple[float, float]
+    harmonic: tuple[float, float]
+    rotation_rad2: float
+    translation_m2: float
 
 
 @dataclass(frozen=True)
@@ -195,6 +219,7 @@ class Report:
     scores: ScoreTable | None = None
     trajectories: tuple[TrajectoryRow, ...] = ()
     loops: tuple[LoopRow, ...] = ()
+    energies: tuple[EnergyRow, ...] = ()
     graph: GraphSummary | None = None
     worst_edges: tuple[EdgeRow, ...] = ()
     stages: tuple[StageRow, ...] = ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +18,20 @@ from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.errors import HodgeError, WorkspaceError
-from hodge_pipeline.pairs.edits import REJECTED, joining, listed_edges, read_history, vertex_rows
-from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.pairs.edits import joining, pair_names, read_history
+from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
-from hodge_pipeline.report.diagnosis_csv import write_edges_csv
 from hodge_pipeline.report.diagnosis_page import PageContents, render
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
 from hodge_pipeline.report.edge_pictures import edge_pictures
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.workspace import RECIPE_FILE, is_run_folder
-from hodge_pipeline.types import Bools, CloudSet, Frame, Ints, Source, ViewGraph
+from hodge_pipeline.store.edge_table import write_edges
+from hodge_pipeline.store.workspace import is_run_folder
+from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, Source, ViewGraph
+from hodge_pipeline.types.edges import DISABLED, USED
 
 PICTURED, LEAST_PICTURED = 6, 2
 SUGGESTED, REGISTERED = 12, 6
@@ -40,14 +42,14 @@ COMMANDED = 20
 
 @dataclass(frozen=True)
 class Subject:
-    """A graph to judge. A run also has its frames and clouds; `disabled (E,)` edges are off by hand, pairs (P, 2) were
-    `tried` in vain.
+    """A graph to judge. A run also has its frames and clouds; `edges` are the graph's, some of them off by hand; pairs
+    (P, 2) were `tried` in vain.
     """
 
     path: Path
     name: str
     graph: ViewGraph
-    disabled: Bools
+    edges: Edges
     is_run: bool = False
     options: DiagnosisOptions = field(default_factory=DiagnosisOptions)
     suggestions: SuggestionOptions = field(default_factory=SuggestionOptions)
@@ -56,44 +58,42 @@ class Subject:
     clouds: CloudSet | None = None
     notes: tuple[str, ...] = ()
 
+    @property
+    def disabled(self) -> Bools:
+        """The edges (E,) that are off by hand."""
+        return np.asarray(self.edges.status == DISABLED)
+
 
 def open_subject(path: Path) -> Subject:
     """The graph of a run's last round, or of a file that a reader knows. Raises `HodgeError` where there is none."""
-    stage = path / "stages" / "diagnose"
-    if (stage / "graph.npz").is_file():
-        return _run_subject(path, artifacts.load(stage / "graph.npz", ViewGraph))
     if is_run_folder(path):
-        raise WorkspaceError(
-            f"{path}: this run is not finished: run the same command again, it goes on where it stopped"
-        )
+        return _run_subject(path, Run.load(path))
     source = read_graph(path)
     assert source.graph is not None
     name = path.stem if path.is_file() else path.name
-    return Subject(path, name, source.graph, _disabled(path, source.graph), notes=source.notes)
-
-
-def _run_subject(path: Path, graph: ViewGraph) -> Subject:
-    recipe = load_recipe(str(path / RECIPE_FILE))
-    frames, notes = _frames(recipe)
-    clouds = path / "stages" / "clouds"
     return Subject(
-        path,
-        path.resolve().name,
-        graph,
-        _disabled(path, graph),
-        is_run=True,
-        options=recipe.diagnosis,
-        suggestions=recipe.suggestions,
-        tried=_rejected(path, graph),
-        frames=frames if len(frames) == graph.vertex_count else (),
-        clouds=CloudSet.open(clouds) if (clouds / "offsets.npy").is_file() else None,
-        notes=notes,
+        path, name, source.graph, _edited(path, source.graph, Edges.measured(source.graph)), notes=source.notes
     )
 
 
-def _rejected(path: Path, graph: ViewGraph) -> Ints:
-    """The pairs of a run that were registered and not accepted."""
-    return vertex_rows(graph.vertex_ids, [edge.name for edge in listed_edges(path) if edge.status == REJECTED])
+def _run_subject(path: Path, run: Run) -> Subject:
+    _ = run.report  # raises where the run has not ended
+    last, recipe = run.result, run.recipe
+    frames, notes = _frames(recipe)
+    known = len(frames) == len(run.source.frames)
+    return Subject(
+        path,
+        path.resolve().name,
+        last.graph,
+        _edited(path, last.graph, last.graph_edges),
+        is_run=True,
+        options=recipe.diagnosis,
+        suggestions=recipe.suggestions,
+        tried=last.rejected.pairs,
+        frames=tuple(frames[row] for row in run.key_frames.rows) if known else (),
+        clouds=run.clouds,
+        notes=notes,
+    )
 
 
 def _frames(recipe: Recipe) -> tuple[Sequence[Frame], tuple[str, ...]]:
@@ -106,11 +106,12 @@ def _frames(recipe: Recipe) -> tuple[Sequence[Frame], tuple[str, ...]]:
         return (), (f"without colour images: {error}",)
 
 
-def _disabled(path: Path, graph: ViewGraph) -> Bools:
-    found = np.zeros(graph.edge_count, bool)
+def _edited(path: Path, graph: ViewGraph, edges: Edges) -> Edges:
+    """The edges of the graph as the edits in a folder have them by now."""
+    edges = edges.put(edges.status == DISABLED, status=USED)
     for pair in read_history(path).disabled if path.is_dir() else ():
-        found |= joining(graph, pair)
-    return found
+        edges = edges.put(joining(graph.vertex_ids, graph.edges, pair), status=DISABLED)
+    return edges
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ def _side_by_side(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
     rows = np.flatnonzero(_beside_kept(subject.graph, found))
     if not len(rows):
         return ()
-    named = ", ".join(dict.fromkeys(_names(subject.graph, subject.graph.edges[rows])))
+    named = ", ".join(dict.fromkeys(pair_names(subject.graph.vertex_ids, subject.graph.edges[rows])))
     return (
         f"beside a wrong edge a right one joins the same two views ({named}): disabling the pair would take out both, "
         "a robust solve takes out the wrong one alone",
@@ -180,7 +181,7 @@ def _side_by_side(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
 def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> tuple[str, ...]:
     meant = (found.verdict == WRONG) & ~subject.disabled & ~_beside_kept(subject.graph, found)
     rows = np.array([row for row in ranked(found) if meant[row]], int)
-    wrong = _names(subject.graph, subject.graph.edges[rows])
+    wrong = pair_names(subject.graph.vertex_ids, subject.graph.edges[rows])
     if not subject.is_run:
         if len(wrong) > COMMANDED:
             return (f"hodge solve {subject.path} --out solved.g2o --robust",)
@@ -191,12 +192,8 @@ def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> t
         return ()
     edit = f"--disable {','.join(wrong) if len(wrong) <= COMMANDED else WRONG}"
     if not wrong:
-        edit = f"--register {','.join(_names(subject.graph, useful))}"
+        edit = f"--register {','.join(pair_names(subject.graph.vertex_ids, useful))}"
     return f"hodge edit {subject.path} {edit}", f"hodge solve {subject.path}"
-
-
-def _names(graph: ViewGraph, pairs: Ints) -> list[str]:
-    return ["{}-{}".format(*ends) for ends in graph.vertex_ids[pairs]]
 
 
 def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:
@@ -206,7 +203,8 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) 
     except OSError as error:
         raise WorkspaceError(f"{out}: cannot be written ({error.strerror}): give another --out") from error
     subject, found = diagnosed.subject, diagnosed.diagnosis
-    write_edges_csv(out / "edges.csv", subject.graph, found)
+    residuals = {"residual_m": found.residual_m, "residual_rad": np.deg2rad(found.residual_deg)}
+    write_edges(out / "edges.csv", replace(found.put_into(subject.edges), **residuals), subject.graph.vertex_ids)
     _write_poses(out / "poses.tum", subject, found)
     artifacts.write_text(out / "diagnosis.html", render(_page(diagnosed)))
     if recording:

@@ -9,6 +9,7 @@ from html import escape
 
 import numpy as np
 
+from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.diagnosis.advice import ranked
 from hodge_pipeline.diagnosis.energy import CAVEAT, PARTS, SHARE_CAVEAT, EnergyRow
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
@@ -16,7 +17,6 @@ from hodge_pipeline.diagnosis.suggestions import Suggestions
 from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle
 from hodge_pipeline.report.page import STYLE
 from hodge_pipeline.report.plots import Plot
-from hodge_pipeline.report.summary import in_runs
 from hodge_pipeline.report.tables import Table, number
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 

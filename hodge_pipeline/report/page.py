@@ -6,7 +6,10 @@ from base64 import b64encode
 from collections.abc import Iterable
 from html import escape
 
+import numpy as np
+
 from hodge_pipeline.report.contents import Photograph, Report
+from hodge_pipeline.report.difference import percent
 from hodge_pipeline.report.plots import Plot
 from hodge_pipeline.report.tables import (
     Table,
@@ -14,10 +17,9 @@ from hodge_pipeline.report.tables import (
     score_tables,
     source_table,
     stages_table,
-    vertex_name,
     worst_edges_table,
 )
-from hodge_pipeline.report.verdict import Outcome, judge, percent, suspicions
+from hodge_pipeline.report.verdict import Outcome, judge, suspicions
 
 NARROW = "\u202f"
 SYMBOLS: dict[Outcome, str] = {"improved": "▲", "unchanged": "＝", "worse": "▼", "mixed": "◆", "not measured": "?"}
@@ -106,7 +108,7 @@ def _head(report: Report) -> str:
 
 def _verdict(report: Report) -> str:
     verdict = judge(report)
-    kind, symbol = verdict.outcome.replace(" ", "-"), SYMBOLS[verdict.outcome]
+    kind, symbol = verdict.mark.replace(" ", "-"), SYMBOLS[verdict.mark]
     return (
         f'<div class="verdict {kind}"><b>{symbol} {escape(verdict.headline)}</b>'
         f"<br>{escape(verdict.details[:1].upper() + verdict.details[1:])}</div>"
@@ -116,8 +118,8 @@ def _verdict(report: Report) -> str:
 def _tiles(report: Report) -> str:
     tiles = [
         (
-            " → ".join(each.replace(" ", NARROW) for each in change.lengths),
-            f"{change.what.removeprefix('the ')}, {percent(change.share)}",
+            " → ".join(each.replace(" ", NARROW) for each in change.values),
+            change.what.removeprefix("the ") + ("" if np.isnan(change.share) else f", {percent(change.share)}"),
         )
         for change in judge(report).changes
     ]
@@ -126,7 +128,7 @@ def _tiles(report: Report) -> str:
         tiles.append(
             (
                 f"{report.graph.edges} edges",
-                f"{report.graph.vertices} {vertex_name(report)}, {_plural(parts, 'connected part')}",
+                f"{report.graph.vertices} {report.source.vertex_name}, {_plural(parts, 'connected part')}",
             )
         )
     if report.stages:

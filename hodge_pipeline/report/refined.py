@@ -11,6 +11,7 @@ from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.verdict import summary
 from hodge_pipeline.report.contents import (
+    EdgeRow,
     Path3D,
     Pictures,
     Report,
@@ -20,7 +21,7 @@ from hodge_pipeline.report.contents import (
 )
 from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.store.cost import Cost
-from hodge_pipeline.store.job import versions
+from hodge_pipeline.store.store import versions
 
 NO_METRES = "There is no depth that tells the scale: lengths are in the model's own unit, called metres here."
 
@@ -43,7 +44,10 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
     sets = {"start": first.start.world_from_body, "result": first.model.world_from_body}
     quality = first.start.quality
     pictures = Pictures(paths=tuple(Path3D(name, poses[:, :3, 3]) for name, poses in sets.items()))
+    graph, worst = None, tuple[EdgeRow, ...]()
     if solved is not None:
+        edges, names = solved.edges(first.model.world_from_body), solved.graph.vertex_ids
+        graph, worst = graph_summary(edges, names, solved.solution.component), worst_edges(edges, names)
         pictures = Pictures(
             paths=pictures.paths,
             component=solved.solution.component,
@@ -55,12 +59,8 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
         source=SourceSummary(f"COLMAP model, {quality.points} points", source, quality.images),
         before="start",
         refinement=replace(summary(first.decision), scale=_scales(first)),
-        graph=None
-        if solved is None
-        else graph_summary(solved.graph, solved.solution.component, solved.solution.weights),
-        worst_edges=()
-        if solved is None
-        else worst_edges(solved.graph, first.model.world_from_body, solved.solution.weights),
+        graph=graph,
+        worst_edges=worst,
         stages=(StageRow("refine", cost.wall_s, cost.cpu_s, cost.peak_mb),),
         notes=(*metric, *others, *first.notes),
         versions=versions(),

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,8 +14,10 @@ from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.verdict import Refined, summary
 from hodge_pipeline.report.contents import (
+    EnergyRow,
     LoopRow,
     Path3D,
     Pictures,
@@ -29,24 +30,23 @@ from hodge_pipeline.report.contents import (
 from hodge_pipeline.report.sides import four_sides, worst_pairs
 from hodge_pipeline.report.summary import graph_summary, trajectory_rows, worst_edges
 from hodge_pipeline.report.write import write_report
-from hodge_pipeline.rounds import Round, Verdicts, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.scene import Round, Scene, has_truth, pose_sets, sequences_of, true_poses
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.job import Job, versions
-from hodge_pipeline.types import CloudSet, Floats, Ints, Solution, Source, Trajectory, ViewGraph
-
-EDGE_COLUMNS = (
-    "i", "j", "source", "status", "fitness", "rmse_m", "correspondences", "weight", "residual_m", "residual_deg",
-    "verdict", "probability", "why",
-)  # fmt: skip
+from hodge_pipeline.store.edge_table import write_edges
+from hodge_pipeline.store.store import Store, versions
+from hodge_pipeline.types import Floats, Ints, Solution, Source, Trajectory
 
 
 def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
-    """`poses.tum` and `poses.kitti`; of several sequences `poses-<sequence>.*` each, since their stamps may repeat."""
+    """`poses.tum` and `poses.kitti`; of several sequences `poses-<sequence>.*` each, since their stamps may repeat.
+
+    A sequence named by folders, as a rig's cameras are, becomes one name: no file lies outside the folder.
+    """
     sequences = sequences_of(source)
     for name, rows in sequences.items():
         stamps = np.array([source.frames[row].stamp_s for row in rows])
         part = Source(source.name, source.path, trajectory=Trajectory(stamps, world_from_cam[rows]))
-        stem = "poses" if len(sequences) == 1 else f"poses-{name}"
+        stem = "poses" if len(sequences) == 1 else "poses-" + re.sub(r"[/\\]", "_", name)
         for writer in ("tum", "kitti"):
             registry.load("writers", writer)().write(folder / f"{stem}.{writer}", part)
 
@@ -59,68 +59,23 @@ def write_graph(folder: Path, source: Source, last: Round) -> None:
     trajectory = Trajectory(np.arange(graph.vertex_count, dtype=float), last.world_from_cam)
     whole = Source(source.name, source.path, trajectory=trajectory, graph=numbered)
     registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)
-    weights = np.ones(graph.edge_count) if last.solution is None else last.solution.weights
-    rejected = [
-        [graph.vertex_ids[i], graph.vertex_ids[j], reason, "rejected", *[""] * 9]
-        for (i, j), reason in zip(last.rejected_pairs, last.rejected_reasons, strict=True)
-    ]
-    artifacts.write_text(folder / "edges.csv", edge_table(graph, last.world_from_cam, weights, rejected, last))
-
-
-def edge_table(
-    graph: ViewGraph,
-    world_from_cam: Floats,
-    weights: Floats,
-    rejected: Sequence[Sequence[object]] = (),
-    judged: Round | None = None,
-) -> str:
-    """Every edge with its residual under the poses as CSV, then the pairs that became no edge; the round of a run adds
-    verdicts, and what was switched off by hand.
-    """
-    out = io.StringIO()
-    translation_m, angle_rad = edge_residuals(graph, world_from_cam)
-    table = csv.writer(out, lineterminator="\n")
-    table.writerow(EDGE_COLUMNS)
-    verdicts = None if judged is None else judged.verdicts
-    off = np.zeros(graph.edge_count, bool) if judged is None or judged.disabled is None else judged.disabled
-    for row, (i, j) in enumerate(graph.edges):
-        table.writerow(
-            [
-                graph.vertex_ids[i],
-                graph.vertex_ids[j],
-                graph.source[row],
-                "disabled" if off[row] else "used" if weights[row] > 0 else "ignored",
-                f"{graph.fitness[row]:.4f}",
-                f"{graph.rmse_m[row]:.5f}",
-                graph.correspondences[row],
-                f"{weights[row]:.4f}",
-                f"{translation_m[row]:.6f}",
-                f"{np.rad2deg(angle_rad[row]):.5f}",
-                *_verdict_cells(verdicts, row),
-            ]
-        )
-    table.writerows(rejected)
-    return out.getvalue()
-
-
-def _verdict_cells(verdicts: Verdicts | None, row: int) -> tuple[str, str, str]:
-    if verdicts is None:
-        return "", "", ""
-    probability = verdicts.probability[row]
-    known = "" if np.isnan(probability) else f"{probability:.6g}"
-    return str(verdicts.verdict[row]), known, str(verdicts.reason[row])
+    write_edges(folder / "edges.csv", last.edges, last.vertex_ids)
 
 
 def make_report(
-    job: Job, source: Source, rounds: Sequence[Round], scores: ScoreTable | None, refined: Refined | None = None
+    recipe: Recipe,
+    store: Store,
+    scene: Scene,
+    rounds: Sequence[Round],
+    scores: ScoreTable | None,
+    refined: Refined | None,
 ) -> Report:
     """Everything that the run measured."""
-    last, whole = rounds[-1], _whole(job, source)
+    last, whole, source = rounds[-1], scene.whole, scene.source
     sets = pose_sets(rounds)
     assert last.solution is not None
     component = last.solution.component
-    verdict = None if last.verdicts is None else last.verdicts.verdict
-    worst = worst_edges(last.graph, last.world_from_cam, last.solution.weights, verdict=verdict)
+    worst = worst_edges(last.edges, last.vertex_ids)
     return Report(
         title=f"{source.name}",
         before=rounds[0].name,
@@ -129,23 +84,26 @@ def make_report(
             path=str(source.path),
             frames=len(whole.frames),
             frames_with_truth=sum(frame.world_from_cam is not None for frame in whole.frames),
-            key_frames=len(source.frames) if len(source.frames) < len(whole.frames) else None,
+            key_frames=None if scene.key_frames.are_all else len(source.frames),
             sequences=tuple(name for name in sequences_of(source) if name),
             notes=source.notes,
+            kind="scans" if all(frame.read_depth is None for frame in source.frames) else "frames",
+            unordered=not scene.in_order,
         ),
         scores=scores,
-        trajectories=_trajectories(job, source, sets, component),
+        trajectories=_trajectories(recipe, scene, sets, component),
         loops=_loop_rows(last.solution),
-        graph=graph_summary(last.graph, component, last.solution.weights, last.rejected_counts, verdict),
+        energies=_energy_rows(rounds),
+        graph=graph_summary(last.edges, last.vertex_ids, component),
         worst_edges=worst,
-        stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in job.costs()),
-        notes=tuple(job.notes),
+        stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in store.costs()),
+        notes=tuple(store.notes),
         versions=versions(),
-        recipe=yaml_file.dump(binding.unbind(job.recipe)),
+        recipe=yaml_file.dump(binding.unbind(recipe)),
         last_shift_m=_last_shift(rounds, component),
         pictures=dataclasses.replace(
             _pictures(source, rounds, sets),
-            sides=four_sides(CloudSet.open(job.path("clouds")), sets[rounds[0].name], sets["result"], component),
+            sides=four_sides(scene.clouds, sets[rounds[0].name], sets["result"], component),
             worst_pairs=worst_pairs(source, worst),
         ),
         refinement=None if refined is None else summary(refined.decision),
@@ -156,29 +114,39 @@ def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
     """How far the last round moved the positions (root mean square, aligned); None where it is the first to solve, or
     that of edits, which are meant to move them.
     """
-    if len(rounds) < 3 or rounds[-1].disabled is not None:
+    if len(rounds) < 3 or rounds[-1].edited:
         return None
     shift_m = absolute_error(rounds[-2].world_from_cam, rounds[-1].world_from_cam, component).rmse_m
     return float(shift_m) if np.isfinite(shift_m) else None
 
 
-def _whole(job: Job, source: Source) -> Source:
-    """The source with all of its frames, where a run works on key frames alone."""
-    if job.tracked is not None:
-        return job.tracked.whole
-    return source if job.given is None else job.given.whole
-
-
-def _trajectories(job: Job, source: Source, sets: Mapping[str, Floats], component: Ints) -> tuple[TrajectoryRow, ...]:
+def _trajectories(
+    recipe: Recipe, scene: Scene, sets: Mapping[str, Floats], component: Ints
+) -> tuple[TrajectoryRow, ...]:
     """The errors of each set of poses, over all frames, those that are not key frames included."""
-    if job.tracked is not None:
-        source, component = job.tracked.whole, component[job.tracked.anchors]
-        sets = {name: job.tracked.all_poses(poses) for name, poses in sets.items()}
-    if not has_truth(source):
+    if not has_truth(scene.whole):
         return ()
-    sequences = [frame.sequence for frame in source.frames]
-    delta_frames = job.recipe.evaluation.rpe_delta_frames
-    return trajectory_rows(sets, true_poses(source), component, sequences, delta_frames=delta_frames)
+    every = {name: scene.key_frames.expand(poses) for name, poses in sets.items()}
+    sequences = [frame.sequence for frame in scene.whole.frames]
+    delta_frames = recipe.evaluation.rpe_delta_frames
+    component = component[scene.key_frames.key_of_frame]
+    return trajectory_rows(every, true_poses(scene.whole), component, sequences, delta_frames=delta_frames)
+
+
+def _energy_rows(rounds: Sequence[Round]) -> tuple[EnergyRow, ...]:
+    found = []
+    for number, one in enumerate(rounds):
+        if one.energies is not None:
+            parts = one.energies.exact, one.energies.coexact, one.energies.harmonic
+            rotation, translation = np.sum(parts, axis=0).tolist()
+            shares = one.energies.shares
+            found.append(
+                EnergyRow(
+                    f"round {number}", one.energies.simplices, shares["exact"], shares["coexact"], shares["harmonic"],
+                    rotation, translation,
+                )
+            )  # fmt: skip
+    return tuple(found)
 
 
 def _loop_rows(solution: Solution) -> tuple[LoopRow, ...]:
@@ -212,10 +180,12 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
 
 
 def write(
-    job: Job,
-    source: Source,
+    folder: Path,
+    recipe: Recipe,
+    store: Store,
+    scene: Scene,
     rounds: Sequence[Round],
-    models: dict[str, Path],
+    models: Mapping[str, Path],
     scores: ScoreTable | None,
     refined: Refined | None = None,
 ) -> Report:
@@ -223,17 +193,13 @@ def write(
 
     Of a refinement the poses of all frames; where nothing could be refined the report alone.
     """
-    folder = job.workspace.folder
-    if job.tracked is not None:
-        write_poses(folder, job.tracked.whole, job.tracked.all_poses(rounds[-1].world_from_cam))
-    elif refined is None:
-        write_poses(folder, source, rounds[-1].world_from_cam)
-    elif job.given is not None and refined.decision.outcome != "nothing":
-        write_poses(folder, job.given.whole, refined.world_from_cam)
     if refined is None or refined.decision.outcome != "nothing":
-        write_graph(folder, source, rounds[-1])
+        last = rounds[-1]
+        poses = scene.key_frames.expand(last.world_from_cam) if refined is None else refined.world_from_cam
+        write_poses(folder, scene.whole, poses)
+        write_graph(folder, scene.source, last)
         for name, path in models.items():
             artifacts.link_or_copy(path, folder / f"{name}.ply")
-    report = make_report(job, source, rounds, scores, refined)
+    report = make_report(recipe, store, scene, rounds, scores, refined)
     write_report(folder, report)
     return report

@@ -5,16 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.recording.solved import record_graph
 from hodge_pipeline.refine.pose_graph import RUN_GRAPH, SolvedFile, write_solved
 from hodge_pipeline.report.contents import Path3D, Pictures, Report, Residuals, SourceSummary, StageRow
-from hodge_pipeline.report.run_files import edge_table
 from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.job import versions
-from hodge_pipeline.types import Floats
+from hodge_pipeline.store.edge_table import write_edges
+from hodge_pipeline.store.store import versions
+from hodge_pipeline.types import Edges, Floats
 
 SOLVED = "solved.json"
 
@@ -25,15 +25,19 @@ def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --run") from error
-    poses = solved.solution.world_from_cam
     write_solved(folder / RUN_GRAPH, solved)
-    artifacts.write_text(folder / "edges.csv", edge_table(solved.graph, poses, solved.solution.weights))
+    write_edges(folder / "edges.csv", _edges(solved), solved.graph.vertex_ids)
     artifacts.write_json(folder / SOLVED, solved.summary())
     write_report(folder, _report(solved))
     solution = solved.solution
     start = solution.world_from_cam if solved.start is None else solved.start
     notes = solved.source.notes
     return record_graph(folder, solved.source.name, solved.graph, start, solution, _before(solved), notes)
+
+
+def _edges(solved: SolvedFile) -> Edges:
+    solution = solved.solution
+    return with_residuals(Edges.measured(solved.graph), solution.world_from_cam, solution.weights)
 
 
 def _before(solved: SolvedFile) -> dict[str, Floats]:
@@ -47,8 +51,8 @@ def _report(solved: SolvedFile) -> Report:
         title=source.name,
         source=SourceSummary(source.name, str(source.path), graph.vertex_count, notes=source.notes),
         before="start",
-        graph=graph_summary(graph, solution.component, solution.weights),
-        worst_edges=worst_edges(graph, solution.world_from_cam, solution.weights),
+        graph=graph_summary(_edges(solved), graph.vertex_ids, solution.component),
+        worst_edges=worst_edges(_edges(solved), graph.vertex_ids),
         stages=(StageRow("solve", solved.wall_s, solved.cpu_s, float("nan")),),
         notes=solution.notes,
         versions=versions(),

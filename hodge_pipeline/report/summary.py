@@ -7,15 +7,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
 from hodge_pipeline.report.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow
-from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types import Edges, Floats, Ints
 
 CENTIMETRES_PER_DEGREE = 1.0
 """How a residual's angle counts beside its translation when edges are ranked: a scene lies about 0.6 m away."""
 
-MAX_RUNS_LISTED = 12
 VERDICTS = ("consistent", "suspect", "wrong", "untestable")
 
 
@@ -71,66 +70,47 @@ def _distinct(component: Ints | None, sequence: Sequence[str] | None, count: int
     return np.asarray(labels * (names.max(initial=0) + 1) + names, np.int64)
 
 
-def graph_summary(
-    graph: ViewGraph,
-    component: Ints,
-    weights: Floats | None = None,
-    rejected: Mapping[str, int] | None = None,
-    verdict: NDArray[np.str_] | None = None,
-) -> GraphSummary:
-    """The viewing graph in numbers; `component (V,)` and `weights (E,)` as the solution has them (0: ignored)."""
-    sources, counts = np.unique(graph.source, return_counts=True)
+def graph_summary(edges: Edges, vertex_ids: NDArray[np.generic], component: Ints) -> GraphSummary:
+    """The viewing graph in numbers; `component (V,)` as the solution has it."""
+    graph = edges.select(edges.in_graph)
+    sources, counts = np.unique(graph.proposed_by, return_counts=True)
     labels, sizes = np.unique(component, return_counts=True)
     largest_first = labels[np.argsort(-sizes, kind="stable")]
     rows = [np.flatnonzero(component == label) for label in largest_first]
     return GraphSummary(
-        vertices=graph.vertex_count,
-        edges=graph.edge_count,
-        edges_by_source={str(name): int(count) for name, count in zip(sources, counts, strict=True)},
-        components=tuple(ComponentRow(len(row), in_runs(row, graph.vertex_ids)) for row in rows),
-        edges_ignored=0 if weights is None else int((weights <= 0).sum()),
-        rejected=dict(rejected or {}),
-        verdicts=_counts(verdict),
-        verdicts_in_use=_counts(verdict if verdict is None or weights is None else verdict[weights > 0]),
+        vertices=len(vertex_ids),
+        edges=len(graph),
+        edges_by_source=dict(zip(sources.tolist(), counts.tolist(), strict=True)),
+        components=tuple(ComponentRow(len(row), in_runs(row, vertex_ids)) for row in rows),
+        edges_ignored=int((graph.weight <= 0).sum()),
+        rejected=edges.rejected_counts,
+        verdicts=_verdicts(graph),
+        verdicts_in_use=_verdicts(graph.select(graph.weight > 0)),
     )
 
 
-def _counts(verdict: NDArray[np.str_] | None) -> dict[str, int]:
-    return {} if verdict is None else {name: int((verdict == name).sum()) for name in VERDICTS}
+def _verdicts(graph: Edges) -> dict[str, int]:
+    """How many edges were judged how; nothing where none was judged."""
+    if not (graph.verdict != "").any():
+        return {}
+    return {name: int((graph.verdict == name).sum()) for name in VERDICTS}
 
 
-def in_runs(rows: Ints, vertex_ids: Ints | np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> str:
-    """Ascending rows in words, `0–120, 124, 130–131`, as the source names their frames."""
-    if not len(rows):
-        return "none"
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-    words = [f"{vertex_ids[run[0]]}" + (f"–{vertex_ids[run[-1]]}" if len(run) > 1 else "") for run in runs]
-    more = f", and {len(runs) - MAX_RUNS_LISTED} more" if len(runs) > MAX_RUNS_LISTED else ""
-    return ", ".join(words[:MAX_RUNS_LISTED]) + more
-
-
-def worst_edges(
-    graph: ViewGraph,
-    world_from_cam: Floats,
-    weights: Floats | None = None,
-    count: int = 10,
-    verdict: NDArray[np.str_] | None = None,
-) -> tuple[EdgeRow, ...]:
-    """The edges furthest from the poses (V, 4, 4), worst first: a centimetre counts like a degree."""
-    translation_m, angle_rad = edge_residuals(graph, world_from_cam)
-    size_cm = translation_m * 100 + np.rad2deg(angle_rad) * CENTIMETRES_PER_DEGREE
-    worst = np.argsort(-np.nan_to_num(size_cm, nan=-1.0), kind="stable")[:count]
-    known = np.ones(graph.edge_count) if weights is None else weights
+def worst_edges(edges: Edges, vertex_ids: NDArray[np.generic], count: int = 10) -> tuple[EdgeRow, ...]:
+    """The edges furthest from the poses, worst first: a centimetre counts like a degree."""
+    graph = edges.select(edges.in_graph)
+    size_cm = graph.residual_m * 100 + np.rad2deg(graph.residual_rad) * CENTIMETRES_PER_DEGREE
+    worst = graph.select(np.argsort(-np.nan_to_num(size_cm, nan=-1.0), kind="stable")[:count])
     return tuple(
         EdgeRow(
-            i=str(graph.vertex_ids[graph.edges[row, 0]]),
-            j=str(graph.vertex_ids[graph.edges[row, 1]]),
-            source=str(graph.source[row]),
-            fitness=float(graph.fitness[row]),
-            weight=float(known[row]),
-            residual_m=float(translation_m[row]),
-            residual_deg=float(np.rad2deg(angle_rad[row])),
-            verdict="" if verdict is None else str(verdict[row]),
+            i=str(i),
+            j=str(j),
+            source=str(worst.proposed_by[row]),
+            fitness=float(worst.fitness[row]),
+            weight=float(worst.weight[row]),
+            residual_m=float(worst.residual_m[row]),
+            residual_deg=float(np.rad2deg(worst.residual_rad[row])),
+            verdict=str(worst.verdict[row]),
         )
-        for row in worst
+        for row, (i, j) in enumerate(vertex_ids[worst.pairs].tolist())
     )

@@ -9,7 +9,8 @@ import numpy as np
 
 from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
 from hodge_pipeline.report.contents import RefinementSummary, Report
-from hodge_pipeline.report.verdict import GRAPH_NAMES, judge, length, suspicions
+from hodge_pipeline.report.difference import length
+from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m, judge, suspicions
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,6 @@ def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
     return (*lines, *(("note", line) for line in suspicions(report)))
 
 
-def vertex_name(report: Report) -> str:
-    """What the vertices of the viewing graph are."""
-    return "frames" if report.source.key_frames is None else "key frames"
-
-
 def _peak(report: Report) -> float:
     return max(stage.peak_mb for stage in report.stages)
 
@@ -63,9 +59,10 @@ def graph_tables(report: Report) -> Iterator[Table]:
         yield _graph(report)
         if len(report.graph.components) > 1:
             parts = tuple((str(n), str(part.count), part.frames) for n, part in enumerate(report.graph.components))
-            yield Table(
-                "Connected parts", ("part", vertex_name(report), "which"), parts, "Nothing measured joins two parts.", 3
-            )
+            header = ("part", report.source.vertex_name, "which")
+            yield Table("Connected parts", header, parts, "Nothing measured joins two parts.", 3)
+    if report.energies:
+        yield _energies(report)
     if report.loops:
         yield _loops(report)
 
@@ -106,12 +103,13 @@ def _score_cells(graph: GraphScores, row: int) -> tuple[str, str, str]:
 def _trajectories(report: Report) -> Table:
     header = ("poses", "ATE", "median", "largest", "RPE", "RPE, rotation", "frames")
     absolute_m = max((row.ate_rmse_m for row in report.trajectories if row.frames), default=0.0)
+    floor = floor_m(report)
     relative_m = max((row.rpe_translation_m for row in report.trajectories if row.frames), default=0.0)
     rows = tuple(
         (
             row.name,
-            *(length(metres, absolute_m) for metres in (row.ate_rmse_m, row.ate_median_m, row.ate_max_m)),
-            length(row.rpe_translation_m, relative_m),
+            *(length(metres, absolute_m, floor) for metres in (row.ate_rmse_m, row.ate_median_m, row.ate_max_m)),
+            length(row.rpe_translation_m, relative_m, floor),
             number(row.rpe_rotation_deg, ".3f", "°"),
             str(row.frames),
         )
@@ -130,7 +128,7 @@ def _graph(report: Report) -> Table:
     graph = report.graph
     assert graph is not None
     rows = [
-        (vertex_name(report), str(graph.vertices)),
+        (report.source.vertex_name, str(graph.vertices)),
         ("edges", str(graph.edges)),
         *((f"edges: {name}", str(count)) for name, count in graph.edges_by_source.items()),
         ("edges ignored by the solver", str(graph.edges_ignored)),
@@ -139,6 +137,20 @@ def _graph(report: Report) -> Table:
         *((f"pairs rejected: {reason}", str(count)) for reason, count in graph.rejected.items()),
     ]
     return Table("Viewing graph", ("what", "count"), tuple(rows), "An edge is a measured motion between two frames.")
+
+
+def _energies(report: Report) -> Table:
+    rows = tuple(
+        (row.round, str(row.simplices[2]), *(f"{100 * part[0]:.1f} / {100 * part[1]:.1f} %" for part in parts))
+        for row in report.energies
+        for parts in [(row.exact, row.coexact, row.harmonic)]
+    )
+    caption = (
+        "Helmholtz–Hodge parts of ω = log(T_i Z_ij T_j⁻¹) before the solve of each round: shares of the energy of "
+        "rotation / translation. Exact: what moving the poses takes away; co-exact: triangles that do not close; "
+        "harmonic: longer loops that do not."
+    )
+    return Table("Decomposition", ("before", "triangles", "exact", "co-exact", "harmonic"), rows, caption, 5)
 
 
 def _loops(report: Report) -> Table:

@@ -10,12 +10,10 @@ import numpy as np
 
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
 from hodge_pipeline.report.contents import GraphSummary, Report, TrajectoryRow
+from hodge_pipeline.report.difference import MEASURABLE, Change, floor_of, length
 from hodge_pipeline.types import Floats
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
-
-SAME = 0.02
-"""A relative change below this counts as none: a truth of the kind that RGB-D benchmarks have is no finer."""
 
 LARGE_RESIDUAL_M = 0.1
 LARGE_RESIDUAL_DEG = 5.0
@@ -23,6 +21,8 @@ UNMATCHED_SHARE = 0.01
 UNSETTLED_M, UNSETTLED_SHARE = 0.05, 0.01
 """By how much (root mean square), and by which share of the path, the last of several rounds may move the positions.
 Runs that end near the truth move by less than 1 cm, one whose edges slide along a bare floor by 30."""
+MOST_SIZES = 3
+"""Pieces whose sizes a headline tells."""
 NO_MEASURE = "there were neither overlapping clouds nor true poses to compare the poses by."
 
 
@@ -30,73 +30,87 @@ REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",
 }  # fmt: skip
-VERBS = {1: "fell", 0: "hardly changed,", -1: "rose"}
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 
 
 @dataclass(frozen=True)
-class Change:
-    """One error before and after, in metres, and by which share of itself it changed."""
-
-    what: str
-    before_m: float
-    after_m: float
-
-    @property
-    def share(self) -> float:
-        """−0.4 where the error fell by 40 %."""
-        return (self.after_m - self.before_m) / self.before_m if self.before_m > 0 else float(self.after_m > 0)
-
-    @property
-    def sign(self) -> int:
-        """1 better, −1 worse, 0 where the change is too small to count."""
-        return 0 if abs(self.share) <= SAME else (1 if self.share < 0 else -1)
-
-    def __str__(self) -> str:
-        before, after = self.lengths
-        return f"{self.what} {VERBS[self.sign]} from {before} to {after} ({percent(self.share)})"
-
-    @property
-    def lengths(self) -> tuple[str, str]:
-        """Before and after in the same unit."""
-        larger_m = max(self.before_m, self.after_m)
-        return length(self.before_m, larger_m), length(self.after_m, larger_m)
-
-
-@dataclass(frozen=True)
 class Verdict:
-    """The outcome in one word, in a headline, in detail, and the changes it rests on."""
+    """The outcome of all measures in one word; a headline, which begins with the pieces where there are several; the
+    details, and the changes they rest on.
+    """
 
     outcome: Outcome
     headline: str
     details: str
     changes: tuple[Change, ...]
+    pieces: int = 1
 
     @property
     def sentence(self) -> str:
         """Headline and details in one."""
-        return f"{self.headline}: {self.details}"
+        return f"{self.headline}. {_capital(self.details)}"
+
+    @property
+    def mark(self) -> Outcome:
+        """What the page shows at a glance: a scene in several pieces is no plain success, whatever the measures say."""
+        return "mixed" if self.pieces > 1 and self.outcome == "improved" else self.outcome
 
 
 def judge(report: Report) -> Verdict:
     """The verdict on a report: every measured error counts, and where they disagree it is `mixed`.
 
-    A refinement has been judged already, by its guard.
+    A refinement has been judged already, by its guard; an error against the truth that got worse is named all the same.
     """
     changes = (*_score_changes(report), *_trajectory_changes(report))
+    outcome, headline, details = _judged(report, changes)
+    pieces = _pieces(report)
+    if pieces:
+        headline = f"{pieces}: {headline[:1].lower()}{headline[1:]}"
+    return Verdict(outcome, headline, details, changes, max(len(_joined(report)), 1))
+
+
+def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, str]:
+    better, worse = ([change for change in changes if change.sign == sign] for sign in (1, -1))
+    but = ", ".join(change.briefly for change in worse)
+    told = f"{'; '.join(str(change) for change in changes)}."
     if report.refinement is not None:
         refinement = report.refinement
-        return Verdict(REFINEMENTS[refinement.outcome], refinement.headline, f"{refinement.reason}.", changes)
+        outcome = REFINEMENTS[refinement.outcome]
+        if outcome == "improved" and worse:
+            return "mixed", f"{refinement.headline}, but {but}", f"{refinement.reason}."
+        return outcome, refinement.headline, f"{refinement.reason}."
     if not changes:
-        return Verdict("not measured", "Not measured", NO_MEASURE, ())
-    signs = {change.sign for change in changes} - {0}
-    outcome: Outcome = "unchanged" if not signs else "mixed" if len(signs) > 1 else _one_way(signs.pop())
-    told = "; ".join(str(change) for change in changes)
-    return Verdict(outcome, f"{outcome.capitalize()} against {report.before}", f"{told}.", changes)
+        return "not measured", "Not measured", NO_MEASURE
+    if better and worse:
+        good = min(better, key=lambda change: change.share).briefly
+        good += f" and {len(better) - 1} more better" if len(better) > 1 else ""
+        return "mixed", f"Mixed against {report.before}: {good}, but {but}", told
+    outcome = "improved" if better else "worse" if worse else "unchanged"
+    return outcome, f"{outcome.capitalize()} against {report.before}", told
 
 
-def _one_way(sign: int) -> Outcome:
-    return "improved" if sign > 0 else "worse"
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _joined(report: Report) -> list[int]:
+    """The frames of each piece that joins at least two, most first."""
+    parts = () if report.graph is None else report.graph.components
+    return sorted((part.count for part in parts if part.count > 1), reverse=True)
+
+
+def _pieces(report: Report) -> str:
+    """What is in one piece and what is not, in words; empty where it goes without saying."""
+    graph, sizes = report.graph, _joined(report)
+    if graph is None or graph.vertices < 2:
+        return ""
+    of_all = f"of {graph.vertices} {report.source.vertex_name}"
+    if not sizes:
+        return f"No two {of_all} joined"
+    if len(sizes) > 1:
+        listed = [str(size) for size in sizes[:MOST_SIZES]] + ["…"] * (len(sizes) > MOST_SIZES)
+        return f"In {len(sizes)} pieces ({', '.join(listed)} {of_all})"
+    return f"{sizes[0]} {of_all} in one piece" if sizes[0] < graph.vertices or report.source.unordered else ""
 
 
 def _score_changes(report: Report) -> Iterator[Change]:
@@ -107,15 +121,34 @@ def _score_changes(report: Report) -> Iterator[Change]:
     for graph in table.graphs:
         distance = graph.mean_distance_m
         if graph.counts[before] and graph.counts[after]:
-            what = f"the mean distance of overlapping clouds ({GRAPH_NAMES[graph.kind]})"
-            yield Change(what, float(distance[before]), float(distance[after]))
+            name = GRAPH_NAMES[graph.kind]
+            what, short = f"the mean distance of overlapping clouds ({name})", f"distance of clouds ({name})"
+            yield Change(what, short, float(distance[before]), float(distance[after]), floor_m(report))
 
 
 def _trajectory_changes(report: Report) -> Iterator[Change]:
     rows = {row.name: row for row in report.trajectories if row.frames}
-    if report.before in rows and report.after in rows:
-        before, after = rows[report.before].ate_rmse_m, rows[report.after].ate_rmse_m
-        yield Change("the error of the trajectory (ATE)", before, after)
+    if report.before not in rows or report.after not in rows:
+        return
+    before, after = rows[report.before], rows[report.after]
+    floor = floor_m(report)
+    yield Change("the error of the trajectory (ATE)", "ATE", before.ate_rmse_m, after.ate_rmse_m, floor)
+    if not np.isfinite(before.rpe_translation_m):
+        return
+    step = "from frame to frame" if before.rpe_delta_frames == 1 else f"over {before.rpe_delta_frames} frames"
+    what = f"the error of the motion {step} (RPE)"
+    yield Change(what, "RPE", before.rpe_translation_m, after.rpe_translation_m, floor)
+    what, floor_deg = f"the error of the rotation {step} (RPE)", float(np.rad2deg(MEASURABLE))
+    yield Change(what, "RPE of the rotation", before.rpe_rotation_deg, after.rpe_rotation_deg, floor_deg, "°")
+
+
+def floor_m(report: Report) -> float:
+    """The least difference of lengths that the report takes for one: see `MEASURABLE`.
+
+    The extent is that of the positions, or the unit that recipes are written in (1 m in a room) where that is larger.
+    """
+    scale = report.scores.scale if report.scores else 0.0
+    return max(floor_of(*(path.positions for path in report.pictures.paths)), MEASURABLE * scale)
 
 
 def suspicions(report: Report) -> tuple[str, ...]:
@@ -199,18 +232,3 @@ def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[str]:
         yield f"{row.name}: {row.left_out} frames without a true pose, or joined to no other, are not in its error."
     if row.degenerate:
         yield f"{row.name}: its positions lie on a line (or are fewer than three): its orientations aligned it."
-
-
-def length(metres: float, unit_of_m: float | None = None) -> str:
-    """A length with a unit that suits its size, or the size `unit_of_m` of another."""
-    if not abs(metres) < float("inf"):
-        return "–"
-    size_m = abs(metres if unit_of_m is None else unit_of_m)
-    if size_m < 0.025:
-        return f"{metres * 1000:.3g} mm"
-    return f"{metres * 100:.3g} cm" if size_m < 1 else f"{metres:.3g} m"
-
-
-def percent(share: float) -> str:
-    """A signed share in per cent, with a real minus sign."""
-    return f"{share * 100:+.0f} %".replace("-", "−")

@@ -41,7 +41,7 @@ __all__ = [
     "write_report",
 ]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Raised when a key of `report.json` is renamed, moved or removed."""
 
 
@@ -62,6 +62,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "verdict": {
             "outcome": verdict.outcome,
             "sentence": verdict.sentence,
+            "pieces": verdict.pieces,
             "before": report.before,
             "after": report.after,
             "changes": [{**asdict(change), "share": change.share} for change in verdict.changes],
@@ -71,6 +72,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "scores": None if report.scores is None else _scores(report.scores),
         "trajectories": [asdict(row) for row in report.trajectories],
         "loops": [{**asdict(row), "mean": row.mean} for row in report.loops],
+        "energies": [asdict(row) for row in report.energies],
         "graph": None if report.graph is None else asdict(report.graph),
         "worst_edges": [asdict(row) for row in report.worst_edges],
         "convergence": {name: list(series) for name, series in report.pictures.convergence.items()},

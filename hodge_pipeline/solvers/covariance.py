@@ -11,14 +11,16 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.full_information import FullObjective
 from hodge_pipeline.solvers.linear import factorise_blocks
+from hodge_pipeline.solvers.priors import with_world
 from hodge_pipeline.solvers.setup import Setup, prepare
 from hodge_pipeline.solvers.weights import PLANAR_AXES
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 
 def marginal_covariances(graph: ViewGraph, world_from_cam: Floats, vertices: Ints) -> Floats:
-    """Covariances (K, 6, 6) of the poses of these vertex rows, the first vertex of each component held still (zeros).
+    """Covariances (K, 6, 6) of the poses of these vertex rows; priors count as in `solve`.
 
+    Zeros for what is held still: the graph's fixed vertices, and the first vertex of each component without any.
     `world_from_cam (V, 4, 4)` must be the full objective's minimum. In the plane the other rows are zero.
     """
     vertices = np.asarray(vertices, np.int64)
@@ -27,7 +29,7 @@ def marginal_covariances(graph: ViewGraph, world_from_cam: Floats, vertices: Int
 
 
 def relative_covariances(graph: ViewGraph, world_from_cam: Floats, pairs: Ints) -> Floats:
-    """Covariances (P, 6, 6) of `T_i⁻¹ T_j · exp(ξ)` for pairs of vertex rows (P, 2), whatever the gauge.
+    """Covariances (P, 6, 6) of `T_i⁻¹ T_j · exp(ξ)` for pairs of vertex rows (P, 2), whatever the free gauge.
 
     Raises `GraphError` for a pair in two components, which no edge relates.
     """
@@ -49,7 +51,9 @@ def relative_covariances(graph: ViewGraph, world_from_cam: Floats, pairs: Ints) 
 
 def _joint_covariance(graph: ViewGraph, world_from_cam: Floats, vertices: Ints) -> tuple[Floats, Setup]:
     """The covariance (K, 6, K, 6) of these vertices together."""
-    setup = prepare(graph, world_from_cam, direct=True)
+    if graph.priors is not None and len(graph.priors.vertices):
+        graph, world_from_cam = with_world(graph, graph.priors, world_from_cam, None)
+    setup = prepare(graph, world_from_cam, graph.fixed, direct=True)
     if not setup.weights.definite:
         raise GraphError("covariances need positive semi-definite information: mend the indefinite matrices")
     problem = setup.problem

@@ -16,9 +16,10 @@ from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
 from hodge_pipeline.solvers.neighbourhood import settled_nearby
 from hodge_pipeline.solvers.newton import Descent, Limits
+from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.priors import PER_EDGE
 from hodge_pipeline.solvers.problem import reweighted
-from hodge_pipeline.solvers.setup import Setup, prepare
+from hodge_pipeline.solvers.setup import Setup, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
 LIMITS = Limits(max_iterations=100, relative_tolerance=1e-9)
@@ -61,12 +62,16 @@ class GraphEditor:
     Edges are named by their rows. A solve after an edit begins at the present poses, near the edges that changed, and
     ends there if those farther off have nothing to win; else it goes on with the factors of the first solve, corrected
     for the edges that changed. Where pieces part or join, or edges are new, the graph is set up again.
+
+    The graph's fixed vertices stay where the solution has them; without a solution they have no such place, and a note
+    says so.
     """
 
     def __init__(
         self, graph: ViewGraph, solution: Solution | None = None, *, objective: ObjectiveName = "full"
     ) -> None:
-        if graph.priors is not None:
+        check_choice("objective", objective, ObjectiveName)
+        if graph.priors is not None and len(graph.priors.vertices):
             raise GraphError("priors cannot be edited yet: solve the graph with `solve`, or leave its priors out")
         if solution is not None and (
             solution.world_from_cam.shape != (graph.vertex_count, 4, 4) or len(solution.weights) != graph.edge_count
@@ -74,7 +79,9 @@ class GraphEditor:
             raise GraphError("the solution is not of this graph: its poses or weights have another count")
         self._objective: ObjectiveName = objective
         self._history: list[_State] = []
-        setup = prepare(graph, None if solution is None else solution.world_from_cam)
+        start = None if solution is None else solution.world_from_cam
+        self._fixed, self._unheld = held_rows(graph, start)
+        setup = prepare(graph, start, self._fixed)
         self._base = _Base(graph, np.arange(graph.edge_count), setup)
         if solution is None:
             solution = self._solution(self._base, minimise(setup, "chordal", LIMITS, self._full(setup)))
@@ -174,7 +181,7 @@ class GraphEditor:
 
     def _solution(self, base: _Base, descent: Descent) -> Solution:
         setup = base.setup
-        notes = (*setup.weights.notes, *describe_components(setup.component, base.graph.vertex_ids))
+        notes = (*self._unheld, *setup.weights.notes, *describe_components(setup.component, base.graph.vertex_ids))
         weights = setup.weights.used.astype(float)
         metrics = metrics_of(descent, self._full(setup))
         return Solution(setup.poses(descent.point), setup.component, weights, metrics=metrics, notes=notes)
@@ -202,4 +209,4 @@ class GraphEditor:
 
     def _make_base(self, rows: Ints) -> _Base:
         start = self._state.solution.world_from_cam
-        return _Base(self.graph, rows, prepare(self.graph.select(rows), start, self.graph.fixed))
+        return _Base(self.graph, rows, prepare(self.graph.select(rows), start, self._fixed))

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
+from hodge_pipeline.complex.checks import NO_EDGES, check_rows
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backends import BackendName
@@ -17,8 +18,9 @@ from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
 from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Limits, Point
+from hodge_pipeline.solvers.options import check_choice, check_positive
 from hodge_pipeline.solvers.priors import with_world, without_world
-from hodge_pipeline.solvers.setup import NO_ROWS, InitialName, Setup, prepare
+from hodge_pipeline.solvers.setup import InitialName, Setup, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, SolverIteration, ViewGraph
 
 ObjectiveName: TypeAlias = Literal["isotropic", "full"]
@@ -60,8 +62,13 @@ def solve(
         graph = ViewGraph.from_edges(np.arange(4), edges, i_from_j, information)
         world_from_cam = solve(graph).world_from_cam
 
-    Raises `GraphError` for numbers that are not finite, edges that name no vertex, and a back end not installed.
+    Raises `GraphError` for motions that are not finite and rigid, edges and fixed rows that name no vertex, unknown
+    options, and a back end not installed.
     """
+    check_choice("objective", objective, ObjectiveName)
+    check_choice("initial", initial, InitialName)
+    check_positive("time_limit_s", time_limit_s, "seconds")
+    check_rows(graph.fixed if fixed is None else np.asarray(fixed), graph.vertex_count, "fixed")
     start = None if start is None else np.asarray(start, float)
     if start is None and (initial == "given" or (fixed is not None and len(fixed))):
         raise GraphError("fixed vertices and a given initial guess need start poses: pass start")
@@ -82,12 +89,11 @@ def solve(
             keep_history=keep_history,
         )
         return without_world(solution, graph)
-    notes: list[str] = []
-    if fixed is None and start is None and len(graph.fixed):
-        notes.append(f"{len(graph.fixed)} fixed vertices have no pose: the first vertex of each piece is held instead")
-    rows = NO_ROWS if start is None else np.asarray(graph.fixed if fixed is None else fixed, np.int64)
+    rows, unheld = held_rows(graph, start, fixed)
     setup = prepare(graph, start, rows, dimension, backend, direct=certificate)
-    notes += [*setup.weights.notes, *describe_components(setup.component, graph.vertex_ids)]
+    notes = [*unheld, *setup.weights.notes, *describe_components(setup.component, graph.vertex_ids)]
+    if not setup.weights.used.any():
+        notes.append(NO_EDGES)
     full = objective == "full" and setup.weights.definite
     if objective == "full" and not full:
         notes.append("the full objective has no minimum with indefinite information: isotropic weights are used")

@@ -9,8 +9,9 @@ from typing import TypeAlias
 
 from hodge_pipeline.solvers import direct
 from hodge_pipeline.solvers.full_information import FullObjective
+from hodge_pipeline.solvers.half_turns import turned_back
 from hodge_pipeline.solvers.isotropic import CG_FIRST_TO, JointObjective, cg_first
-from hodge_pipeline.solvers.newton import CG_LIMIT_REACHED, Descent, Limits, Point, descend
+from hodge_pipeline.solvers.newton import CG_LIMIT_REACHED, ROUNDING_REACHED, Descent, Limits, Point, descend
 from hodge_pipeline.solvers.objective import IsotropicObjective, residuals
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.setup import InitialName, Setup
@@ -32,6 +33,22 @@ def minimise(
     not tried for the isotropic one.
     """
     begin = setup.initial(initial)
+    found = _minimum(setup, begin, limits, full, watch, known)
+    while found.converged or found.reason == ROUNDING_REACHED:
+        off = turned_back(setup.problem, found.point.rotations, found.point.translations)
+        if off is None:
+            break
+        lower = _minimum(setup, off, limits.after(len(found.costs) - 1), full, watch, known=full)
+        if lower.point.cost >= found.point.cost:
+            break
+        found = replace(lower, costs=found.costs + lower.costs[1:], cg_steps=found.cg_steps + lower.cg_steps)
+    return found
+
+
+def _minimum(
+    setup: Setup, begin: tuple[Floats, Floats], limits: Limits, full: bool, watch: Watch | None, known: bool
+) -> Descent:
+    """The descent from there, which may end at a saddle."""
     if full and (known or full_at_once(setup.problem)):
         objective = full_objective(setup)
         return descend(objective, objective.at(*begin), limits, setup.rounding, watch)

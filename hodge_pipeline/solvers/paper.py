@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.complex.checks import check_graph
+from hodge_pipeline.complex.checks import NO_EDGES, check_graph, refuse_priors
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.cycles import Loops, loop_deviation
 from hodge_pipeline.complex.minimum_cycles import MOST_CANDIDATES
@@ -64,17 +64,19 @@ class PaperSolver:
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """Consistent poses; a graph of several components is solved piece by piece, isolated vertices keep their pose.
 
-        Raises `GraphError` for motions or information that are not finite, and for an empty graph.
+        Fixed vertices have f = 0. Raises `GraphError` for motions that are not finite and rigid, for an empty graph,
+        and for priors.
         """
         world_from_cam = np.asarray(world_from_cam, float)
         check_graph(graph, world_from_cam)
+        refuse_priors(graph, "paper")
         problem = make_problem(graph, world_from_cam)
         weights = np.zeros(graph.edge_count)
         weights[problem.rows] = 1.0
         pieces = describe_components(problem.component, graph.vertex_ids)
         if not len(problem.edges):
-            note = "no edge joins two vertices: every pose is as it was at the start"
-            return Solution(world_from_cam.copy(), problem.component, np.zeros(graph.edge_count), notes=(*pieces, note))
+            notes = (*problem.notes(), *pieces, NO_EDGES)
+            return Solution(world_from_cam.copy(), problem.component, np.zeros(graph.edge_count), notes=notes)
         surface = make_surface(problem.edges, problem.start, self.rotation, self.seed)
         around_loops = loops_of(problem.edges, len(problem.component), MOST_CANDIDATES)
         generators = surface.generators() if surface.is_checked else None

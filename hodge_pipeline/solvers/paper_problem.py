@@ -1,18 +1,16 @@
-"""The measured edges of a graph around the centroid of each component, and the Poisson equation on their vertices."""
+"""The measured edges of a graph around the centroid of each component, in the order of the complex."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import orthonormal
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.one_form import Logarithm, centroids, residual_form, shifted
-from hodge_pipeline.solvers.potential import CentredProblem, poisson
+from hodge_pipeline.solvers.potential import CentredProblem
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 
@@ -36,10 +34,6 @@ class PaperProblem(CentredProblem):
         motions = self.i_from_j.copy()
         motions[backwards] = se3.inverse(motions[backwards])
         return np.asarray(self.sign[:, None] * residual_form(as_measured, motions, poses, log))
-
-    def poisson(self, d0: csr_matrix, weights: Floats) -> Callable[[Floats], Floats]:
-        """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω`, of mean zero on each component (Eq. (7))."""
-        return poisson(d0, weights, self.component)
 
     def notes(self) -> tuple[str, ...]:
         """What was ignored."""
@@ -65,6 +59,7 @@ def make_problem(graph: ViewGraph, world_from_cam: Floats) -> PaperProblem:
         i_from_j=i_from_j,
         sign=np.where(backwards, -1, 1),
         component=component,
+        fixed=graph.fixed,
         start=orthonormal(shifted(world_from_cam, -offset)),
         offset=offset,
         start_in_world=world_from_cam,

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.sparse import csr_matrix
 
-from hodge_pipeline.complex.checks import check_graph, orthonormal
+from hodge_pipeline.complex.checks import NO_EDGES, check_graph, orthonormal, refuse_priors
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.complex.cycles import loop_deviation
@@ -22,7 +22,6 @@ from hodge_pipeline.solvers.potential import (
     deviation_metrics,
     iterate,
     loops_of,
-    poisson,
     residuals,
     unconverged_notes,
 )
@@ -51,7 +50,7 @@ class PoissonSolver:
     Every step is one scalar sparse factorisation with six right-hand sides. ω is formed around the centroid of each
     connected component: far from the world's origin a little rotation would become much translation, and the result
     would depend on where the origin is. f is taken with mean zero, then the component is moved back as one body, so
-    that its first vertex keeps its pose exactly.
+    that its first vertex keeps its pose exactly. Fixed vertices have f = 0, and a component with one is not moved back.
 
     With a robust kernel the edges are first reweighted (IRLS) by steps from the start poses; then the weights are
     frozen and the reported iterations begin at the start poses again. So the loop deviation D in the history falls
@@ -99,10 +98,11 @@ class PoissonSolver:
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """Consistent poses; a graph of several components is solved piece by piece, isolated vertices keep their pose.
 
-        Raises `GraphError` for motions or information that are not finite, and for an empty graph.
+        Raises `GraphError` for motions that are not finite and rigid, for an empty graph, and for priors.
         """
         world_from_cam = np.asarray(world_from_cam, float)
         check_graph(graph, world_from_cam)
+        refuse_priors(graph, "poisson")
         base_weights, notes = edge_weights(graph, self.weights, self.lever_arm_m)
         proper = graph.edges[:, 0] != graph.edges[:, 1]
         used = proper & (base_weights > 0)
@@ -138,7 +138,7 @@ class PoissonSolver:
         if len(problem.edges) == 0:
             return ()
         total = problem.base_weights * weights
-        potential = poisson(problem.d0, total, problem.component)
+        potential = problem.poisson(problem.d0, total)
         return iterate(problem, self.log, potential, total, around_loops, self.inner_iterations, self.tolerance)
 
     def _robust_weights(self, problem: _Problem) -> tuple[Floats, float]:
@@ -149,7 +149,7 @@ class PoissonSolver:
         poses, scale = problem.start, float("nan")
         for _ in range(self.reweighting_steps):
             total = problem.base_weights * weights
-            correction = poisson(problem.d0, total, problem.component)(problem.form(poses, self.log))
+            correction = problem.poisson(problem.d0, total)(problem.form(poses, self.log))
             poses = problem.moved(poses, correction, self.log)
             residual = self._displacement(problem, poses)
             scale = self.scale_m or _robust_scale(residual)
@@ -165,7 +165,7 @@ class PoissonSolver:
 
     def _convergence_notes(self, problem: _Problem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
         if not history:
-            return ("no edge joins two vertices: every pose is as it was at the start",)
+            return (NO_EDGES,)
         return (*problem.half_turn_notes(self.log), *unconverged_notes(history))
 
 
@@ -179,6 +179,7 @@ def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam
         base_weights=base_weights[used],
         d0=coboundary_0(edges, graph.vertex_count),
         component=component,
+        fixed=graph.fixed,
         start=orthonormal(shifted(world_from_cam, -offset)),
         offset=offset,
         start_in_world=world_from_cam,

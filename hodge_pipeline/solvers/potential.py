@@ -12,7 +12,6 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.coboundary import grounded_laplacian
-from hodge_pipeline.complex.components import first_of_component
 from hodge_pipeline.complex.cycles import (
     adjusted_edges,
     fundamental_products,
@@ -23,6 +22,7 @@ from hodge_pipeline.complex.cycles import (
 from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
 from hodge_pipeline.complex.one_form import Logarithm, residual_form, shifted
 from hodge_pipeline.solvers.linear import factorise
+from hodge_pipeline.solvers.problem import pinned_vertices
 from hodge_pipeline.types import Floats, Ints, SolverIteration
 
 STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
@@ -40,6 +40,7 @@ class CentredProblem:
     edges: Ints
     i_from_j: Floats
     component: Ints
+    fixed: Ints
     start: Floats
     offset: Floats
     start_in_world: Floats
@@ -49,15 +50,19 @@ class CentredProblem:
         return residual_form(self.edges, self.i_from_j, poses, log)
 
     def in_world(self, poses: Floats) -> Floats:
-        """The poses away from the centroid again; first vertices are those of the start to the last bit."""
+        """The poses away from the centroid again; held vertices are those of the start to the last bit."""
         out = shifted(poses, self.offset)
-        gauge = first_of_component(self.component)
-        out[gauge] = self.start_in_world[gauge]
+        held = pinned_vertices(self.component, self.fixed)
+        out[held] = self.start_in_world[held]
         return out
 
     def moved(self, poses: Floats, correction: Floats, log: Logarithm) -> Floats:
-        """`exp(f_k) T_k` (V, 4, 4), then each component as one body, so that its first vertex is at its start."""
-        return moved(poses, correction, self.start, self.component, log)
+        """`exp(f_k) T_k` (V, 4, 4), with the held vertices at their start; see `moved`."""
+        return moved(poses, correction, self.start, self.component, self.fixed, log)
+
+    def poisson(self, d0: csr_matrix, weights: Floats) -> Callable[[Floats], Floats]:
+        """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω` (Eq. (7)); see `poisson`."""
+        return poisson(d0, weights, self.component, self.fixed)
 
     def half_turn_notes(self, log: Logarithm) -> tuple[str, ...]:
         """How many edges disagree with the start so much that their ω is ambiguous."""
@@ -125,14 +130,16 @@ def unconverged_notes(history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
     return (f"not converged: step {len(history)} still moved the poses by {step:.2g}: more inner_iterations",)
 
 
-def poisson(d0: csr_matrix, weights: Floats, component: Ints) -> Callable[[Floats], Floats]:
-    """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω`, of mean zero on each component (V,) (Eq. (7)).
+def poisson(d0: csr_matrix, weights: Floats, component: Ints, fixed: Ints) -> Callable[[Floats], Floats]:
+    """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω` (Eq. (7)).
 
+    f is 0 at the fixed vertices (rows), and of mean zero on each component (V,) that has none.
     The Laplacian is factorised once; six right-hand sides are solved at a time.
     """
-    gauge = first_of_component(component)
+    gauge = pinned_vertices(component, fixed)
     factor = factorise(grounded_laplacian(d0, weights, gauge))
-    count = np.bincount(component)[:, None]
+    count = np.bincount(component)[:, None].astype(float)
+    count[component[fixed]] = np.inf
 
     def solve(omega: Floats) -> Floats:
         divergence = d0.T @ (weights[:, None] * omega)
@@ -144,13 +151,18 @@ def poisson(d0: csr_matrix, weights: Floats, component: Ints) -> Callable[[Float
     return solve
 
 
-def moved(poses: Floats, correction: Floats, start: Floats, component: Ints, log: Logarithm) -> Floats:
-    """`exp(f_k) T_k` (V, 4, 4), then each component as one body, so that its first vertex is at its start exactly."""
+def moved(poses: Floats, correction: Floats, start: Floats, component: Ints, fixed: Ints, log: Logarithm) -> Floats:
+    """`exp(f_k) T_k` (V, 4, 4), then each component without a fixed vertex as one body, so that its first vertex is at
+    its start exactly, as the fixed vertices (rows) are.
+    """
     motion = se3.pairing_exp(correction) if log == "pairing" else se3.exp(correction)
     out = motion @ poses
     _, first = np.unique(component, return_index=True)
-    out = np.asarray((start[first] @ se3.inverse(out[first]))[component] @ out)
-    out[first] = start[first]
+    body = np.asarray(start[first] @ se3.inverse(out[first]))
+    body[component[fixed]] = np.eye(4)
+    out = np.asarray(body[component] @ out)
+    gauge = pinned_vertices(component, fixed)
+    out[gauge] = start[gauge]
     return out
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from hodge_pipeline.complex.checks import check_motions
+from hodge_pipeline.complex.components import by_size
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, ViewGraph
 
@@ -15,7 +17,7 @@ def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: In
     """The graph with the world as its last vertex, held at the identity, and start poses (V + 1, 4, 4).
 
     Without a start every vertex begins at the world's origin, which only a descent from given poses would heed.
-    Raises `GraphError` where a prior names no vertex.
+    Raises `GraphError` where a prior names no vertex, or holds no motion.
     """
     vertices, count = np.asarray(priors.vertices, np.int64), graph.vertex_count
     outside = (vertices < 0) | (vertices >= count)
@@ -23,6 +25,8 @@ def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: In
         raise GraphError(
             f"prior {np.argmax(outside)} names vertex row {vertices[np.argmax(outside)]} of {count}: mend it"
         )
+    names = graph.vertex_ids[vertices]
+    check_motions(priors.world_from_vertex, "priors", lambda row: f"prior {row} (vertex {names[row]})")
     added = ViewGraph.from_edges(
         np.arange(count + 1),
         np.column_stack([np.full(len(vertices), count), vertices]),
@@ -57,12 +61,11 @@ def _unused(graph: ViewGraph) -> object:
 
 def without_world(solution: Solution, graph: ViewGraph) -> Solution:
     """The solution of the graph alone; the components are those that edges and priors together join."""
-    _, component = np.unique(solution.component[:-1], return_inverse=True)
     history = tuple(replace(step, world_from_cam=step.world_from_cam[:-1]) for step in solution.history)
     return replace(
         solution,
         world_from_cam=solution.world_from_cam[:-1],
-        component=component.reshape(-1).astype(np.int64),
+        component=by_size(solution.component[:-1]),
         weights=solution.weights[: graph.edge_count],
         history=history,
     )

@@ -14,12 +14,14 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
+from hodge_pipeline.solvers.confirmation import confirmed
 from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.minimise import descend_isotropic
 from hodge_pipeline.solvers.newton import Limits, Point
 from hodge_pipeline.solvers.objective import residuals
-from hodge_pipeline.solvers.setup import NO_ROWS, Setup, prepare
+from hodge_pipeline.solvers.options import check_choice, check_positive
+from hodge_pipeline.solvers.setup import Setup, held_rows, prepare
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 Kernel: TypeAlias = Literal["truncated", "geman_mcclure"]
@@ -52,6 +54,7 @@ def solve_robust(
     graph: ViewGraph,
     *,
     start: Floats | None = None,
+    confidence: Floats | None = None,
     kernel: Kernel = "truncated",
     threshold: float | None = None,
     objective: ObjectiveName = "full",
@@ -61,20 +64,32 @@ def solve_robust(
     """The poses of the edges that agree, with `weights` 1 for those and 0 for the others (between, for Geman–McClure).
 
     `threshold`: an edge is wrong where its χ² with isotropic weights exceeds this; None takes the 99 % quantile of
-    right edges. The graph's fixed vertices stay at their start. The components are those of the edges that are kept.
+    right edges. `confidence (E,)`, above 0: what share of its information an edge weighs, and of its weight in the
+    solution; the threshold is for its χ² with all of it. The graph's fixed vertices stay at their start. The
+    components are those of the edges that are kept. `confirmed` is False where edges are left out and the cycles
+    of those kept close no better than by chance.
     """
-    setup = prepare(graph, start, NO_ROWS if start is None else graph.fixed, dimension)
+    check_choice("kernel", kernel, Kernel)
+    check_choice("objective", objective, ObjectiveName)
+    if threshold is not None:
+        check_positive("threshold", threshold, "χ²")
+    start = None if start is None else np.asarray(start, float)
+    fixed, unheld = held_rows(graph, start)
+    setup = prepare(graph, start, fixed, dimension)
     limit = threshold or (CHI2_99_PLANAR if setup.dimension == 2 else CHI2_99_SPATIAL)
     problem = setup.problem
     # the isotropic objective counts a rotation of θ as 2 κ θ²; in the plane κ is the information itself, so twice
     setup = replace(setup, problem=replace(problem, kappa=problem.kappa / 2)) if setup.dimension == 2 else setup
     corruption = _corruption(graph, setup, limit)
-    tried = [end for spread in TRUST_SPREADS for end in _ends(setup, _trust(corruption, spread), limit, kernel)]
-    last = min(tried, key=lambda end: float(np.minimum(_squares(setup, end.point), limit).sum()))
+    say = np.ones(graph.edge_count) if confidence is None else np.asarray(confidence, float)
+    search = _Search(setup, say[setup.weights.used], limit, kernel)
+    tried = [end for spread in TRUST_SPREADS for end in search.ends(_trust(corruption, spread))]
+    last = min(tried, key=lambda end: search.truncated_cost(end.point))
     tested = int((~np.isnan(corruption)).sum())
     weights = np.zeros(graph.edge_count)
     weights[setup.weights.used] = np.round(last.weights) if kernel == "truncated" else last.weights
-    kept = np.flatnonzero(weights > LEAST_WEIGHT)
+    weights = np.where(weights > LEAST_WEIGHT, weights * say, 0.0)
+    kept = np.flatnonzero(weights)
     chosen = graph.select(kept)
     chosen = replace(chosen, information=weights[kept, None, None] * chosen.information)
     final = solve(
@@ -83,15 +98,30 @@ def solve_robust(
         initial="given" if graph.priors is None else "chordal",
         objective=objective,
         dimension=2 if setup.dimension == 2 else 3,
+        fixed=fixed,
         certificate=certificate,
     )
     notes = (
+        *unheld,
         *(note for note in setup.weights.notes if note not in final.notes),
         f"{len(kept)} of {graph.edge_count} edges kept; short cycles test {tested} of them all",
         *final.notes,
     )
     metrics = {**final.metrics, "kept_edges": float(len(kept)), "tested_edges": float(tested)}
-    return replace(final, weights=weights, notes=notes, metrics=metrics)
+    return _with_confirmation(graph, replace(final, weights=weights, notes=notes, metrics=metrics), setup)
+
+
+def _with_confirmation(graph: ViewGraph, solution: Solution, setup: Setup) -> Solution:
+    """The solution that says whether anything confirms it."""
+    left_out = int((setup.weights.used & (solution.weights == 0)).sum())
+    if confirmed(graph, np.flatnonzero(solution.weights)):
+        return replace(solution, confirmed=True)
+    if left_out:
+        why = f"{left_out} edges are left out, and the cycles of the others close no better than by chance"
+        note = f"{why}: nothing confirms the poses"
+        return replace(solution, confirmed=False, notes=(note, *solution.notes))
+    note = "no edge is left out, and no cycles close better than by chance: nothing tests the edges"
+    return replace(solution, notes=(*solution.notes, note))
 
 
 def _corruption(graph: ViewGraph, setup: Setup, limit: float) -> Floats:
@@ -107,53 +137,77 @@ def _trust(corruption: Floats, spread: float) -> Floats:
     return np.where(np.isnan(corruption), UNTESTED_WEIGHT, weights)
 
 
-def _ends(setup: Setup, trust: Floats, limit: float, kernel: Kernel) -> list[_Round]:
-    """Where the rounds lead from the edges trusted first.
-
-    The smooth kernel seldom loses right edges, but keeps more of the wrong ones: so its end, truncated, is tried too.
+@dataclass(frozen=True)
+class _Search:
+    """Rounds of weighted solves: a used edge weighs `confidence (used edges,)` of its information at the most, and its
+    χ² with all of it is held against the limit.
     """
-    start = _solved(setup, trust, None)
-    smooth = _graduate(setup, trust, start, limit, "geman_mcclure")
-    if kernel == "geman_mcclure":
-        return [smooth]
-    return [_graduate(setup, trust, start, limit, kernel), _truncated_after(setup, smooth, limit)]
 
+    setup: Setup
+    confidence: Floats
+    limit: float
+    kernel: Kernel
 
-def _truncated_after(setup: Setup, smooth: _Round, limit: float) -> _Round:
-    """The end of rounds with weights 0 and 1 from there."""
-    weights, point = smooth.weights, smooth.point
-    for _ in range(MAX_ROUNDS):
-        new = _truncated(_squares(setup, point), limit, math.inf)
-        if np.array_equal(new, weights):
-            break
-        weights, point = new, _solved(setup, new, point)
-    return _Round(point, weights)
+    def ends(self, trust: Floats) -> list[_Round]:
+        """Where the rounds lead from the edges trusted first.
 
+        The smooth kernel seldom loses right edges, but keeps more of the wrong ones: so its end, truncated, is tried
+        too.
+        """
+        start = self._solved(trust, None)
+        smooth = self._graduate(trust, start, "geman_mcclure")
+        if self.kernel == "geman_mcclure":
+            return [smooth]
+        return [self._graduate(trust, start, self.kernel), self._truncated_after(smooth)]
 
-def _graduate(setup: Setup, trust: Floats, point: Point, limit: float, kernel: Kernel) -> _Round:
-    """Rounds of weighted solves in which the kernel goes from convex to its final shape."""
-    squares = _squares(setup, point)
-    seen = np.average(squares, weights=np.maximum(trust, WEIGHT_FLOOR))
-    worst = float(max(np.max(squares[trust > KEPT_FROM], initial=0.0), seen))
-    control = limit / (2 * worst - limit) if worst > limit else math.inf
-    if kernel == "geman_mcclure":
-        control = max(2 * worst / limit, 1.0)
-    weights = trust
-    for _ in range(MAX_ROUNDS):
-        new = _truncated(squares, limit, control) if kernel == "truncated" else _geman_mcclure(squares, limit, control)
-        point = _solved(setup, new, point)
-        squares = _squares(setup, point)
-        settled = np.abs(new - weights).max(initial=0.0) < SETTLED[kernel]
-        weights = new
-        if kernel == "truncated":
-            control *= STEP
-            if settled and bool(((weights < 1e-3) | (weights > 1 - 1e-3)).all()):
+    def truncated_cost(self, point: Point) -> float:
+        """The cost of the edges, none more than the limit."""
+        return float(self.confidence @ np.minimum(_squares(self.setup, point), self.limit))
+
+    def _truncated_after(self, smooth: _Round) -> _Round:
+        """The end of rounds with weights 0 and 1 from there."""
+        weights, point = smooth.weights, smooth.point
+        for _ in range(MAX_ROUNDS):
+            new = _truncated(_squares(self.setup, point), self.limit, math.inf)
+            if np.array_equal(new, weights):
                 break
-        else:
-            if settled and control <= 1.0:
-                break
-            control = max(control / STEP, 1.0)
-    return _Round(point, weights)
+            weights, point = new, self._solved(new, point)
+        return _Round(point, weights)
+
+    def _graduate(self, trust: Floats, point: Point, kernel: Kernel) -> _Round:
+        """Rounds of weighted solves in which the kernel goes from convex to its final shape."""
+        limit, squares = self.limit, _squares(self.setup, point)
+        seen = np.average(squares, weights=np.maximum(trust, WEIGHT_FLOOR)) if len(squares) else 0.0
+        worst = float(max(np.max(squares[trust > KEPT_FROM], initial=0.0), seen))
+        control = limit / (2 * worst - limit) if worst > limit else math.inf
+        if kernel == "geman_mcclure":
+            control = max(2 * worst / limit, 1.0)
+        weights = trust
+        for _ in range(MAX_ROUNDS):
+            shape = _truncated if kernel == "truncated" else _geman_mcclure
+            new = shape(squares, limit, control)
+            point = self._solved(new, point)
+            squares = _squares(self.setup, point)
+            settled = np.abs(new - weights).max(initial=0.0) < SETTLED[kernel]
+            weights = new
+            if kernel == "truncated":
+                control *= STEP
+                if settled and bool(((weights < 1e-3) | (weights > 1 - 1e-3)).all()):
+                    break
+            else:
+                if settled and control <= 1.0:
+                    break
+                control = max(control / STEP, 1.0)
+        return _Round(point, weights)
+
+    def _solved(self, weights: Floats, point: Point | None) -> Point:
+        """The point that some Newton steps with these weights lead to; the first are from the chordal rotations."""
+        problem = self.setup.problem
+        held = self.confidence * np.maximum(weights, WEIGHT_FLOOR)
+        weighted = replace(self.setup, problem=replace(problem, kappa=held * problem.kappa, tau=held * problem.tau))
+        begin = weighted.initial("chordal") if point is None else (point.rotations, point.translations)
+        limits = Limits(FIRST_STEPS, 1e-3) if point is None else Limits(STEPS_EACH, 1e-6)
+        return descend_isotropic(weighted.problem, begin, limits, weighted.rounding).point
 
 
 def _truncated(squares: Floats, limit: float, control: float) -> Floats:
@@ -167,16 +221,6 @@ def _truncated(squares: Floats, limit: float, control: float) -> Floats:
 def _geman_mcclure(squares: Floats, limit: float, control: float) -> Floats:
     """Weights of the Geman–McClure kernel (Yang et al., equation 12)."""
     return np.asarray((control * limit / (squares + control * limit)) ** 2)
-
-
-def _solved(setup: Setup, weights: Floats, point: Point | None) -> Point:
-    """The point that some Newton steps with these weights lead to, from the chordal rotations where there is none."""
-    held = np.maximum(weights, WEIGHT_FLOOR)
-    problem = replace(setup.problem, kappa=held * setup.problem.kappa, tau=held * setup.problem.tau)
-    weighted = replace(setup, problem=problem)
-    begin = weighted.initial("chordal") if point is None else (point.rotations, point.translations)
-    limits = Limits(FIRST_STEPS, 1e-3) if point is None else Limits(STEPS_EACH, 1e-6)
-    return descend_isotropic(problem, begin, limits, weighted.rounding).point
 
 
 def _squares(setup: Setup, point: Point) -> Floats:

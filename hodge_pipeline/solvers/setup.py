@@ -8,18 +8,20 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.chordal import initial_rotations
 from hodge_pipeline.solvers.newton import Point
 from hodge_pipeline.solvers.objective import gradient, residuals
+from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
 from hodge_pipeline.solvers.rotations import project
-from hodge_pipeline.solvers.weights import Weights, check_graph, edge_weights, is_planar
+from hodge_pipeline.solvers.weights import Weights, edge_weights, is_planar
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 InitialName: TypeAlias = Literal["chordal", "given"]
+DimensionName: TypeAlias = Literal[2, 3, None]
 ROUNDING = 1e-22
 """Of the objective of edges as wrong as they can be: below it, a cost is rounding."""
 NO_ROWS = np.zeros(0, np.int64)
@@ -75,7 +77,7 @@ def prepare(
     graph: ViewGraph,
     start: Floats | None = None,
     fixed: Ints = NO_ROWS,
-    dimension: Literal[2, 3] | None = None,
+    dimension: DimensionName = None,
     backend: BackendName = "auto",
     direct: bool = False,
 ) -> Setup:
@@ -83,12 +85,9 @@ def prepare(
 
     Raises `GraphError` where its numbers cannot be used, or the back end is not installed.
     """
-    check_graph(graph)
-    if start is not None and start.shape != (graph.vertex_count, 4, 4):
-        raise GraphError(f"start poses have shape {start.shape}, expected {(graph.vertex_count, 4, 4)}")
-    if start is not None and not np.isfinite(start).all():
-        row = int(np.argmax(~np.isfinite(start).all(axis=(1, 2))))
-        raise GraphError(f"start pose of vertex {graph.vertex_ids[row]} is not finite: mend it or start without")
+    check_choice("backend", backend, BackendName)
+    check_choice("dimension", dimension, DimensionName)
+    check_graph(graph, start)
     size = (2 if graph.dimension == 2 or is_planar(graph) else 3) if dimension is None else dimension
     weights = edge_weights(graph, size)
     used = graph.edges[weights.used]
@@ -106,6 +105,16 @@ def prepare(
         direct,
     )
     return Setup(weights, size, component, gauge, gauge if start is None else se3.inverse(gauge) @ start, problem)
+
+
+def held_rows(graph: ViewGraph, start: Floats | None, fixed: Ints | None = None) -> tuple[Ints, tuple[str, ...]]:
+    """Rows of the vertices that stay at their start, `fixed` or the graph's; a note where these have no start."""
+    if fixed is not None:
+        return np.asarray(fixed, np.int64), ()
+    if start is not None or not len(graph.fixed):
+        return graph.fixed, ()
+    count = len(graph.fixed)
+    return NO_ROWS, (f"{count} fixed vertices have no pose: the first vertex of each piece is held instead",)
 
 
 def _gauge(component: Ints, fixed: Ints, start: Floats | None) -> Floats:

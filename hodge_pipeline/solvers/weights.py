@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 PLANAR_AXES = np.array([2, 3, 4])
@@ -34,19 +33,6 @@ class Weights:
     used: Bools
     definite: bool
     notes: tuple[str, ...]
-
-
-def check_graph(graph: ViewGraph) -> None:
-    """Raise `GraphError` for the first edge that is no finite motion, has no finite information or names no vertex."""
-    if graph.edge_count and (graph.edges.min() < 0 or graph.edges.max() >= graph.vertex_count):
-        row = int(np.argmax(((graph.edges < 0) | (graph.edges >= graph.vertex_count)).any(axis=1)))
-        raise GraphError(f"edge {row} names vertex row {graph.edges[row].tolist()} of {graph.vertex_count}: mend it")
-    for name, values in (("measurement", graph.i_from_j), ("information", graph.information)):
-        bad = ~np.isfinite(values).all(axis=(1, 2))
-        if bad.any():
-            i, j = graph.vertex_ids[graph.edges[np.argmax(bad)]]
-            count = int(bad.sum())
-            raise GraphError(f"edge {np.argmax(bad)} ({i}, {j}): its {name} is not finite ({count} such): remove it")
 
 
 def is_planar(graph: ViewGraph) -> bool:

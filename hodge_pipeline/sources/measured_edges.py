@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -16,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import FrameReader
-from hodge_pipeline.types import Bools, Candidates, Frame, Ints, Source, ViewGraph
+from hodge_pipeline.types import Bools, Edges, Frame, Ints, Source, ViewGraph
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
@@ -71,7 +70,7 @@ def measured_edges(source: Source, options: MeasuredOptions) -> tuple[ViewGraph,
                 f"{file.path}: no edge is between two frames of {source.path} (ids {frames[0].frame_id}, …): "
                 "set first_frame, or name the vertices as the frames are"
             )
-    found = joined(parts)
+    found = ViewGraph.joined(parts)
     found = replace(found, information=found.information * options.information_scale)
     if found.edge_count:
         counts = ", ".join(f"{count} {name}" for name, count in sorted(Counter(found.source.tolist()).items()))
@@ -79,21 +78,13 @@ def measured_edges(source: Source, options: MeasuredOptions) -> tuple[ViewGraph,
     return found, tuple(notes)
 
 
-def joined(graphs: Sequence[ViewGraph]) -> ViewGraph:
-    """One graph with the edges of all, one graph's after the other's, over the vertices of the first."""
-    shared = ("vertex_ids", "dimension", "fixed", "priors")
-    names = [field.name for field in fields(ViewGraph) if field.name not in shared]
-    columns: dict[str, Any] = {name: np.concatenate([getattr(graph, name) for graph in graphs]) for name in names}
-    return replace(graphs[0], **columns)
-
-
-def without_measured(candidates: Candidates, measured: ViewGraph) -> Candidates:
+def without_measured(candidates: Edges, measured: ViewGraph) -> Edges:
     """The candidates of pairs that are not measured already, in either direction."""
     known = {(min(i, j), max(i, j)) for i, j in measured.edges.tolist()}
     if not known:
         return candidates
     kept = np.array([(i, j) not in known for i, j in candidates.pairs.tolist()], bool)
-    return Candidates(candidates.pairs[kept], candidates.source[kept], candidates.overlap[kept])
+    return candidates.select(kept)
 
 
 def digest(graph: ViewGraph) -> str:
@@ -118,6 +109,12 @@ def _between_frames(
     lost = int((~good).sum())
     if lost:
         notes.append(f"{name}: {lost} of {graph.edge_count} measured edges left out: they are not between two frames")
+    known = 0 if graph.priors is None else len(graph.priors.vertices)
+    if known or len(graph.fixed):
+        notes.append(
+            f"{name}: its {len(graph.fixed)} fixed vertices and {known} priors have no part in a run: "
+            "hodge solve heeds them"
+        )
     over_frames = replace(graph.select(good), edges=rows[good], vertex_ids=_no_edges(frames).vertex_ids)
     return replace(over_frames, dimension=3, fixed=np.zeros(0, np.int64))
 

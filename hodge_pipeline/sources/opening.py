@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import uuid
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +12,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe import recipe_file
 from hodge_pipeline.sources.inspect import Guess, guess_reader, guesses
 from hodge_pipeline.sources.unknown import without_frames
-from hodge_pipeline.stages import FrameReader
-from hodge_pipeline.store.job import source_key
+from hodge_pipeline.stages import FrameReader, Steps
 from hodge_pipeline.types import Source
 
 SURE = 0.6
@@ -20,8 +21,18 @@ MARGIN = 0.2
 """How much surer it must be than the reader of the recipe."""
 
 
-def open_source(path: Path, reader: FrameReader | None) -> tuple[Source, str]:
-    """The source at a path and its key; without a reader, by the surest.
+def remembered(source: Source, reader: FrameReader | None, steps: Steps) -> Source:
+    """The source, for which name, size and time of each of its files, and the reader's options, stand in keys.
+
+    A source that no reader opened is in memory and cannot be told from its like: no other run has its key.
+    """
+    files = [(str(path), status.st_size, status.st_mtime_ns) for path in source.files for status in [os.stat(path)]]
+    steps.remember(source, uuid.uuid4().hex if reader is None else steps.key([files, reader]))
+    return source
+
+
+def open_source(path: Path, reader: FrameReader | None) -> tuple[Source, FrameReader]:
+    """The source at a path and the reader that opened it; without a reader, the surest.
 
     Where another reader is much surer of the path than this one, the error (`SourceError`), or else a note, names it
     and the recipe for it.
@@ -38,7 +49,7 @@ def open_source(path: Path, reader: FrameReader | None) -> tuple[Source, str]:
     if likelier is not None:
         read_as = f"read as {registry.name_of(chosen)}, but it looks like {_described(likelier)}"
         source = replace(source, notes=(*source.notes, f"{read_as}: {_remedy(likelier.name, path)}"))
-    return source, source_key(source, chosen)
+    return source, chosen
 
 
 def _likelier(path: Path, chosen: FrameReader) -> Guess | None:

@@ -1,87 +1,162 @@
-"""A run that starts from given poses: which they are, its key frames, and how it begins between sparse ones."""
+"""First poses that another program made: matched to the frames, between sparse ones carried by odometry."""
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import RecipeError, SourceError
-from hodge_pipeline.refine.correction import spread_correction
-from hodge_pipeline.refine.given_poses import Given, Matched, match_poses, own_poses
-from hodge_pipeline.refine.key_frames import choose_key_frames
-from hodge_pipeline.registration import clouds as cloud_stage
-from hodge_pipeline.registration import odometry as odometry_stage
-from hodge_pipeline.rounds import Round, sequences_of
+from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.odometry import OdometryOptions
+from hodge_pipeline.scene import (
+    START,
+    GivenFile,
+    KeyFrames,
+    Round,
+    Scene,
+    key_source,
+    sequence_numbers,
+    sequences_of,
+    vertex_ids,
+)
+from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guess_reader
-from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.job import Job
-from hodge_pipeline.store.workspace import key_of
-from hodge_pipeline.types import Floats, Source, Trajectory, ViewGraph
+from hodge_pipeline.stages import Steps, Workers
+from hodge_pipeline.start.choose_key_frames import choose_key_frames
+from hodge_pipeline.start.clouds import make_clouds
+from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_poses
+from hodge_pipeline.start.odometry import OPTIONS, chain
+from hodge_pipeline.types import Edges, Floats, Source, Trajectory
 
 SAME_M = 1e-6
+"""Metres: poses of a file that are this near the frames' own are the frames' own."""
 
 
-def given_poses(job: Job, source: Source) -> Given:
-    """The poses that the recipe starts from, for every frame, and the key frames.
+@dataclass(frozen=True, config=OPTIONS)
+class GivenStart:
+    """Starts from the poses of another program, and registers key frames among the frames."""
 
-    Raises `RecipeError` where no file is named, `SourceError` where its poses are not of these frames.
+    poses: Literal["frames", "file"] = Field(
+        default="file", description="frames: the source's own poses; file: those of `path`"
+    )
+    path: Path | None = Field(default=None, description="a trajectory of any format that a reader opens")
+    match: Match = Field(
+        default="auto",
+        description="how a frame finds its pose in the file: stamp, between two poses; number, that of the frame; row, "
+        "the n-th pose is that of the n-th frame; auto: the first of these that fits",
+    )
+    max_gap_s: float = Field(
+        default=0.1,
+        ge=0,
+        description="seconds to the poses around a frame's stamp; frames with a wider gap, between the sparse poses of "
+        "key frames, are carried over it by odometry",
+    )
+    odometry: OdometryOptions = Field(default=OdometryOptions(), description="between sparse poses")
+    distance_m: float = Field(
+        default=0.1, ge=0, description="metres from the last key frame at which a frame becomes one; 0: every frame"
+    )
+    angle_deg: float = Field(default=8.0, ge=0, description="degrees, likewise")
+    every: int = Field(
+        default=5,
+        ge=0,
+        description="frames: every such frame of a sequence is a key frame, however little it moved, since given poses "
+        "can jump where their maker joined two pieces; 0: none for that reason",
+    )
+
+    def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
+        """The key frames at their given poses, without an edge yet.
+
+        Raises `RecipeError` where no file is named, `SourceError` where its poses are not of these frames.
+        """
+        matched, file = self._matched(source, steps)
+        known = np.isfinite(matched.world_from_cam).all(axis=(1, 2))
+        steps.note(
+            f"{int(known.sum())} of {len(source.frames)} frames have a given pose, by {matched.how}; "
+            f"{len(matched.pose_times)} poses given"
+        )
+        poses = matched.world_from_cam
+        if not known.all():
+            poses = self._bridged(source, matched, clouds, steps, workers)
+        rows = choose_key_frames(
+            poses, list(sequences_of(source).values()), self.distance_m, self.angle_deg, self.every
+        )
+        steps.note(f"{len(rows)} of {len(source.frames)} frames are key frames")
+        whole = without_truth(source, poses, rows, own=self.poses == "frames")
+        count = len(poses)
+        key_frames = KeyFrames(
+            rows=rows,
+            first=poses,
+            world_from_key=poses[rows],
+            part=np.zeros(count, np.int64),
+            times=matched.frame_times,
+            found=np.ones(count, bool),
+            stamps_s=matched.frame_times,
+            sequence=sequence_numbers(source),
+            key_of_frame=np.clip(np.searchsorted(rows, np.arange(count), side="right") - 1, 0, None),
+        )
+        keys = replace(key_source(whole, rows), graph=None)
+        steps.remember(keys, steps.key([steps.key(source), rows, poses]))
+        made = make_clouds(keys, clouds, steps, workers)
+        first = Round(Edges.of([]), vertex_ids(keys), poses[rows], name=START)
+        return Scene(whole, keys, key_frames, made, first, is_given=True, given=file)
+
+    def _matched(self, source: Source, steps: Steps) -> tuple[Matched, GivenFile | None]:
+        if self.poses == "frames":
+            matched = own_poses(source.frames)
+            if not len(matched.pose_times):
+                raise SourceError(f"{source.path}: its frames have no poses: give a file of them (start.path)")
+            return matched, None
+        if self.path is None:
+            raise RecipeError("start.path: no file of poses named: give one, or set start.poses to frames")
+        trajectory = _trajectory(self.path, steps)
+        matched = match_poses(trajectory, source.frames, self.match, self.max_gap_s, str(self.path))
+        return matched, GivenFile(self.path, trajectory, matched.pose_times)
+
+    def _bridged(
+        self, source: Source, matched: Matched, clouds: CloudOptions, steps: Steps, workers: Workers
+    ) -> Floats:
+        """A pose for every frame: between the given ones the odometry's, bent so that it meets them.
+
+        Where frames of a sequence have no given pose at all, the correction of the nearest given pose holds.
+        """
+        known = np.flatnonzero(np.isfinite(matched.world_from_cam).all(axis=(1, 2)))
+        times = np.arange(len(source.frames), dtype=float)
+        steps.note(
+            f"{len(times) - len(known)} frames without a given pose are carried from the nearest ones by odometry"
+        )
+        every = make_clouds(source, clouds, steps, workers)
+        sequences, stamps = tuple(sequences_of(source).values()), np.array([f.stamp_s for f in source.frames])
+        title = "poses between the given ones"
+        found = steps.step(
+            chain, every, sequences, stamps, self.odometry, title=title, total=len(times), workers=workers
+        )
+        odometry = found.world_from_cam
+        return spread_correction(times, odometry, times[known], odometry[known], matched.world_from_cam[known])
+
+
+def without_truth(source: Source, poses: Floats, rows: np.ndarray, *, own: bool) -> Source:
+    """The source; its frames' own poses are no truth to compare with where the run starts from them.
+
+    Nor are they where a file holds the very poses that the frames have, as a SLAM system's log beside its images.
     """
-    options = job.recipe.given
-    path, trajectory = None, None
-    if options.poses == "frames":
-        matched = own_poses(source.frames)
-        if not len(matched.pose_times):
-            raise SourceError(f"{source.path}: its frames have no poses: give a file of them (given.path)")
-    else:
-        path = options.path
-        if path is None:
-            raise RecipeError("given.path: no file of poses named: give one, or set given.poses to frames")
-        trajectory = _trajectory(job, path)
-        matched = match_poses(trajectory, source.frames, options, str(path))
-    known = np.isfinite(matched.world_from_cam).all(axis=(1, 2))
-    _tell(job, matched, int(known.sum()), len(source.frames))
-    poses = matched.world_from_cam if known.all() else _bridged(job, source, matched)
-    rows = choose_key_frames(poses, list(sequences_of(source).values()), job.recipe.key_frames)
-    job.note(f"{len(rows)} of {len(source.frames)} frames are key frames")
-    job.keys["source"] = key_of(job.keys["source"], rows.tolist(), digest(poses))
-    return Given(source, poses, rows, matched.frame_times, matched.pose_times, path, trajectory)
-
-
-def first_poses(job: Job, given: Given, source: Source) -> Round:
-    """Round 0: the given poses of the key frames, with no edge yet."""
-    poses = given.world_from_cam[given.key_rows]
-    with job.stage("start", "given poses", 1, digest(poses), ("clouds",)) as (_, advance):
-        advance(1)
-    ids = np.array([frame.frame_id for frame in source.frames])
-    none = ViewGraph.from_edges(ids, np.zeros((0, 2), np.int64), np.zeros((0, 4, 4)))
-    return Round(none, poses, name="start")
-
-
-def key_source(given: Given, own: bool) -> Source:
-    """The key frames as a source. Where the run starts from the frames' `own` poses these are no truth to compare with.
-
-    Nor are they where the file holds the very poses that the frames have, as a SLAM system's log beside its images.
-    """
-    frames = tuple(given.whole.frames[row] for row in given.key_rows)
-    poses = given.world_from_cam[given.key_rows]
-    same = [
-        frame.world_from_cam is not None and np.abs(frame.world_from_cam - pose).max() < SAME_M
-        for frame, pose in zip(frames, poses, strict=True)
-    ]
+    given = [(source.frames[row].world_from_cam, poses[row]) for row in rows]
+    same = [known is not None and np.abs(known - pose).max() < SAME_M for known, pose in given]
     if own or sum(same) > len(same) / 2:
-        frames = tuple(replace(frame, world_from_cam=None) for frame in frames)
-    return replace(given.whole, frames=frames, graph=None)
+        return replace(source, frames=tuple(replace(frame, world_from_cam=None) for frame in source.frames))
+    return source
 
 
-def _trajectory(job: Job, path: Path) -> Trajectory:
+def _trajectory(path: Path, steps: Steps) -> Trajectory:
     opened = guess_reader(path).open(path)
     if opened.graph is not None and opened.graph.edge_count:
         raise SourceError(f"{path}: a graph of measured edges, which needs no frames: give it to hodge solve")
     for note in opened.notes:
-        job.note(f"{path.name}: {note}")
+        steps.note(f"{path.name}: {note}")
     if opened.trajectory is not None:
         return opened.trajectory
     posed = [(frame.stamp_s, frame.world_from_cam) for frame in opened.frames if frame.world_from_cam is not None]
@@ -91,39 +166,3 @@ def _trajectory(job: Job, path: Path) -> Trajectory:
     if (np.diff(stamps) <= 0).any():
         raise SourceError(f"{path}: several sequences with stamps of their own: give one sequence's poses")
     return Trajectory(stamps, np.array([pose for _, pose in posed]))
-
-
-def _tell(job: Job, matched: Matched, known: int, frames: int) -> None:
-    job.note(f"{known} of {frames} frames have a given pose, by {matched.how}; {len(matched.pose_times)} poses given")
-
-
-def _bridged(job: Job, source: Source, matched: Matched) -> Floats:
-    """A pose for every frame: between the given ones the odometry's, bent so that it meets them.
-
-    Where frames of a sequence have no given pose at all, the correction of the nearest given pose holds.
-    """
-    missing = np.flatnonzero(~np.isfinite(matched.world_from_cam).all(axis=(1, 2)))
-    job.note(f"{len(missing)} frames without a given pose are carried from the nearest ones by odometry")
-    clouds, options = job.recipe.clouds, job.recipe.odometry
-    stamps = np.array([frame.stamp_s for frame in source.frames])
-    given_key = digest(matched.world_from_cam)
-    stage = job.stage("bridge", "poses between the given ones", len(stamps), (clouds, options, given_key), ("source",))
-    with stage as (folder, advance):
-        if not folder.finished:
-            with job.recipe.executor.open() as workers:
-                made, _ = cloud_stage.prepare_clouds(source.frames, clouds, workers)
-                made.save(folder.path)
-                sequences = list(sequences_of(source).values())
-                found = odometry_stage.odometry(folder.path, sequences, stamps, options, workers, advance)
-            for note in found.notes:
-                job.note(note)
-            artifacts.save_arrays(folder.path / "poses.npz", {"world_from_cam": found.world_from_cam})
-    odometry = artifacts.load_arrays(job.path("bridge") / "poses.npz")["world_from_cam"]
-    known = np.setdiff1d(np.arange(len(stamps)), missing)
-    given = matched.world_from_cam[known]
-    return spread_correction(np.arange(len(stamps), dtype=float), odometry, known.astype(float), odometry[known], given)
-
-
-def digest(poses: Floats) -> str:
-    """A short name of these very numbers."""
-    return hashlib.sha256(np.ascontiguousarray(poses).tobytes()).hexdigest()

@@ -15,7 +15,7 @@ from typing import IO, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.types import Solution, SolverIteration
+from hodge_pipeline.types import Edges, Solution, SolverIteration
 
 T = TypeVar("T")
 
@@ -102,12 +102,25 @@ def load(path: Path, cls: type[T]) -> T:
     return cls(**{name: array.item() if array.ndim == 0 else array for name, array in arrays.items()})
 
 
+def save_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic]) -> None:
+    """Write a round's edges with the names of the vertices."""
+    save_arrays(path, {"vertex_ids": vertex_ids, **vars(edges)})
+
+
+def load_edges(path: Path) -> tuple[Edges, NDArray[np.generic]]:
+    """The edges and the names of the vertices that `save_edges` wrote."""
+    arrays: dict[str, NDArray[Any]] = load_arrays(path)
+    vertex_ids = arrays.pop("vertex_ids")
+    return Edges(**arrays), vertex_ids
+
+
 def save_solution(path: Path, solution: Solution) -> None:
     """Write a solution with its history."""
     history = solution.history
     text = {
         "metrics": dict(solution.metrics),
         "notes": list(solution.notes),
+        "confirmed": solution.confirmed,
         "history": [{"objective": step.objective, "metrics": dict(step.metrics)} for step in history],
     }
     poses = np.array([step.world_from_cam for step in history]).reshape(-1, *solution.world_from_cam.shape)
@@ -138,6 +151,7 @@ def load_solution(path: Path) -> Solution:
         ),
         metrics={name: _number(value) for name, value in text["metrics"].items()},
         notes=tuple(text["notes"]),
+        confirmed=text.get("confirmed"),
     )
 
 

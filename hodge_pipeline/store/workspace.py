@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,9 +22,9 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, N
 """What the system says when a file cannot be written; None is numpy's own short write."""
 
 
-def key_of(*parts: Any) -> str:
-    """The key of a stage: a hash of its resolved options, versions and the keys of its inputs."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
+def identity_of(folder: Path) -> str:
+    """A name of the run in a folder that stays the same when it is resumed."""
+    return hashlib.sha256((folder / RECIPE_FILE).read_bytes()).hexdigest()[:32]
 
 
 def is_run_folder(path: Path) -> bool:
@@ -35,26 +32,11 @@ def is_run_folder(path: Path) -> bool:
     return (path / RECIPE_FILE).is_file() and (path / RUN).is_dir()
 
 
-@dataclass(frozen=True)
-class StageFolder:
-    """Where one stage's artifacts lie. `finished`: read `path`; else write into `path`, which commits on leaving."""
-
-    path: Path
-    key: str
-    finished: bool
-
-    @property
-    def info(self) -> dict[str, Any]:
-        """What was noted of a finished stage (`Workspace.stage` writes the key, the caller may add its cost)."""
-        return dict(artifacts.read_json(self.path / KEY_FILE)) if self.finished else {}
-
-
 class Workspace:
     """One run folder, held by one process at a time.
 
-    `stages/<name>` holds a finished stage, `stages/<name>.part` one that was begun; a part is continued when its key
-    is still the same. Everything else in the folder is for people. `kind` is what `stages` is called: what runs and
-    what refines a model never share a folder.
+    Its steps lie in the folder `stages` (see `Store`); everything else is for people. `kind` is what `stages` is
+    called: what runs and what refines a model never share a folder.
     """
 
     def __init__(self, folder: Path, lock: IO[str], kind: str = RUN) -> None:
@@ -74,8 +56,10 @@ class Workspace:
         """The run folder for this recipe, made if it is not there.
 
         Raises `WorkspaceError` where the folder is something else, belongs to another recipe (without `overwrite`;
-        `refusal` then says so, with the first `{change}`) or is in use.
+        `refusal` then says so, with the first `{change}`), holds a symbolic link or is in use.
         """
+        if (folder / RECIPE_FILE).exists():
+            _refuse_links(folder)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             lock = (folder / ".lock").open("a+")
@@ -102,9 +86,9 @@ class Workspace:
         return cls.open(folder, recipe, refusal=refusal)
 
     @property
-    def identity(self) -> str:
-        """A name of this run that stays the same when it is resumed."""
-        return key_of((self.folder / RECIPE_FILE).read_text("utf-8"))
+    def steps(self) -> Path:
+        """The folder of the steps."""
+        return self.folder / self.kind
 
     def close(self) -> None:
         """Let another process have the folder."""
@@ -116,43 +100,11 @@ class Workspace:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def is_finished(self, name: str, key: str) -> bool:
-        """Whether the stage is there under its key."""
-        return _key_at(self.path(name)) == key
-
-    def path(self, name: str) -> Path:
-        """Where the artifacts of a finished stage lie."""
-        return self.folder / self.kind / name
-
-    @contextmanager
-    def stage(self, name: str, key: str) -> Iterator[StageFolder]:
-        """The folder of one stage under its key; what the body writes is committed when it leaves without an error.
-
-        A full disk raises `WorkspaceError`; what other stages finished stays.
-        """
-        path = self.path(name)
-        if _key_at(path) == key:
-            yield StageFolder(path, key, finished=True)
-            return
-        part = path.with_name(f"{name}.part")
-        with _disk_errors(part):
-            if _key_at(part) != key:
-                shutil.rmtree(part, ignore_errors=True)
-                part.mkdir(parents=True)
-                artifacts.write_json(part / KEY_FILE, {"key": key})
-            yield StageFolder(part, key, finished=False)
-            shutil.rmtree(path, ignore_errors=True)
-            os.replace(part, path)
-
-    def note(self, name: str, info: dict[str, Any]) -> None:
-        """Add facts (cost, versions) to a finished stage."""
-        path = self.path(name) / KEY_FILE
-        artifacts.write_json(path, {**artifacts.read_json(path), **info})
-
 
 @contextmanager
 def holding(folder: Path) -> Iterator[None]:
     """While the body runs no run uses the folder. Raises `WorkspaceError` where one does already."""
+    _refuse_links(folder)
     try:
         lock = (folder / ".lock").open("a+")
     except OSError as error:
@@ -160,6 +112,17 @@ def holding(folder: Path) -> Iterator[None]:
     with lock:
         _hold(lock, folder)
         yield
+
+
+def _refuse_links(folder: Path) -> None:
+    """A run folder may be a stranger's: through a link in it what is written, or emptied, would lie elsewhere."""
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            if os.path.islink(os.path.join(parent, name)):
+                raise WorkspaceError(
+                    f"{os.path.join(parent, name)}: is a symbolic link, which no run makes, and would be written "
+                    "through: remove it, or put what it leads to in its place"
+                )
 
 
 def _hold(lock: IO[str], folder: Path) -> None:
@@ -195,7 +158,7 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal
         with suppress(OSError):
             (folder / ".lock").unlink()
         raise WorkspaceError(f"{folder}: is not empty and not a run folder: give another --out")
-    with _disk_errors(path):
+    with disk_errors(path):
         artifacts.write_text(path, text)
 
 
@@ -214,16 +177,8 @@ def _first_change(old: Any, new: Any, key: str = "") -> str:
     return f"{key} was {old!r}, is {new!r}" if key else "formatting"
 
 
-def _key_at(path: Path) -> str | None:
-    """The key of a stage folder, None where there is none that can be read."""
-    try:
-        return str(artifacts.read_json(path / KEY_FILE)["key"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
 @contextmanager
-def _disk_errors(path: Path) -> Iterator[None]:
+def disk_errors(path: Path) -> Iterator[None]:
     """A full or unwritable disk as one line."""
     try:
         yield

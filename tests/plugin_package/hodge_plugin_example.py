@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -15,8 +15,8 @@ class RingEdges:
 
     reach: int = Field(1, ge=1, description="frames from one end of a pair to the other")
 
-    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Candidates:
+    def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """The pairs of the ring."""
         rows = np.arange(len(frames))
         pairs = np.unique(np.sort(np.stack([rows, (rows + self.reach) % len(rows)], axis=1), axis=1), axis=0)
-        return Candidates(pairs, np.full(len(pairs), "ring"), np.full(len(pairs), np.nan))
+        return Edges.proposed(pairs, "ring")

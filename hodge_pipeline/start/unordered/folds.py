@@ -14,8 +14,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.evaluation.scores import evenly
-from hodge_pipeline.start.unordered.graphs import without_wrong
 from hodge_pipeline.start.unordered.hypotheses import ViewOf, violations
 from hodge_pipeline.start.unordered.options import HypothesisLimits
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, ViewGraph
@@ -38,6 +38,11 @@ class Pieces:
     piece: Ints
     poses: Floats
     notes: tuple[str, ...] = ()
+
+    @classmethod
+    def kept(cls, graph: ViewGraph, diagnosis: Diagnosis) -> Pieces:
+        """What is left of a graph when the diagnosis has spoken."""
+        return cls(graph.select(diagnosis.kept), diagnosis.piece, diagnosis.world_from_cam)
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,7 @@ def unfolded(
         graph = pieces.graph.select(kept)
         judged = diagnose(graph, options)
         strength = strength[judged.kept]
-        pieces = Pieces(*without_wrong(graph, judged))
+        pieces = Pieces.kept(graph, judged)
         found = contradictions(clouds, pieces, held, view_of, limits)
         if not found.folded:
             break

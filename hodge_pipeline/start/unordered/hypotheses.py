@@ -2,73 +2,25 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView, free_directions_of, violation
 from hodge_pipeline.registration.global_pairs import Matches
-from hodge_pipeline.registration.pairs import Registered, register_pairs
+from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
 from hodge_pipeline.start.unordered.options import HypothesisLimits
-from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
+from hodge_pipeline.types.edges import REJECTED, USED
 
 POINTS_PROJECTED = 1500
 USUAL_VIOLATIONS = 8.0
 USUAL_HUE_CONFLICTS = 12.0
 ViewOf = Callable[[int], DepthView | None]
-
-
-@dataclass(frozen=True)
-class Hypotheses:
-    """Where one cloud may lie in another, with the evidence, in columns.
-
-    - `pairs (P, 2)`, `inliers`, `matches (P,)`: of the features; 0 inliers where no motion was found.
-    - `registered`: after refinement; rows of pairs that were not worth it hold the match itself.
-    - `overlap (P,)`: share of the smaller cloud near the other; `violation (P,)`: the share of points in view that the
-      other camera saw through, NaN where there are no depth images; `free (P,)`: motions that the common surfaces
-      leave open, in words.
-    - `reason (P,)`: why it is no edge, an empty word where it is one.
-    """
-
-    pairs: Ints
-    inliers: Ints
-    matches: Ints
-    registered: Registered
-    overlap: Floats
-    violation: Floats
-    free: NDArray[np.str_]
-    reason: NDArray[np.str_]
-
-    @property
-    def accepted(self) -> Bools:
-        """Where (P,) it is good enough to be judged with the others."""
-        return np.asarray(self.reason == "")
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many were refused for each reason."""
-        return dict(sorted(Counter(self.reason[self.reason != ""].tolist()).items()))
-
-    def as_graph(self, vertex_ids: NDArray[np.generic], source: str) -> ViewGraph:
-        """The accepted ones as a viewing graph."""
-        chosen = self.registered.select(self.accepted)
-        return chosen.as_graph(vertex_ids, np.full(len(chosen.pairs), source))
-
-    @classmethod
-    def joined(cls, first: Hypotheses, second: Hypotheses) -> Hypotheses:
-        """These columns one after the other."""
-        columns = {
-            field.name: np.concatenate([getattr(first, field.name), getattr(second, field.name)])
-            for field in fields(cls)
-            if field.name != "registered"
-        }
-        return cls(registered=Registered.joined([first.registered, second.registered]), **columns)
 
 
 def weigh(
@@ -80,17 +32,20 @@ def weigh(
     needs_all_directions: bool,
     workers: Workers,
     advance: Advance = no_progress,
-) -> Hypotheses:
-    """The matches with enough inliers refined, and all of them with their evidence; `folder` holds the clouds.
+) -> Edges:
+    """The matches (P,), those with enough inliers refined; what is good enough to be judged with the others counts.
+
+    `folder` holds the clouds. `overlap` is the share of the smaller cloud near the other.
 
     `needs_all_directions`: whether a pair whose common surfaces leave a motion open is refused, as it must be where
     nothing but the surfaces joined it.
     """
     clouds = CloudSet.open(folder)
-    worth = matches.inliers >= limits.min_inliers
-    advance(int((~worth).sum()))
-    chosen = matches.select(worth)
-    registered = register_pairs(folder, refine, chosen.pairs, chosen.i_from_j, workers, advance)
+    edges = Edges.of(matches.pairs).put(slice(None), status=REJECTED, why="too few matches agree")
+    worth = np.flatnonzero(matches.inliers >= limits.min_inliers)
+    advance(len(edges) - len(worth))
+    chosen = Edges.of(matches.pairs[worth])
+    registered = register_pairs(folder, refine, chosen, matches.i_from_j[worth], workers, advance)
     sizes = clouds.sizes
     smaller = np.minimum(sizes[chosen.pairs[:, 0]], sizes[chosen.pairs[:, 1]])
     overlap = np.minimum(1.0, registered.fitness * sizes[chosen.pairs[:, 1]] / np.maximum(smaller, 1))
@@ -111,7 +66,8 @@ def weigh(
     reason[seen_through > allowed_violation(seen_through, limits)] = "one camera saw through the other's surface"
     reason[~(registered.rmse_m <= limits.max_rmse_m)] = "points too far apart"
     reason[~(overlap >= limits.min_overlap)] = "too little overlap"
-    return _with_unworthy(matches, worth, registered, overlap, seen_through, free, reason)
+    status = np.where(reason == "", USED, REJECTED)
+    return edges.put(worth, **vars(replace(registered, overlap=overlap, why=reason, status=status)))
 
 
 def allowed_violation(seen_through: Floats, limits: HypothesisLimits) -> float:
@@ -149,35 +105,3 @@ def violations(clouds: CloudSet, pairs: Ints, i_from_j: Floats, view_of: ViewOf)
 def _sampled(clouds: CloudSet, row: int) -> Floats:
     points = clouds[row].points_in_cam
     return np.asarray(points[:: max(1, len(points) // POINTS_PROJECTED)], float)
-
-
-def _with_unworthy(
-    matches: Matches,
-    worth: Bools,
-    registered: Registered,
-    overlap: Floats,
-    seen_through: Floats,
-    free: NDArray[np.str_],
-    reason: NDArray[np.str_],
-) -> Hypotheses:
-    order = np.argsort(np.concatenate([np.flatnonzero(worth), np.flatnonzero(~worth)]), kind="stable")
-    rest = matches.select(~worth)
-    count = len(rest)
-    unrefined = Registered(
-        rest.pairs, rest.i_from_j, np.zeros((count, 6, 6)), np.zeros(count), np.full(count, np.nan),
-        np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, bool),
-    )  # fmt: skip
-
-    def column(values: NDArray[np.generic], other: object) -> NDArray[np.generic]:
-        return np.concatenate([values, np.full(count, other)])[order]
-
-    return Hypotheses(
-        pairs=matches.pairs,
-        inliers=matches.inliers,
-        matches=matches.matches,
-        registered=Registered.joined([registered, unrefined]).select(order),
-        overlap=column(overlap, np.nan),  # type: ignore[arg-type]
-        violation=column(seen_through, np.nan),  # type: ignore[arg-type]
-        free=column(free, ""),  # type: ignore[arg-type]
-        reason=column(reason, "too few matches agree"),  # type: ignore[arg-type]
-    )

@@ -14,14 +14,13 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
-from hodge_pipeline.start.unordered.graphs import joined_graph, without_wrong
-from hodge_pipeline.start.unordered.hypotheses import Hypotheses, weigh
+from hodge_pipeline.start.unordered.hypotheses import weigh
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans
 from hodge_pipeline.start.unordered.similarity import LocalDescriptors, all_pairs, similar_pairs
 from hodge_pipeline.start.unordered.views import Views
-from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, ViewGraph
 
 DESCRIBED, VIEWS = "described", "views"
 
@@ -31,13 +30,13 @@ class Start:
     """The first poses (N, 4, 4), pieces laid apart; the edges that they rest on; the piece (N,) of each frame."""
 
     world_from_cam: Floats
-    graph: ViewGraph
+    edges: Edges
     piece: Ints
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Scene:
+class Frames:
     """What is to be joined: frames, their clouds (a folder), and edges and poses (N, 4, 4) that are known already, from
     odometry, or none.
     """
@@ -45,11 +44,11 @@ class Scene:
     frames: Sequence[Frame]
     clouds: Path
     vertex_ids: NDArray[np.generic]
-    given: ViewGraph | None = None
+    given: Edges | None = None
     drifted: Floats | None = None
 
 
-def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance) -> Start:
+def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance) -> Start:
     """Poses of all frames that the evidence joins; `advance` counts frames, once described and once placed.
 
     `scratch` is a folder for the descriptions. Frames that nothing joins are pieces of their own, and said.
@@ -65,16 +64,20 @@ def find_start(scene: Scene, options: GlobalStart, scratch: Path, workers: Worke
     views = Views.make(scene.frames, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, not by_image, workers)
     notes.append(_tried(len(rows), pairs, hypotheses))
-    measured = hypotheses.as_graph(scene.vertex_ids, "landmarks" if by_image else "features")
-    graph = measured if scene.given is None else joined_graph(scene.given, measured)
+    labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
+    measured = labelled.select(labelled.counts).as_graph(scene.vertex_ids)
+    graph = measured
+    if scene.given is not None:
+        graph = ViewGraph.joined([scene.given.as_graph(scene.vertex_ids), measured])
     found = diagnose(graph, options.diagnosis)
     notes += [f"{int((~found.kept).sum())} of {graph.edge_count} edges are distrusted"]
     given = int(found.kept[: graph.edge_count - measured.edge_count].sum())
-    pieces = Pieces(*without_wrong(graph, found))
+    pieces = Pieces.kept(graph, found)
     pieces = unfolded(clouds, pieces, given, views, options.limits, options.diagnosis)
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
-    return Start(laid_apart(pieces.piece, pieces.poses, clouds), pieces.graph, pieces.piece, tuple(notes))
+    poses = laid_apart(pieces.piece, pieces.poses, clouds)
+    return Start(poses, Edges.measured(pieces.graph), pieces.piece, tuple(notes))
 
 
 def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
@@ -84,7 +87,7 @@ def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
     return int((np.diff(clouds.marks) >= options.limits.min_inliers).sum()) * 2 >= int((clouds.sizes > 0).sum())
 
 
-def propose(scene: Scene, clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart) -> Ints:
+def propose(scene: Frames, clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart) -> Ints:
     """The pairs (P, 2) to match: all of a few frames, else each with those most similar, or near by drifted poses."""
     if len(rows) <= options.all_pairs_up_to:
         return all_pairs(rows)
@@ -96,8 +99,8 @@ def propose(scene: Scene, clouds: CloudSet, rows: Ints, described: Path, options
     return np.unique(np.concatenate([pairs, near]), axis=0)
 
 
-def _tried(count: int, pairs: Ints, hypotheses: Hypotheses) -> str:
+def _tried(count: int, pairs: Ints, hypotheses: Edges) -> str:
     every = count * (count - 1) // 2
-    refused = ", ".join(f"{number} {reason}" for reason, number in hypotheses.counts.items())
-    text = f"{len(pairs)} of {every} pairs were matched, {int(hypotheses.accepted.sum())} may be edges"
+    refused = ", ".join(f"{number} {reason}" for reason, number in hypotheses.rejected_counts.items())
+    text = f"{len(pairs)} of {every} pairs were matched, {int(hypotheses.counts.sum())} may be edges"
     return f"{text} ({refused})" if refused else text

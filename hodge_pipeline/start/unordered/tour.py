@@ -6,12 +6,12 @@ Edge builders that know an order (the frames before and after, loops of every le
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from hodge_pipeline.pairs.candidates import labelled
 from hodge_pipeline.stages import EdgeBuilder
-from hodge_pipeline.types import Candidates, CloudSet, Floats, Frame, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
 
 METRES_A_RADIAN = 1.0
 """How far a camera may move for what it loses from view when it turns by a radian, in a room."""
@@ -31,17 +31,14 @@ def tour(world_from_cam: Floats) -> Ints:
     return order
 
 
-def propose_along_tour(
-    edges: EdgeBuilder, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats
-) -> Candidates:
+def propose_along_tour(edges: EdgeBuilder, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
     """What the builder proposes for the frames in the order of their tour; `sequential` pairs are called nearest."""
     order = tour(world_from_cam)
     found = edges.propose(
         [frames[row] for row in order], CloudSet.from_clouds([clouds[row] for row in order]), world_from_cam[order]
     )
     pairs = order[found.pairs]
-    back = labelled(pairs, "", found.overlap)
+    back = Edges.proposed(pairs, "", found.overlap)
     low, high = np.sort(pairs, axis=1).T
-    rows = np.lexsort((high, low))
-    names = np.char.replace(found.source[rows], "sequential", "nearest") if len(rows) else back.source
-    return Candidates(back.pairs, names, back.overlap)
+    names = np.char.replace(found.proposed_by[np.lexsort((high, low))], "sequential", "nearest")
+    return replace(back, proposed_by=names)

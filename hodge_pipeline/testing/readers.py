@@ -1,4 +1,4 @@
-"""Contract checks that every stage can be put through, ours and third parties': `pytest` shows what does not hold."""
+"""The contract of readers, and of what they give."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import FrameReader, Sniff
+from hodge_pipeline.testing.stage import check_stage
 from hodge_pipeline.types import Camera, EncodedImage, Frame, PointCloud, Source, Trajectory, ViewGraph
 
 MAX_PICKLED_FRAME_BYTES = 1 << 14
@@ -24,7 +25,7 @@ def check_reader(reader: FrameReader, path: Path, max_decoded: int = 3) -> Sourc
     The path must hold good data. Frames are checked in full, their images for `max_decoded` evenly spaced ones.
     Raises `AssertionError` that says what does not hold.
     """
-    _check_stage(reader)
+    check_stage(reader)
     _check_sniff(reader, path)
     source, again = reader.open(path), reader.open(path)
     assert isinstance(source, Source), f"open gives a {type(source).__name__}, not a Source"
@@ -80,16 +81,6 @@ def check_view_graph(graph: ViewGraph) -> None:
     scale = np.abs(graph.information).max(axis=(1, 2), initial=0.0, keepdims=True)
     skew = np.abs(graph.information - np.swapaxes(graph.information, 1, 2))
     assert np.isfinite(graph.information).all() and (skew <= 1e-9 * scale).all(), "information is not symmetric"
-
-
-def _check_stage(stage: object) -> None:
-    assert type(stage) is type(pickle.loads(pickle.dumps(stage))), "the stage does not pickle"
-    assert pickle.loads(pickle.dumps(stage)) == stage, "the stage pickled is not equal to itself: is it a dataclass?"
-    try:
-        stage.made_by_a_check = True  # type: ignore[attr-defined]
-    except Exception:  # noqa: BLE001 - whatever it raises, it refused
-        return
-    raise AssertionError("the stage can be changed: make it a frozen dataclass")
 
 
 def _check_sniff(reader: FrameReader, path: Path) -> None:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass as plain_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guesses
-from hodge_pipeline.types import Floats, Frame, Ints, Source, Trajectory
+from hodge_pipeline.types import Floats, Frame, Trajectory
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
 SAME_STAMP_S = 1e-6
@@ -32,29 +30,7 @@ def recipe_for(frames: Path) -> str:
     return CALIBRATED.get(found[0].name, RECIPE) if found else RECIPE
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class GivenOptions:
-    """Poses that the run starts from instead of finding its own."""
-
-    poses: Literal["none", "frames", "file"] = Field(
-        default="none",
-        description="none: as `start` says; frames: the source's own poses; file: those of `path`",
-    )
-    path: Path | None = Field(default=None, description="a trajectory of any format that a reader opens")
-    match: Match = Field(
-        default="auto",
-        description="how a frame finds its pose in the file: stamp, between two poses; number, that of the frame; row, "
-        "the n-th pose is that of the n-th frame; auto: the first of these that fits",
-    )
-    max_gap_s: float = Field(
-        default=0.1,
-        ge=0,
-        description="seconds to the poses around a frame's stamp; frames with a wider gap, between the sparse poses of "
-        "key frames, are carried over it by odometry",
-    )
-
-
-@plain_dataclass(frozen=True)
+@dataclass(frozen=True)
 class Matched:
     """Poses on the frames: `frame_times (N,)` and `pose_times (P,)` on one clock, `world_from_cam (N, 4, 4)` at the
     frames, NaN where there is none, and how they were matched.
@@ -64,23 +40,6 @@ class Matched:
     pose_times: Floats
     world_from_cam: Floats
     how: str
-
-
-@plain_dataclass(frozen=True)
-class Given:
-    """What a run starts from: the whole source, a pose (N, 4, 4) for each of its frames, and the rows of key frames.
-
-    `path` and `trajectory` are the file of poses and what it holds; `pose_times (P,)` are the moments of its poses on
-    the clock of `frame_times (N,)`.
-    """
-
-    whole: Source
-    world_from_cam: Floats
-    key_rows: Ints
-    frame_times: Floats
-    pose_times: Floats
-    path: Path | None = None
-    trajectory: Trajectory | None = None
 
 
 def own_poses(frames: Sequence[Frame]) -> Matched:
@@ -93,25 +52,25 @@ def own_poses(frames: Sequence[Frame]) -> Matched:
     return Matched(times, times[np.isfinite(poses).all(axis=(1, 2))], poses, "the frames' own")
 
 
-def match_poses(trajectory: Trajectory, frames: Sequence[Frame], options: GivenOptions, where: str) -> Matched:
+def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, max_gap_s: float, where: str) -> Matched:
     """The trajectory's poses on the frames.
 
-    Raises `SourceError` where they have nothing in common, or `options.match` asks for what is not there.
+    Raises `SourceError` where they have nothing in common, or `match` asks for what is not there.
     """
     usable = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2)) & np.isfinite(trajectory.stamps_s)
     trajectory = Trajectory(trajectory.stamps_s[usable], trajectory.world_from_cam[usable])
     if not len(trajectory):
         raise SourceError(f"{where}: no pose in it: give a trajectory")
-    if options.match != "auto":
-        matched = _matched(options.match, trajectory, frames, options.max_gap_s)
+    if match != "auto":
+        matched = _matched(match, trajectory, frames, max_gap_s)
         if matched is None or not np.isfinite(matched.world_from_cam).any():
-            raise SourceError(f"{where}: no frame finds a pose by {options.match}: {_ranges(trajectory, frames)}")
+            raise SourceError(f"{where}: no frame finds a pose by {match}: {_ranges(trajectory, frames)}")
         return matched
     rows_for_stamps = len(trajectory) == len(frames) and np.array_equal(
         trajectory.stamps_s, np.arange(len(frames), dtype=float)
     )
     for how in ("row", "stamp", "number") if rows_for_stamps else ("stamp", "number"):
-        matched = _matched(how, trajectory, frames, options.max_gap_s)
+        matched = _matched(how, trajectory, frames, max_gap_s)
         found = 0 if matched is None else int(np.isfinite(matched.world_from_cam).all(axis=(1, 2)).sum())
         if matched is not None and found and (how != "number" or found >= LIKELY_SHARE * len(frames)):
             return matched

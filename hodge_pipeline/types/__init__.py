@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.errors import GraphError
-
-Floats: TypeAlias = NDArray[np.float64]
-Floats32: TypeAlias = NDArray[np.float32]
-Ints: TypeAlias = NDArray[np.int64]
-Bools: TypeAlias = NDArray[np.bool_]
-Bytes: TypeAlias = NDArray[np.uint8]
+from hodge_pipeline.types.arrays import Bools as Bools
+from hodge_pipeline.types.arrays import Bytes as Bytes
+from hodge_pipeline.types.arrays import Floats as Floats
+from hodge_pipeline.types.arrays import Floats32 as Floats32
+from hodge_pipeline.types.arrays import Ints as Ints
+from hodge_pipeline.types.edges import Edges as Edges
+from hodge_pipeline.types.edges import Priors as Priors
+from hodge_pipeline.types.edges import Registration as Registration
+from hodge_pipeline.types.edges import ViewGraph as ViewGraph
 
 
 @dataclass(frozen=True)
@@ -117,106 +118,6 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
-class Priors:
-    """Poses known from elsewhere: vertex rows (P,), `world_from_vertex (P, 4, 4)`, and `information (P, 6, 6)` of ξ =
-    (rotation, translation) in `world_from_vertex · exp(ξ)`; several of one vertex count each.
-    """
-
-    vertices: Ints
-    world_from_vertex: Floats
-    information: Floats
-
-
-@dataclass(frozen=True)
-class ViewGraph:
-    """The viewing graph, in columns. A million edges are arrays, not a million objects.
-
-    - `vertex_ids (V,)` int64 or str, as the source names them; `edges (E, 2)` hold *rows* of it.
-    - `i_from_j (E, 4, 4)`: moves points of vertex j into vertex i, for the edge (i, j) in the direction measured.
-      Parallel edges are legal.
-    - `information (E, 6, 6)`: inverse covariance of ξ = (rotation, translation) in `i_from_j · exp(ξ)`, radians and
-      metres in j's axes.
-    - `fitness (E,)`: share of cloud j with a correspondence, or of i where the registrar says so; `rmse_m (E,)`: their
-      RMS distance; NaN where unknown.
-    - `source (E,)`: where the edge comes from (sequential, overlap, sift, colmap, g2o, …).
-    - `correspondences (E,)`: how many; 0 where unknown.
-    - `dimension`: 2 for a graph in the plane z = 0, lifted, with no information out of it; it stays one when written.
-    - `fixed`: rows of the vertices that the source holds at the poses it gives them.
-    - `priors`: what the source says of single poses, None where it says nothing.
-    """
-
-    vertex_ids: NDArray[np.generic]
-    edges: Ints
-    i_from_j: Floats
-    information: Floats
-    fitness: Floats
-    rmse_m: Floats
-    source: NDArray[np.str_]
-    correspondences: Ints
-    dimension: int = 3
-    fixed: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    priors: Priors | None = None
-
-    @property
-    def vertex_count(self) -> int:
-        """How many vertices there are, isolated ones included."""
-        return len(self.vertex_ids)
-
-    @property
-    def edge_count(self) -> int:
-        """How many edges there are, parallel ones each."""
-        return len(self.edges)
-
-    @classmethod
-    def from_edges(
-        cls,
-        vertex_ids: NDArray[np.generic],
-        edges: Ints,
-        i_from_j: Floats,
-        information: Floats | None = None,
-        source: str = "given",
-        *,
-        dimension: int = 3,
-        fixed: Ints | None = None,
-    ) -> ViewGraph:
-        """A graph of measured edges; the information defaults to the identity, what was not seen to NaN or 0.
-
-        Raises `GraphError` where there is not one motion (4, 4) and one information (6, 6) for each edge.
-        """
-        count = len(edges)
-        for name, given, side in (("i_from_j", i_from_j, 4), ("information", information, 6)):
-            if count and given is not None and np.shape(given) != (count, side, side):
-                raise GraphError(f"{name} has the shape {np.shape(given)}: expected ({count}, {side}, {side})")
-        return cls(
-            vertex_ids=np.asarray(vertex_ids),
-            edges=np.asarray(edges, np.int64).reshape(-1, 2),
-            i_from_j=np.asarray(i_from_j, float).reshape(-1, 4, 4),
-            information=np.broadcast_to(np.eye(6), (count, 6, 6)).copy()
-            if information is None
-            else np.asarray(information, float),
-            fitness=np.full(count, np.nan),
-            rmse_m=np.full(count, np.nan),
-            source=np.full(count, source),
-            correspondences=np.zeros(count, np.int64),
-            dimension=dimension,
-            fixed=np.zeros(0, np.int64) if fixed is None else np.asarray(fixed, np.int64),
-        )
-
-    def select(self, rows: Ints | Bools) -> ViewGraph:
-        """The graph with these edges only, in this order; every vertex is kept."""
-        return replace(
-            self,
-            edges=self.edges[rows],
-            i_from_j=self.i_from_j[rows],
-            information=self.information[rows],
-            fitness=self.fitness[rows],
-            rmse_m=self.rmse_m[rows],
-            source=self.source[rows],
-            correspondences=self.correspondences[rows],
-        )
-
-
-@dataclass(frozen=True)
 class Source:
     """What a reader's `open` gives: any of lazy frames, a trajectory, a measured graph.
 
@@ -232,32 +133,6 @@ class Source:
     graph: ViewGraph | None = None
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Pairs that an edge builder proposes, not yet edges.
-
-    `pairs (P, 2)` rows with i < j, sorted and unique; `source (P,)` the reason; `overlap (P,)` its score in [0, 1],
-    NaN where the reason has none.
-    """
-
-    pairs: Ints
-    source: NDArray[np.str_]
-    overlap: Floats
-
-
-@dataclass(frozen=True)
-class Registration:
-    """What a registrar found for one pair; see `ViewGraph` for the meaning and units of each field."""
-
-    i_from_j: Floats
-    information: Floats
-    fitness: float
-    rmse_m: float
-    correspondences: int
-    iterations: int
-    converged: bool
 
 
 @dataclass(frozen=True)
@@ -287,6 +162,8 @@ class Solution:
 
     - `component (V,)`: the connected component of each vertex, 0 the largest.
     - `weights (E,)`: the final weight of each edge relative to its own information, 0 for one that was ignored.
+    - `confirmed`: of a robust solve, whether cycles of the edges that it used close better than by chance. None where
+      it left none out and no cycle tells, as in a tree; and of other solves.
     """
 
     world_from_cam: Floats
@@ -295,6 +172,7 @@ class Solution:
     history: tuple[SolverIteration, ...] = ()
     metrics: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    confirmed: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -311,13 +189,19 @@ class Model:
 
 @dataclass(frozen=True)
 class ModelQuality:
-    """How well the points of a model fit its images: pixels between a point seen and projected, images to a point."""
+    """How well the points of a model fit its images: of N observations, pixels between a point seen and projected.
+
+    `keypoints (N, 2)`: the row in `image_names`, and which of the image's keypoints; `errors_px (N,)`: infinite where
+    the point lies behind the camera; beyond `cap_px` an observation is wrong, and how far off tells no more.
+    """
 
     images: int
     points: int
-    observations: int
-    mean_reprojection_px: float
     mean_track_length: float
+    image_names: tuple[str, ...]
+    keypoints: Ints
+    errors_px: Floats
+    cap_px: float
 
 
 @dataclass(frozen=True)
@@ -333,7 +217,7 @@ class CloudSet(Sequence[PointCloud]):
 
     `offsets (N + 1,)` cut `points (P, 3)`, `normals (P, 3)`, `colours (P, 3)` into frames; an empty slice is a frame
     without a valid measurement. `marks (N + 1,)` cut the landmarks' `mark_points (Q, 3)` and `mark_descriptors
-    (Q, 128)` likewise.
+    (Q, 128)` likewise. `folder` is where the columns lie, which worker processes open; None of what is in memory.
     """
 
     FILES = ("offsets", "points", "normals", "colours", "marks", "mark_points", "mark_descriptors")
@@ -347,14 +231,16 @@ class CloudSet(Sequence[PointCloud]):
         marks: Ints,
         mark_points: Floats32,
         mark_descriptors: Bytes,
+        folder: Path | None = None,
     ) -> None:
+        self.folder = folder
         self.offsets, self.points, self.normals, self.colours = offsets, points, normals, colours
         self.marks, self.mark_points, self.mark_descriptors = marks, mark_points, mark_descriptors
 
     @classmethod
     def open(cls, folder: Path) -> CloudSet:
         """The clouds that `save` wrote to this folder, mapped read-only."""
-        return cls(*(np.load(folder / f"{name}.npy", mmap_mode="r") for name in cls.FILES))
+        return cls(**{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in cls.FILES}, folder=folder)
 
     @classmethod
     def from_clouds(cls, clouds: Sequence[PointCloud]) -> CloudSet:

@@ -1,0 +1,29 @@
+"""The scores of a run's rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hodge_pipeline.evaluation.scaled_scores import scaled_score_table
+from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.scene import Round, has_truth, pose_sets, true_poses
+from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.types import CloudSet, Floats, Source
+
+
+def score_rounds(
+    source: Source, clouds: CloudSet, rounds: Sequence[Round], scale: float, steps: Steps, workers: Workers
+) -> ScoreTable:
+    """The score tables of the true poses (where there are any) and of every round; lengths are in units of `scale`."""
+    sets = pose_sets(rounds)
+    sets = {"truth": true_poses(source), **sets} if has_truth(source) else sets
+    reference = "truth" if has_truth(source) else "result"
+    return steps.step(evaluate, clouds, sets, reference, scale, title="evaluation", workers=workers)
+
+
+def evaluate(
+    clouds: CloudSet, sets: dict[str, Floats], reference: str, scale: float, *, workers: Workers, step: Step
+) -> ScoreTable:
+    """Step: the scores of each set of poses (K, 4, 4), on the pairs that overlap under the reference."""
+    assert clouds.folder is not None
+    return scaled_score_table(clouds.folder, sets, reference, workers, scale, step.folder / "scaled")

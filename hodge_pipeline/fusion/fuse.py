@@ -1,0 +1,51 @@
+"""The fused models of a run, as files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline.fusion.ply import write_ply
+from hodge_pipeline.scene import KeyFrames, Scene
+from hodge_pipeline.stages import Fuser, Step, Steps
+from hodge_pipeline.types import Bools, Floats, Source
+
+
+def fuse_all(
+    fusers: Sequence[Fuser], scene: Scene, world_from_key: Floats, steps: Steps, *, keys_only: bool = False
+) -> dict[str, Path]:
+    """The PLY file of each model by its name, from the poses (K, 4, 4) of the key frames.
+
+    Every frame with a pose of its own is fused, key frame or not; of `keys_only` the key frames alone, which is faster.
+    """
+    if keys_only and not scene.key_frames.are_all:
+        source, poses, placed = scene.source, world_from_key, scene.clouds.sizes > 0
+        steps.note(
+            f"fused after an edit: the {len(source.frames)} key frames alone; hodge run, as before, fuses all frames"
+        )
+    else:
+        source, poses = scene.whole, scene.key_frames.expand(world_from_key)
+        placed = _placed(scene.key_frames, scene.clouds.sizes > 0)
+    poses = np.asarray(np.where(placed[:, None, None], poses, np.nan))
+    files = [
+        steps.step(fuse, fuser, source, poses, title=f"fusion {row}", total=len(source.frames))
+        for row, fuser in enumerate(fusers, start=1)
+    ]
+    return {file.stem: file for file in files}
+
+
+def fuse(fuser: Fuser, source: Source, world_from_cam: Floats, *, step: Step) -> Path:
+    """Step: the PLY file of the model; frames whose pose is not finite, such as a scan in other units, are left out."""
+    model = fuser.fuse(source.frames, world_from_cam, step.advance)
+    path = step.folder / f"{model.name}.ply"
+    write_ply(path, model)
+    for note in model.notes:
+        step.note(note)
+    return path
+
+
+def _placed(key_frames: KeyFrames, has_cloud: Bools) -> Bools:
+    """Where (N,) a frame was placed: a key frame by its cloud, where every frame is one; else as the start found it."""
+    return has_cloud if key_frames.are_all else key_frames.found

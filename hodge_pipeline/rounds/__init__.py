@@ -1,0 +1,1 @@
+"""The rounds of a run: propose pairs, register them, solve and judge, whoever proposes."""

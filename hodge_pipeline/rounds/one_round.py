@@ -1,0 +1,158 @@
+"""One round: the pairs of an edge builder, registered from the poses so far, and the poses consistent with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.parts import Energies
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.evaluation.residuals import with_residuals
+from hodge_pipeline.pairs.candidates import merge
+from hodge_pipeline.recipe.schema import Recipe
+from hodge_pipeline.refine.held_out import HeldOut
+from hodge_pipeline.registration.acceptance import accepted
+from hodge_pipeline.registration.register import register_edges
+from hodge_pipeline.scene import START, Round, Scene
+from hodge_pipeline.sources.measured_edges import without_measured
+from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Step, Steps, Workers
+from hodge_pipeline.start.unordered.tour import propose_along_tour
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source, ViewGraph
+from hodge_pipeline.types.edges import HELD_OUT
+
+EDITED = "edited"
+"""The name of a round that a person's edits made."""
+
+
+@dataclass(frozen=True)
+class Registered:
+    """What a round is solved from: its pairs, measured ones last, of which it registered the rows `fresh (F,)` from the
+    poses `before (N, 4, 4)`; and the poses `start (N, 4, 4)` of the solve.
+    """
+
+    name: str
+    edges: Edges
+    fresh: Ints
+    before: Floats
+    start: Floats
+
+    def graph(self, vertex_ids: NDArray[np.generic]) -> ViewGraph:
+        """The viewing graph of the edges that count."""
+        return self.edges.select(self.edges.counts).as_graph(vertex_ids)
+
+    @property
+    def title(self) -> str:
+        """The title of its solve."""
+        return f"solve, {self.name}"
+
+
+@dataclass(frozen=True)
+class Work:
+    """What every round of a run needs: `measured` edges join each round's graph as they are."""
+
+    recipe: Recipe
+    steps: Steps
+    scene: Scene
+    measured: ViewGraph
+    workers: Workers
+
+    def propose(self, number: int, before: Round) -> Edges:
+        """The pairs to register in round `number` from the poses of the one before."""
+        scene, recipe = self.scene, self.recipe
+        held_out = HeldOut(recipe.guard.held_out, recipe.seed) if scene.is_given else None
+        proposed = self.steps.step(
+            propose_edges, recipe.edges, scene.source, scene.clouds, before.world_from_cam, self.measured, held_out,
+            scene.in_order, title=f"edges, round {number}",
+        )  # fmt: skip
+        return with_start_edges(proposed, scene.first)
+
+    def register(self, number: int, edges: Edges, world_from_cam: Floats) -> Registered:
+        """The candidates registered from these poses, and accepted or rejected."""
+        registered = self.steps.step(
+            register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam,
+            title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
+        )  # fmt: skip
+        fresh = np.flatnonzero(registered.status != HELD_OUT)
+        edges = self.with_measured(self.accept(registered))
+        return Registered(f"round {number}", edges, fresh, world_from_cam, world_from_cam)
+
+    def accept(self, edges: Edges) -> Edges:
+        """The table with the status of every registered pair."""
+        scale = self.recipe.scale if isinstance(self.recipe.scale, float) else 1.0
+        return accepted(edges, self.recipe.acceptance, self.scene.drift, scale)
+
+    def with_measured(self, edges: Edges) -> Edges:
+        """The table with the edges that came measured at its end."""
+        return Edges.joined([edges, Edges.measured(self.measured)])
+
+    def solve(self, registered: Registered, graph: ViewGraph, found: Energies | None) -> Round:
+        """The round of these edges, and the poses consistent with them, of which `graph` holds those that count."""
+        return self.steps.step(solve_edges, registered, graph, self.recipe.solver, found, title=registered.title)
+
+    def judge(self, last: Round) -> Round:
+        """The last round, with the verdict of the diagnosis on each of its edges."""
+        return self.steps.step(judge_edges, last, self.recipe.diagnosis, title="diagnosis")
+
+
+def propose_edges(
+    builder: EdgeBuilder,
+    source: Source,
+    clouds: CloudSet,
+    world_from_cam: Floats,
+    measured: ViewGraph,
+    held_out: HeldOut | None,
+    in_order: bool,
+    *,
+    step: Step,
+) -> Edges:
+    """Step: the pairs to register, from the poses so far; measured ones are not registered again.
+
+    Where the run starts from given poses a share of them is kept out, for its guard.
+    """
+    if in_order:
+        candidates = builder.propose(source.frames, clouds, world_from_cam)
+    else:
+        candidates = propose_along_tour(builder, source.frames, clouds, world_from_cam)
+    candidates = without_measured(candidates, measured)
+    return candidates if held_out is None else candidates.put(held_out.of(candidates), status=HELD_OUT)
+
+
+def with_start_edges(candidates: Edges, first: Round) -> Edges:
+    """The candidates, and those edges of the start that join what the candidates leave apart.
+
+    Consecutive frames join nothing here: across a gap they have nothing in common.
+    """
+    if first.name != START:
+        return candidates
+    proven = candidates.pairs[~np.isin(candidates.proposed_by, ("sequential", "nearest"))]
+    component = connected_components(proven, len(first.vertex_ids))
+    joining = component[first.edges.pairs[:, 0]] != component[first.edges.pairs[:, 1]]
+    if not joining.any():
+        return candidates
+    pairs = np.unique(np.sort(first.edges.pairs[joining], axis=1), axis=0)
+    return merge([candidates, Edges.proposed(pairs, START)])[0]
+
+
+def solve_edges(
+    registered: Registered, graph: ViewGraph, solver: ConsistencySolver, found: Energies | None, *, step: Step
+) -> Round:
+    """Step: the round of these edges and the poses consistent with them; `found` of ω at its start is kept."""
+    edges, solution = registered.edges, solver.solve(graph, registered.start)
+    weights = np.zeros(len(edges))
+    weights[edges.counts] = solution.weights
+    solution = replace(solution, weights=weights[edges.in_graph])
+    for note in solution.notes:
+        step.note(f"{registered.name}: {note}")
+    return Round(
+        with_residuals(edges, solution.world_from_cam, solution.weights), graph.vertex_ids, solution.world_from_cam,
+        solution, registered.fresh, registered.before, found, edited=registered.name == EDITED,
+    )  # fmt: skip
+
+
+def judge_edges(last: Round, options: DiagnosisOptions, *, step: Step) -> Round:
+    """Step: the round with the verdict of the diagnosis on each of its edges."""
+    return replace(last, edges=diagnose(last.graph, options).put_into(last.edges))

@@ -1,0 +1,212 @@
+"""A run folder as an object: what a run left, read without its source and whatever version made it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.evaluation.evaluate import evaluate
+from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.fusion.fuse import fuse
+from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.refine.verdict import Refined
+from hodge_pipeline.report.contents import Report
+from hodge_pipeline.rounds.one_round import judge_edges, solve_edges
+from hodge_pipeline.scene import KeyFrames, Round, Scene
+from hodge_pipeline.stages import Step
+from hodge_pipeline.store.store import stored, stored_folders
+from hodge_pipeline.store.workspace import RECIPE_FILE, RUN, is_run_folder
+from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, Source
+
+
+@dataclass(frozen=True)
+class FrameTable:
+    """The frames of a source in columns: `frame_ids`, `stamps_s`, `sequences (N,)`, `cameras (N, 6)` (width, height,
+    fx, fy, cx, cy) and poses `world_from_cam (N, 4, 4)` of the source's own, NaN where it has none.
+    """
+
+    name: str
+    path: str
+    notes: tuple[str, ...]
+    frame_ids: np.ndarray
+    stamps_s: Floats
+    sequences: np.ndarray
+    cameras: Floats
+    world_from_cam: Floats
+
+    @classmethod
+    def of(cls, source: Source) -> FrameTable:
+        """The table of a source's frames."""
+        frames = source.frames
+        return cls(
+            name=source.name,
+            path=str(source.path),
+            notes=tuple(source.notes),
+            frame_ids=np.array([frame.frame_id for frame in frames]),
+            stamps_s=np.array([frame.stamp_s for frame in frames], float),
+            sequences=np.array([frame.sequence for frame in frames], np.str_),
+            cameras=np.array([_numbers(frame.camera) for frame in frames]).reshape(-1, 6),
+            world_from_cam=np.array([_pose(frame) for frame in frames]).reshape(-1, 4, 4),
+        )
+
+    def source(self) -> Source:
+        """A source of these frames, without images."""
+        rows = zip(
+            self.frame_ids.tolist(), self.stamps_s.tolist(), self.sequences.tolist(), self.cameras,
+            self.world_from_cam, strict=True,
+        )  # fmt: skip
+        frames = tuple(
+            Frame(name, stamp, _camera(camera), world_from_cam=_known(pose), sequence=sequence)
+            for name, stamp, sequence, camera, pose in rows
+        )
+        return Source(self.name, Path(self.path), frames, notes=self.notes)
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What a run began with: all frames, those that are registered, and the first round."""
+
+    frames: FrameTable
+    key_frames: KeyFrames
+    first: Round
+
+
+@dataclass(frozen=True)
+class Ending:
+    """What a run ended with: poses (N, 4, 4) of all frames, its report, and what became of given poses."""
+
+    world_from_cam: Floats
+    report: Report
+    refined: Refined | None
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run: its folder, what was read, its rounds, and `poses (N, 4, 4)`, world from camera, of all frames.
+
+    `rounds` begins with the first poses; the last one's edges have verdicts. A round knows the key frames alone, which
+    `key_frames` spreads over all frames. `ending` is None where the run has not ended.
+    """
+
+    folder: Path
+    source: Source
+    key_frames: KeyFrames
+    clouds: CloudSet
+    rounds: tuple[Round, ...]
+    poses: Floats
+    models: Mapping[str, Path]
+    scores: ScoreTable | None = None
+    ending: Ending | None = None
+
+    @classmethod
+    def load(cls, folder: Path | str) -> Run:
+        """The run in a folder, as far as it came. Neither its source nor the libraries that made it are needed.
+
+        Raises `WorkspaceError` where the folder is none of a run, was made in another layout, or a file in it has
+        changed.
+        """
+        folder = Path(folder)
+        check_layout(folder)
+        steps = folder / RUN
+        opening = stored(steps, begin)
+        clouds = [path / "clouds" for path in stored_folders(steps) if (path / "clouds" / "offsets.npy").is_file()]
+        if not opening or not clouds:
+            raise WorkspaceError(f"{folder}: the run has not begun to register: run the same command again")
+        judged, ended = stored(steps, judge_edges), stored(steps, end)
+        rounds = [opening[-1].first, *stored(steps, solve_edges)]
+        rounds = [*rounds[:-1], *judged] if judged else rounds
+        key_frames = opening[-1].key_frames
+        scores = stored(steps, evaluate)
+        return cls(
+            folder=folder,
+            source=opening[-1].frames.source(),
+            key_frames=key_frames,
+            clouds=CloudSet.open(clouds[-1]),
+            rounds=tuple(rounds),
+            poses=ended[-1].world_from_cam if ended else key_frames.expand(rounds[-1].world_from_cam),
+            models={path.stem: path for path in stored(steps, fuse)},
+            scores=scores[-1] if scores else None,
+            ending=ended[-1] if ended else None,
+        )
+
+    @property
+    def report(self) -> Report:
+        """What the run measured. Raises `WorkspaceError` where it has not ended."""
+        if self.ending is None:
+            raise WorkspaceError(
+                f"{self.folder}: this run is not finished: run the same command again, it goes on where it stopped"
+            )
+        return self.ending.report
+
+    @property
+    def refined(self) -> Refined | None:
+        """What became of given poses; None where the run started from none."""
+        return None if self.ending is None else self.ending.refined
+
+    @property
+    def result(self) -> Round:
+        """The last round."""
+        return self.rounds[-1]
+
+    @property
+    def edges(self) -> Edges:
+        """Every pair of the last round, between the key frames."""
+        return self.result.edges
+
+    @property
+    def recipe(self) -> Recipe:
+        """The recipe in the folder."""
+        return load_recipe(str(self.folder / RECIPE_FILE))
+
+    def __repr__(self) -> str:
+        graph = self.result.graph
+        state = "" if self.ending is not None else ", unfinished"
+        return f"Run({str(self.folder)!r}: {len(self.poses)} frames, {graph.edge_count} edges{state})"
+
+
+def begin(source: Source, key_frames: KeyFrames, first: Round, *, step: Step) -> Opening:
+    """Step: what a run begins with, kept."""
+    return Opening(FrameTable.of(source), key_frames, first)
+
+
+def end(world_from_cam: Floats, report: Report, refined: Refined | None, *, step: Step) -> Ending:
+    """Step: what a run ends with, kept."""
+    return Ending(world_from_cam, report, refined)
+
+
+def opening_of(scene: Scene) -> tuple[Source, KeyFrames, Round]:
+    """The inputs of `begin`."""
+    return scene.whole, scene.key_frames, scene.first
+
+
+def check_layout(folder: Path) -> None:
+    """Raise `WorkspaceError` where a folder is none of a run, or was left by a version with another layout."""
+    if not is_run_folder(folder):
+        raise WorkspaceError(f"{folder}: is no run folder: there is no {RECIPE_FILE} with steps in it")
+    if any((folder / RUN).glob("*/key.json")):
+        again = f"hodge run {folder / RECIPE_FILE} --out {folder} --overwrite"
+        raise WorkspaceError(f"{folder}: was made in the layout of an earlier version: '{again}' makes it again")
+
+
+def _numbers(camera: Camera | None) -> list[float]:
+    if camera is None:
+        return [np.nan] * 6
+    return [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+
+
+def _camera(numbers: Floats) -> Camera | None:
+    if np.isnan(numbers).any():
+        return None
+    return Camera(int(numbers[0]), int(numbers[1]), *map(float, numbers[2:]))
+
+
+def _pose(frame: Frame) -> Floats:
+    return np.full((4, 4), np.nan) if frame.world_from_cam is None else frame.world_from_cam
+
+
+def _known(pose: Floats) -> Floats | None:
+    return pose if np.isfinite(pose).all() else None

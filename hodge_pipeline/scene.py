@@ -1,0 +1,222 @@
+"""What a run works on and what it finds: key frames, their clouds, how all frames follow from them, and its rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.parts import Energies
+from hodge_pipeline.se3 import spread_correction
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, Trajectory, ViewGraph
+from hodge_pipeline.types.edges import REJECTED
+
+START = "start"
+"""The name of first poses that are not odometry's."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """One outer iteration: every pair that it knows of, and the poses (N, 4, 4) that its edges led to. Round 0 holds
+    the first poses, which `name` tells: odometry, or start where they were given.
+
+    The pairs that any round so far registered come first in `edges`, then those that came measured. This round itself
+    registered the rows `fresh (F,)` from the poses `before (N, 4, 4)`; `energies` are those of ω's parts at the poses
+    that the solve started from. It is `edited` where a person's edits made it.
+    """
+
+    edges: Edges
+    vertex_ids: NDArray[np.generic]
+    world_from_cam: Floats
+    solution: Solution | None = None
+    fresh: Ints | None = None
+    before: Floats | None = None
+    energies: Energies | None = None
+    edited: bool = False
+    name: str = "odometry"
+
+    @cached_property
+    def graph_edges(self) -> Edges:
+        """The rows that are edges, in the order of `graph`: those that count, and those that are off by hand."""
+        return self.edges.select(self.edges.in_graph)
+
+    @cached_property
+    def graph(self) -> ViewGraph:
+        """The viewing graph."""
+        return self.graph_edges.as_graph(self.vertex_ids)
+
+    @property
+    def rejected(self) -> Edges:
+        """The pairs that were registered and are no edges."""
+        return self.edges.select(self.edges.status == REJECTED)
+
+    def registered(self, measured: ViewGraph) -> Edges:
+        """The rows without those that came measured."""
+        return self.edges.select(slice(len(self.edges) - measured.edge_count))
+
+
+@dataclass(frozen=True)
+class KeyFrames:
+    """Which of the N frames are registered, the K `rows`, and how the others move with them.
+
+    `first (N, 4, 4)` are the first poses of all frames, `world_from_key (K, 4, 4)` those of the key frames; `part (N,)`
+    is the part of the source that the start held together; `times (N,)` ascend within a part; `found (N,)` says which
+    frames the start could place: the others lie between their neighbours by `stamps_s (N,)` in each `sequence (N,)`.
+    `key_of_frame (N,)` is the key frame, counted among the K, that each frame belongs to.
+    """
+
+    rows: Ints
+    first: Floats
+    world_from_key: Floats
+    part: Ints
+    times: Floats
+    found: Bools
+    stamps_s: Floats
+    sequence: Ints
+    key_of_frame: Ints
+
+    @classmethod
+    def all_of(cls, source: Source, world_from_cam: Floats) -> KeyFrames:
+        """Every frame of the source is a key frame."""
+        count = len(source.frames)
+        stamps = np.array([frame.stamp_s for frame in source.frames], float)
+        every, zeros = np.arange(count), np.zeros(count, np.int64)
+        ones = np.ones(count, bool)
+        return cls(every, world_from_cam, world_from_cam, zeros, every.astype(float), ones, stamps, zeros, every)
+
+    @property
+    def are_all(self) -> bool:
+        """Whether every frame is a key frame."""
+        return len(self.rows) == len(self.first)
+
+    def expand(self, world_from_key: Floats) -> Floats:
+        """Poses (N, 4, 4) of all frames that follow from those (K, 4, 4) of the key frames.
+
+        Between two key frames the change that these went through is interpolated.
+        """
+        if self.are_all:
+            return world_from_key
+        after = self.first.copy()
+        for part in np.unique(self.part):
+            rows = np.flatnonzero(self.part == part)
+            keys = np.flatnonzero(self.part[self.rows] == part)
+            after[rows] = spread_correction(
+                self.times[rows], self.first[rows], self.times[self.rows[keys]], self.world_from_key[keys],
+                world_from_key[keys],
+            )  # fmt: skip
+        for name in np.unique(self.sequence):
+            rows = np.flatnonzero(self.sequence == name)
+            after[rows] = _filled(after[rows], self.found[rows], self.stamps_s[rows])
+        return np.asarray(after)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What odometry says of the way between two frames: its poses (K, 4, 4), the part (K,) of each that it held
+    together, and the share of the way that it may err by.
+    """
+
+    world_from_cam: Floats
+    part: Ints
+    largest: float
+
+
+@dataclass(frozen=True)
+class GivenFile:
+    """A file of given poses, what it holds, and the moments (P,) of its poses on the clock of `KeyFrames.times`."""
+
+    path: Path
+    trajectory: Trajectory
+    pose_times: Floats
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The whole source, its key frames as a source of their own, their clouds, and the first round: edges and poses.
+
+    `drift`: None where the first poses are not odometry's; `given`: the file that they come from, where there is one;
+    `in_order`: whether frames that follow each other in the source do so in time.
+    """
+
+    whole: Source
+    source: Source
+    key_frames: KeyFrames
+    clouds: CloudSet
+    first: Round
+    drift: Drift | None = None
+    is_given: bool = False
+    given: GivenFile | None = None
+    in_order: bool = True
+
+
+def key_source(whole: Source, rows: Ints) -> Source:
+    """The frames of these rows alone."""
+    return replace(whole, frames=tuple(whole.frames[row] for row in rows))
+
+
+def vertex_ids(source: Source) -> NDArray[np.generic]:
+    """The frames as the source names them: numbers, or words."""
+    return np.array([frame.frame_id for frame in source.frames])
+
+
+def stamps_of(source: Source) -> Floats:
+    """Times (N,) of the frames; their numbers in a sequence whose stamps do not ascend: those are no clock."""
+    stamps = np.array([frame.stamp_s for frame in source.frames], float)
+    for rows in sequences_of(source).values():
+        if not (np.diff(stamps[rows]) > 0).all():
+            stamps[rows] = np.arange(len(rows))
+    return stamps
+
+
+def sequence_numbers(source: Source) -> Ints:
+    """The number (N,) of each frame's sequence, in the order of the source."""
+    numbers = np.zeros(len(source.frames), np.int64)
+    for number, rows in enumerate(sequences_of(source).values()):
+        numbers[rows] = number
+    return numbers
+
+
+def _filled(poses: Floats, found: Bools, times: Floats) -> Floats:
+    """The poses, those not found taken between the nearest found ones, or from the nearest at an end."""
+    known = np.flatnonzero(found)
+    if found.all() or not len(known):
+        return poses
+    missing = np.flatnonzero(~found)
+    after = np.clip(np.searchsorted(known, missing), 0, len(known) - 1)
+    before = np.clip(np.searchsorted(known, missing) - 1, 0, len(known) - 1)
+    a, b = known[before], known[after]
+    share = np.clip((times[missing] - times[a]) / np.where(b > a, times[b] - times[a], 1.0), 0.0, 1.0)
+    out = poses.copy()
+    out[missing] = se3.interpolate(poses[a], poses[b], share)
+    return np.asarray(out)
+
+
+def pose_sets(rounds: Sequence[Round]) -> dict[str, Floats]:
+    """The poses by name: odometry (or start), round 1, …, result."""
+    names = [rounds[0].name, *(f"round {number}" for number in range(1, len(rounds) - 1)), "result"]
+    return {name: one.world_from_cam for name, one in zip(names, rounds, strict=True)}
+
+
+def true_poses(source: Source) -> Floats:
+    """The source's own poses (N, 4, 4), NaN where a frame has none."""
+    poses = np.full((len(source.frames), 4, 4), np.nan)
+    for row, frame in enumerate(source.frames):
+        if frame.world_from_cam is not None:
+            poses[row] = frame.world_from_cam
+    return poses
+
+
+def has_truth(source: Source) -> bool:
+    """Whether there are at least two poses of the source's own to compare with."""
+    return sum(frame.world_from_cam is not None for frame in source.frames) > 1
+
+
+def sequences_of(source: Source) -> dict[str, Ints]:
+    """The rows of each sequence, in the order of the source."""
+    names = np.array([frame.sequence for frame in source.frames])
+    return {str(name): np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())}

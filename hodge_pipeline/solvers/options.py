@@ -1,0 +1,19 @@
+"""Options of solvers given as plain arguments, which no recipe has checked."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+from hodge_pipeline.errors import GraphError
+
+
+def check_choice(name: str, value: object, known: Any) -> None:
+    """Raises `GraphError` that lists what exists where the value is none of a `Literal` type's."""
+    if value not in get_args(known):
+        raise GraphError(f"{name} {value!r} does not exist: take {' or '.join(map(repr, get_args(known)))}")
+
+
+def check_positive(name: str, value: float, unit: str) -> None:
+    """Raises `GraphError` where the value is not above zero, or not a number."""
+    if not value > 0:
+        raise GraphError(f"{name} is {value:g}: expected {unit} above zero")

@@ -1,0 +1,30 @@
+"""The clouds that every start needs, with landmarks where frames are matched by their images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hodge_pipeline.registration.clouds import CloudOptions, prepare_clouds
+from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.start.unordered.options import GlobalStart
+from hodge_pipeline.types import CloudSet, Source
+
+
+def make_clouds(source: Source, options: CloudOptions, steps: Steps, workers: Workers) -> CloudSet:
+    """The down-sampled cloud of each frame."""
+    return steps.step(clouds, source, options, title="clouds", total=len(source.frames), workers=workers)
+
+
+def clouds(source: Source, options: CloudOptions, *, workers: Workers, step: Step) -> CloudSet:
+    """Step: the cloud of each frame by `registration.clouds`."""
+    made, notes = prepare_clouds(source.frames, options, workers, step.advance)
+    for note in notes:
+        step.note(note)
+    return made
+
+
+def landmarks_for(clouds: CloudOptions, matching: GlobalStart) -> CloudOptions:
+    """The clouds with as many landmarks as matching without a guess wants, unless their own options say how many."""
+    if matching.use == "geometry" or clouds.landmarks:
+        return clouds
+    return replace(clouds, landmarks=matching.landmarks)

@@ -1,0 +1,92 @@
+"""First poses from consecutive frames, every frame registered to the one before it."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.registration import odometry as tracking
+from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.gaps import has_gap
+from hodge_pipeline.registration.odometry import Odometry, OdometryOptions
+from hodge_pipeline.scene import Drift, KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
+from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.start.clouds import landmarks_for, make_clouds
+from hodge_pipeline.start.unordered.join import join_parts
+from hodge_pipeline.start.unordered.options import GlobalStart
+from hodge_pipeline.types import CloudSet, Floats, Ints, Source
+
+OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+
+
+@dataclass(frozen=True, config=OPTIONS)
+class OdometryStart(OdometryOptions):
+    """Registers each frame to the one before it; what this leaves apart may be joined without a guess."""
+
+    relocalise: bool | Literal["auto"] = Field(
+        default=False,
+        description="join what odometry leaves apart, by `unordered`: after lost tracking, or several sequences; "
+        "auto: only where it left something apart, true: always, which closes loops that have drifted too far as well",
+    )
+    unordered: GlobalStart = Field(default=GlobalStart(), description="how parts are joined without a guess")
+
+    @property
+    def odometry(self) -> OdometryOptions:
+        """The options of the odometry alone: others do not change what it finds."""
+        return OdometryOptions(**{field.name: getattr(self, field.name) for field in fields(OdometryOptions)})
+
+    def cloud_options(self, clouds: CloudOptions, apart: bool) -> CloudOptions:
+        """The clouds, with landmarks where parts are joined by them; `apart`: several parts are likely."""
+        relocalises = apart if self.relocalise == "auto" else self.relocalise
+        return landmarks_for(clouds, self.unordered) if relocalises else clouds
+
+    def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
+        """Every frame of the source with its cloud and its pose by odometry."""
+        sequences, stamps = tuple(sequences_of(source).values()), _stamps(source)
+        options = self.cloud_options(clouds, len(sequences) > 1 or has_gap(sequences, stamps))
+        made = make_clouds(source, options, steps, workers)
+        found = steps.step(
+            chain, made, sequences, stamps, self.odometry, title="odometry", total=len(stamps), workers=workers
+        )
+        return self.joined(source, made, found, KeyFrames.all_of(source, found.world_from_cam), steps, workers)
+
+    def joined(
+        self, source: Source, clouds: CloudSet, found: Odometry, key_frames: KeyFrames, steps: Steps, workers: Workers
+    ) -> Scene:
+        """The scene of the key frames of `source`, its parts joined as `relocalise` says."""
+        keys = key_source(source, key_frames.rows)
+        part = connected_components(found.steps.pairs, len(found.world_from_cam))
+        drift, first = (
+            Drift(found.world_from_cam, part, self.max_drift),
+            Round(found.steps, vertex_ids(keys), found.world_from_cam),
+        )
+        several = int((np.bincount(part) > 1).sum()) > 1
+        if self.relocalise is True or (self.relocalise == "auto" and several):
+            first = join_parts(keys, clouds, first, self.unordered, steps, workers)
+        return Scene(source, keys, key_frames, clouds, first, drift)
+
+
+def chain(
+    clouds: CloudSet,
+    sequences: tuple[Ints, ...],
+    stamps_s: Floats,
+    options: OdometryOptions,
+    *,
+    workers: Workers,
+    step: Step,
+) -> Odometry:
+    """Step: poses of all frames by `registration.odometry`."""
+    assert clouds.folder is not None
+    found = tracking.odometry(clouds.folder, sequences, stamps_s, options, workers, step.advance)
+    for note in found.notes:
+        step.note(note)
+    return found
+
+
+def _stamps(source: Source) -> Floats:
+    return np.array([frame.stamp_s for frame in source.frames])

@@ -1,0 +1,83 @@
+"""First poses without a guess: of frames in no order, or of the parts that odometry left apart."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.gaps import has_gap
+from hodge_pipeline.scene import START, KeyFrames, Round, Scene, sequences_of, vertex_ids
+from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.start.clouds import landmarks_for, make_clouds
+from hodge_pipeline.start.unordered.options import GlobalStart
+from hodge_pipeline.start.unordered.start import Frames, Start, find_start
+from hodge_pipeline.types import CloudSet, Edges, Source
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+class UnorderedStart(GlobalStart):
+    """Matches frames or scans without a guess; nothing is taken from the order of the files or their stamps."""
+
+    def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
+        """Every frame of the source with its cloud and the pose that the evidence joins it at."""
+        made = make_clouds(source, landmarks_for(clouds, self), steps, workers)
+        first = _round(source, made, None, self, steps, workers)
+        key_frames = KeyFrames.all_of(source, first.world_from_cam)
+        return Scene(source, source, key_frames, made, first, in_order=False)
+
+
+def join_parts(
+    source: Source, clouds: CloudSet, first: Round, options: GlobalStart, steps: Steps, workers: Workers
+) -> Round:
+    """The parts of the first round, those of its edges, joined without a guess where the evidence allows."""
+    return _round(source, clouds, first, options, steps, workers)
+
+
+def _round(
+    source: Source, clouds: CloudSet, known: Round | None, options: GlobalStart, steps: Steps, workers: Workers
+) -> Round:
+    edges, poses = (None, None) if known is None else (known.edges, known.world_from_cam)
+    total = 2 * len(source.frames)
+    found = steps.step(
+        start_without_guess, source, clouds, edges, poses, options,
+        title="start without a guess", total=total, workers=workers,
+    )  # fmt: skip
+    return Round(found.edges, vertex_ids(source), found.world_from_cam, name=START)
+
+
+def start_without_guess(
+    source: Source,
+    clouds: CloudSet,
+    edges: Edges | None,
+    world_from_cam: np.ndarray | None,
+    options: GlobalStart,
+    *,
+    workers: Workers,
+    step: Step,
+) -> Start:
+    """Step: the start that the evidence of matches allows; the `edges` and poses of odometry are kept where given."""
+    assert clouds.folder is not None
+    frames = Frames(source.frames, clouds.folder, vertex_ids(source), edges, world_from_cam)
+    scratch = step.folder / "scratch"
+    found = find_start(frames, options, scratch, workers, step.advance)
+    shutil.rmtree(scratch, ignore_errors=True)
+    for note in found.notes:
+        step.note(note)
+    if edges is not None and world_from_cam is not None and _stays(source, edges, found):
+        step.note("nothing joins what tracking left apart: it starts where the guessed motion puts it")
+        return replace(found, edges=edges, world_from_cam=world_from_cam)
+    return found
+
+
+def _stays(source: Source, edges: Edges, found: Start) -> bool:
+    """Whether no two parts were joined, and none lies behind a hole, over which no motion can be guessed."""
+    parts = connected_components(edges.pairs, len(source.frames))
+    stamps_s = np.array([frame.stamp_s for frame in source.frames])
+    holes = has_gap(list(sequences_of(source).values()), stamps_s)
+    return not holes and len(np.unique(found.piece)) >= len(np.unique(parts))

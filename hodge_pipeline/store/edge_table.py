@@ -1,0 +1,84 @@
+"""The table of edges that people read: `edges.csv`, written and read."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline.errors import WorkspaceError, not_written
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.types import Edges
+from hodge_pipeline.types.edges import Words
+
+COLUMNS = {
+    "source": "proposed_by",
+    "status": "status",
+    "overlap": "overlap",
+    "fitness": "fitness",
+    "rmse_m": "rmse_m",
+    "correspondences": "correspondences",
+    "weight": "weight",
+    "residual_m": "residual_m",
+    "residual_deg": "residual_rad",
+    "verdict": "verdict",
+    "probability": "probability",
+    "leverage": "leverage",
+    "why": "why",
+}
+"""The columns after `i` and `j`, and the field of `Edges` that each shows."""
+LEAST = ("i", "j", "source", "status")
+
+
+def write_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic]) -> None:
+    """One row a pair by vertex ids, the edges before those that are none; empty where nothing is known.
+
+    Raises `WorkspaceError` where the file cannot be written.
+    """
+    edges = edges.select(np.argsort(~edges.in_graph, kind="stable"))
+    columns = [_cells(name, getattr(edges, field)) for name, field in COLUMNS.items()]
+    text = io.StringIO(newline="")
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(("i", "j", *COLUMNS))
+    table.writerows(zip(*vertex_ids[edges.pairs].T.tolist(), *columns, strict=True))
+    try:
+        artifacts.write_text(path, text.getvalue())
+    except OSError as error:
+        raise not_written(path, error) from error
+
+
+def _cells(name: str, column: NDArray[Any]) -> list[Any]:
+    if column.dtype.kind != "f":
+        return list(column.tolist())
+    return [
+        f"{value:.6g}" if isfinite(value) else "" for value in (np.rad2deg(column) if name.endswith("_deg") else column)
+    ]
+
+
+def read_edges(path: Path) -> tuple[Edges, Words]:
+    """What `write_edges` wrote but for the motions, and the names of the vertices.
+
+    Raises `WorkspaceError` for a table without the ends, source and status of its rows.
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+        header = ("i", "j", *COLUMNS) if not rows else tuple(rows[0])
+    if missing := [name for name in LEAST if name not in header]:
+        raise WorkspaceError(f"{path}: has no column {missing[0]!r}: run the same recipe again")
+    names, ends = np.unique(np.array([(row["i"], row["j"]) for row in rows], np.str_), return_inverse=True)
+    edges = Edges.of(ends.reshape(-1, 2))
+    columns = {field: [row[name] or "" for row in rows] for name, field in COLUMNS.items() if name in header}
+    edges = replace(edges, **{field: _column(getattr(edges, field), cells) for field, cells in columns.items()})
+    return replace(edges, residual_rad=np.deg2rad(edges.residual_rad)), names
+
+
+def _column(like: NDArray[Any], cells: list[str]) -> NDArray[Any]:
+    if like.dtype.kind == "U":
+        return np.array(cells, np.str_)
+    return np.array([float(cell or "nan") for cell in cells]).astype(like.dtype)

@@ -1,0 +1,232 @@
+"""Steps that are computed once: named, keyed, saved and loaded in one place."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import numpy as np
+
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.stages import Step
+from hodge_pipeline.store import artifacts, codec
+from hodge_pipeline.store.cost import Cost, Monitor
+from hodge_pipeline.store.log import log
+from hodge_pipeline.store.progress import Nobody, Watcher
+from hodge_pipeline.store.workspace import disk_errors
+
+T = TypeVar("T")
+LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless", "pycolmap")
+RECORD, KEY, INDEX = "step.json", "key.txt", "index.json"
+"""Of a finished step: its key, the hash of each file, notes, cost; of a begun one: its key; of a run: its steps."""
+HASHED_AT_ONCE = 1 << 22
+"""Bytes."""
+
+
+@cache
+def versions() -> dict[str, str]:
+    """The versions of this package and of the libraries that decide its numbers."""
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "absent"
+    return found
+
+
+class Store:
+    """The steps of one run, in `folder`: each is computed once for its inputs and read back afterwards.
+
+    A step's key is a hash of its name, the library versions and the keys of its inputs: the key of an earlier step for
+    what that step returned, the contents for anything else. A step is finished when its folder has its final name; the
+    hash of every file is kept with the key, and a step whose files have changed since is computed again, and reported.
+    """
+
+    def __init__(self, folder: Path, watcher: Watcher | None = None) -> None:
+        self.folder, self.notes = folder, list[str]()
+        self.watcher = watcher or Nobody()
+        self._monitor, self._counts = Monitor(), Counter[str]()
+        self._keys: dict[int, tuple[object, str]] = {}
+        self._index: list[dict[str, Any]] = []
+
+    def step(
+        self, function: Callable[..., T], *inputs: Any, title: str, total: int = 1, name: str = "", **resources: Any
+    ) -> T:
+        """What the function returns, computed or read back: see `stages.Steps`, and `codec` for what can be stored."""
+        name = self._numbered(name or function.__name__)
+        key = self.key([name, versions(), inputs])
+        path, kind = self.folder / name, get_type_hints(function)["return"]
+        if self._is_whole(path, key):
+            log.info("%s: already done", title)
+        else:
+            self._compute(path, key, title, total, partial(function, *inputs, **resources))
+        record = artifacts.read_json(path / RECORD)
+        for message in record["notes"]:
+            self.note(message)
+        value: T = codec.load(path, kind)
+        self.remember(value, key)
+        self._listed(name, function.__name__, title)
+        return value
+
+    def key(self, value: Any) -> str:
+        """The key of an input: of the step that made it, else of its contents."""
+        known = self._keys.get(id(value))
+        return known[1] if known is not None and known[0] is value else _hash(self._content(value))
+
+    def remember(self, value: object, key: str) -> None:
+        """Let `value`, this very object, stand for `key` wherever it is an input."""
+        if value is not None and not isinstance(value, (bool, int, float, str)):
+            self._keys[id(value)] = (value, key)
+
+    def note(self, message: str) -> None:
+        """Tell the user, the log and the report, once; a finished step tells its notes again in every later run."""
+        if message not in self.notes:
+            self.notes.append(message)
+            self.watcher.say(message)
+            log.warning(message)
+
+    def costs(self) -> list[dict[str, Any]]:
+        """Title, wall_s, cpu_s and peak_mb of each step so far, whenever it was computed; those of one title added."""
+        found: dict[str, dict[str, Any]] = {}
+        for entry in self._index:
+            own = artifacts.read_json(self.folder / entry["name"] / RECORD)["cost"]
+            sums = found.pop(entry["title"], {"title": entry["title"], **vars(Cost())})
+            added = {part: sums[part] + own[part] for part in ("wall_s", "cpu_s")}
+            found[entry["title"]] = {**sums, **added, "peak_mb": max(sums["peak_mb"], own["peak_mb"])}
+        return list(found.values())
+
+    def _numbered(self, name: str) -> str:
+        self._counts[name] += 1
+        return f"{name}-{self._counts[name]}"
+
+    def _content(self, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            data = np.ascontiguousarray(value)
+            return [str(data.dtype), list(data.shape), hashlib.sha256(data.tobytes()).hexdigest()]
+        if isinstance(value, bytes):
+            return hashlib.sha256(value).hexdigest()
+        if isinstance(value, Path):
+            return _facts(value) if value.is_file() else str(value)
+        if isinstance(value, Mapping):
+            return {str(name): self.key(item) for name, item in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [self.key(item) for item in value]
+        if dataclasses.is_dataclass(value):
+            fields = {one.name: self.key(getattr(value, one.name)) for one in dataclasses.fields(value)}
+            return [type(value).__qualname__, fields]
+        return value
+
+    def _is_whole(self, path: Path, key: str) -> bool:
+        """Whether the step is finished under this key and each of its files is as it was written."""
+        try:
+            record = artifacts.read_json(path / RECORD)
+            if record["key"] != key:
+                return False
+            changed = next((name for name, known in record["files"].items() if _facts(path / name) != known), None)
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+        if changed is not None:
+            self.note(f"{path.name}/{changed} has changed since it was written: the step is computed again")
+        return changed is None
+
+    def _compute(self, path: Path, key: str, title: str, total: int, function: Callable[..., Any]) -> None:
+        part = path.with_name(f"{path.name}.part")
+        notes: list[str] = []
+        log.info("%s: begins", title)
+        with self._monitor.measure() as cost, disk_errors(part), self.watcher.stage(title, total) as advance:
+            if _text(part / KEY) != key:
+                shutil.rmtree(part, ignore_errors=True)
+                part.mkdir(parents=True)
+                artifacts.write_text(part / KEY, key)
+            codec.save(part, function(step=Step(part, advance, notes.append)))
+        with disk_errors(part):
+            (part / KEY).unlink()
+            files = {str(file.relative_to(part)): _facts(file) for file in sorted(part.rglob("*")) if file.is_file()}
+            facts = {"key": key, "title": title, "files": files, "notes": list(dict.fromkeys(notes))}
+            artifacts.write_json(part / RECORD, {**facts, "versions": versions(), "cost": vars(cost)})
+            _commit(part, path)
+        log.info("%s: %.1f s wall, %.1f s CPU, %.0f MB", title, cost.wall_s, cost.cpu_s, cost.peak_mb)
+
+    def _listed(self, name: str, function: str, title: str) -> None:
+        """Keep the list of the steps so far, in order, without those that another run of this folder left."""
+        self._index.append({"name": name, "function": function, "title": title})
+        artifacts.write_json(self.folder / INDEX, self._index)
+
+
+def stored(folder: Path, function: Callable[..., T]) -> list[T]:
+    """What every call of a step's function returned in the latest run, in order, as far as it came; `folder` as a
+    `Store`'s. Nothing is computed, and no version or source is asked for.
+
+    Raises `WorkspaceError` where a file has changed since it was written.
+    """
+    kind, name, found = get_type_hints(function)["return"], function.__name__, []
+    try:
+        index = artifacts.read_json(folder / INDEX)
+    except (OSError, ValueError):
+        return []
+    for path in (folder / entry["name"] for entry in index if entry["function"] == name):
+        try:
+            files: Mapping[str, Sequence[Any]] = artifacts.read_json(path / RECORD)["files"]
+            changed = next((file for file, known in files.items() if _facts(path / file) != known), None)
+            if changed is not None:
+                raise ValueError(f"{changed} has changed since it was written")
+            found.append(codec.load(path, kind))
+        except (OSError, ValueError, KeyError) as error:
+            raise WorkspaceError(f"{path}: {error}: the same hodge run computes it again") from error
+    return found
+
+
+def stored_folders(folder: Path) -> list[Path]:
+    """The folders of the steps of the latest run, in order, as far as it came."""
+    try:
+        return [folder / entry["name"] for entry in artifacts.read_json(folder / INDEX)]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def _facts(path: Path) -> list[Any]:
+    """Size and SHA-256 of a file."""
+    total, size = hashlib.sha256(), 0
+    with path.open("rb") as stream:
+        while block := stream.read(HASHED_AT_ONCE):
+            total.update(block)
+            size += len(block)
+    return [size, total.hexdigest()]
+
+
+def _commit(part: Path, path: Path) -> None:
+    """Give a finished step its name, once all of its bytes are on the disk."""
+    for file in (*part.rglob("*"), part):
+        handle = os.open(file, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    shutil.rmtree(path, ignore_errors=True)
+    os.replace(part, path)
+    handle = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:32]

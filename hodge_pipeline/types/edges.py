@@ -1,0 +1,281 @@
+"""The edges of a run as one table that grows by columns, and the viewing graph that solvers get of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.types.arrays import Bools, Floats, Ints
+
+Words = NDArray[np.str_]
+CANDIDATE, HELD_OUT, REJECTED = "candidate", "held_out", "rejected"
+USED, IGNORED, DISABLED = "used", "ignored", "disabled"
+"""The `status` of a row of `Edges`: proposed; kept out to judge by; registered, but no edge; an edge that counts; one
+to which the solver gave no weight; one that a person switched off.
+"""
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Poses known from elsewhere: vertex rows (P,), `world_from_vertex (P, 4, 4)`, and `information (P, 6, 6)` of ξ =
+    (rotation, translation) in `world_from_vertex · exp(ξ)`; several of one vertex count each.
+    """
+
+    vertices: Ints
+    world_from_vertex: Floats
+    information: Floats
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What a registrar found for one pair; see `ViewGraph` for the meaning and units of each field."""
+
+    i_from_j: Floats
+    information: Floats
+    fitness: float
+    rmse_m: float
+    correspondences: int
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class ViewGraph:
+    """The viewing graph, in columns. A million edges are arrays, not a million objects.
+
+    - `vertex_ids (V,)` int64 or str, as the source names them; `edges (E, 2)` hold *rows* of it.
+    - `i_from_j (E, 4, 4)`: moves points of vertex j into vertex i, for the edge (i, j) in the direction measured.
+      Parallel edges are legal.
+    - `information (E, 6, 6)`: inverse covariance of ξ = (rotation, translation) in `i_from_j · exp(ξ)`, radians and
+      metres in j's axes.
+    - `fitness (E,)`: share of cloud j with a correspondence, or of i where the registrar says so; `rmse_m (E,)`: their
+      RMS distance; NaN where unknown.
+    - `source (E,)`: where the edge comes from (sequential, overlap, sift, colmap, g2o, …).
+    - `correspondences (E,)`: how many; 0 where unknown.
+    - `dimension`: 2 for a graph in the plane z = 0, lifted, with no information out of it; it stays one when written.
+    - `fixed`: rows of the vertices that the source holds at the poses it gives them.
+    - `priors`: what the source says of single poses, None where it says nothing.
+    """
+
+    vertex_ids: NDArray[np.generic]
+    edges: Ints
+    i_from_j: Floats
+    information: Floats
+    fitness: Floats
+    rmse_m: Floats
+    source: NDArray[np.str_]
+    correspondences: Ints
+    dimension: int = 3
+    fixed: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    priors: Priors | None = None
+
+    @property
+    def vertex_count(self) -> int:
+        """How many vertices there are, isolated ones included."""
+        return len(self.vertex_ids)
+
+    @property
+    def edge_count(self) -> int:
+        """How many edges there are, parallel ones each."""
+        return len(self.edges)
+
+    @classmethod
+    def from_edges(
+        cls,
+        vertex_ids: NDArray[np.generic],
+        edges: Ints,
+        i_from_j: Floats,
+        information: Floats | None = None,
+        source: str = "given",
+        *,
+        dimension: int = 3,
+        fixed: Ints | None = None,
+    ) -> ViewGraph:
+        """A graph of measured edges; the information defaults to the identity, what was not seen to NaN or 0.
+
+        Raises `GraphError` where there is not one motion (4, 4) and one information (6, 6) for each edge.
+        """
+        count = len(edges)
+        for name, given, side in (("i_from_j", i_from_j, 4), ("information", information, 6)):
+            if count and given is not None and np.shape(given) != (count, side, side):
+                raise GraphError(f"{name} has the shape {np.shape(given)}: expected ({count}, {side}, {side})")
+        return cls(
+            vertex_ids=np.asarray(vertex_ids),
+            edges=np.asarray(edges, np.int64).reshape(-1, 2),
+            i_from_j=np.asarray(i_from_j, float).reshape(-1, 4, 4),
+            information=np.broadcast_to(np.eye(6), (count, 6, 6)).copy()
+            if information is None
+            else np.asarray(information, float),
+            fitness=np.full(count, np.nan),
+            rmse_m=np.full(count, np.nan),
+            source=np.full(count, source),
+            correspondences=np.zeros(count, np.int64),
+            dimension=dimension,
+            fixed=np.zeros(0, np.int64) if fixed is None else np.asarray(fixed, np.int64),
+        )
+
+    def select(self, rows: Ints | Bools) -> ViewGraph:
+        """The graph with these edges only, in this order; every vertex is kept."""
+        return replace(
+            self,
+            edges=self.edges[rows],
+            i_from_j=self.i_from_j[rows],
+            information=self.information[rows],
+            fitness=self.fitness[rows],
+            rmse_m=self.rmse_m[rows],
+            source=self.source[rows],
+            correspondences=self.correspondences[rows],
+        )
+
+    @classmethod
+    def joined(cls, graphs: Sequence[ViewGraph]) -> ViewGraph:
+        """One graph with the edges of all, one graph's after the other's, over the vertices of the first."""
+        names = ("edges", "source", *MEASURED)
+        columns: dict[str, Any] = {name: np.concatenate([getattr(graph, name) for graph in graphs]) for name in names}
+        return replace(graphs[0], **columns)
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Every pair of views that a run knows of, in columns that fill from proposal to verdict; unknown is NaN or empty.
+
+    - Proposed: `pairs (E, 2)`, rows of the vertices, in the direction measured, i < j where only proposed; parallel
+      ones are legal. `proposed_by (E,)`: the reasons, joined by "+", or the format that a measured edge comes from.
+      `overlap (E,)`: the score of the proposal in [0, 1].
+    - Registered: `i_from_j`, `information`, `fitness`, `rmse_m`, `correspondences` as in `ViewGraph`, `iterations`, and
+      whether it `converged`.
+    - Accepted: `status (E,)`, one of the six above; `why (E,)`: the reason of a rejection, later that of the verdict.
+    - Solved: `weight (E,)` relative to its own information, `residual_m`, `residual_rad (E,)` under the poses.
+    - Judged: `verdict (E,)`; `probability (E,)` that it is right, NaN where untestable; `leverage (E,)`: its share in
+      where its ends lie.
+    """
+
+    pairs: Ints
+    proposed_by: Words
+    overlap: Floats
+    i_from_j: Floats
+    information: Floats
+    fitness: Floats
+    rmse_m: Floats
+    correspondences: Ints
+    iterations: Ints
+    converged: Bools
+    status: Words
+    why: Words
+    weight: Floats
+    residual_m: Floats
+    residual_rad: Floats
+    verdict: Words
+    probability: Floats
+    leverage: Floats
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    @classmethod
+    def of(cls, pairs: Ints | Sequence[Sequence[int]], proposed_by: str | Words = "") -> Edges:
+        """Candidates (P, 2) as they are, of which nothing else is known."""
+        pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
+        count = len(pairs)
+        number, word, whole = np.full(count, np.nan), np.full(count, ""), np.zeros(count, np.int64)
+        return cls(
+            pairs=pairs,
+            proposed_by=np.full(count, proposed_by),
+            overlap=number,
+            i_from_j=np.full((count, 4, 4), np.nan),
+            information=np.full((count, 6, 6), np.nan),
+            fitness=number,
+            rmse_m=number,
+            correspondences=whole,
+            iterations=whole,
+            converged=np.zeros(count, bool),
+            status=np.full(count, CANDIDATE),
+            why=word,
+            weight=number,
+            residual_m=number,
+            residual_rad=number,
+            verdict=word,
+            probability=number,
+            leverage=number,
+        )
+
+    @classmethod
+    def proposed(cls, pairs: Ints, proposed_by: str, overlap: Floats | None = None) -> Edges:
+        """What an edge builder gives: distinct pairs (P, 2) for one reason, each turned to i < j, all sorted."""
+        pairs = np.sort(np.asarray(pairs, np.int64).reshape(-1, 2), axis=1)
+        order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+        table = cls.of(pairs[order], proposed_by)
+        return table if overlap is None else replace(table, overlap=np.asarray(overlap, float)[order])
+
+    @classmethod
+    def measured(cls, graph: ViewGraph) -> Edges:
+        """The edges of a graph, which count."""
+        columns = {name: getattr(graph, name) for name in MEASURED}
+        return replace(cls.of(graph.edges, graph.source), status=np.full(graph.edge_count, USED), **columns)
+
+    def with_registrations(self, found: Sequence[Registration]) -> Edges:
+        """The table with a registration for each row; all count until acceptance rejects some."""
+
+        def column(name: str, shape: tuple[int, ...], kind: type) -> NDArray[Any]:
+            return np.array([getattr(one, name) for one in found], kind).reshape(-1, *shape)
+
+        return replace(
+            self,
+            i_from_j=column("i_from_j", (4, 4), float),
+            information=column("information", (6, 6), float),
+            fitness=column("fitness", (), float),
+            rmse_m=column("rmse_m", (), float),
+            correspondences=column("correspondences", (), np.int64),
+            iterations=column("iterations", (), np.int64),
+            converged=column("converged", (), np.bool_),
+            status=np.full(len(found), USED),
+        )
+
+    def put(self, rows: Ints | Bools | slice, **columns: Any) -> Edges:
+        """The table with new values in some rows of these columns."""
+        filled: dict[str, NDArray[Any]] = {}
+        for name, values in columns.items():
+            old = getattr(self, name)
+            filled[name] = old.astype(np.result_type(old, np.asarray(values)))  # a longer word must fit
+            filled[name][rows] = values
+        return replace(self, **filled)
+
+    def select(self, rows: Ints | Bools | slice) -> Edges:
+        """These rows only, in this order."""
+        return Edges(*(getattr(self, column.name)[rows] for column in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Edges]) -> Edges:
+        """These tables one after the other."""
+        parts = [cls.of(np.zeros((0, 2), np.int64)), *parts]
+        return cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
+
+    @property
+    def counts(self) -> Bools:
+        """The rows (E,) that a solver is given."""
+        return np.isin(self.status, (USED, IGNORED))
+
+    @property
+    def in_graph(self) -> Bools:
+        """The rows (E,) that are edges, those that are off by hand included."""
+        return np.isin(self.status, (USED, IGNORED, DISABLED))
+
+    @property
+    def rejected_counts(self) -> dict[str, int]:
+        """How many pairs were rejected for each reason."""
+        reasons, counts = np.unique(self.why[self.status == REJECTED], return_counts=True)
+        return dict(zip(reasons.tolist(), counts.tolist(), strict=True))
+
+    def as_graph(self, vertex_ids: NDArray[np.generic]) -> ViewGraph:
+        """The viewing graph of all rows, each of which has a motion: `select` first."""
+        columns = {name: getattr(self, name) for name in MEASURED}
+        return ViewGraph(vertex_ids=vertex_ids, edges=self.pairs, source=self.proposed_by, **columns)
+
+
+MEASURED = ("i_from_j", "information", "fitness", "rmse_m", "correspondences")
+"""The columns that `Edges` and `ViewGraph` have in common."""
