@@ -22,7 +22,7 @@ from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import has_truth, true_poses
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import Floats, Solution
+from hodge_pipeline.types import Floats
 
 HEADING = "The paper's tables"
 OUTER_ITERATIONS = 3
@@ -118,7 +118,7 @@ def _peer(folder: Path, sequence: Found, run: Run) -> tuple[Floats | None, str]:
 
 
 def _measured(run: Run, kind: GraphKind, wall_s: float, peer: Floats | None, peer_note: str) -> Measured:
-    solutions = [_solution(run, number) for number in range(1, OUTER_ITERATIONS + 1)]
+    solutions = [found.solution for found in run.rounds if found.solution is not None]
     first = solutions[0]
     stages = run.report.stages
     assert run.report.scores is not None
@@ -143,16 +143,12 @@ def _measured(run: Run, kind: GraphKind, wall_s: float, peer: Floats | None, pee
     )
 
 
-def _solution(run: Run, number: int) -> Solution:
-    return artifacts.load_solution(run.folder / "stages" / f"solve-{number}" / "solution.npz")
-
-
 def _peer_score(run: Run, kind: GraphKind, peer: Floats) -> float:
     """The peer's score on the pairs of the true poses, or of our result where there are none."""
-    reference = true_poses(run.source) if has_truth(run.source) else run.result.world_from_cam
+    reference = true_poses(run.source) if has_truth(run.source) else run.poses
     sets = {"reference": reference, "peer": peer}
     with load_recipe(f"paper-{kind}").executor.open() as workers:
-        table = score_table(run.folder / "stages" / "clouds", sets, "reference", workers, kinds=(kind,))
+        table = score_table(run.clouds.folder, sets, "reference", workers, kinds=(kind,))
     return float(table.graphs[0].mean_score[1])
 
 
@@ -162,7 +158,7 @@ def _picture(name: str, run: Run, peer: Floats | None, peer_name: str, out: Path
     sets = {"GT": true_poses(run.source)} if has_truth(run.source) else {}
     if peer is not None:
         sets[peer_name] = peer
-    sets["Hodge 3rd"] = run.result.world_from_cam
+    sets["Hodge 3rd"] = run.poses
     path = out / f"{name}.png"
     draw_comparison(path, run.source.frames, sets)
     shown = ", ".join(sets)
