@@ -16,6 +16,7 @@ from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import listed_edges
 from hodge_pipeline.recipe import binding
+from hodge_pipeline.recipe.recipe_file import recipe_names
 from hodge_pipeline.recipe.scale import with_scale
 from hodge_pipeline.recipe.schema import Recipe, load_recipe, with_source
 from hodge_pipeline.recording.run import Recording
@@ -115,7 +116,9 @@ class _Job:
         path = self.recipe.source.path
         if path is None:
             raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
-        source, reader = (self.opened, None) if self.opened else open_source(path, self.recipe.source.reader)
+        source, reader = (
+            (self.opened, None) if self.opened else open_source(path, self.recipe.source.reader, recipe_names())
+        )
         if not source.frames:
             raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
         for note in source.notes:

@@ -14,15 +14,15 @@ from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.fusion.ply import read_ply
-from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.recipe import binding
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge_parts
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.recorder import APPLICATION, Recorder
 from hodge_pipeline.scene import Round, has_truth, pose_sets, true_poses
 from hodge_pipeline.stages import Step, Steps
-from hodge_pipeline.store import artifacts
+from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.store.log import log
 from hodge_pipeline.store.workspace import identity_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
