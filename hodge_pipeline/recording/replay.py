@@ -42,6 +42,7 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
         store = Store(folder / PARTS, watcher)
         source = _with_images(run, recipe, store)
         with Recording(store, folder, changed, source) as recording:
+            recording.begin(source, run.clouds, run.rounds[0])
             _record(run, recording)
     return folder / FILE, run.ending is not None
 
@@ -64,7 +65,6 @@ def _with_images(run: Run, recipe: Recipe, store: Store) -> Source:
 
 
 def _record(run: Run, recording: Recording) -> None:
-    recording.begin(run.clouds, run.rounds[0])
     for number, one in enumerate(run.rounds[1:], start=1):
         recording.round(number, one)
     if (run.result.edges.verdict != "").any():
