@@ -59,8 +59,8 @@ def _with_images(run: Run, recipe: Recipe, store: Store) -> Source:
                 store.note(f"{opened.path}: holds other frames by now: recorded without images")
         except (HodgeError, OSError) as error:
             store.note(f"recorded without images: {error}")
-    keys = source if run.key_frames.are_all else key_source(source, run.key_frames.rows)
-    store.remember(keys, store.key([store.key(source), run.key_frames.rows]))
+    keys = key_source(source, run.key_frames.rows)
+    store.remember(keys, store.key([source, run.key_frames.rows]))
     return keys
 
 
