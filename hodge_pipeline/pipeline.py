@@ -99,9 +99,10 @@ class _Job:
         job = _Job(**{**vars(self), "recipe": with_scale(self.recipe, source, self.store)})
         with ExitStack() as pool:
             workers = pool.enter_context(open_workers(job.recipe.executor, job.dask))
-            scene = job.recipe.start.begin(source, job.recipe.clouds, job.store, workers)
-            job.store.step(begin, *opening_of(scene), title="frames")
-            with Recording(job.store, job.workspace.folder, job.recipe, scene.source, job.live) as recording:
+            with Recording(job.store, job.workspace.folder, job.recipe, source, job.live) as recording:
+                scene = job.recipe.start.begin(source, job.recipe.clouds, job.store, workers)
+                job.store.step(begin, *opening_of(scene), title="frames")
+                recording.begin(scene.source, scene.clouds, scene.first)
                 work = Work(job.recipe, job.store, scene, job.measured(scene), workers)
                 rounds, scores = job.compute(work, recording)
                 refined = verdict.finish(work, job.workspace.folder, rounds) if scene.is_given else None
@@ -137,7 +138,6 @@ class _Job:
     def compute(self, work: Work, recording: Recording) -> tuple[list[Round], ScoreTable | None]:
         """The rounds and their scores: the paper's algorithm."""
         rounds = [work.scene.first]
-        recording.begin(work.scene.clouds, rounds[0])
         for number in range(1, self.recipe.outer_iterations + 1):
             proposed = work.propose(number, rounds[-1])
             registered = work.register(number, proposed, rounds[-1].world_from_cam)

@@ -35,11 +35,13 @@ LEAST_JOINED = 0.2
 
 @dataclass(frozen=True)
 class Refined:
-    """What a refinement came to: the decision, poses (N, 4, 4) of all frames, and the written file of poses."""
+    """What a refinement came to: the decision, poses (N, 4, 4) of all frames, and the name, in the run folder, of the
+    written file of poses, or of the folder; empty where nothing is written.
+    """
 
     decision: Decision
     world_from_cam: Floats
-    file: Path | None
+    file: str
 
 
 def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
@@ -52,7 +54,7 @@ def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
     work.steps.note(decision.reason)
     poses = key_frames.first if decision.keeps_input else key_frames.expand(last.world_from_cam)
     file = None if decision.outcome == "nothing" else _write(work, folder, decision, last)
-    return Refined(decision, poses, file)
+    return Refined(decision, poses, "" if file is None else file.name)
 
 
 def _decision(work: Work, rounds: Sequence[Round], before: Floats) -> Decision:
