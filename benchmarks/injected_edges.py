@@ -32,8 +32,8 @@ from edge_scores import area_under_roc, precision_and_recall
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.report.diagnosed import open_subject
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.uses.diagnosed import open_subject
 
 SHARES = (0.01, 0.05, 0.2, 0.5)
 GROUP = 20

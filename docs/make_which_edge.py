@@ -22,11 +22,11 @@ from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.report import splat
-from hodge_pipeline.report.diagnosed import diagnose_subject, open_subject, write_diagnosed
 from hodge_pipeline.report.diagnosis_plots import draw
 from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.types import CloudSet, Floats, ViewGraph
+from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
 
 PICTURES = Path(__file__).parent / "pictures"
 RIGHT = ((2, 109), (6, 113), (10, 117))

@@ -28,12 +28,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hodge_pipeline.pipeline import run
     from hodge_pipeline.recipe.schema import Recipe, load_recipe
-    from hodge_pipeline.refine.colmap import refine_colmap
     from hodge_pipeline.refine.open3d_objects import solve_pose_graph
-    from hodge_pipeline.refine.trajectory import frames_from_images, refine_trajectory
     from hodge_pipeline.run_folder import Run
     from hodge_pipeline.solvers.maximum_likelihood import solve
     from hodge_pipeline.types import Solution, ViewGraph
+    from hodge_pipeline.uses.colmap import refine_colmap
+    from hodge_pipeline.uses.trajectory import frames_from_images, refine_trajectory
 
 __all__ = [
     "Recipe", "Run", "Solution", "ViewGraph", "frames_from_images", "load_recipe", "refine_colmap", "refine_trajectory",
@@ -45,9 +45,9 @@ _HOMES = {
     "load_recipe": "recipe.schema",
     "Run": "run_folder",
     "run": "pipeline",
-    "refine_colmap": "refine.colmap",
-    "refine_trajectory": "refine.trajectory",
-    "frames_from_images": "refine.trajectory",
+    "refine_colmap": "uses.colmap",
+    "refine_trajectory": "uses.trajectory",
+    "frames_from_images": "uses.trajectory",
     "solve_pose_graph": "refine.open3d_objects",
     "solve": "solvers.maximum_likelihood",
     "Solution": "types",

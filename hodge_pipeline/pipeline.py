@@ -16,6 +16,7 @@ from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import listed_edges
 from hodge_pipeline.recipe import binding
+from hodge_pipeline.recipe.recipe_file import recipe_names
 from hodge_pipeline.recipe.scale import with_scale
 from hodge_pipeline.recipe.schema import Recipe, load_recipe, with_source
 from hodge_pipeline.recording.run import Recording
@@ -98,9 +99,10 @@ class _Job:
         job = _Job(**{**vars(self), "recipe": with_scale(self.recipe, source, self.store)})
         with ExitStack() as pool:
             workers = pool.enter_context(open_workers(job.recipe.executor, job.dask))
-            scene = job.recipe.start.begin(source, job.recipe.clouds, job.store, workers)
-            job.store.step(begin, *opening_of(scene), title="frames")
-            with Recording(job.store, job.workspace.folder, job.recipe, scene.source, job.live) as recording:
+            with Recording(job.store, job.workspace.folder, job.recipe, source, job.live) as recording:
+                scene = job.recipe.start.begin(source, job.recipe.clouds, job.store, workers)
+                job.store.step(begin, *opening_of(scene), title="frames")
+                recording.begin(scene.source, scene.clouds, scene.first)
                 work = Work(job.recipe, job.store, scene, job.measured(scene), workers)
                 rounds, scores = job.compute(work, recording)
                 refined = verdict.finish(work, job.workspace.folder, rounds) if scene.is_given else None
@@ -115,7 +117,9 @@ class _Job:
         path = self.recipe.source.path
         if path is None:
             raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
-        source, reader = (self.opened, None) if self.opened else open_source(path, self.recipe.source.reader)
+        source, reader = (
+            (self.opened, None) if self.opened else open_source(path, self.recipe.source.reader, recipe_names())
+        )
         if not source.frames:
             raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
         for note in source.notes:
@@ -134,7 +138,6 @@ class _Job:
     def compute(self, work: Work, recording: Recording) -> tuple[list[Round], ScoreTable | None]:
         """The rounds and their scores: the paper's algorithm."""
         rounds = [work.scene.first]
-        recording.begin(work.scene.clouds, rounds[0])
         for number in range(1, self.recipe.outer_iterations + 1):
             proposed = work.propose(number, rounds[-1])
             registered = work.register(number, proposed, rounds[-1].world_from_cam)

@@ -9,9 +9,9 @@ from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.recipe_file import recipe_names
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
-from hodge_pipeline.recipe.yaml_file import dump, parse
 from hodge_pipeline.refine.model_options import RECIPE as MODEL_RECIPE
 from hodge_pipeline.refine.model_options import ModelRefinement, load_model_refinement
+from hodge_pipeline.store.yaml_file import dump, parse
 
 SMALL = """
 edges: {stage: overlap, min_iou: 0.4}

@@ -21,13 +21,13 @@ from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.energy import energy_rows
-from hodge_pipeline.diagnosis.matches import side_by_side
-from hodge_pipeline.diagnosis.two_clouds import FIRST, SECOND, picture, views
 from hodge_pipeline.errors import GraphError, HodgeError
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.report.diagnosed import open_subject
 from hodge_pipeline.report.diagnosis_plots import side_by_side as pieces_apart
+from hodge_pipeline.report.matches import side_by_side
+from hodge_pipeline.report.two_clouds import FIRST, SECOND, picture, views
 from hodge_pipeline.types import PointCloud, ViewGraph
+from hodge_pipeline.uses.diagnosed import open_subject
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 

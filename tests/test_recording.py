@@ -20,9 +20,9 @@ from rerun.chunk import Chunk, RrdReader
 
 from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_pipeline import se3
+from hodge_pipeline.recipe.recording_options import SHARES, RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.frames import image_rows
-from hodge_pipeline.recording.options import SHARES, RecordingOptions
 from hodge_pipeline.recording.recorder import Recorder
 from hodge_pipeline.types import (
     Camera,

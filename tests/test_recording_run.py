@@ -21,9 +21,9 @@ from hodge_pipeline.errors import HodgeError, SourceError, WorkspaceError
 from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recording import binary, layout, shapes
-from hodge_pipeline.recording.replay import record_again
 from hodge_pipeline.store.artifacts import load, load_arrays, load_solution
 from hodge_pipeline.types import CloudSet, Edges
+from hodge_pipeline.uses.record_again import record_again
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_pipeline import SMALL, Log, small_recipe
 from test_recording import rgb, rows

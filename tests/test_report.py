@@ -13,10 +13,10 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
+from hodge_pipeline.evaluation.difference import MEASURABLE, length, percent, sign_of
 from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.evaluation.scores import GraphScores, ScoreTable
 from hodge_pipeline.report.contents import RefinementSummary
-from hodge_pipeline.report.difference import MEASURABLE, length, percent, sign_of
 from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows, worst_edges
 from hodge_pipeline.report.tables import score_tables, summary_lines
 from hodge_pipeline.report.verdict import judge, suspicions

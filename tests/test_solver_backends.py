@@ -10,7 +10,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers import backends
 from hodge_pipeline.solvers import multigrid as multigrid_module
-from hodge_pipeline.solvers.backends import BackendName, backend, choose, cholmod_installed
+from hodge_pipeline.solvers.backends import BackendName, backend, cholmod_installed, choose
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.iterative import IterativeSolver

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from hodge_pipeline.errors import RecipeError
-from hodge_pipeline.recipe import recipe_file, yaml_file
+from hodge_pipeline.recipe import recipe_file
+from hodge_pipeline.store import yaml_file
 
 
 def test_plain_values_and_their_lines() -> None:

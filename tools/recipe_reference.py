@@ -9,8 +9,9 @@ from typing import Any, get_args, get_type_hints
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import HodgeError
-from hodge_pipeline.recipe import binding, recipe_file, yaml_file
+from hodge_pipeline.recipe import binding, recipe_file
 from hodge_pipeline.recipe.schema import Recipe
+from hodge_pipeline.store import yaml_file
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "recipes.md"
 OURS = "hodge-pipeline "

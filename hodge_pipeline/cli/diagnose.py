@@ -10,7 +10,7 @@ from hodge_pipeline.cli.console import Terminal
 
 if TYPE_CHECKING:
     from hodge_pipeline.diagnosis.energy import EnergyRow
-    from hodge_pipeline.report.diagnosed import Diagnosed
+    from hodge_pipeline.uses.diagnosed import Diagnosed
 
 SUGGESTED = 3
 LEAST_SHOWN, MOST_BAD = 3, 20
@@ -20,7 +20,7 @@ HEADER = ("edge", "verdict", "right", "why", "what to do")
 
 def diagnose(path: Path, out: Path | None, *, top: int | None, quiet: bool, as_json: bool) -> None:
     """Judge every edge, print the worst, and leave the rest in a folder where one is given."""
-    from hodge_pipeline.report.diagnosed import diagnose_subject, open_subject, write_diagnosed
+    from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
 
     with Terminal(quiet or as_json) as terminal:
         with terminal.stage("diagnosis", 1):

@@ -72,7 +72,8 @@ def _print_stage(kind: str, name: str, *, with_options: bool) -> None:
 
 def recipes(name: str | None, *, schema: bool) -> None:
     """Print the recipes' names and first words, one recipe with its defaults, or the JSON schema of its kind."""
-    from hodge_pipeline.recipe import binding, recipe_file, yaml_file
+    from hodge_pipeline.recipe import binding, recipe_file
+    from hodge_pipeline.store import yaml_file
 
     if schema:
         print(json.dumps(binding.json_schema(_kind(name)), indent=1))

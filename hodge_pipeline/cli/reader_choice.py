@@ -7,9 +7,10 @@ from pathlib import Path
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
-from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.recipe import binding
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import FrameReader
+from hodge_pipeline.store import yaml_file
 
 
 def choose_reader(path: Path, name: str | None, settings: Sequence[str]) -> FrameReader:

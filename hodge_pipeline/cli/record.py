@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from hodge_pipeline.cli.console import Terminal, print_table
 from hodge_pipeline.errors import RecipeError, WorkspaceError
-from hodge_pipeline.recording.options import Level
+from hodge_pipeline.recipe.recording_options import Level
 
 
 def record(run_folder: Path, level: str | None, max_megabytes: float | None, *, quiet: bool) -> None:
@@ -19,7 +19,7 @@ def record(run_folder: Path, level: str | None, max_megabytes: float | None, *, 
         raise RecipeError(f"--level {level}: expected {', '.join(levels)}")
     if max_megabytes is not None and not max_megabytes > 0:
         raise RecipeError(f"--max-megabytes {max_megabytes:g}: expected a size above zero")
-    from hodge_pipeline.recording.replay import record_again
+    from hodge_pipeline.uses.record_again import record_again
 
     given: dict[str, Any] = {"level": level, "max_megabytes": max_megabytes}
     with Terminal(quiet) as terminal:

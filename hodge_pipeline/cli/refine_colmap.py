@@ -29,7 +29,7 @@ def refine(
 ) -> None:
     """Refine a model into a run folder. Raises `CheckError` (exit code 3) where the guard kept the input as worse."""
     options = load_model_refinement(recipe or RECIPE, overrides)
-    from hodge_pipeline.refine.colmap import run_refinement
+    from hodge_pipeline.uses.colmap import run_refinement
 
     with resumable(out), Terminal(quiet or as_json) as terminal:
         done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal, dask=dask)

@@ -14,7 +14,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
-from hodge_pipeline.recipe.yaml_file import Keys
+from hodge_pipeline.store.yaml_file import Keys
 
 T = TypeVar("T")
 Where = Callable[[Keys], str]

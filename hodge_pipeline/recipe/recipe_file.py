@@ -8,8 +8,8 @@ from typing import Any
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
-from hodge_pipeline.recipe import yaml_file
-from hodge_pipeline.recipe.yaml_file import Document, Keys
+from hodge_pipeline.store import yaml_file
+from hodge_pipeline.store.yaml_file import Document, Keys
 
 MAX_EXTENDS = 8
 

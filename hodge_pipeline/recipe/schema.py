@@ -14,9 +14,9 @@ from hodge_pipeline.complex.parts import ComplexOptions
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.pairs.held_out import GuardOptions
 from hodge_pipeline.recipe import binding, recipe_file
-from hodge_pipeline.recording.options import RecordingOptions
-from hodge_pipeline.refine.held_out import GuardOptions
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.sources.measured_edges import MeasuredOptions

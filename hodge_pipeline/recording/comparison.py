@@ -9,9 +9,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hodge_pipeline import se3
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import BACKGROUND, without_panels
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.recorder import APPLICATION
 from hodge_pipeline.recording.results import log_model
 from hodge_pipeline.recording.shapes import evenly, frustum_lines

@@ -9,9 +9,9 @@ import rerun as rr
 
 from hodge_pipeline.complex.cech import clique_counts, flag_complex
 from hodge_pipeline.diagnosis.energy import AFTER, ALL_EDGES, PARTS, energy_rows
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.curl import ALPHA, log_triangles, triangle_curl_m
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import log_markdown, log_notes
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 

@@ -6,8 +6,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import log_markdown, log_notes
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 

@@ -9,13 +9,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hodge_pipeline.diagnosis.result import Diagnosis
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.blueprint import scene_view, without_panels
 from hodge_pipeline.recording.curl import log_tested_triangles
 from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.eye import Eye
 from hodge_pipeline.recording.loops import log_loops
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import log_markdown, writing
 from hodge_pipeline.types import Floats, ViewGraph
 

@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.shapes import evenly
 from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes
 from hodge_pipeline.types import Camera, CloudSet, EncodedImage, Frame, Ints

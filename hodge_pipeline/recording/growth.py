@@ -6,8 +6,8 @@ import numpy as np
 import rerun as rr
 
 from hodge_pipeline import se3
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import story_columns
 from hodge_pipeline.types import CloudSet, Floats, Floats32, Ints, Model
 

@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import frames as frame_log
 from hodge_pipeline.recording import graph as graph_log
 from hodge_pipeline.recording import layout, results
@@ -16,7 +17,6 @@ from hodge_pipeline.recording.complex import log_complex
 from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.growth import log_growth
 from hodge_pipeline.recording.merge import Merged, merge
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.registration import log_registration
 from hodge_pipeline.recording.stream import writing
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Model, Solution, ViewGraph

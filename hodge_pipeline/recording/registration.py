@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 
 from hodge_pipeline import se3
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.shapes import evenly
 from hodge_pipeline.recording.stream import log_markdown
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32

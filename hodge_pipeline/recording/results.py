@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
-from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_columns
 from hodge_pipeline.types import Floats, Frame, Model
 

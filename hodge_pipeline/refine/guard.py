@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from hodge_pipeline.report.difference import Better, sign_of
+from hodge_pipeline.evaluation.difference import Better, sign_of
 
 Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "nothing"]
 

@@ -12,10 +12,9 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
+from hodge_pipeline.pairs.held_out import held_out_pairs
 from hodge_pipeline.refine.guard import Decision, Measure, decide
-from hodge_pipeline.refine.held_out import held_out_pairs
 from hodge_pipeline.refine.uncertainty import change, mean_chi2
-from hodge_pipeline.report.contents import MeasureRow, RefinementSummary
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.scene import GivenFile, Round
 from hodge_pipeline.se3 import spread_correction
@@ -33,22 +32,16 @@ LEAST_TOLERANCE = 0.002
 LEAST_JOINED = 0.2
 """Of the key frames: the least that overlap with another one where the given poses are of these frames."""
 
-HEADLINES = {
-    "refined": "Better than the poses given",
-    "optimal": "The poses given were as good already: they are given back",
-    "worse": "Worse than the poses given: those are given back",
-    "forced": "Worse than the poses given, written all the same",
-    "nothing": "Nothing could be refined: no poses are written",
-}
-
 
 @dataclass(frozen=True)
 class Refined:
-    """What a refinement came to: the decision, poses (N, 4, 4) of all frames, and the written file of poses."""
+    """What a refinement came to: the decision, poses (N, 4, 4) of all frames, and the name, in the run folder, of the
+    written file of poses, or of the folder; empty where nothing is written.
+    """
 
     decision: Decision
     world_from_cam: Floats
-    file: Path | None
+    file: str
 
 
 def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
@@ -61,14 +54,7 @@ def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
     work.steps.note(decision.reason)
     poses = key_frames.first if decision.keeps_input else key_frames.expand(last.world_from_cam)
     file = None if decision.outcome == "nothing" else _write(work, folder, decision, last)
-    return Refined(decision, poses, file)
-
-
-def summary(decision: Decision) -> RefinementSummary:
-    """The decision as the report shows it."""
-    rows = tuple(MeasureRow(m.name, m.before, m.after, m.better, m.unit, m.is_worse) for m in decision.measures)
-    change = "" if decision.change is None else f"The {decision.change}."
-    return RefinementSummary(decision.outcome, HEADLINES[decision.outcome], decision.reason, rows, change)
+    return Refined(decision, poses, "" if file is None else file.name)
 
 
 def _decision(work: Work, rounds: Sequence[Round], before: Floats) -> Decision:

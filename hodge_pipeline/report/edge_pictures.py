@@ -7,14 +7,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.matches import side_by_side
 from hodge_pipeline.diagnosis.result import Diagnosis
-from hodge_pipeline.diagnosis.two_clouds import View, picture, views
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.report import splat
 from hodge_pipeline.report.diagnosis_page import EdgePictures
+from hodge_pipeline.report.matches import side_by_side
 from hodge_pipeline.report.plots import Plot
 from hodge_pipeline.report.thumbnails import beside, thumbnail
+from hodge_pipeline.report.two_clouds import View, picture, views
 from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, PointCloud, ViewGraph
 
 IMAGE_WIDTH = 420

@@ -8,8 +8,8 @@ from html import escape
 
 import numpy as np
 
+from hodge_pipeline.evaluation.difference import percent
 from hodge_pipeline.report.contents import Photograph, Report
-from hodge_pipeline.report.difference import percent
 from hodge_pipeline.report.plots import Plot
 from hodge_pipeline.report.tables import (
     Table,

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.recipe import binding
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
-from hodge_pipeline.refine.verdict import summary
 from hodge_pipeline.report.contents import (
     EdgeRow,
     Path3D,
@@ -19,7 +18,9 @@ from hodge_pipeline.report.contents import (
     SourceSummary,
     StageRow,
 )
+from hodge_pipeline.report.refinement import summary
 from hodge_pipeline.report.summary import graph_summary, worst_edges
+from hodge_pipeline.store import yaml_file
 from hodge_pipeline.store.cost import Cost
 from hodge_pipeline.store.store import versions
 

@@ -13,9 +13,9 @@ from hodge_pipeline import registry
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
-from hodge_pipeline.recipe import binding, yaml_file
+from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.schema import Recipe
-from hodge_pipeline.refine.verdict import Refined, summary
+from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report.contents import (
     EnergyRow,
     LoopRow,
@@ -27,11 +27,12 @@ from hodge_pipeline.report.contents import (
     StageRow,
     TrajectoryRow,
 )
+from hodge_pipeline.report.refinement import summary
 from hodge_pipeline.report.sides import four_sides, worst_pairs
 from hodge_pipeline.report.summary import graph_summary, trajectory_rows, worst_edges
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.scene import Round, Scene, has_truth, pose_sets, sequences_of, true_poses
-from hodge_pipeline.store import artifacts
+from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import Store, versions
 from hodge_pipeline.types import Floats, Ints, Solution, Source, Trajectory

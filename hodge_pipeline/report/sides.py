@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.report import splat
 from hodge_pipeline.report.contents import EdgeRow, Photograph
-from hodge_pipeline.report.difference import length
 from hodge_pipeline.report.thumbnails import pair_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
 from hodge_pipeline.report.contents import RefinementSummary, Report
-from hodge_pipeline.report.difference import length
 from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m, judge, suspicions
 
 

@@ -9,8 +9,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
+from hodge_pipeline.evaluation.difference import MEASURABLE, Change, floor_of, length
 from hodge_pipeline.report.contents import GraphSummary, Report, TrajectoryRow
-from hodge_pipeline.report.difference import MEASURABLE, Change, floor_of, length
 from hodge_pipeline.types import Floats
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]

@@ -13,8 +13,8 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.pairs.candidates import merge
+from hodge_pipeline.pairs.held_out import HeldOut
 from hodge_pipeline.recipe.schema import Recipe
-from hodge_pipeline.refine.held_out import HeldOut
 from hodge_pipeline.registration.acceptance import accepted
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.scene import START, Round, Scene

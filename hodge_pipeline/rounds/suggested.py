@@ -12,7 +12,7 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
-from hodge_pipeline.refine.held_out import held_out_pairs
+from hodge_pipeline.pairs.held_out import held_out_pairs
 from hodge_pipeline.rounds.more import Placed, register_more
 from hodge_pipeline.rounds.one_round import Registered, Work
 from hodge_pipeline.scene import Round

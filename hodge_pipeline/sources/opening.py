@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import uuid
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.recipe import recipe_file
 from hodge_pipeline.sources.inspect import Guess, guess_reader, guesses
 from hodge_pipeline.sources.unknown import without_frames
 from hodge_pipeline.stages import FrameReader, Steps
@@ -31,11 +31,11 @@ def remembered(source: Source, reader: FrameReader | None, steps: Steps) -> Sour
     return source
 
 
-def open_source(path: Path, reader: FrameReader | None) -> tuple[Source, FrameReader]:
+def open_source(path: Path, reader: FrameReader | None, recipes: Collection[str] = ()) -> tuple[Source, FrameReader]:
     """The source at a path and the reader that opened it; without a reader, the surest.
 
     Where another reader is much surer of the path than this one, the error (`SourceError`), or else a note, names it
-    and the recipe for it.
+    and the recipe for it, where it is among `recipes`.
     """
     chosen = reader or guess_reader(path)
     try:
@@ -44,11 +44,13 @@ def open_source(path: Path, reader: FrameReader | None) -> tuple[Source, FrameRe
         likelier = _likelier(path, chosen)
         if likelier is None:
             raise
-        raise SourceError(f"{error}; it looks like {_described(likelier)}: {_remedy(likelier.name, path)}") from error
+        raise SourceError(
+            f"{error}; it looks like {_described(likelier)}: {_remedy(likelier.name, path, recipes)}"
+        ) from error
     likelier = None if reader is None else _likelier(path, chosen)
     if likelier is not None:
         read_as = f"read as {registry.name_of(chosen)}, but it looks like {_described(likelier)}"
-        source = replace(source, notes=(*source.notes, f"{read_as}: {_remedy(likelier.name, path)}"))
+        source = replace(source, notes=(*source.notes, f"{read_as}: {_remedy(likelier.name, path, recipes)}"))
     return source, chosen
 
 
@@ -66,9 +68,9 @@ def _described(guess: Guess) -> str:
     return f"{guess.name} ({guess.sniff.reason})"
 
 
-def _remedy(reader: str, path: Path) -> str:
+def _remedy(reader: str, path: Path, recipes: Collection[str]) -> str:
     """The recipe that is named as the reader, else the option that takes it; the command for what has no frames."""
-    if reader in recipe_file.recipe_names():
+    if reader in recipes:
         return f"try the recipe {reader}"
     try:
         source: Source = registry.load("readers", reader)().open(path)

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recipe import yaml_file
-from hodge_pipeline.store import artifacts
+from hodge_pipeline.store import artifacts, yaml_file
 
 KEY_FILE = "key.json"
 RECIPE_FILE = "recipe.yaml"
