@@ -117,7 +117,7 @@ def test_arrays_in_hand(capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, Any] = {}
     exec(code, names)
     solution = names["solution"]
-    assert solution.metrics["certified"] == 1
+    assert solution.certified is True
     assert 0 < solution.metrics["objective"] < 25 * 0.1**2
     assert "globally optimal" in capsys.readouterr().out
 

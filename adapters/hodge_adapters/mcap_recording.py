@@ -35,6 +35,8 @@ from hodge_adapters.ros_tf import PoseColumns, TransformTree
 
 Layout = TypeVar("Layout")
 
+NO_PINHOLE = "a matrix K that is no pinhole camera's"
+
 
 @dataclass(frozen=True)
 class Seen(Generic[Layout]):
@@ -174,7 +176,7 @@ def _add_calibration(recording: Recording, message: Message, path: Path, logged:
     topic = logged.channel.topic
     k, p, distortion = numbers(message, "k", "K"), numbers(message, "p", "P"), numbers(message, "d", "D")
     if len(k) != 9 or not np.isfinite(k).all() or k[0] <= 0 or k[4] == 0:
-        raise Malformed("a matrix K that is no pinhole camera's")
+        raise Malformed(NO_PINHOLE)
     calibration = Calibration(
         frame_id=frame_id(message),
         width=whole(message, "width"),

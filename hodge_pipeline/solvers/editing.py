@@ -86,7 +86,7 @@ class GraphEditor:
         if solution is None:
             solution = self._solution(self._base, minimise(setup, "chordal", LIMITS, self._full(setup)))
         own = "chi2" if self._full(setup) else "isotropic"
-        settled = own in solution.metrics and solution.metrics.get("converged") == 1
+        settled = own in solution.metrics and solution.converged is True
         owed = 0.0 if settled else math.inf
         self._state = _State(graph, np.asarray(solution.weights, float).copy(), solution, owed)
 
