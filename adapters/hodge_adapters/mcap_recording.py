@@ -35,6 +35,7 @@ from hodge_adapters.ros_tf import PoseColumns, TransformTree
 
 Layout = TypeVar("Layout")
 
+A_MESSAGE_WITH = "a message with "
 NO_PINHOLE = "a matrix K that is no pinhole camera's"
 
 
@@ -92,7 +93,7 @@ class Recording:
             try:
                 self._add(path, logged)
             except Malformed as error:
-                self.complaints.count(topic, f"a message with {error}")
+                self.complaints.count(topic, A_MESSAGE_WITH + str(error))
 
     def _wants(self, channel: Channel, schema: Schema | None) -> bool:
         name = schema.name if schema else ""

@@ -78,7 +78,7 @@ class Oddity(NamedTuple):
 
 
 class CloudCounts(NamedTuple):
-    """What became of a frame: measurements looked at, those valid and in range, points kept; what is odd, if anything."""
+    """What became of a frame: measurements looked at, those valid and in range, points kept; what is odd."""
 
     looked_at: int
     valid: int

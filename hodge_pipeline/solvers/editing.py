@@ -184,7 +184,10 @@ class GraphEditor:
         notes = (*self._unheld, *setup.weights.notes, *describe_components(setup.component, base.graph.vertex_ids))
         weights = setup.weights.used.astype(float)
         metrics = metrics_of(descent, self._full(setup))
-        return Solution(setup.poses(descent.point), setup.component, weights, metrics=metrics, notes=notes)
+        return Solution(
+            setup.poses(descent.point), setup.component, weights, metrics=metrics, notes=notes,
+            converged=descent.converged, stopped_by=descent.reason,
+        )  # fmt: skip
 
     def _remember(self, new: _State) -> None:
         self._history.append(self._state)
