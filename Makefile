@@ -31,7 +31,7 @@ demo: $(STAMP)
 	@echo "open runs/demo/report.html, or: $(BIN)/hodge view runs/demo"
 
 paper: $(STAMP)
-	$(BIN)/python -m hodge_pipeline.cli.papering $(PAPER_ARGS)
+	$(BIN)/python -m benchmarks.paper $(PAPER_ARGS)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

@@ -28,10 +28,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from edge_scores import area_under_roc, precision_and_recall
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.evaluation.edges import area_under_roc, precision_and_recall
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 from hodge_pipeline.uses.diagnosed import open_subject
 

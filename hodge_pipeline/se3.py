@@ -34,15 +34,10 @@ def so3_exp(phi: Floats) -> Floats:
 def so3_log(rotation: Floats) -> Floats:
     """Rotation vectors (..., 3) of rotation matrices (..., 3, 3), of length at most π.
 
-    At exactly π the axis has two signs; the one that scipy's quaternion gives is taken: see `is_half_turn`.
+    At exactly π the axis has two signs; the one that scipy's quaternion gives is taken.
     """
     rotation = np.asarray(rotation, float)
     return np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()).reshape(*rotation.shape[:-2], 3)
-
-
-def is_half_turn(rotation: Floats, tolerance_rad: float = 1e-6) -> Bools:
-    """Where (...,) a rotation is within the tolerance of π, so that the sign of its logarithm is arbitrary."""
-    return np.asarray(np.linalg.norm(so3_log(rotation), axis=-1) > np.pi - tolerance_rad, bool)
 
 
 def _series(angle: Floats) -> tuple[Floats, Floats]:

@@ -11,11 +11,11 @@ from rerun.chunk import RrdReader
 from typer.testing import CliRunner
 
 import hodge_pipeline
+from betti import betti_numbers
 from hodge_adapters.g2o import write_g2o
-from hodge_adapters.poses_text import read_tum
+from hodge_adapters.poses_text import parse_tum
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.complex.betti import betti_numbers
 from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
@@ -80,7 +80,7 @@ def test_the_files_say_the_same(wrong_edge: tuple[Path, str, ViewGraph]) -> None
     assert list(rows[0])[:4] == ["i", "j", "source", "status"]
     assert [[int(row["i"]), int(row["j"])] for row in rows] == graph.vertex_ids[graph.edges].tolist()
     assert [n for n, row in enumerate(rows) if row["verdict"] != "consistent"] == [17]
-    poses = read_tum(folder / "why/poses.tum")
+    poses = parse_tum(folder / "why/poses.tum").trajectory
     np.testing.assert_array_equal(poses.stamps_s, graph.vertex_ids)
     between = se3.inverse(poses.world_from_cam[0]) @ poses.world_from_cam[1]
     np.testing.assert_allclose(between, graph.i_from_j[0], atol=0.02)
@@ -155,7 +155,7 @@ def test_pieces_are_pieces(tmp_path: Path) -> None:
     write_g2o(tmp_path / "two.g2o", both, np.concatenate([poses, poses]))
     text = hodge(tmp_path / "two.g2o", "--out", tmp_path / "why")
     assert "poses.tum holds 2 pieces, each in a frame of its own" in text
-    assert len(read_tum(tmp_path / "why/poses.tum")) == 12
+    assert len(parse_tum(tmp_path / "why/poses.tum").trajectory) == 12
 
 
 def test_pieces_are_drawn_beside_each_other() -> None:

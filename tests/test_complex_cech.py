@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
+from betti import betti_numbers, sparse_rank
 from complex_graphs import FIGURE_EIGHT, SQUARE, TRIANGLE, TWO_TRIANGLES, complete, graphs, torus_grid
-from hodge_pipeline.complex.betti import betti_numbers, sparse_rank
 from hodge_pipeline.complex.cech import clique_counts, flag_complex, nerve, orient_edges, voxel_occupancy
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.errors import GraphError

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from betti import betti_numbers
 from complex_graphs import SQUARE, TWO_TRIANGLES, complete, graphs, torus_grid, torus_rotation
-from hodge_pipeline.complex.betti import betti_numbers
 from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.cotangent import cotangent_weights

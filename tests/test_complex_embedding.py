@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import vstack
 
+from betti import sparse_rank
 from complex_graphs import (
     FIGURE_EIGHT,
     SQUARE,
@@ -18,7 +19,6 @@ from complex_graphs import (
     torus_grid,
     torus_rotation,
 )
-from hodge_pipeline.complex.betti import sparse_rank
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.connectivity import connectivity
 from hodge_pipeline.complex.cycles import loop_products

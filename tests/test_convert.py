@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hodge_adapters.poses_text import read_tum
+from hodge_adapters.poses_text import parse_tum
 from hodge_pipeline.cli.convert import convert, writer_name
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
@@ -22,7 +22,7 @@ def test_poses_survive_a_conversion_there_and_back(tmp_path: Path, name: str, ca
     convert(sequence, tmp_path / name)
     assert "written as" in capsys.readouterr().out
     convert(tmp_path / name, tmp_path / "back.tum")
-    back = read_tum(tmp_path / "back.tum").world_from_cam
+    back = parse_tum(tmp_path / "back.tum").trajectory.world_from_cam
     np.testing.assert_allclose(back, [frame.world_from_cam for frame in original.frames], atol=1e-9)
 
 

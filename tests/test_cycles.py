@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from betti import sparse_rank
 from complex_graphs import FIGURE_EIGHT, SQUARE, TRIANGLE, complete, graphs, random_motions, torus_grid
 from hodge_pipeline import se3
-from hodge_pipeline.complex.betti import sparse_rank
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.complex.cycles import (
@@ -133,15 +133,11 @@ def test_minimum_bases_of_named_graphs() -> None:
     assert minimum_cycle_basis(FIGURE_EIGHT, 5).lengths.tolist() == [3, 3]
     assert minimum_cycle_basis(complete(5), 5).lengths.tolist() == [3] * 6
     assert sorted(minimum_cycle_basis(torus_grid(5), 25).lengths.tolist()) == [4] * 24 + [5, 5]
-    heavy = minimum_cycle_basis(complete(4), 4, np.array([10.0, 1, 1, 1, 1, 1]))
-    assert heavy.lengths.tolist() == [3, 3, 3]
 
 
 def test_minimum_bases_refuse_what_would_take_too_long() -> None:
     with pytest.raises(GraphError, match="takes too long"):
         minimum_cycle_basis(torus_grid(40), 1600)
-    with pytest.raises(GraphError, match="positive"):
-        minimum_cycle_basis(TRIANGLE, 3, np.array([1.0, 0.0, 1.0]))
 
 
 def test_components_are_ordered_by_size_and_described() -> None:

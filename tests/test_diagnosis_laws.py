@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.edge_scores import area_under_roc
 from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
@@ -15,7 +16,6 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
 from hodge_pipeline.diagnosis.short_cycles import short_cycles
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.evaluation.edges import area_under_roc
 from hodge_pipeline.types import ViewGraph
 
 QUICK = DiagnosisOptions()

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.edge_scores import PairTruth, area_under_roc, pose_recall, precision_and_recall, right_edges
 from hodge_adapters.pair_log import PairLogReader
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.diagnosis.solver import DiagnosedSolver
-from hodge_pipeline.evaluation.edges import PairTruth, area_under_roc, pose_recall, precision_and_recall, right_edges
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.types import Bools, ViewGraph
 

@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.pair_log import PairLogReader
-from hodge_pipeline import se3
-from hodge_pipeline.evaluation.edges import (
+from benchmarks.edge_scores import (
     PairTruth,
     area_under_roc,
     pose_recall,
     precision_and_recall,
     right_edges,
 )
+from hodge_adapters.pair_log import PairLogReader
+from hodge_pipeline import se3
 from hodge_pipeline.types import ViewGraph
 
 """Truth:  0 --1 m-- 1 --1 m-- 2     3 (not joined)"""

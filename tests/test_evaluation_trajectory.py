@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.paper.sequences import associate
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.evaluation.trajectory import absolute_error, align, associate, relative_error
+from hodge_pipeline.evaluation.trajectory import absolute_error, align, relative_error
 from hodge_pipeline.types import Floats
 
 EVO = "trajectories/evo"

@@ -12,13 +12,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from complex_graphs import random_motions
-from hodge_pipeline import se3
-from hodge_pipeline.cli.paper_picture import draw_comparison
-from hodge_pipeline.cli.paper_sequences import find_sequences, peer_poses
-from hodge_pipeline.cli.papering import papering
-from hodge_pipeline.errors import RecipeError, SourceError
-from hodge_pipeline.evaluation.paper_tables import (
+from benchmarks.paper.__main__ import paper
+from benchmarks.paper.picture import draw_comparison
+from benchmarks.paper.sequences import find_sequences, peer_poses
+from benchmarks.paper.tables import (
     PAPER_SCORES,
     SEQUENCES,
     Measured,
@@ -29,6 +26,9 @@ from hodge_pipeline.evaluation.paper_tables import (
     deviation,
     tables,
 )
+from complex_graphs import random_motions
+from hodge_pipeline import se3
+from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.types import Bytes, Camera, Floats32, Frame
 
 KITCHEN = Measured(
@@ -183,7 +183,7 @@ def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     runner = CliRunner()
     app = typer.Typer()
-    app.command()(papering)
+    app.command()(paper)
     empty = runner.invoke(app, ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")])
     assert isinstance(empty.exception, SourceError) and "redkitchen: not present" in str(empty.exception)
     for peer, message in (("bundlefusion", "NAME=DIR"), (f"x={tmp_path / 'none'}", "no such folder")):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.poses_text import read_tum
+from hodge_adapters.poses_text import parse_tum
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError, WorkspaceError
 from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
@@ -61,7 +61,7 @@ def test_a_run_leaves_what_a_person_can_open(run: Run) -> None:
     assert names >= expected | {"cloud.ply", "recording.rrd", "log.txt"}
     report = json.loads((run.folder / "report.json").read_text())
     assert report["source"]["frames"] == 24
-    np.testing.assert_array_equal(read_tum(run.folder / "poses.tum").world_from_cam[:, :3, 3],
+    np.testing.assert_array_equal(parse_tum(run.folder / "poses.tum").trajectory.world_from_cam[:, :3, 3],
                                   run.result.world_from_cam[:, :3, 3])  # fmt: skip
 
 
@@ -172,7 +172,7 @@ def test_unreadable_and_empty_frames_are_kept_without_edges_and_reported(damaged
     for row in bad:
         assert f"frame {result.source.frames[row].frame_id}" in notes
     assert not bad & set(result.result.graph.edges.ravel().tolist())
-    assert len(read_tum(tmp_path / "run/poses.tum")) == 23
+    assert len(parse_tum(tmp_path / "run/poses.tum").trajectory) == 23
     good = sorted(set(range(23)) - bad)
     steps = np.linalg.norm(np.diff(result.result.world_from_cam[good, :3, 3], axis=0), axis=1)
     assert steps.max() < 0.3

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers import poisson
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
@@ -52,7 +53,7 @@ def test_relabelling_flipping_and_shifting_change_nothing(seed: int) -> None:
     truth = motions(rng, 7)
     graph = measured(ring_with_chords(rng, 7, 6), truth, rng, noise=0.05)
     start = truth @ se3.exp(rng.normal(size=(7, 6)) * 0.05)
-    solver = PoissonSolver(robust="huber")
+    solver = PoissonSolver()
     expected = relative(solver.solve(graph, start).world_from_cam)
 
     flip = rng.random(graph.edge_count) < 0.5
@@ -115,21 +116,21 @@ def test_the_loop_deviation_falls_to_nothing_within_three_iterations() -> None:
     assert deviation[2] < deviation[1] / 20
 
 
-def test_the_basis_of_loops_changes_what_is_reported_and_not_the_poses() -> None:
+def test_the_basis_of_loops_changes_what_is_reported_and_not_the_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(4)
     truth = motions(rng, 30, angle=0.5)
     graph = measured(ring_with_chords(rng, 30, 60), truth, rng, noise=0.01)
     start = truth @ se3.exp(rng.normal(size=(30, 6)) * 0.03)
-    tree = PoissonSolver(cycle_basis="tree").solve(graph, start)
-    shortest = PoissonSolver(cycle_basis="shortest").solve(graph, start)
+    shortest = PoissonSolver().solve(graph, start)
+    monkeypatch.setattr(poisson, "AFFORDABLE_BASIS", 0)
+    tree = PoissonSolver().solve(graph, start)
     np.testing.assert_array_equal(tree.world_from_cam, shortest.world_from_cam)
     assert tree.metrics["loops"] == shortest.metrics["loops"]
     first = [s.history[0].metrics["loop_deviation_mean"] for s in (tree, shortest)]
     assert 0 < first[1] < first[0]
 
 
-@pytest.mark.parametrize("robust", ["huber", "geman_mcclure"])
-def test_a_false_edge_pulls_less_with_a_kernel(robust: str) -> None:
+def test_a_false_edge_pulls_less_with_a_kernel() -> None:
     rng = np.random.default_rng(5)
     truth = motions(rng, 20, angle=0.3)
     graph = measured(ring_with_chords(rng, 20, 40), truth, rng, noise=0.002)
@@ -141,8 +142,8 @@ def test_a_false_edge_pulls_less_with_a_kernel(robust: str) -> None:
         poses = solver.solve(wrong, truth).world_from_cam
         return float(np.abs(relative(poses) - relative(truth)).max())
 
-    solution = PoissonSolver(robust=robust).solve(wrong, truth)
-    assert error(PoissonSolver(robust=robust)) < 0.3 * error(PoissonSolver(robust="none"))
+    solution = PoissonSolver().solve(wrong, truth)
+    assert error(PoissonSolver()) < 0.3 * error(PoissonSolver(robust="none"))
     joins_two = graph.edges[:, 0] != graph.edges[:, 1]
     assert np.where(joins_two, solution.weights, 1.0).argmin() == 33
 
@@ -249,9 +250,3 @@ def test_poses_that_cannot_be_used_are_named() -> None:
     empty = ViewGraph.from_edges(np.zeros(0, int), np.zeros((0, 2), int), np.zeros((0, 4, 4)))
     with pytest.raises(GraphError, match="no vertices"):
         PoissonSolver().solve(empty, np.zeros((0, 4, 4)))
-
-
-def test_fitness_must_be_known() -> None:
-    graph, truth = good_graph()
-    with pytest.raises(GraphError, match="fitness is unknown"):
-        PoissonSolver(weights="fitness").solve(graph, truth)

@@ -7,7 +7,7 @@ import pytest
 
 from hodge_adapters.icl_nuim import IclNuimReader
 from hodge_adapters.icl_pov import read_pose, read_ray_lengths
-from hodge_adapters.redwood import read_log
+from hodge_adapters.log_text import read_log_file
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
@@ -163,14 +163,14 @@ def test_the_redwood_layout(tmp_path: Path) -> None:
     [
         ("", r"trajectory\.log: 0 lines"),
         ("0 0 1\n1 0 0 0\n", r"trajectory\.log: 2 lines"),
-        ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1\n0 0 0 1\n", r"trajectory\.log:1: not"),
-        ("0 0 1\n2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", r"trajectory\.log:1: .*no rigid motion"),
+        ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1\n0 0 0 1\n", r"trajectory\.log:4: not"),
+        ("0 0 1\n2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", r"trajectory\.log:1: .*rigid motion"),
     ],
 )
 def test_a_log_that_is_damaged_is_named(tmp_path: Path, text: str, where: str) -> None:
     (tmp_path / "trajectory.log").write_text(text)
     with pytest.raises(SourceError, match=where):
-        read_log(tmp_path / "trajectory.log")
+        read_log_file(tmp_path / "trajectory.log")
 
 
 def test_what_is_none_of_the_layouts(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.poses_text import KittiWriter, TumWriter, parse_tum, read_kitti, read_tum, write_kitti, write_tum
+from hodge_adapters.poses_text import KittiWriter, TumWriter, parse_tum, read_kitti, write_kitti, write_tum
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.stages import Writer
@@ -27,7 +27,7 @@ def trajectory(count: int, seed: int, start_s: float = 1305031229.528784) -> Tra
 def test_what_is_written_reads_back(tmp_path_factory: pytest.TempPathFactory, seed: int, count: int) -> None:
     folder, written = tmp_path_factory.mktemp("poses"), trajectory(count, seed)
     write_tum(folder / "poses.tum", written)
-    back = read_tum(folder / "poses.tum")
+    back = parse_tum(folder / "poses.tum").trajectory
     np.testing.assert_array_equal(back.stamps_s, written.stamps_s)
     np.testing.assert_array_equal(back.world_from_cam[:, :3, 3], written.world_from_cam[:, :3, 3])
     np.testing.assert_allclose(back.world_from_cam, written.world_from_cam, atol=1e-14)
@@ -39,7 +39,7 @@ def test_what_is_written_reads_back(tmp_path_factory: pytest.TempPathFactory, se
 def test_a_quarter_turn_by_hand(tmp_path: Path) -> None:
     path = tmp_path / "a.tum"
     path.write_text("# comment\r\n5.5, 1 2 3\t0 0 0.70710678118654752 0.70710678118654752\r\n\r\n")
-    found = read_tum(path)
+    found = parse_tum(path).trajectory
     expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     np.testing.assert_allclose(found.world_from_cam, [expected], atol=1e-15)
     assert found.stamps_s.tolist() == [5.5]
@@ -53,7 +53,7 @@ def test_the_writers_are_stages(tmp_path: Path) -> None:
         first = (tmp_path / "poses").read_bytes()
         writer.write(tmp_path / "poses", source)
         assert (tmp_path / "poses").read_bytes() == first
-        with pytest.raises(SourceError, match="no trajectory"):
+        with pytest.raises(SourceError, match="no poses to write"):
             writer.write(tmp_path / "poses", Source("empty", tmp_path))
 
 
@@ -68,8 +68,6 @@ def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_a_line_that_is_no_pose_is_named_or_noted(tmp_path: Path, line: str) -> None:
     path = tmp_path / "a.tum"
     path.write_text(f"# header\n0 {IDENTITY}\n{line}\n2 {IDENTITY}\n")
-    with pytest.raises(SourceError, match=r"a\.tum:3: "):
-        read_tum(path)
     parsed = parse_tum(path)
     assert parsed.trajectory.stamps_s.tolist() == [0, 2]
     assert parsed.notes == ("a.tum: 1 lines that are no pose left out: 3",)
@@ -86,7 +84,7 @@ def test_unsorted_and_repeated_stamps_are_put_in_order_and_noted(tmp_path: Path)
     assert len(parsed.notes) == 2
 
 
-@pytest.mark.parametrize("reader", [read_tum, parse_tum, read_kitti])
+@pytest.mark.parametrize("reader", [parse_tum, read_kitti])
 def test_an_empty_or_missing_or_binary_file_is_an_error(tmp_path: Path, reader) -> None:
     path = tmp_path / "a.txt"
     with pytest.raises(SourceError, match=r"a\.txt: cannot be read"):
@@ -119,4 +117,4 @@ def test_real_trajectories(data_dir: Path) -> None:
     truth = parse_tum(folder / "fr2_desk_groundtruth.txt")
     assert len(truth.trajectory) == 20956 and "stamp of an earlier one" in truth.notes[0]
     assert len(read_kitti(folder / "KITTI_00_gt.txt", folder / "KITTI_00_gt_times.txt")) == 4541
-    assert len(read_tum(folder / "freiburg1_xyz-rgbdslam.txt")) == 788
+    assert len(parse_tum(folder / "freiburg1_xyz-rgbdslam.txt").trajectory) == 788

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from hodge_adapters.poses_text import read_tum, write_tum
+from hodge_adapters.poses_text import parse_tum, write_tum
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app, main
@@ -80,11 +80,12 @@ def refined(sequence: Path, drifted: Trajectory, tmp_path_factory: pytest.TempPa
 
 def test_drift_is_taken_out_and_the_stamps_stay(refined: Path, drifted: Trajectory, truth: Trajectory) -> None:
     assert outcome(refined) == "refined"
-    found = read_tum(refined / "refined.txt")
+    found = parse_tum(refined / "refined.txt").trajectory
     np.testing.assert_array_equal(found.stamps_s, drifted.stamps_s)
     assert error_m(drifted.world_from_cam, truth) > 0.05
     assert error_m(found.world_from_cam, truth) < 0.02
-    np.testing.assert_allclose(read_tum(refined / "poses.tum").world_from_cam, found.world_from_cam, atol=1e-9)
+    poses = parse_tum(refined / "poses.tum").trajectory
+    np.testing.assert_allclose(poses.world_from_cam, found.world_from_cam, atol=1e-9)
 
 
 def test_the_report_shows_what_the_guard_measured(refined: Path) -> None:
@@ -120,7 +121,8 @@ def test_a_worse_result_is_not_written_but_with_force(
         main()
     assert stopped.value.code == 3 and outcome(tmp_path / "run") == "worse"
     assert (tmp_path / "run" / "refined.tum").read_bytes() == (tmp_path / "slam.tum").read_bytes()
-    np.testing.assert_allclose(read_tum(tmp_path / "run" / "poses.tum").world_from_cam, truth.world_from_cam, atol=1e-9)
+    poses = parse_tum(tmp_path / "run" / "poses.tum").trajectory
+    np.testing.assert_allclose(poses.world_from_cam, truth.world_from_cam, atol=1e-9)
     forced = refine(tmp_path / "slam.tum", sequence, tmp_path / "forced", *blind, "--force")
     assert forced.exit_code == 0 and outcome(tmp_path / "forced") == "forced"
     assert (tmp_path / "forced" / "refined.tum").read_bytes() != (tmp_path / "slam.tum").read_bytes()
@@ -135,8 +137,8 @@ def test_sparse_poses_are_carried_over_all_frames(
     write_tum(tmp_path / "KeyFrameTrajectory.txt", every)
     found = refine(tmp_path / "KeyFrameTrajectory.txt", sequence, tmp_path / "run")
     assert found.exit_code == 0, found.output
-    assert len(read_tum(tmp_path / "run" / "refined.txt")) == len(every)
-    poses = read_tum(tmp_path / "run" / "poses.tum")
+    assert len(parse_tum(tmp_path / "run" / "refined.txt").trajectory) == len(every)
+    poses = parse_tum(tmp_path / "run" / "poses.tum").trajectory
     np.testing.assert_array_equal(poses.stamps_s, truth.stamps_s)
     assert error_m(poses.world_from_cam, truth) < 0.03
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.poses_text import read_tum
+from hodge_adapters.poses_text import parse_tum
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
@@ -107,7 +107,7 @@ def with_dark(source: Source, rows: range) -> Source:
 
 def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeline.Run) -> None:
     assert 2 < len(run.result.world_from_cam) < FRAMES / 2
-    poses = read_tum(run.folder / "poses.tum")
+    poses = parse_tum(run.folder / "poses.tum").trajectory
     assert len(poses) == FRAMES
     assert any("of 64 frames are key frames" in note for note in run.report.notes)
     keys = len(run.result.world_from_cam)

@@ -18,12 +18,13 @@ from hodge_adapters.colmap_files import natural
 from hodge_adapters.log_text import read_log_file
 from hodge_adapters.pcd_points import read_pcd
 from hodge_adapters.ply_points import read_ply, write_ply
+from hodge_adapters.posed import posed_frames
 from hodge_adapters.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
 from hodge_adapters.text_rows import listed
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Floats, Frame, PointCloud, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import Floats, Frame, PointCloud, Source, ViewGraph
 
 OTHER_SCANS = frozenset((".xyz", ".pts", ".ptx", ".asc", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
 _NUMBER = re.compile(r"(\d{1,15})\D*$")
@@ -80,13 +81,10 @@ class CloudFolderReader:
             )
             for number, fragment in zip(numbers, fragments, strict=True)
         )
-        posed = [(frame.stamp_s, frame.world_from_cam) for frame in frames if frame.world_from_cam is not None]
-        trajectory = Trajectory(np.array([s for s, _ in posed]), np.array([p for _, p in posed])) if posed else None
         graph = _graph(numbers, parsed.pairs, parsed.i_from_j, notes) if parsed and len(parsed.pairs) else None
-        found = tuple(filter(None, [log]))
-        return Source(
-            path.resolve().name, path, frames[:: self.every], trajectory, graph, tuple(notes), (*files, *found)
-        )
+        every = frames[:: self.every]
+        read = (*files, *filter(None, [log]))
+        return Source(path.resolve().name, path, every, posed_frames(frames), graph, tuple(notes), read)
 
     def _files(self, path: Path, notes: list[str]) -> list[Path]:
         try:

@@ -29,14 +29,8 @@ def metres_per_unit(
     """The median of sensor depth over model depth at the observations of a few images; 1 where too few."""
     rows = sorted(sensors)
     picked = np.unique(np.linspace(0, len(rows) - 1, SAMPLED_IMAGES).round().astype(int))
-    ratios = [np.zeros(0)]
-    for at in picked:
-        try:
-            depth = images.read_depth(sensors[rows[at]], units_per_metre=units_per_metre, no_depth=no_depth)
-        except SourceError:
-            continue  # the frame itself reports it when it is read
-        ratios.append(_ratios(model, rows[at], depth))
-    found = np.concatenate(ratios)
+    chosen = {rows[at]: sensors[rows[at]] for at in picked}
+    found = np.concatenate([np.zeros(0), *depth_ratios(model, chosen, units_per_metre, no_depth)])
     if len(found) < LEAST_POINTS:
         notes.append(f"scale 1 m per unit: only {len(found)} points have sensor depth; set scale")
         return 1.0
@@ -107,7 +101,7 @@ def depth_ratios(
     sensors: Mapping[int, Path],
     units_per_metre: float,
     no_depth: tuple[int, ...],
-    camera: tuple[float, float, float, float] | None,
+    camera: tuple[float, float, float, float] | None = None,
 ) -> Sequence[Floats]:
     """Metres by the sensor over units by the model at the observations of each image (by row), of `MOST_IMAGES` evenly.
 
@@ -126,7 +120,7 @@ def depth_ratios(
     return ratios
 
 
-def _ratios(model: Model, row: int, depth: Floats32, camera: tuple[float, float, float, float] | None = None) -> Floats:
+def _ratios(model: Model, row: int, depth: Floats32, camera: tuple[float, float, float, float] | None) -> Floats:
     image = model.images[row]
     record = model.cameras[image.camera_id]
     seen = image.point_ids != NO_POINT

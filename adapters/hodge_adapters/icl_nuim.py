@@ -17,12 +17,14 @@ from hodge_adapters.camera_files import Intrinsics, checked
 from hodge_adapters.icl_pov import list_pov, pov_frames
 from hodge_adapters.image_frames import image_frame
 from hodge_adapters.image_lists import StampedImages, find_association_file, read_pairs
+from hodge_adapters.log_text import read_log_file
+from hodge_adapters.posed import posed_frames
 from hodge_adapters.poses_text import parse_tum
-from hodge_adapters.redwood import find_log, is_redwood, list_images, read_log
+from hodge_adapters.redwood import find_log, is_redwood, list_images
 from hodge_adapters.tum import frame_ids
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Floats, Frame, Source, Trajectory
+from hodge_pipeline.types import Source
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
 REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
@@ -140,15 +142,15 @@ class IclNuimReader:
         colours = [file for file in (depth.with_suffix(".png") for depth in pov.values()) if file.is_file()]
         camera = self._camera(ICL).camera(images.common_size(colours) if colours else (640, 480))
         frames, files = pov_frames(pov, camera, self.units_per_metre or 1.0, notes)
-        trajectory = _trajectory(frames)
-        return Source(path.resolve().name, path, tuple(frames[:: self.every]), trajectory, None, tuple(notes), files)
+        every = tuple(frames[:: self.every])
+        return Source(path.resolve().name, path, every, posed_frames(frames), notes=tuple(notes), files=files)
 
     def _open_redwood(self, path: Path) -> Source:
         notes: list[str] = []
         listing = list_images(path, notes)
         camera = self._camera(REDWOOD).camera(images.common_size(listing.depth))
         log = find_log(path)
-        estimates: dict[int, Floats] = read_log(log) if log else {}
+        estimates = read_log_file(log).poses if log else {}
         if log:
             notes.append(f"poses from {log.relative_to(path)}: an estimate of another program, not the truth")
         without = [number for number in listing.numbers if number not in estimates]
@@ -180,10 +182,3 @@ def _is_numbered(association: Path) -> bool:
     with association.open(encoding="utf-8", errors="replace") as lines:
         row = next((line.split() for line in lines if line.strip() and not line.startswith("#")), [""])
     return row[0].isdigit()
-
-
-def _trajectory(frames: list[Frame]) -> Trajectory | None:
-    posed = [(frame.stamp_s, frame.world_from_cam) for frame in frames if frame.world_from_cam is not None]
-    if not posed:
-        return None
-    return Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed]))

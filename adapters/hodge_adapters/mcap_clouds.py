@@ -36,11 +36,6 @@ class CloudLayout:
     fields: tuple[tuple[str, str, int], ...]
     cloud_from_points: tuple[float, ...] | None = None
 
-    @property
-    def has_colour(self) -> bool:
-        """Whether points have colours."""
-        return any(name in ("rgb", "rgba", "red") for name, _, _ in self.fields)
-
 
 def ros_layout(message: Message, length: int) -> CloudLayout:
     """The layout of a PointCloud2 whose data has `length` bytes; raises `Malformed` where it does not fit."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, Source, Trajectory
+from hodge_pipeline.types import Floats, Frame, Source, Trajectory
 
 UNIT_TOLERANCE = 1e-3
 """Three decimals of a quaternion leave as much; more is another mistake."""
@@ -25,7 +27,13 @@ def trajectory_of(source: Source) -> Trajectory:
     """The source's trajectory, else the poses of its frames. Raises `SourceError` where it has neither."""
     if source.trajectory is not None:
         return source.trajectory
-    posed = [(frame.stamp_s, frame.world_from_cam) for frame in source.frames if frame.world_from_cam is not None]
-    if not posed:
+    found = posed_frames(source.frames)
+    if found is None:
         raise SourceError(f"{source.path}: has no poses to write: convert one that has a trajectory")
-    return Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed]))
+    return found
+
+
+def posed_frames(frames: Sequence[Frame]) -> Trajectory | None:
+    """The poses of the frames that have one, as a trajectory; None where none has."""
+    posed = [(frame.stamp_s, frame.world_from_cam) for frame in frames if frame.world_from_cam is not None]
+    return Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed])) if posed else None

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.posed import length_notes
+from hodge_adapters.posed import length_notes, trajectory_of
 from hodge_adapters.text_rows import Row, listed, read_rows, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -26,20 +26,11 @@ class ParsedTrajectory:
     notes: tuple[str, ...] = ()
 
 
-def read_tum(path: Path) -> Trajectory:
+def parse_tum(path: Path) -> ParsedTrajectory:
     """The trajectory in a TUM file, ascending by stamp; of poses with the same stamp the first is kept.
 
-    Raises `SourceError` with `file:line` for a line that is not eight finite numbers with a quaternion.
+    Lines that are no pose are left out and noted. Raises `SourceError` where no pose is left.
     """
-    rows = read_rows(path)
-    table, bad = _tum_table(rows)
-    if bad or not rows:
-        raise _unreadable(path, bad, "stamp tx ty tz qx qy qz qw")
-    return _ordered(table).trajectory
-
-
-def parse_tum(path: Path) -> ParsedTrajectory:
-    """As `read_tum`, but lines that are no pose are left out and noted; an error only where no pose is left."""
     table, bad = _tum_table(read_rows(path))
     if not len(table):
         raise _unreadable(path, bad, "stamp tx ty tz qx qy qz qw")
@@ -88,7 +79,7 @@ class TumWriter:
 
     def write(self, path: Path, source: Source) -> None:
         """One file, atomically; see `write_tum`."""
-        write_tum(path, _trajectory(source))
+        write_tum(path, trajectory_of(source))
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -97,13 +88,7 @@ class KittiWriter:
 
     def write(self, path: Path, source: Source) -> None:
         """One file, atomically; see `write_kitti`."""
-        write_kitti(path, _trajectory(source))
-
-
-def _trajectory(source: Source) -> Trajectory:
-    if source.trajectory is None:
-        raise SourceError(f"{source.path}: has no trajectory to write: convert one that has poses")
-    return source.trajectory
+        write_kitti(path, trajectory_of(source))
 
 
 def _lines(table: Floats) -> str:

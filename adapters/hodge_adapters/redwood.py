@@ -7,12 +7,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from hodge_adapters.text_rows import Row, listed, read_rows, to_floats
-from hodge_pipeline import se3
+from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats
 
 COLOUR_FOLDERS = ("image", "color", "rgb")
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
@@ -57,31 +53,6 @@ def list_images(folder: Path, notes: list[str]) -> NumberedImages:
 def find_log(folder: Path) -> Path | None:
     """The trajectory of a folder, by its usual places."""
     return next((folder / name for name in LOG_FILES if (folder / name).is_file()), None)
-
-
-def read_log(path: Path) -> dict[int, Floats]:
-    """Poses world_from_cam (4, 4) by frame number, from blocks of `i j k` and four rows; rotations made orthonormal.
-
-    Raises `SourceError` with `file:line` for a block that is incomplete or no rigid motion.
-    """
-    rows = read_rows(path)
-    if not rows or len(rows) % 5:
-        raise SourceError(
-            f"{path}: {len(rows)} lines are no blocks of `i j k` and a 4x4 matrix: is it a .log trajectory?"
-        )
-    return dict(_parse_block(path, rows[at : at + 5]) for at in range(0, len(rows), 5))
-
-
-def _parse_block(path: Path, block: list[Row]) -> tuple[int, Floats]:
-    head, *body = block
-    values = [to_floats(row.fields) for row in body]
-    if len(head.fields) != 3 or not head.fields[0].isdecimal() or any(not v or len(v) != 4 for v in values):
-        raise SourceError(f"{path}:{head.line}: not `i j k` and four rows of four numbers: is it a .log trajectory?")
-    pose = np.array(values, np.float64)
-    if not se3.is_motion(pose):
-        raise SourceError(f"{path}:{head.line}: the pose of frame {head.fields[0]} is no rigid motion: mend the file")
-    pose[:3, :3] = se3.project_to_so3(pose[:3, :3])
-    return int(head.fields[0]), pose
 
 
 def _by_number(folder: Path, notes: list[str]) -> dict[int, Path]:

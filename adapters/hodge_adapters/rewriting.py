@@ -37,8 +37,16 @@ class _Poses:
         return self.trajectory.world_from_cam[row] if found else None
 
 
+class _OneFile:
+    """A format of one file."""
+
+    def copy(self, folder: Path, original: Path) -> Path:
+        """See `PoseRewriter`."""
+        return _copied(folder, original)
+
+
 @dataclass(frozen=True, config=NO_OPTIONS)
-class TumRewriter:
+class TumRewriter(_OneFile):
     """Lines of `stamp tx ty tz qx qy qz qw`."""
 
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
@@ -52,13 +60,9 @@ class TumRewriter:
 
         return _rewritten(folder, original, numbers, first=1)
 
-    def copy(self, folder: Path, original: Path) -> Path:
-        """See `PoseRewriter`."""
-        return _copied(folder, original)
-
 
 @dataclass(frozen=True, config=NO_OPTIONS)
-class KittiRewriter:
+class KittiRewriter(_OneFile):
     """Lines of twelve numbers, which are the poses in their order."""
 
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
@@ -69,10 +73,6 @@ class KittiRewriter:
             return next(rows)[:3].ravel().tolist() if len(fields) == 12 else None
 
         return _rewritten(folder, original, numbers, first=0)
-
-    def copy(self, folder: Path, original: Path) -> Path:
-        """See `PoseRewriter`."""
-        return _copied(folder, original)
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
@@ -96,7 +96,7 @@ class EurocRewriter:
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
-class LogRewriter:
+class LogRewriter(_OneFile):
     """Blocks of `i j n` and four rows of a matrix."""
 
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
@@ -113,10 +113,6 @@ class LogRewriter:
             return None
 
         return _rewritten(folder, original, numbers, first=0)
-
-    def copy(self, folder: Path, original: Path) -> Path:
-        """See `PoseRewriter`."""
-        return _copied(folder, original)
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
@@ -145,7 +141,7 @@ class SevenScenesRewriter:
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
-class Open3dRewriter:
+class Open3dRewriter(_OneFile):
     """Open3D's camera trajectory in JSON, with its cameras."""
 
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
@@ -157,10 +153,6 @@ class Open3dRewriter:
         out = folder / f"refined{original.suffix}"
         Open3dTrajectoryWriter().write(out, dataclasses.replace(source, frames=frames, trajectory=trajectory))
         return out
-
-    def copy(self, folder: Path, original: Path) -> Path:
-        """See `PoseRewriter`."""
-        return _copied(folder, original)
 
 
 def _rewritten(folder: Path, original: Path, numbers: Callable[[list[str]], list[float] | None], *, first: int) -> Path:

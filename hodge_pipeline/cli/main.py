@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hodge_pipeline.cli import refine as refining
-from hodge_pipeline.cli.dask_option import Dask
+from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -61,21 +61,6 @@ def root(
     """Options of `hodge` itself."""
 
 
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change an option, such as edges.max_edges_per_frame=6."),
-]
-Reader = Annotated[str | None, typer.Option(help="The reader by name; none: the surest of the path.")]
-ReaderSet = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="OPTION=VALUE", help="An option of the reader, such as tracks=false."),
-]
-Out = Annotated[Path, typer.Option("--out", help="The run folder; the same command goes on where it stopped.")]
-Overwrite = Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-
-
 @app.command()
 def run(
     recipe: Annotated[str, typer.Argument(help="A recipe by name (see `hodge recipes`) or a .yaml file.")],
@@ -114,8 +99,7 @@ def solve(
         typer.Option("--out", help="The result: .g2o or .json (Open3D) with edges; .tum, .kitti, .csv, .log without."),
     ] = None,
     objective: Annotated[
-        str | None,
-        typer.Option(help="full: g2o's chi2, the default; isotropic: SE-Sync's F, which can be certified."),
+        str | None, typer.Option(help="full: g2o's chi2, the default; isotropic: SE-Sync's F, which can be certified.")
     ] = None,
     start: Annotated[
         str, typer.Option(help="chordal: from the edges alone; given: from the file's poses.")
@@ -135,10 +119,7 @@ def solve(
         typer.Option(metavar="A-B", help="Leave out the edges between these vertex ids; may be repeated."),
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds after which the best so far is given.")] = float("inf"),
-    run_folder: Annotated[
-        Path | None,
-        typer.Option("--run", help="Folder for report, edges and recording."),
-    ] = None,
+    run_folder: Annotated[Path | None, typer.Option("--run", help="Folder for report, edges and recording.")] = None,
     dask: Dask = None,
     quiet: Quiet = False,
     json: Json = False,
@@ -162,12 +143,10 @@ def solve(
 def diagnose(
     path: Annotated[Path, typer.Argument(help="A finished run, or a pose graph (g2o, TORO, Open3D, pair .log).")],
     out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for edges.csv, poses.tum, diagnosis.html and diagnosis.rrd."),
+        Path | None, typer.Option("--out", help="Folder for edges.csv, poses.tum, diagnosis.html and diagnosis.rrd.")
     ] = None,
     top: Annotated[
-        int | None,
-        typer.Option(min=0, help="Edges to print; default: those that are not consistent, 20 at most."),
+        int | None, typer.Option(min=0, help="Edges to print; default: those that are not consistent, 20 at most.")
     ] = None,
     quiet: Quiet = False,
     json: Json = False,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hodge_pipeline.cli.dask_option import Dask
+from hodge_pipeline.cli.options import Dask, Force, Json, Overrides, Overwrite, Quiet
 
 HELP = """Make the poses of COLMAP or SLAM better, in their own format.
 
@@ -38,18 +38,15 @@ def trajectory(
     match: Annotated[
         str, typer.Option(help="How a pose finds its frame: stamp, number, row (n-th pose, n-th frame), or auto.")
     ] = "auto",
-    force: Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")] = False,
+    force: Force = False,
     recipe: Annotated[
         str, typer.Option("--recipe", help="A recipe like slam-refine, which is the default; for TUM slam-refine-tum.")
     ] = "",
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe."),
-    ] = None,
+    overrides: Overrides = None,
     dask: Dask = None,
-    overwrite: Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Refine SLAM poses with the frames they belong to: loops, registration, a robust solve."""
     from hodge_pipeline.cli import refine_trajectory as refining_trajectory
@@ -95,16 +92,13 @@ def colmap(
         tuple[float, float, float, float] | None,
         typer.Option("--depth-camera", help="FX FY CX CY of depth that is not on the pixels of the colour images."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")] = False,
+    force: Force = False,
     recipe: Annotated[str, typer.Option("--recipe", help="A recipe like colmap-refine, by name or file.")] = "",
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the recipe colmap-refine."),
-    ] = None,
+    overrides: Overrides = None,
     dask: Dask = None,
     overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Refine a COLMAP model: edges measured anew, a robust solve, bundle adjustment; metric where there is depth."""
     from hodge_pipeline.cli import refine_colmap as refining_colmap

@@ -6,32 +6,16 @@ from typing import Literal
 
 import numpy as np
 
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, ViewGraph
 
-EdgeWeighting = Literal["unit", "fitness", "information"]
+EdgeWeighting = Literal["unit", "information"]
 
 
 def edge_weights(graph: ViewGraph, kind: EdgeWeighting, lever_arm_m: float) -> tuple[Floats, tuple[str, ...]]:
     """The weight (E,) of each edge, 0 for one to be ignored, and notes on what had to be replaced."""
-    if kind == "fitness":
-        return _fitness(graph)
     if kind == "information":
         return _information(graph, lever_arm_m)
     return np.ones(graph.edge_count), ()
-
-
-def _fitness(graph: ViewGraph) -> tuple[Floats, tuple[str, ...]]:
-    known = np.isfinite(graph.fitness)
-    if graph.edge_count and not known.any():
-        raise GraphError("weights: fitness is unknown for every edge: use `unit` or `information`")
-    if (graph.fitness[known] < 0).any():
-        raise GraphError("weights: an edge's fitness is negative: it must be a share in [0, 1]")
-    if known.all():
-        return np.asarray(graph.fitness, float), ()
-    median = float(np.median(graph.fitness[known]))
-    note = f"{int((~known).sum())} edges of unknown fitness are given the median {median:.3g}"
-    return np.where(known, graph.fitness, median), (note,)
 
 
 def _information(graph: ViewGraph, lever_arm_m: float) -> tuple[Floats, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""A cycle basis of least total weight, for small graphs (Horton 1987): the loops that say most about single edges."""
+"""A cycle basis of least total length, for small graphs (Horton 1987): the loops that say most about single edges."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from scipy.sparse.csgraph import dijkstra
 from hodge_pipeline.complex.coboundary import check_edges
 from hodge_pipeline.complex.cycles import Loops, spanning_forest
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Ints
 
 MOST_CANDIDATES = 2_000_000
 
 
-def minimum_cycle_basis(edges: Ints, vertex_count: int, weights: Floats | None = None) -> Loops:
-    """E − V + C loops of least total weight, shortest first; weights (E,) are positive, 1 by default.
+def minimum_cycle_basis(edges: Ints, vertex_count: int) -> Loops:
+    """E − V + C loops of least total length, shortest first.
 
     Every loop of such a basis is an edge (x, y) and the shortest paths from some vertex v to both its ends (Horton);
-    they are taken by weight as long as they are independent over GF(2). Raises `GraphError` for a graph of more than
+    they are taken by length as long as they are independent over GF(2). Raises `GraphError` for a graph of more than
     2 million pairs (v, edge): take `fundamental_loops` there.
     """
     edges = np.asarray(edges, np.int64).reshape(-1, 2)
@@ -28,26 +28,23 @@ def minimum_cycle_basis(edges: Ints, vertex_count: int, weights: Floats | None =
             f"a minimum cycle basis of {vertex_count} vertices and {len(edges)} edges takes too long: use the "
             "fundamental loops of a spanning tree"
         )
-    weights = np.ones(len(edges)) if weights is None else np.asarray(weights, float)
-    if weights.shape != (len(edges),) or not (np.isfinite(weights) & (weights > 0)).all():
-        raise GraphError(f"a minimum cycle basis needs {len(edges)} positive, finite weights")
-    return _independent(_Horton(edges, vertex_count, weights), edges, vertex_count)
+    return _independent(_Horton(edges, vertex_count), edges, vertex_count)
 
 
 class _Horton:
-    """Shortest-path trees from every vertex, and the loops that an edge closes in them, lightest first."""
+    """Shortest-path trees from every vertex, and the loops that an edge closes in them, shortest first."""
 
-    def __init__(self, edges: Ints, vertex_count: int, weights: Floats) -> None:
+    def __init__(self, edges: Ints, vertex_count: int) -> None:
         low, high = edges.min(axis=1), edges.max(axis=1)
-        order = np.lexsort((weights, low * vertex_count + high))
+        order = np.argsort(low * vertex_count + high, kind="stable")
         order = order[(low < high)[order]]
         keys, first = np.unique((low * vertex_count + high)[order], return_index=True)
         self.edges = edges
         self.edge_of_key: dict[int, int] = dict(zip(keys.tolist(), order[first].tolist(), strict=True))
         kept = order[first]
-        adjacency = csr_matrix((weights[kept], (low[kept], high[kept])), shape=(vertex_count, vertex_count))
+        adjacency = csr_matrix((np.ones(len(kept)), (low[kept], high[kept])), shape=(vertex_count, vertex_count))
         distance, self.parent = dijkstra(adjacency, directed=False, return_predecessors=True)
-        total = distance[:, edges[:, 0]] + distance[:, edges[:, 1]] + weights
+        total = distance[:, edges[:, 0]] + distance[:, edges[:, 1]]
         self.count = vertex_count
         flat = np.argsort(total, axis=None, kind="stable")
         self.order = flat[np.isfinite(total.ravel()[flat])]
@@ -62,7 +59,7 @@ class _Horton:
         return steps if len(set(used)) == len(used) else None
 
     def edge_between(self, a: int, b: int) -> int:
-        """The lightest edge that joins two vertices."""
+        """The first edge that joins two vertices."""
         return self.edge_of_key[min(a, b) * self.count + max(a, b)]
 
     def _to_root(self, root: int, vertex: int) -> list[tuple[int, int]]:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import clique_counts, flag_complex, orient_edges
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.decomposition import hodge_decomposition
+from hodge_pipeline.complex.one_form import centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -67,8 +67,9 @@ def energy_rows(
     inside &= graph.edges[:, 0] != graph.edges[:, 1]
     rows: list[EnergyRow] = []
     try:
+        centred = shifted(world_from_cam, -centroids(world_from_cam, piece))
         for when, chosen in ((BEFORE, inside), (AFTER, inside & kept)):
-            rows += _rows(graph.select(np.flatnonzero(chosen)), _centred(world_from_cam, piece), piece, when)
+            rows += _rows(graph.select(np.flatnonzero(chosen)), centred, piece, when)
     except GraphError as error:
         return (), (f"energy shares are left out: {error}",)
     return tuple(sorted(rows, key=lambda row: _place(row.group))), ()
@@ -104,8 +105,7 @@ def _rows(graph: ViewGraph, world_from_cam: Floats, piece: Ints, when: str) -> I
         raise GraphError(f"there are more than {MOST_EDGES} edges")
     if clique_counts(graph.edges, graph.vertex_count)[2] > MOST_TRIANGLES:
         raise GraphError(f"there are more than {MOST_TRIANGLES} triangles")
-    i, j = graph.edges.T
-    omega = se3.log(world_from_cam[i] @ graph.i_from_j @ se3.inverse(world_from_cam[j]))
+    omega = residual_form(graph.edges, graph.i_from_j, world_from_cam)
     oriented = orient_edges(graph.edges, graph.vertex_count)
     form, weights = oriented.pooled(omega, np.ones(graph.edge_count))
     complex_ = flag_complex(graph.edges, graph.vertex_count)
@@ -130,10 +130,3 @@ def _groups(piece: NDArray[np.int64], source: NDArray[np.str_]) -> Iterator[tupl
     if len(sources) > 1:
         for name in sources.tolist():
             yield f"source {name}", source == name
-
-
-def _centred(world_from_cam: Floats, piece: Ints) -> Floats:
-    centred: Floats = np.array(world_from_cam)
-    sums = [np.bincount(piece, centred[:, axis, 3]) for axis in range(3)]
-    centred[:, :3, 3] -= (np.stack(sums, axis=1) / np.bincount(piece)[:, None])[piece]
-    return centred

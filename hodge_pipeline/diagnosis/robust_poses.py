@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.clusters import DIMENSION, FREEDOM, Springs, clustered
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.pieces import Alignment
 from hodge_pipeline.diagnosis.resistance import effective_resistance
+from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.solvers.minimise import descend_isotropic
 from hodge_pipeline.solvers.newton import Limits
 from hodge_pipeline.solvers.setup import prepare
@@ -120,8 +120,8 @@ def _squares(evidence: Evidence, graph: ViewGraph, poses: Floats) -> Floats:
 
 def left_over(graph: ViewGraph, poses: Floats) -> tuple[Floats, Floats]:
     """The angle (E,) in radians and distance (E,) in metres between each edge and the poses."""
-    motion = se3.inverse(graph.i_from_j) @ se3.inverse(poses[graph.edges[:, 0]]) @ poses[graph.edges[:, 1]]
-    return np.linalg.norm(se3.so3_log(motion[:, :3, :3]), axis=1), np.linalg.norm(motion[:, :3, 3], axis=1)
+    moved, angle = edge_residuals(graph, poses)
+    return angle, moved
 
 
 def chi2_at(evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats) -> Floats:

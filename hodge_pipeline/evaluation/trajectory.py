@@ -156,24 +156,3 @@ def relative_error(
         rotation_deg,
         len(start) - len(chosen),
     )
-
-
-def associate(stamps_a: Floats, stamps_b: Floats, max_difference_s: float = 0.01) -> tuple[Ints, Ints]:
-    """Rows (M,) of each list of ascending stamps that belong together: each is the other's nearest, within the limit.
-
-    Mutual nearness keeps the match one to one; what has no partner is in neither list.
-    """
-    if not len(stamps_a) or not len(stamps_b):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    nearest_b, nearest_a = _nearest(stamps_a, stamps_b), _nearest(stamps_b, stamps_a)
-    rows_a = np.arange(len(stamps_a))
-    mutual = nearest_a[nearest_b] == rows_a
-    near = np.abs(stamps_a - stamps_b[nearest_b]) <= max_difference_s
-    return rows_a[mutual & near], nearest_b[mutual & near]
-
-
-def _nearest(stamps: Floats, among: Floats) -> Ints:
-    after = np.clip(np.searchsorted(among, stamps), 1, max(len(among) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(among) - 1)
-    return np.asarray(np.where(stamps - among[before] <= among[after] - stamps, before, after), np.int64)

@@ -34,11 +34,16 @@ def make_blueprint(contents: Contents, room: Eye | None, graph: Eye | None, acti
 
     `room` sees the model, `graph` the cameras alone.
     """
+    return without_panels(rrb.Tabs(*make_tabs(contents, room, graph), active_tab=active_tab), layout.STORY)
+
+
+def without_panels(root: rrb.Container, timeline: str) -> rrb.Blueprint:
+    """A blueprint whose panels are closed; no time panel at all without a timeline."""
     return rrb.Blueprint(
-        rrb.Tabs(*make_tabs(contents, room, graph), active_tab=active_tab),
+        root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=layout.STORY),
+        rrb.TimePanel(state="collapsed", timeline=timeline) if timeline else rrb.TimePanel(state="hidden"),
         auto_views=False,
     )
 

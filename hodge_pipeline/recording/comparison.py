@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from hodge_pipeline import se3
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.blueprint import BACKGROUND
+from hodge_pipeline.recording.blueprint import BACKGROUND, without_panels
 from hodge_pipeline.recording.recorder import APPLICATION
 from hodge_pipeline.recording.results import log_model
 from hodge_pipeline.recording.shapes import evenly, frustum_lines
@@ -77,10 +77,4 @@ def _blueprint(names: tuple[str, str]) -> rrb.Blueprint:
             scene(names[0], "a/model", "a/trajectory"), scene(names[1], "b/model", "b/trajectory"), name="Side by side"
         ),
     )
-    return rrb.Blueprint(
-        tabs,
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=layout.FRAME),
-        auto_views=False,
-    )
+    return without_panels(tabs, layout.FRAME)

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
-from hodge_pipeline.recording.blueprint import scene_view
+from hodge_pipeline.recording.blueprint import scene_view, without_panels
 from hodge_pipeline.recording.curl import log_tested_triangles
 from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.eye import Eye
@@ -68,13 +68,7 @@ def _blueprint(eye: Eye | None) -> rrb.Blueprint:
         rrb.TextDocumentView(origin=layout.LEGEND, name="Colours"),
         row_shares=[3, 1],
     )
-    return rrb.Blueprint(
-        rrb.Horizontal(verdicts, curl, texts, column_shares=[2, 2, 1.4]),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="hidden"),
-        auto_views=False,
-    )
+    return without_panels(rrb.Horizontal(verdicts, curl, texts, column_shares=[2, 2, 1.4]), "")
 
 
 def _eye(world_from_cam: Floats) -> Eye | None:

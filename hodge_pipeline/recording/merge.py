@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,11 +21,9 @@ from hodge_pipeline.recording.stream import log_markdown, log_notes, partial_pat
 
 @dataclass(frozen=True)
 class Merged:
-    """What `merge` wrote: `part_bytes` by file name, and notes of parts that were mended or lost."""
+    """The file that `merge` wrote, and notes of parts that were mended or lost."""
 
     path: Path
-    total_bytes: int
-    part_bytes: Mapping[str, int]
     notes: tuple[str, ...] = ()
 
 
@@ -58,8 +56,7 @@ def merge_parts(
                 send(stream, reader, poses)
             log_notes(stream, 0, notes, level="WARN")
             log_markdown(stream, layout.LEGEND, legend(contents))
-    sizes = {part.name: part.stat().st_size for part in parts}
-    return Merged(out, out.stat().st_size, sizes, tuple(notes))
+    return Merged(out, tuple(notes))
 
 
 def find_parts(folder: Path) -> list[Path]:

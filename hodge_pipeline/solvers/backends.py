@@ -21,10 +21,10 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
 from hodge_pipeline.solvers.linear import Factor, factorise, factorise_blocks, fill_reducing_order
-from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioner, Preconditioning, multigrid
+from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioning, multigrid
 from hodge_pipeline.types import Floats, Ints
 
-BackendName: TypeAlias = Literal["auto", "superlu", "cholmod", "pyamg", "multigrid"]
+BackendName: TypeAlias = Literal["auto", "superlu", "cholmod", "multigrid"]
 ITERATIVE_FROM = 15_000
 """Vertices: below, a factorisation and a hundred solves cost less than the hierarchies."""
 CHAIN_EDGES_PER_VERTEX = 1.5
@@ -37,7 +37,6 @@ SECONDS_A_PRODUCT, SECONDS_A_BLOCK = 0.25e-9, 6e-6
 """Measured, of one Newton step: of products of entries in a factorisation; of blocks of the matrix by multigrid."""
 JOINT_SIZE = 6
 SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
-MODULES = {"cholmod": ("sksparse.cholmod", "scikit-sparse"), "pyamg": ("pyamg", "pyamg")}
 
 
 @dataclass(frozen=True)
@@ -76,23 +75,20 @@ class Backend:
 
 def backend(name: BackendName) -> Backend:
     """The back end of this name, not `auto`. Raises `GraphError` where its library is not installed."""
-    if name in MODULES and not installed(name):
-        raise GraphError(f"back end {name} is not installed: pip install {MODULES[name][1]}, or take backend auto")
     if name == "cholmod":
+        if not cholmod_installed():
+            raise GraphError("back end cholmod is not installed: pip install scikit-sparse, or take backend auto")
         return Backend(name, factorise_core=_cholmod)
-    if name in ("pyamg", "multigrid"):
-        return Backend(name, precondition=_pyamg if name == "pyamg" else _multigrid())
-    return Backend("superlu")
+    return Backend(name, precondition=_multigrid()) if name == "multigrid" else Backend("superlu")
 
 
 @cache
-def installed(name: BackendName) -> bool:
-    """Whether the library of a back end can be imported: looked up once, since a search of the path takes as long as a
-    twentieth of a solve for a thousand poses.
+def cholmod_installed() -> bool:
+    """Whether scikit-sparse can be imported: looked up once, since a search of the path takes as long as a twentieth
+    of a solve for a thousand poses.
     """
-    module = MODULES.get(name, ("scipy", ""))[0]
     try:
-        return importlib.util.find_spec(module) is not None
+        return importlib.util.find_spec("sksparse.cholmod") is not None
     except ModuleNotFoundError:
         return False
 
@@ -103,7 +99,7 @@ def choose(name: BackendName, tail: Ints, head: Ints, count: int, direct: bool =
     `auto` is the cheaper of a factorisation, whose fill is foretold, and multigrid; where one will be needed
     (`direct`), it is a factorisation.
     """
-    factors = backend("cholmod" if installed("cholmod") else "superlu") if name == "auto" else backend(name)
+    factors = backend("cholmod" if cholmod_installed() else "superlu") if name == "auto" else backend(name)
     if factors.iterative:
         return factors, unordered(count)
     if name != "auto" or direct or count <= ITERATIVE_FROM:
@@ -162,18 +158,3 @@ def _cholmod(matrix: csc_matrix) -> Callable[[Floats], Floats]:
     except CholmodError as error:
         raise GraphError(f"a linear system of {matrix.shape[0]} unknowns is singular: {error}") from error
     return lambda rhs: np.asarray(factor(rhs))
-
-
-def _pyamg(matrix: bsr_matrix, modes: Modes) -> Preconditioner:
-    import pyamg
-
-    size = matrix.blocksize[0]
-    near = modes.blocks(matrix.shape[0] // size, size).reshape(-1, size)
-    levels = pyamg.smoothed_aggregation_solver(matrix, B=near, symmetry="symmetric")
-    cycle = levels.aspreconditioner()
-
-    def apply(_: bsr_matrix, r: Floats) -> Floats:
-        columns = r.reshape(len(near), -1)
-        return np.stack([cycle @ column for column in columns.T], axis=1).reshape(r.shape)
-
-    return apply

@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import Literal, TypeAlias
-
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.complex.checks import NO_EDGES, check_graph, refuse_priors
 from hodge_pipeline.complex.components import describe_components
-from hodge_pipeline.complex.cycles import (
-    Loops,
-    adjusted_edges,
-    fundamental_products,
-    loop_deviation,
-    loop_products,
-    spanning_forest,
-)
-from hodge_pipeline.complex.minimum_cycles import MOST_CANDIDATES, minimum_cycle_basis
+from hodge_pipeline.complex.cycles import Loops, loop_deviation
+from hodge_pipeline.complex.minimum_cycles import MOST_CANDIDATES
 from hodge_pipeline.complex.one_form import Logarithm
-from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem, path_lengths
+from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem
 from hodge_pipeline.solvers.paper_surface import (
     MOST_CHECKED_EDGES,
     PaperSurface,
@@ -30,12 +19,14 @@ from hodge_pipeline.solvers.paper_surface import (
     homology_metrics,
     make_surface,
 )
+from hodge_pipeline.solvers.potential import (
+    AroundLoops,
+    deviation_metrics,
+    iterate,
+    loops_of,
+    unconverged_notes,
+)
 from hodge_pipeline.types import Floats, Solution, SolverIteration, ViewGraph
-
-STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
-
-AroundLoops: TypeAlias = Callable[[Floats], Floats]
-"""The motions (L, 4, 4) around the loops of one cycle basis, from the motions (E, 4, 4) of the edges."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -58,11 +49,6 @@ class PaperSolver:
         "the angle of the neighbours in each vertex's principal plane, which makes smaller cells and less genus",
     )
     seed: int = Field(0, ge=0, description="of the random orders; the same seed gives the same poses")
-    paths: Literal["hops", "uncertainty"] = Field(
-        "hops",
-        description="what Algorithm 2's shortest paths are shortest by: the number of edges (the paper), or the sum of "
-        "their standard deviations, from the information of the edges",
-    )
     log: Logarithm = Field(
         "pairing",
         description="logarithm of the residual motion: pairing is the paper's (rotation vector, translation), which "
@@ -73,11 +59,6 @@ class PaperSolver:
     )
     tolerance: float = Field(
         1e-10, gt=0, description="stop once the RMS of f over the vertices (radians and metres) is below this"
-    )
-    cycle_basis: Literal["auto", "tree", "shortest"] = Field(
-        "auto",
-        description="the loops over which D is summed: those of a breadth-first tree, or a basis of least total "
-        "length, mostly triangles; auto takes the shortest while vertices × edges is at most two million",
     )
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
@@ -96,9 +77,8 @@ class PaperSolver:
         if not len(problem.edges):
             notes = (*problem.notes(), *pieces, NO_EDGES)
             return Solution(world_from_cam.copy(), problem.component, np.zeros(graph.edge_count), notes=notes)
-        lengths = path_lengths(graph.select(problem.rows), self.paths)
-        surface = make_surface(problem.edges, problem.start, lengths, self.rotation, self.seed)
-        around_loops = self._around_loops(problem)
+        surface = make_surface(problem.edges, problem.start, self.rotation, self.seed)
+        around_loops = loops_of(problem.edges, len(problem.component), MOST_CANDIDATES)
         generators = surface.generators() if surface.is_checked else None
         history = self._iterate(problem, surface, around_loops, generators)
         measured = loop_deviation(around_loops(problem.i_from_j))
@@ -109,8 +89,7 @@ class PaperSolver:
             history=history,
             metrics={
                 "loops": float(len(measured)),
-                "measured_loop_deviation_sum": float(measured.sum()),
-                "measured_loop_deviation_mean": _mean(measured),
+                **deviation_metrics(measured, "measured_loop_deviation"),
                 "iterations": float(len(history)),
                 **surface.sizes(),
                 **(surface.shares(surface.form(problem.form(problem.start, self.log))) if surface.is_checked else {}),
@@ -124,55 +103,25 @@ class PaperSolver:
         self, problem: PaperProblem, surface: PaperSurface, around_loops: AroundLoops, generators: Loops | None
     ) -> tuple[SolverIteration, ...]:
         solve_poisson = problem.poisson(surface.d0, surface.weights)
-        poses, history = problem.start, []
-        omega = problem.form(poses, self.log)
-        for _ in range(self.inner_iterations):
-            correction = solve_poisson(surface.form(omega))
-            adjusted = adjusted_edges(problem.edges, poses, correction, pairing=self.log == "pairing")
-            deviation = loop_deviation(around_loops(adjusted))
-            poses = problem.moved(poses, correction, self.log)
-            omega = problem.form(poses, self.log)
-            step = float(np.sqrt((correction**2).sum(axis=1).mean()))
-            metrics = {
-                **problem.residual_metrics(poses),
-                "step_rms": step,
-                "loop_deviation_sum": float(deviation.sum()),
-                "loop_deviation_mean": _mean(deviation),
-                **homology_metrics(generators, adjusted, "homology"),
-            }
-            objective = float(0.5 * surface.weights[: len(omega)] @ (omega**2).sum(axis=1))
-            history.append(SolverIteration(problem.in_world(poses), objective, metrics))
-            if step < self.tolerance:
-                break
-        return tuple(history)
-
-    def _around_loops(self, problem: PaperProblem) -> AroundLoops:
-        edges, vertex_count = problem.edges, len(problem.component)
-        affordable = vertex_count * len(edges) <= MOST_CANDIDATES
-        if self.cycle_basis == "shortest" or (self.cycle_basis == "auto" and affordable):
-            return partial(loop_products, minimum_cycle_basis(edges, vertex_count))
-        return partial(fundamental_products, spanning_forest(edges, vertex_count))
+        return iterate(
+            problem,
+            self.log,
+            lambda omega: solve_poisson(surface.form(omega)),
+            surface.weights[: len(problem.edges)],
+            around_loops,
+            self.inner_iterations,
+            self.tolerance,
+            lambda adjusted: homology_metrics(generators, adjusted, "homology"),
+        )
 
     def _notes(
         self, problem: PaperProblem, surface: PaperSurface, history: tuple[SolverIteration, ...]
     ) -> tuple[str, ...]:
-        notes = list(problem.notes())
-        half_turns = int((np.linalg.norm(problem.form(problem.start, self.log)[:, :3], axis=1) > np.pi - 1e-3).sum())
-        if half_turns:
-            notes.append(f"{half_turns} edges disagree with the start by a half turn: the sign of their ω is arbitrary")
+        notes = [*problem.notes(), *problem.half_turn_notes(self.log)]
         if surface.is_checked:
             notes.extend(surface.connectivity_notes())
         else:
             notes.append(
                 f"more than {MOST_CHECKED_EDGES} edges: energy shares, homology loops and connectivity are not computed"
             )
-        step = history[-1].metrics["step_rms"]
-        if step > STILL_MOVING:
-            notes.append(
-                f"not converged: step {len(history)} still moved the poses by {step:.2g}: more inner_iterations"
-            )
-        return tuple(notes)
-
-
-def _mean(values: Floats) -> float:
-    return float(values.mean()) if len(values) else 0.0
+        return (*notes, *unconverged_notes(history))

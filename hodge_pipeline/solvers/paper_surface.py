@@ -30,19 +30,17 @@ they would take longer than the solve."""
 class PaperSurface:
     """A viewing graph embedded in closed surfaces, one for each component, and triangulated.
 
-    `d0 (E + D, V)` and `weights (E + D,)`, the cotangent weights of unit edges, are those of the surface;
-    `lengths (E,)` are what Algorithm 2 measures its shortest paths by.
+    `d0 (E + D, V)` and `weights (E + D,)`, the cotangent weights of unit edges, are those of the surface.
     """
 
     embedding: Embedding
     surface: Surface
     d0: csr_matrix
     weights: Floats
-    lengths: Floats
 
     def form(self, omega: Floats) -> Floats:
         """ω (E + D, 6) on all edges of the surface, from ω (E, 6) on the graph's (Algorithm 2)."""
-        return surface_form(self.surface, omega, self.lengths)
+        return surface_form(self.surface, omega)
 
     @property
     def is_checked(self) -> bool:
@@ -84,9 +82,7 @@ class PaperSurface:
         )
 
 
-def make_surface(
-    edges: Ints, world_from_cam: Floats, lengths: Floats, rotation: RotationSystem, seed: int
-) -> PaperSurface:
+def make_surface(edges: Ints, world_from_cam: Floats, rotation: RotationSystem, seed: int) -> PaperSurface:
     """The surface of a graph: Algorithm 1 with random orders (seeded), or by the angle of the neighbours' positions."""
     vertex_count = len(world_from_cam)
     if rotation == "random":
@@ -96,7 +92,7 @@ def make_surface(
     embedding = embed(edges, vertex_count, orders)
     surface = triangulate(embedding)
     d0 = coboundary_0(surface.edges, vertex_count)
-    return PaperSurface(embedding, surface, d0, cotangent_weights(surface), lengths)
+    return PaperSurface(embedding, surface, d0, cotangent_weights(surface))
 
 
 def homology_metrics(generators: Loops | None, i_from_j: Floats, name: str) -> Mapping[str, float]:

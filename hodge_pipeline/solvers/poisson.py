@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass as plain_dataclass
-from functools import partial
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -15,52 +13,34 @@ from scipy.sparse import csr_matrix
 from hodge_pipeline.complex.checks import NO_EDGES, check_graph, orthonormal, refuse_priors
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.components import connected_components, describe_components
-from hodge_pipeline.complex.cycles import (
-    adjusted_edges,
-    fundamental_products,
-    loop_deviation,
-    loop_products,
-    spanning_forest,
-)
+from hodge_pipeline.complex.cycles import loop_deviation
 from hodge_pipeline.complex.edge_weights import EdgeWeighting, edge_weights
-from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
-from hodge_pipeline.complex.one_form import Logarithm, centroids, residual_form, shifted
-from hodge_pipeline.solvers.potential import moved, poisson, residual_metrics, residuals
-from hodge_pipeline.solvers.problem import pinned_vertices
-from hodge_pipeline.types import Bools, Floats, Ints, Solution, SolverIteration, ViewGraph
+from hodge_pipeline.complex.one_form import Logarithm, centroids, shifted
+from hodge_pipeline.solvers.potential import (
+    AroundLoops,
+    CentredProblem,
+    deviation_metrics,
+    iterate,
+    loops_of,
+    residuals,
+    unconverged_notes,
+)
+from hodge_pipeline.types import Bools, Floats, Solution, SolverIteration, ViewGraph
 
-STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
 WEIGHTS_SETTLED = 1e-3
 SMALLEST_WEIGHT = 1e-6  # a rejected edge still ties its ends together, so that no component falls apart
 SMALLEST_SCALE_M = 1e-6
 AFFORDABLE_BASIS = 1_000_000  # vertices times edges: a few tenths of a second
 MAD_TO_SIGMA = 1.4826
-TUNING = {"huber": 1.345, "geman_mcclure": 3.0}  # in sigmas: 95 % efficiency; half weight at about 2 sigma
-
-AroundLoops: TypeAlias = Callable[[Floats], Floats]
-"""The motions (L, 4, 4) around the loops of one cycle basis, from the motions (E, 4, 4) of the edges."""
+TUNING = 3.0  # in sigmas: half weight at about 2 sigma
 
 
 @plain_dataclass(frozen=True)
-class _Problem:
-    """The edges that can be used, around the centroid of their component."""
+class _Problem(CentredProblem):
+    """With the weight of each edge before any kernel."""
 
-    edges: Ints
-    i_from_j: Floats
     base_weights: Floats
     d0: csr_matrix
-    component: Ints
-    fixed: Ints
-    start: Floats
-    offset: Floats
-    start_in_world: Floats
-
-    def in_world(self, poses: Floats) -> Floats:
-        """The poses away from the centroid again; the held vertices are those of the start to the last bit."""
-        out = shifted(poses, self.offset)
-        held = pinned_vertices(self.component, self.fixed)
-        out[held] = self.start_in_world[held]
-        return out
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -82,13 +62,13 @@ class PoissonSolver:
 
     weights: EdgeWeighting = Field(
         "unit",
-        description="weight of each edge: unit as in the paper up to a factor; fitness of its registration; "
+        description="weight of each edge: unit as in the paper up to a factor; "
         "information, 6 / tr(S Ω⁻¹ S) with S = diag(lever_arm_m × 3, 1 × 3), for measured pose graphs",
     )
-    robust: Literal["none", "huber", "geman_mcclure"] = Field(
+    robust: Literal["none", "geman_mcclure"] = Field(
         "geman_mcclure",
-        description="kernel against false edges: none is the paper's least squares; huber bounds the pull of a false "
-        "edge; geman_mcclure, the default, all but removes it",
+        description="kernel against false edges: none is the paper's least squares; geman_mcclure, the default, all "
+        "but removes a false edge",
     )
     scale_m: float | None = Field(
         None,
@@ -114,12 +94,6 @@ class PoissonSolver:
         description="logarithm of the residual motion: se3 does not depend on the edges' directions; pairing is the "
         "paper's own (rotation vector, translation), which does",
     )
-    cycle_basis: Literal["auto", "tree", "shortest"] = Field(
-        "auto",
-        description="the loops over which D is summed: those of a breadth-first tree, or a basis of least total "
-        "length, mostly triangles; auto takes the shortest while vertices × edges is at most a million. D grows with "
-        "the loops' length, so compare it only on the same basis; the poses do not depend on it",
-    )
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """Consistent poses; a graph of several components is solved piece by piece, isolated vertices keep their pose.
@@ -134,15 +108,14 @@ class PoissonSolver:
         used = proper & (base_weights > 0)
         problem = _problem(graph, used, base_weights, world_from_cam)
         robust_weights, scale = self._robust_weights(problem)
-        around_loops = self._around_loops(problem)
+        around_loops = loops_of(problem.edges, len(problem.component), AFFORDABLE_BASIS)
         history = self._iterate(problem, robust_weights, around_loops)
         weights = np.zeros(graph.edge_count)
         weights[used] = robust_weights
         measured = loop_deviation(around_loops(problem.i_from_j))
         metrics = {
             "loops": float(len(measured)),
-            "measured_loop_deviation_sum": float(measured.sum()),
-            "measured_loop_deviation_mean": _mean(measured),
+            **deviation_metrics(measured, "measured_loop_deviation"),
             "robust_scale_m": scale,
             "iterations": float(len(history)),
             **(history[-1].metrics if history else {}),
@@ -161,39 +134,12 @@ class PoissonSolver:
             ),
         )
 
-    def _around_loops(self, problem: _Problem) -> AroundLoops:
-        edges, vertex_count = problem.edges, len(problem.component)
-        short = self.cycle_basis == "shortest" or (
-            self.cycle_basis == "auto" and vertex_count * len(edges) <= AFFORDABLE_BASIS
-        )
-        if short:
-            return partial(loop_products, minimum_cycle_basis(edges, vertex_count))
-        return partial(fundamental_products, spanning_forest(edges, vertex_count))
-
     def _iterate(self, problem: _Problem, weights: Floats, around_loops: AroundLoops) -> tuple[SolverIteration, ...]:
         if len(problem.edges) == 0:
             return ()
         total = problem.base_weights * weights
-        potential = poisson(problem.d0, total, problem.component, problem.fixed)
-        poses, history = problem.start, []
-        omega = self._form(problem, poses)
-        for _ in range(self.inner_iterations):
-            correction = potential(omega)
-            adjusted = adjusted_edges(problem.edges, poses, correction, pairing=self.log == "pairing")
-            deviation = loop_deviation(around_loops(adjusted))
-            poses = self._moved(problem, poses, correction)
-            omega = self._form(problem, poses)
-            step = float(np.sqrt((correction**2).sum(axis=1).mean()))
-            history.append(
-                SolverIteration(
-                    world_from_cam=problem.in_world(poses),
-                    objective=float(0.5 * total @ (omega**2).sum(axis=1)),
-                    metrics=_metrics(problem, poses, deviation, step),
-                )
-            )
-            if step < self.tolerance:
-                break
-        return tuple(history)
+        potential = problem.poisson(problem.d0, total)
+        return iterate(problem, self.log, potential, total, around_loops, self.inner_iterations, self.tolerance)
 
     def _robust_weights(self, problem: _Problem) -> tuple[Floats, float]:
         """The frozen weights (E,) in (0, 1], 1 without a kernel, and the scale in metres that they ended with."""
@@ -203,11 +149,11 @@ class PoissonSolver:
         poses, scale = problem.start, float("nan")
         for _ in range(self.reweighting_steps):
             total = problem.base_weights * weights
-            correction = poisson(problem.d0, total, problem.component, problem.fixed)(self._form(problem, poses))
-            poses = self._moved(problem, poses, correction)
+            correction = problem.poisson(problem.d0, total)(problem.form(poses, self.log))
+            poses = problem.moved(poses, correction, self.log)
             residual = self._displacement(problem, poses)
             scale = self.scale_m or _robust_scale(residual)
-            previous, weights = weights, _kernel(residual / (TUNING[self.robust] * scale), self.robust)
+            previous, weights = weights, _kernel(residual / (TUNING * scale))
             if np.abs(weights - previous).mean() < WEIGHTS_SETTLED:
                 break
         return weights, scale
@@ -217,25 +163,10 @@ class PoissonSolver:
         translation, angle = residuals(problem.edges, problem.i_from_j, poses)
         return np.hypot(translation, self.lever_arm_m * angle)
 
-    def _form(self, problem: _Problem, poses: Floats) -> Floats:
-        return residual_form(problem.edges, problem.i_from_j, poses, self.log)
-
-    def _moved(self, problem: _Problem, poses: Floats, correction: Floats) -> Floats:
-        return moved(poses, correction, problem.start, problem.component, problem.fixed, self.log)
-
     def _convergence_notes(self, problem: _Problem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
         if not history:
             return (NO_EDGES,)
-        notes = []
-        half_turns = int((np.linalg.norm(self._form(problem, problem.start)[:, :3], axis=1) > np.pi - 1e-3).sum())
-        if half_turns:
-            notes.append(f"{half_turns} edges disagree with the start by a half turn: the sign of their ω is arbitrary")
-        step = history[-1].metrics["step_rms"]
-        if step > STILL_MOVING:
-            notes.append(
-                f"not converged: step {len(history)} still moved the poses by {step:.2g}: more inner_iterations"
-            )
-        return tuple(notes)
+        return (*problem.half_turn_notes(self.log), *unconverged_notes(history))
 
 
 def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam: Floats) -> _Problem:
@@ -255,28 +186,14 @@ def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam
     )
 
 
-def _metrics(problem: _Problem, poses: Floats, deviation: Floats, step: float) -> Mapping[str, float]:
-    return {
-        **residual_metrics(problem.edges, problem.i_from_j, poses),
-        "step_rms": step,
-        "loop_deviation_sum": float(deviation.sum()),
-        "loop_deviation_mean": _mean(deviation),
-    }
-
-
-def _mean(values: Floats) -> float:
-    return float(values.mean()) if len(values) else 0.0
-
-
 def _robust_scale(residual: Floats) -> float:
     """One sigma in metres from the median; edges in no loop fit exactly and would drag it to 0, so they do not vote."""
     voting = residual[residual > 1e-9 * residual.max(initial=0.0)]
     return max(MAD_TO_SIGMA * float(np.median(voting)) if len(voting) else 0.0, SMALLEST_SCALE_M)
 
 
-def _kernel(ratio: Floats, robust: str) -> Floats:
-    weight = 1.0 / np.maximum(ratio, 1.0) if robust == "huber" else 1.0 / (1.0 + ratio**2) ** 2
-    return np.maximum(weight, SMALLEST_WEIGHT)
+def _kernel(ratio: Floats) -> Floats:
+    return np.maximum(1.0 / (1.0 + ratio**2) ** 2, SMALLEST_WEIGHT)
 
 
 def _edge_notes(proper: Bools, base_weights: Floats) -> tuple[str, ...]:

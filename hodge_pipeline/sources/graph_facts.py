@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.betti import betti_numbers
-from hodge_pipeline.complex.cech import clique_counts, flag_complex
+from hodge_pipeline.complex.cech import clique_counts
 from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 MOST_TRIANGLES = 20_000
-"""Exact elimination takes seconds beyond."""
+"""Elimination takes seconds beyond."""
 LISTED = 5
 INDEFINITE = 1e-9
 """Of the largest eigenvalue: a more negative one is not rounding."""
@@ -56,8 +56,7 @@ def _cycle_facts(simple: Ints, vertices: int, pieces: int) -> dict[str, Any]:
     triangles = clique_counts(simple, vertices)[2] if len(simple) else 0
     facts["triangles"] = triangles
     if triangles <= MOST_TRIANGLES:
-        open_cycles = betti_numbers(flag_complex(simple, vertices))[1] if len(simple) else 0
-        facts["cycles that no triangles fill (b1)"] = open_cycles
+        facts["cycles that no triangles fill (b1)"] = unfilled_loops(simple, vertices, most_loops=0).count
     return facts
 
 

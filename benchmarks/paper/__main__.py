@@ -1,4 +1,4 @@
-"""The paper's tables from start to end: `python -m hodge_pipeline.cli.papering`, which `make paper` calls."""
+"""The paper's tables from start to end: `python -m benchmarks.paper`, which `make paper` calls."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.paper import tables as paper_tables
+from benchmarks.paper.sequences import Found, find_sequences, peer_poses
+from benchmarks.paper.tables import NAN, Measured, Results
 from hodge_pipeline.cli.console import Terminal
-from hodge_pipeline.cli.dask_option import Dask
-from hodge_pipeline.cli.paper_sequences import Found, find_sequences, peer_poses
+from hodge_pipeline.cli.options import Dask
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
-from hodge_pipeline.evaluation import paper_tables
-from hodge_pipeline.evaluation.paper_tables import NAN, Measured, Results
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphKind, score_table
 from hodge_pipeline.pipeline import run as run_pipeline
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import has_truth, true_poses
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import Floats, Solution
+from hodge_pipeline.types import Floats
 
 HEADING = "The paper's tables"
 OUTER_ITERATIONS = 3
@@ -33,7 +33,7 @@ def default_data() -> Path:
     return Path(os.environ.get("HODGE_DATA", Path("..") / "shared" / "data"))
 
 
-def papering(
+def paper(
     data: Annotated[
         Path | None,
         typer.Option(help="The folder with the sequences, or with seven_scenes/ and icl_nuim/. Default: HODGE_DATA."),
@@ -118,7 +118,7 @@ def _peer(folder: Path, sequence: Found, run: Run) -> tuple[Floats | None, str]:
 
 
 def _measured(run: Run, kind: GraphKind, wall_s: float, peer: Floats | None, peer_note: str) -> Measured:
-    solutions = [_solution(run, number) for number in range(1, OUTER_ITERATIONS + 1)]
+    solutions = [found.solution for found in run.rounds if found.solution is not None]
     first = solutions[0]
     stages = run.report.stages
     assert run.report.scores is not None
@@ -143,26 +143,22 @@ def _measured(run: Run, kind: GraphKind, wall_s: float, peer: Floats | None, pee
     )
 
 
-def _solution(run: Run, number: int) -> Solution:
-    return artifacts.load_solution(run.folder / "stages" / f"solve-{number}" / "solution.npz")
-
-
 def _peer_score(run: Run, kind: GraphKind, peer: Floats) -> float:
     """The peer's score on the pairs of the true poses, or of our result where there are none."""
-    reference = true_poses(run.source) if has_truth(run.source) else run.result.world_from_cam
+    reference = true_poses(run.source) if has_truth(run.source) else run.poses
     sets = {"reference": reference, "peer": peer}
     with load_recipe(f"paper-{kind}").executor.open() as workers:
-        table = score_table(run.folder / "stages" / "clouds", sets, "reference", workers, kinds=(kind,))
+        table = score_table(run.clouds.folder, sets, "reference", workers, kinds=(kind,))
     return float(table.graphs[0].mean_score[1])
 
 
 def _picture(name: str, run: Run, peer: Floats | None, peer_name: str, out: Path) -> dict[str, str]:
-    from hodge_pipeline.cli.paper_picture import draw_comparison
+    from benchmarks.paper.picture import draw_comparison
 
     sets = {"GT": true_poses(run.source)} if has_truth(run.source) else {}
     if peer is not None:
         sets[peer_name] = peer
-    sets["Hodge 3rd"] = run.result.world_from_cam
+    sets["Hodge 3rd"] = run.poses
     path = out / f"{name}.png"
     draw_comparison(path, run.source.frames, sets)
     shown = ", ".join(sets)
@@ -172,7 +168,7 @@ def _picture(name: str, run: Run, peer: Floats | None, peer_name: str, out: Path
 def main() -> None:
     """Run it; what a user can mend is one line and exit code 1."""
     try:
-        typer.run(papering)
+        typer.run(paper)
     except HodgeError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(error.exit_code)

@@ -1,4 +1,4 @@
-"""Betti numbers: how many pieces, unfilled loops and voids a complex has (paper, Section 3.1)."""
+"""Betti numbers by exact ranks: how many pieces, unfilled loops and voids a complex has (paper, Section 3.1)."""
 
 from __future__ import annotations
 

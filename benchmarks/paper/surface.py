@@ -1,6 +1,6 @@
 """The same ω through the embedding surface and through the plain graph Laplacian: accuracy, spread, size, time.
 
-    python benchmarks/paper.py runs/paper/redkitchen-distance [round]
+    python -m benchmarks.paper.surface runs/paper/redkitchen-distance [round]
 
 reads the registered edges of a finished run (its first round, unless another is given) and prints a Markdown table.
 """
@@ -18,11 +18,11 @@ import numpy as np
 from hodge_pipeline.evaluation.scores import score_table
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 SEEDS = 20
@@ -39,18 +39,12 @@ class Problem:
     clouds: Path
 
 
-def read_problem(run: Path, round_number: int) -> Problem:
-    """The problem that a round of a finished run solved."""
-    recipe = load_recipe(str(run / "recipe.yaml"))
-    assert recipe.source.path is not None and recipe.source.reader is not None
-    source = recipe.source.reader.open(recipe.source.path)
-    stages = run / "stages"
-    edges, ids = artifacts.load_edges(stages / f"solve-{round_number}" / "edges.npz")
-    if round_number == 1:
-        start = artifacts.load_arrays(stages / "odometry" / "poses.npz")["world_from_cam"]
-    else:
-        start = artifacts.load_solution(stages / f"solve-{round_number - 1}" / "solution.npz").world_from_cam
-    return Problem(edges.select(edges.counts).as_graph(ids), start, true_poses(source), stages / "clouds")
+def read_problem(folder: Path, round_number: int) -> Problem:
+    """The problem that a round of a finished run solved; each of its frames is a key frame."""
+    run = Run.load(folder)
+    before, solved = run.rounds[round_number - 1 : round_number + 1]
+    graph = solved.edges.select(solved.edges.counts).as_graph(solved.vertex_ids)
+    return Problem(graph, before.world_from_cam, true_poses(run.source), run.clouds.folder)
 
 
 def solve_all(problem: Problem, make: Callable[[int], ConsistencySolver], seeds: int) -> tuple[list[Solution], float]:

@@ -1,0 +1,1 @@
+"""The reproduction of the paper: `python -m benchmarks.paper`, which `make paper` calls."""
