@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hodge_pipeline.recording.replay import record_again
 from rerun.chunk import RrdReader
 
 import hodge_pipeline
@@ -25,6 +24,7 @@ from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.start.odometry import chain
 from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.store import stored
+from hodge_pipeline.uses.record_again import record_again
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_pipeline import SMALL, Log, small_recipe
 from test_recording import rgb, rows
