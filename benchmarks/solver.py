@@ -106,7 +106,7 @@ def row(task: tuple[str, str | int, int]) -> list[str]:
         f"{plain_s.cpu_s:.3f}",
         f"{plain_s.wall_s:.3f}",
         f"{gradient:.0e}",
-        {1.0: "yes", 0.0: "no"}.get(certified.metrics.get("certified", -1.0), ""),
+        {True: "yes", False: "no"}.get(certified.certified, ""),
         seconds(certified_s),
         "" if full_s is None else chi2_cell(full),
         seconds(full_s),

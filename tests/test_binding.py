@@ -62,7 +62,10 @@ def test_a_stage_by_name_has_its_defaults(tmp_path: Path) -> None:
             "fusion:\n  - stage: tsdf\n    voxle_m: 1\n",
             "r.yaml:8: fusion.0.voxle_m: unknown option (did you mean 'voxel_m'",
         ),
-        ("odometry: {registration: {stage: gicp, distances_m: []}}\n", "r.yaml:6: odometry.registration.distances_m:"),
+        (
+            "start: {stage: odometry, registration: {stage: gicp, distances_m: []}}\n",
+            "r.yaml:6: start.registration.distances_m:",
+        ),
         ("scale: big\n", "r.yaml:6: scale: expected number or 'auto', got 'big'"),
         (
             "source: {reader: {stage: tum, camera: [525, 525]}}\n",
@@ -133,6 +136,6 @@ def test_every_registered_stage_loads_and_keeps_its_contract(kind: str) -> None:
 
 
 def test_the_seed_of_a_recipe_reaches_every_stage_that_has_one(tmp_path: Path) -> None:
-    recipe = load(tmp_path, SMALL + "seed: 7\nodometry: {registration: {stage: vgicp, seed: 3}}\n")
+    recipe = load(tmp_path, SMALL + "seed: 7\nstart: {stage: odometry, registration: {stage: vgicp, seed: 3}}\n")
     assert recipe.registration.seed == 7  # type: ignore[attr-defined]
-    assert recipe.odometry.registration.seed == 3  # type: ignore[attr-defined]
+    assert recipe.start.registration.seed == 3  # type: ignore[attr-defined]

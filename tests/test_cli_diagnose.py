@@ -253,7 +253,11 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     (tmp_path / "half/stages").mkdir(parents=True)
     (tmp_path / "half/recipe.yaml").write_text("x: 1\n")
-    for path, message in (("poses.tum", "no graph"), ("half", "not finished"), ("nothing.g2o", "no such file")):
+    for path, message in (
+        ("poses.tum", "no graph"),
+        ("half", "has not begun to register"),
+        ("nothing.g2o", "no such file"),
+    ):
         with pytest.raises(HodgeError, match=message):
             hodge(tmp_path / path)
 

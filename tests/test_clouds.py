@@ -66,7 +66,7 @@ def test_one_pixel_is_back_projected_where_the_camera_equation_says() -> None:
 def test_what_is_out_of_range_is_an_empty_cloud_with_a_note(z: float) -> None:
     cloud, counts = make_cloud(frame(wall(z), frame_id=3), CloudOptions())
     assert len(cloud) == counts.valid == 0
-    assert "frame 3: no valid measurement" in counts.note
+    assert "frame 3: no valid measurement" in str(counts.odd)
 
 
 def test_colours_are_averaged_and_an_image_of_another_size_is_looked_up() -> None:
@@ -83,7 +83,7 @@ def test_a_colour_image_that_cannot_be_read_costs_the_colours_alone() -> None:
     cloud, counts = make_cloud(frame(wall(WALL_M), frame_id=7, read_colour=unreadable), CloudOptions())
     assert len(cloud) > 100
     assert not cloud.colours.any()
-    assert "frame 7: its cloud has no colours: depth/7.png" in counts.note
+    assert "frame 7: its cloud has no colours: depth/7.png" in str(counts.odd)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -180,4 +180,4 @@ def test_a_scan_of_many_points_is_said_to_be_down_sampled(monkeypatch: pytest.Mo
     points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)).astype(np.float32)
     frame = Frame(7, 0.0, read_points=lambda: PointCloud(points))
     _, counts = make_cloud(frame, CloudOptions(voxel_m=0.5, min_range_m=0.0))
-    assert counts.note == f"frame 7: down-sampled in parts: 2000 points to {counts.points}, one a voxel of 0.5 m"
+    assert str(counts.odd) == f"frame 7: down-sampled in parts: 2000 points to {counts.points}, one a voxel of 0.5 m"

@@ -19,7 +19,8 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     site = tmp_path_factory.mktemp("site")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target"]
     subprocess.run([*pip, str(site), str(PACKAGE)], check=True, capture_output=True)
-    return {**os.environ, "PYTHONPATH": str(site)}
+    here = [os.environ[name] for name in ("PYTHONPATH",) if name in os.environ]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *here])}
 
 
 def hodge(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:

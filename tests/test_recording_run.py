@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -21,8 +20,10 @@ from hodge_pipeline.errors import HodgeError, SourceError, WorkspaceError
 from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recording import binary, layout, shapes
-from hodge_pipeline.store.artifacts import load, load_arrays, load_solution
-from hodge_pipeline.types import CloudSet, Edges
+from hodge_pipeline.registration.register import register_edges
+from hodge_pipeline.start.odometry import chain
+from hodge_pipeline.store import store as store_module
+from hodge_pipeline.store.store import stored
 from hodge_pipeline.uses.record_again import record_again
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_pipeline import SMALL, Log, small_recipe
@@ -83,14 +84,14 @@ def stopped(run: Run, out: Path, signal_name: str) -> subprocess.CompletedProces
     script = textwrap.dedent(f"""
         import os, signal, sys
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background of a script ignores it
-        from hodge_pipeline import steps
         from hodge_pipeline.cli.main import main
-        solve = steps.solve
-        def solve_and_stop(job, number, *rest):
+        from hodge_pipeline.rounds.one_round import Work
+        solve = Work.solve
+        def solve_and_stop(work, number, *rest):
             if number == 2:
                 os.kill(os.getpid(), signal.{signal_name})
-            return solve(job, number, *rest)
-        steps.solve = solve_and_stop
+            return solve(work, number, *rest)
+        Work.solve = solve_and_stop
         sys.argv[1:] = ["run", "demo", "--source", {str(run.source.path)!r}, "--out", {str(out)!r}, "--quiet"]
         for change in {[*SMALL, *NORMAL]!r}:
             sys.argv += ["--set", change]
@@ -117,13 +118,13 @@ def test_a_killed_run_is_recorded_from_its_folder(run: Run, tmp_path: Path) -> N
     folder = tmp_path / "run"
     assert stopped(run, folder, "SIGKILL").returncode == -signal.SIGKILL
     assert not (folder / "recording.rrd").exists()
-    parts = [str(path) for path in sorted((folder / "stages").glob("record-*/*.rrd"))]
+    parts = [str(path) for path in sorted((folder / "stages").glob("record_*/*.rrd"))]
     mended = str(tmp_path / "mended.rrd")
     merge = ["rrd", "merge", "--continue-on-error", *parts, "-o", mended]
     binary.run(merge, binary.quiet_environment(tmp_path))
     verify(Path(mended), tmp_path)
-    path, missing = record_again(folder, {})
-    assert missing == "solve, round 2"
+    path, is_whole = record_again(folder, {})
+    assert not is_whole
     verify(path, tmp_path)
     assert layout.solved_edges(1) in entities(path) and layout.edges(2) not in entities(path)
 
@@ -132,28 +133,39 @@ def test_a_recording_made_again_computes_nothing(run: Run, tmp_path: Path) -> No
     folder, log = tmp_path / "run", Log()
     shutil.copytree(run.folder, folder)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.npz")}
-    path, missing = record_again(folder, {"level": "summary"}, log)
-    assert missing == "" and set(log.stages) == {"recording"}
+    path, is_whole = record_again(folder, {"level": "summary"}, log)
+    assert is_whole and set(log.stages) == {"recording"}
     assert layout.COLOUR not in entities(path) and layout.MODEL in entities(path)
     assert path.stat().st_size < (run.folder / "recording.rrd").stat().st_size
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.npz")} == before
     again = Log()
     hodge_pipeline.run(small_recipe(run.source.path, *NORMAL), folder, watcher=again)  # back to the recipe's level
-    assert set(again.stages) == {"recording"}
+    assert again.stages == []
     assert layout.COLOUR in entities(folder / "recording.rrd")
 
 
-def test_a_run_of_other_versions_or_of_a_changed_source_keeps_its_recording(run: Run, tmp_path: Path) -> None:
+def test_a_run_of_other_versions_or_of_a_source_that_is_gone_is_recorded_all_the_same(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, source = tmp_path / "run", tmp_path / "gone"
+    shutil.copytree(run.folder, folder)
+    recipe = folder / "recipe.yaml"
+    recipe.write_text(recipe.read_text().replace(str(run.source.path), str(source)))
+    monkeypatch.setattr(store_module, "versions", lambda: {"open3d": "0.1"})
+    log = Log()
+    path, is_whole = record_again(folder, {}, log)
+    assert is_whole and any(f"recorded without images: {source}" in said for said in log.said)
+    found = entities(path)
+    assert layout.COLOUR not in found and {layout.CLOUD, layout.MODEL, layout.solved_edges(2)} <= found
+
+
+def test_a_run_with_a_changed_file_keeps_its_recording(run: Run, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(run.folder, folder)
     recorded = (folder / "recording.rrd").read_bytes()
-    facts = folder / "stages/clouds/key.json"
-    known = json.loads(facts.read_text())
-    facts.write_text(json.dumps({**known, "key": "of another version", "versions": {"open3d": "0.1"}}))
-    with pytest.raises(WorkspaceError, match=r"stage 'clouds' was made with open3d 0.1, here is .*: run the recipe"):
-        record_again(folder, {})
-    facts.write_text(json.dumps({**known, "key": "of another source"}))
-    with pytest.raises(WorkspaceError, match="made from a source that has changed since"):
+    with (folder / "stages/solve_edges-1/value.npz").open("ab") as file:
+        file.write(b"!")
+    with pytest.raises(WorkspaceError, match=r"solve_edges-1: value.npz has changed .*: the same hodge run computes"):
         record_again(folder, {})
     assert (folder / "recording.rrd").read_bytes() == recorded
 
@@ -167,29 +179,28 @@ def test_what_is_no_run_cannot_be_recorded(tmp_path: Path) -> None:
 
 def test_reader_and_odometry_read_back(run: Run) -> None:
     path, frames = run.folder / "recording.rrd", run.source.frames
-    first = run.folder / "stages/odometry/poses.npz"
     for entity, column, encoded in (
         (layout.COLOUR, "EncodedImage:blob", "encoded_colour"),
         (layout.DEPTH, "EncodedDepthImage:blob", "encoded_depth"),
     ):
         blobs = [bytes(row[0]) for row in rows(path, entity, column)]
         assert blobs == [getattr(frame, encoded)().contents for frame in frames]
-    odometry = load_arrays(first)["world_from_cam"]
+    (odometry,) = (found.world_from_cam for found in stored(run.folder / "stages", chain))
     centres = np.squeeze(rows(path, layout.poses("odometry"), "Transform3D:translation"))
     np.testing.assert_array_equal(np.float32(centres), np.float32(odometry[:, :3, 3]))
     points = np.squeeze(rows(path, layout.under(layout.FRAME_PLOTS, "points"), "Scalars:scalars"))
-    np.testing.assert_array_equal(points, CloudSet.open(run.folder / "stages/clouds").sizes)
+    np.testing.assert_array_equal(points, run.clouds.sizes)
 
 
 def test_registration_and_edges_read_back(run: Run) -> None:
     path = run.folder / "recording.rrd"
-    registered = load(run.folder / "stages/register-2/edges.npz", Edges)
+    registered = stored(run.folder / "stages", register_edges)[1]
     columns = layout.registration(2)
     np.testing.assert_array_equal(np.float32(rows(path, columns, "fitness")[0]), np.float32(registered.fitness))
     np.testing.assert_array_equal(np.float32(rows(path, columns, "rmse_m")[0]), np.float32(registered.rmse_m))
     assert rows(path, columns, "i")[0] == registered.pairs[:, 0].tolist()
     graph = run.result.graph
-    before = load_solution(run.folder / "stages/solve-1/solution.npz").world_from_cam
+    before = run.rounds[1].world_from_cam
     (lines,) = rows(path, layout.edges(2), "LineStrips3D:strips")
     np.testing.assert_array_equal(np.float32(lines), np.float32(before[graph.edges, :3, 3]))
     (colours,) = rows(path, layout.edges(2), "LineStrips3D:colors")
@@ -200,7 +211,8 @@ def test_registration_and_edges_read_back(run: Run) -> None:
 def test_solver_reads_back_iteration_by_iteration(run: Run) -> None:
     path, solution = run.folder / "recording.rrd", run.result.solution
     assert solution is not None
-    first = load_solution(run.folder / "stages/solve-1/solution.npz")
+    first = run.rounds[1].solution
+    assert first is not None
     states = [step.world_from_cam for step in solution.history]
     film = dict(
         zip(

@@ -259,8 +259,9 @@ def test_what_can_be_measured_goes_by_the_extent_of_the_scene() -> None:
 def test_pieces_come_first_in_the_headline(
     report: Report, tmp_path: Path, component: list[int], unordered: bool, headline: str
 ) -> None:
-    assert report.pictures.graph is not None
-    graph = graph_summary(report.pictures.graph, np.array(component))
+    drawn = report.pictures.graph
+    assert drawn is not None
+    graph = graph_summary(Edges.measured(drawn), drawn.vertex_ids, np.array(component))
     source = replace(report.source, unordered=unordered, kind="scans" if unordered else "frames")
     shown = replace(report, graph=graph, source=source)
     verdict = judge(shown)

@@ -57,9 +57,9 @@ def test_every_length_is_taken_times_the_factor_and_nothing_else() -> None:
     before = load_recipe("scans")
     after = scaled_recipe(before, 10.0)
     assert after.clouds.voxel_m == pytest.approx(0.4) and after.clouds.normal_neighbours == 10
-    assert after.global_start.registrar.voxel_m == pytest.approx(0.5)  # type: ignore[attr-defined]
-    assert after.global_start.refine.distances_m == pytest.approx((3.0, 1.0, 0.5))  # type: ignore[attr-defined]
-    assert after.global_start.limits.max_rmse_m == pytest.approx(0.6)
+    assert after.start.registrar.voxel_m == pytest.approx(0.5)  # type: ignore[attr-defined]
+    assert after.start.refine.distances_m == pytest.approx((3.0, 1.0, 0.5))  # type: ignore[attr-defined]
+    assert after.start.limits.max_rmse_m == pytest.approx(0.6)  # type: ignore[attr-defined]
     assert after.edges.builders[1].voxel_m == pytest.approx(1.0)  # type: ignore[attr-defined]
     assert after.fusion[0].voxel_m == pytest.approx(0.1)  # type: ignore[attr-defined]
     assert scaled_recipe(before, 1.0) is before

@@ -160,7 +160,7 @@ def test_a_run_goes_on_with_or_without_the_cluster(run_folder: Path, made: Run) 
 
     before = (run_folder / "recipe.yaml").read_text()
     again = load_recipe(str(run_folder / "recipe.yaml"))
-    for stage in ("register-1", "solve-1"):
+    for stage in ("register_edges-1", "solve_edges-1"):
         shutil.rmtree(run_folder / "stages" / stage)
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
         found = hodge_pipeline.run(again, run_folder, dask=cluster.scheduler_address)
@@ -168,12 +168,12 @@ def test_a_run_goes_on_with_or_without_the_cluster(run_folder: Path, made: Run) 
         solve_again(run_folder, dask=cluster.scheduler_address)
     assert (run_folder / "recipe.yaml").read_text() == before
     assert "executor" in yaml_file.read(run_folder / "recipe.yaml").data
-    shutil.rmtree(run_folder / "stages" / "register-1")
+    shutil.rmtree(run_folder / "stages" / "register_edges-1")
     local = hodge_pipeline.run(again, run_folder)
     assert (local.result.world_from_cam == made.result.world_from_cam).all()
 
 
-@pytest.mark.parametrize("name", ["log.txt", "stages", "stages/clouds", "stages/solve-1/solution.npz"])
+@pytest.mark.parametrize("name", ["log.txt", "stages", "stages/clouds-1", "stages/solve_edges-1/value.npz"])
 def test_a_link_in_a_run_folder_is_not_written_through(run_folder: Path, tmp_path: Path, name: str) -> None:
     theirs = run_folder / name
     elsewhere = tmp_path / "elsewhere"

@@ -23,8 +23,8 @@ from solver_graphs import CERTIFIED_OPTIMA, as_sesync_reads_it, ladder
 def test_certified_optima_of_the_literature_are_reached(data_dir, name):
     solution = solve(as_sesync_reads_it(data_dir, name), objective="isotropic", certificate=True)
     assert solution.metrics["objective"] == pytest.approx(CERTIFIED_OPTIMA[name], rel=1e-8)
-    assert solution.metrics["converged"] == 1
-    assert solution.metrics["certified"] == 1
+    assert solution.converged is True
+    assert solution.certified is True
 
 
 @pytest.mark.parametrize("objective", ["isotropic", "full"])

@@ -34,7 +34,7 @@ def test_half_a_turn_is_shared_out_over_the_ring(count, axis, objective, initial
         exact = ring(count, axis, at)
         for graph in (exact, dataclasses.replace(exact, i_from_j=exact.i_from_j @ se3.exp(off))):
             solution = solve(graph, start=start, objective=objective, initial=initial)
-            assert solution.metrics["converged"]
+            assert solution.converged
             assert solution.metrics["objective"] == pytest.approx(least, rel=1e-6)
 
 

@@ -115,5 +115,5 @@ def test_mistakes_are_one_line(run: Run, tmp_path: Path) -> None:
     with pytest.raises(GraphError, match="no edge that counts is wrong"):
         hodge("edit", run.folder, "--disable", "wrong")
     (tmp_path / "edges.csv").write_text("i,j,source,status\n0,1,given,used\n")
-    with pytest.raises(WorkspaceError, match="is no run of frames"):
+    with pytest.raises(WorkspaceError, match="is no run folder"):
         hodge("edit", tmp_path, "--register", "0-1")

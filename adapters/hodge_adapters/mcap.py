@@ -22,7 +22,7 @@ from hodge_adapters.mcap_clouds import read_points
 from hodge_adapters.mcap_files import find_files, sniff_recording
 from hodge_adapters.mcap_images import ImageLayout, encoded_image, read_colour, read_depth
 from hodge_adapters.mcap_poses import PoseOptions, find_poses
-from hodge_adapters.mcap_recording import Recording, Seen
+from hodge_adapters.mcap_recording import A_MESSAGE_WITH, NO_PINHOLE, Recording, Seen
 from hodge_adapters.mcap_topics import (
     ImageTopics,
     best_colour,
@@ -132,7 +132,7 @@ class McapReader:
         images = one_per_stamp(topic, depth[topic], notes)
         camera = self._camera(recording, topic, images[0], notes)
         if camera is None:
-            why = "".join(f"; {note}" for note in recording.complaints.notes() if "matrix K" in note)
+            why = "".join(f"; {note}" for note in recording.complaints.counted(A_MESSAGE_WITH + NO_PINHOLE))
             raise SourceError(f"{path}: no calibration for {topic}{why}: give option camera (fx fy cx cy)")
         if self.colour_topic:
             colour = dict([named_topic(colour, self.colour_topic, "colour_topic")])

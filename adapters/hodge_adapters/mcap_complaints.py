@@ -32,8 +32,12 @@ class Complaints:
         else:
             self._others += 1
 
+    def counted(self, fault: str | None = None) -> list[str]:
+        """The counts in the order of their first fault, those of one `fault` alone where it is given."""
+        kinds = [(kind, count) for kind, count in self._counts.items() if fault in (None, kind[1])]
+        return [f"{where}: {count} left out: {what}" for (where, what), count in kinds]
+
     def notes(self) -> list[str]:
-        """All that was said, then the counts in the order of their first fault."""
-        counted = [f"{where}: {count} left out: {what}" for (where, what), count in self._counts.items()]
+        """All that was said, then the counts."""
         others = [f"{self._others} other faults of many kinds"] if self._others else []
-        return [*self._lines, *counted, *others]
+        return [*self._lines, *self.counted(), *others]

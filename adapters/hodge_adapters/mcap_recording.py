@@ -35,6 +35,9 @@ from hodge_adapters.ros_tf import PoseColumns, TransformTree
 
 Layout = TypeVar("Layout")
 
+A_MESSAGE_WITH = "a message with "
+NO_PINHOLE = "a matrix K that is no pinhole camera's"
+
 
 @dataclass(frozen=True)
 class Seen(Generic[Layout]):
@@ -90,7 +93,7 @@ class Recording:
             try:
                 self._add(path, logged)
             except Malformed as error:
-                self.complaints.count(topic, f"a message with {error}")
+                self.complaints.count(topic, A_MESSAGE_WITH + str(error))
 
     def _wants(self, channel: Channel, schema: Schema | None) -> bool:
         name = schema.name if schema else ""
@@ -174,7 +177,7 @@ def _add_calibration(recording: Recording, message: Message, path: Path, logged:
     topic = logged.channel.topic
     k, p, distortion = numbers(message, "k", "K"), numbers(message, "p", "P"), numbers(message, "d", "D")
     if len(k) != 9 or not np.isfinite(k).all() or k[0] <= 0 or k[4] == 0:
-        raise Malformed("a matrix K that is no pinhole camera's")
+        raise Malformed(NO_PINHOLE)
     calibration = Calibration(
         frame_id=frame_id(message),
         width=whole(message, "width"),

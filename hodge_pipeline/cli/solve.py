@@ -13,6 +13,7 @@ from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.pairs.edits import read_history
 from hodge_pipeline.refine.pose_graph import Choices, SolvedFile, solve_file, write_solved
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
+from hodge_pipeline.solvers.newton import TIME_LIMIT_REACHED
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.store.workspace import RECIPE_FILE
 from hodge_pipeline.types import Source
@@ -147,6 +148,6 @@ def _check(summary: dict[str, Any]) -> None:
             "chance; add edges between the same views, or see which are wrong with hodge diagnose"
         )
     if not summary["converged"]:
-        late = any("time limit" in note for note in summary["notes"])
+        late = summary["stopped_by"] == TIME_LIMIT_REACHED
         remedy = "raise --time-limit" if late else "if edges may be wrong, hodge diagnose names them, or add --robust"
         raise CheckError(f"the solver stopped before it converged, with the best poses so far: {remedy}")

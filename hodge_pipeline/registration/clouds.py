@@ -66,20 +66,32 @@ class CloudOptions:
         return self
 
 
+class Oddity(NamedTuple):
+    """What is odd about a frame's cloud: `what`, the same words for all frames alike, and `why`."""
+
+    frame: int | str
+    what: str
+    why: str = ""
+
+    def __str__(self) -> str:
+        return f"frame {self.frame}: {self.what}{self.why and ': '}{self.why}"
+
+
 class CloudCounts(NamedTuple):
-    """What became of a frame: measurements looked at, those valid and in range, points kept; a note where it is odd."""
+    """What became of a frame: measurements looked at, those valid and in range, points kept; what is odd."""
 
     looked_at: int
     valid: int
     points: int
-    note: str = ""
+    odd: Oddity | None = None
 
 
 class _Samples(NamedTuple):
     points_in_cam: Floats32
     colours: Bytes | None
     looked_at: int
-    note: str = ""
+    odd: Oddity | None = None
+    why_none: str = ""
 
 
 def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:
@@ -92,14 +104,13 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     points, colours = voxel_means(samples.points_in_cam, samples.colours, options.voxel_m)
     landmarks = _landmarks(frame, options)
     cloud = PointCloud(points, _normals(points, options.normal_neighbours), colours, landmarks)
-    empty = f"frame {frame.frame_id}: no valid measurement in range, its cloud is empty"
-    if samples.note and not len(points):
-        empty += f": {samples.note}"
-    note = samples.note if len(points) else empty
-    if len(points) and samples.looked_at > MANY_POINTS:
-        note = f"frame {frame.frame_id}: down-sampled in parts: {samples.looked_at} points to {len(points)}, one a "
-        note += f"voxel of {options.voxel_m:.3g} m"
-    return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), note)
+    odd = samples.odd
+    if not len(points):
+        odd = Oddity(frame.frame_id, "no valid measurement in range, its cloud is empty", samples.why_none)
+    elif samples.looked_at > MANY_POINTS:
+        kept = f"{samples.looked_at} points to {len(points)}, one a voxel of {options.voxel_m:.3g} m"
+        odd = Oddity(frame.frame_id, "down-sampled in parts", kept)
+    return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), odd)
 
 
 def _landmarks(frame: Frame, options: CloudOptions) -> Landmarks:
@@ -129,24 +140,24 @@ def prepare_clouds(
         made[index] = result
         advance(len(result))
     results = [one for index in range(len(blocks)) for one in made[index]]
-    notes = tuple(counts.note for _, counts in results if counts.note)
+    odd = [counts.odd for _, counts in results if counts.odd is not None]
     if not any(counts.points for _, counts in results):
-        reason = notes[0] if notes else "the source has no frames"
+        reason = odd[0] if odd else "the source has no frames"
         raise SourceError(f"none of the {len(frames)} frames gave a point cloud; the first: {reason}")
-    return CloudSet.from_clouds([cloud for cloud, _ in results]), _shortened(notes)
+    return CloudSet.from_clouds([cloud for cloud, _ in results]), _shortened(odd)
 
 
-def _shortened(notes: Sequence[str]) -> tuple[str, ...]:
-    """Notes `frame 7: what: why`: of many with the same `what` the first ones, and how many more there are."""
-    alike: dict[str, list[str]] = {}
-    for note in notes:
-        alike.setdefault(note.split(": ")[1], []).append(note)
+def _shortened(odd: Sequence[Oddity]) -> tuple[str, ...]:
+    """A note for each oddity: of many with the same `what` the first ones, and how many more there are."""
+    alike: dict[str, list[Oddity]] = {}
+    for one in odd:
+        alike.setdefault(one.what, []).append(one)
     more = tuple(
         f"{len(same) - LISTED_NOTES} more frames: {what}, as of those before"
         for what, same in alike.items()
         if len(same) > LISTED_NOTES
     )
-    return tuple(note for same in alike.values() for note in same[:LISTED_NOTES]) + more
+    return tuple(str(one) for same in alike.values() for one in same[:LISTED_NOTES]) + more
 
 
 def _make_block(frames: Sequence[Frame], options: CloudOptions) -> list[tuple[PointCloud, CloudCounts]]:
@@ -156,7 +167,7 @@ def _make_block(frames: Sequence[Frame], options: CloudOptions) -> list[tuple[Po
 def cloud_or_note(frame: Frame, options: CloudOptions) -> tuple[PointCloud, str]:
     """The cloud of a frame and a note, empty where all is well; an empty cloud where it cannot be read."""
     cloud, counts = _make_or_report(frame, options)
-    return cloud, counts.note
+    return cloud, "" if counts.odd is None else str(counts.odd)
 
 
 def with_landmarks(cloud: PointCloud, frame: Frame, options: CloudOptions) -> PointCloud:
@@ -168,8 +179,8 @@ def _make_or_report(frame: Frame, options: CloudOptions) -> tuple[PointCloud, Cl
     try:
         return make_cloud(frame, options)
     except (SourceError, OSError) as error:
-        note = f"frame {frame.frame_id}: its cloud is empty: {error}"
-        return PointCloud(np.zeros((0, 3), np.float32)), CloudCounts(0, 0, 0, note)
+        odd = Oddity(frame.frame_id, "its cloud is empty", str(error))
+        return PointCloud(np.zeros((0, 3), np.float32)), CloudCounts(0, 0, 0, odd)
 
 
 def _read_samples(frame: Frame, options: CloudOptions) -> _Samples:
@@ -190,7 +201,7 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
     z_kept = z[rows, columns].astype(np.float32)
     x = ((columns * options.stride - camera.cx) / camera.fx).astype(np.float32) * z_kept
     y = ((rows * options.stride - camera.cy) / camera.fy).astype(np.float32) * z_kept
-    colours, note = None, ""
+    colours, odd = None, None
     if options.colours and frame.read_colour is not None and len(rows):
         try:
             image = frame.read_colour()
@@ -199,8 +210,8 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
             u = columns * options.stride * image.shape[1] // depth.shape[1]
             colours = image[v, u]
         except (SourceError, OSError) as error:
-            note = f"frame {frame.frame_id}: its cloud has no colours: {error}"
-    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, note)
+            odd = Oddity(frame.frame_id, "its cloud has no colours", str(error))
+    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd)
 
 
 def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
@@ -212,7 +223,8 @@ def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
     colours = cloud.colours if options.colours else None
     if not kept.all():  # a copy of what may be large
         points, colours = points[kept], None if colours is None else colours[kept]
-    return _Samples(points, colours, len(kept), "" if kept.any() else _out_of_range(ranges, options))
+    why_none = "" if kept.any() else _out_of_range(ranges, options)
+    return _Samples(points, colours, len(kept), why_none=why_none)
 
 
 def _out_of_range(ranges: Floats32, options: CloudOptions) -> str:

@@ -86,7 +86,7 @@ class GraphEditor:
         if solution is None:
             solution = self._solution(self._base, minimise(setup, "chordal", LIMITS, self._full(setup)))
         own = "chi2" if self._full(setup) else "isotropic"
-        settled = own in solution.metrics and solution.metrics.get("converged") == 1
+        settled = own in solution.metrics and solution.converged is True
         owed = 0.0 if settled else math.inf
         self._state = _State(graph, np.asarray(solution.weights, float).copy(), solution, owed)
 
@@ -184,7 +184,10 @@ class GraphEditor:
         notes = (*self._unheld, *setup.weights.notes, *describe_components(setup.component, base.graph.vertex_ids))
         weights = setup.weights.used.astype(float)
         metrics = metrics_of(descent, self._full(setup))
-        return Solution(setup.poses(descent.point), setup.component, weights, metrics=metrics, notes=notes)
+        return Solution(
+            setup.poses(descent.point), setup.component, weights, metrics=metrics, notes=notes,
+            converged=descent.converged, stopped_by=descent.reason,
+        )  # fmt: skip
 
     def _remember(self, new: _State) -> None:
         self._history.append(self._state)

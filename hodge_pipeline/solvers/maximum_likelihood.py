@@ -44,7 +44,7 @@ def solve(
     time_limit_s: float = math.inf,
     keep_history: bool = False,
 ) -> Solution:
-    """The poses of least cost, with `metrics["objective"]` their cost and `metrics["certified"]` 1 where proven.
+    """The poses of least cost, with `metrics["objective"]` their cost; `certified` where proven.
 
     - `objective`: `full` is Σ rᵀ Ω r with the 6x6 information of each edge (g2o's chi²); `isotropic` is
       Σ κ‖R_j − R_i R_ij‖² + τ‖t_j − t_i − R_i t_ij‖² (SE-Sync), the one that can be certified. A graph with an
@@ -108,6 +108,7 @@ def solve(
     metrics = metrics_of(descent, full)
     if start is not None:
         metrics["objective_at_start"] = here(setup, full).point.cost
+    certified: bool | None = None
     if certificate and full:
         notes.append("only the isotropic objective can be certified")
     elif certificate:
@@ -120,13 +121,17 @@ def solve(
                 metrics |= metrics_of(descent, full)
             answer = bounded(found.certificate, descent.point.cost, found.bound)
         notes.append(answer.note)
-        metrics |= {"certified": float(answer.optimal), "gap_bound": answer.gap_bound}
+        certified = answer.optimal
+        metrics["gap_bound"] = answer.gap_bound
         metrics |= {} if answer.optimal else {"smallest_eigenvalue": answer.smallest_eigenvalue}
     if not descent.converged:
         why = f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far"
         notes.append(f"{why}; {WILD_NUMBERS}" if descent.reason == ROUNDING_REACHED else why)
     weights = setup.weights.used.astype(float)
-    return Solution(setup.poses(descent.point), setup.component, weights, tuple(history), metrics, tuple(notes))
+    return Solution(
+        setup.poses(descent.point), setup.component, weights, tuple(history), metrics, tuple(notes),
+        converged=descent.converged, stopped_by=descent.reason, certified=certified,
+    )  # fmt: skip
 
 
 def _certify(setup: Setup, point: Point) -> Certificate:

@@ -116,7 +116,7 @@ def here(setup: Setup, full: bool) -> Descent:
         cost = full_objective(setup).at(rotations, translations).cost
     else:
         cost = residuals(setup.problem, rotations, translations).cost
-    return Descent(Point(rotations, translations, cost), (cost,), 0, True, "converged")
+    return Descent(Point(rotations, translations, cost), (cost,), 0, True, "")
 
 
 def metrics_of(descent: Descent, full: bool) -> dict[str, float]:
@@ -126,5 +126,4 @@ def metrics_of(descent: Descent, full: bool) -> dict[str, float]:
         "chi2" if full else "isotropic": descent.point.cost,
         "iterations": float(len(descent.costs) - 1),
         "cg_steps": float(descent.cg_steps),
-        "converged": float(descent.converged),
     }

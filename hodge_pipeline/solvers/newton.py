@@ -13,6 +13,7 @@ from hodge_pipeline.types import Floats
 SUFFICIENT_DECREASE = 1e-4
 MAX_HALVINGS = 40
 CG_LIMIT_REACHED = "limit of CG steps reached"
+TIME_LIMIT_REACHED, ITERATION_LIMIT_REACHED = "time limit reached", "iteration limit reached"
 ROUNDING_REACHED = "no further decrease within rounding"
 CG_SHARE = 0.1
 """Of what further steps may still win: where so little is left in a linear system, it is solved."""
@@ -69,7 +70,7 @@ class Objective(Protocol):
 
 @dataclass(frozen=True)
 class Descent:
-    """Where a descent ended, the objective on the way, and why it stopped."""
+    """Where a descent ended, the objective on the way, and why it stopped before it converged, else an empty word."""
 
     point: Point
     costs: tuple[float, ...]
@@ -93,7 +94,7 @@ def descend(
     costs, cg_steps, tolerance, before = [point.cost], 0, LOOSEST_TOLERANCE, math.inf
     for _ in range(limits.max_iterations):
         if point.cost <= floor:
-            return Descent(point, tuple(costs), cg_steps, True, "converged")
+            return Descent(point, tuple(costs), cg_steps, True, "")
         smallest = limits.relative_tolerance * point.cost + floor
         step = objective.step(point, tolerance, CG_SHARE * smallest)
         cg_steps += step.cg_steps
@@ -106,14 +107,14 @@ def descend(
         if watch is not None:
             watch(point)
         if still_to_come(max(step.predicted, decrease), before, tolerance**2) <= smallest:
-            return Descent(point, tuple(costs), cg_steps, True, "converged")
+            return Descent(point, tuple(costs), cg_steps, True, "")
         if time.monotonic() > limits.deadline_s:
-            return Descent(point, tuple(costs), cg_steps, False, "time limit reached")
+            return Descent(point, tuple(costs), cg_steps, False, TIME_LIMIT_REACHED)
         if cg_steps > most_cg_steps:
             return Descent(point, tuple(costs), cg_steps, False, CG_LIMIT_REACHED)
         before = decrease
         tolerance = min(LOOSEST_TOLERANCE, max(TIGHTEST_TOLERANCE, math.sqrt(max(decrease, 0.0) / costs[-2])))
-    return Descent(point, tuple(costs), cg_steps, False, "iteration limit reached")
+    return Descent(point, tuple(costs), cg_steps, False, ITERATION_LIMIT_REACHED)
 
 
 def still_to_come(decrease: float, before: float, least_share: float) -> float:

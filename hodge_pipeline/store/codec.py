@@ -47,6 +47,8 @@ def load(folder: Path, kind: Any) -> Any:
 
 def _plain(folder: Path, value: Any, place: str, arrays: dict[str, NDArray[Any]]) -> Any:
     if isinstance(value, np.ndarray):
+        if value.dtype.hasobject:
+            raise TypeError(f"{place or 'value'}: an array of objects cannot be stored")
         arrays[place or "array"] = value
         return {"array": place or "array"}
     if isinstance(value, bytes):

@@ -23,6 +23,7 @@ from hodge_pipeline.store.cost import Cost, Monitor
 from hodge_pipeline.store.log import log
 from hodge_pipeline.store.progress import Nobody, Watcher
 from hodge_pipeline.store.workspace import disk_errors
+from hodge_pipeline.types import CloudSet
 
 T = TypeVar("T")
 LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless", "pycolmap")
@@ -111,8 +112,11 @@ class Store:
 
     def _content(self, value: Any) -> Any:
         if isinstance(value, np.ndarray):
-            data = np.ascontiguousarray(value)
-            return [str(data.dtype), list(data.shape), hashlib.sha256(data.tobytes()).hexdigest()]
+            if value.dtype.hasobject:
+                raise TypeError("an array of objects has no key: let the store remember what holds it")
+            return [str(value.dtype), list(value.shape), hashlib.sha256(value.tobytes()).hexdigest()]
+        if isinstance(value, CloudSet):
+            return {name: self.key(getattr(value, name)) for name in CloudSet.FILES}
         if isinstance(value, bytes):
             return hashlib.sha256(value).hexdigest()
         if isinstance(value, Path):

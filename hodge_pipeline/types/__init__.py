@@ -162,6 +162,8 @@ class Solution:
 
     - `component (V,)`: the connected component of each vertex, 0 the largest.
     - `weights (E,)`: the final weight of each edge relative to its own information, 0 for one that was ignored.
+    - `converged`: whether the least cost was reached, None where a solver does not tell; `stopped_by`: what stopped it
+      before; `certified`: whether the least cost is proven to be the global one, None where that was not tried.
     - `confirmed`: of a robust solve, whether cycles of the edges that it used close better than by chance. None where
       it left none out and no cycle tells, as in a tree; and of other solves.
     """
@@ -172,6 +174,9 @@ class Solution:
     history: tuple[SolverIteration, ...] = ()
     metrics: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    converged: bool | None = None
+    stopped_by: str = ""
+    certified: bool | None = None
     confirmed: bool | None = None
 
 

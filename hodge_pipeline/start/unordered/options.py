@@ -80,7 +80,7 @@ class GlobalStart:
     landmarks: int = Field(
         default=1000, ge=15, description="landmarks of a frame, where `clouds.landmarks` leaves it to the start; 60 ms"
     )
-    limits: HypothesisLimits = HypothesisLimits()
+    limits: HypothesisLimits = Field(default=HypothesisLimits(), description="which matches become edges")
     diagnosis: DiagnosisOptions = Field(
         default=DiagnosisOptions(order_prior=False),
         description="who judges the edges together; the order of the frames is no evidence here",
