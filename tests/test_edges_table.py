@@ -14,7 +14,7 @@ from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.pairs.edits import listed_edges
 from hodge_pipeline.refine.verdict import held_out_pairs
 from hodge_pipeline.scene import Round
-from hodge_pipeline.store import artifacts
+from hodge_pipeline.store import codec
 from hodge_pipeline.store.edge_table import COLUMNS, read_edges, write_edges
 from hodge_pipeline.types import Edges, Registration
 
@@ -71,11 +71,11 @@ def test_a_longer_word_is_not_cut_and_other_rows_stay() -> None:
 
 def test_columns_survive_their_file_with_the_names_of_the_vertices(tmp_path: Path) -> None:
     table = grown()
-    artifacts.save_edges(tmp_path / "edges.npz", table, IDS)
-    again, names = artifacts.load_edges(tmp_path / "edges.npz")
-    assert names.tolist() == IDS.tolist()
+    codec.save(tmp_path, Round(table, IDS, np.tile(np.eye(4), (4, 1, 1))))
+    again = codec.load(tmp_path, Round)
+    assert again.vertex_ids.tolist() == IDS.tolist()
     for column in fields(Edges):
-        np.testing.assert_array_equal(getattr(again, column.name), getattr(table, column.name))
+        np.testing.assert_array_equal(getattr(again.edges, column.name), getattr(table, column.name))
 
 
 def test_the_table_that_people_read_reads_back(tmp_path: Path) -> None:

@@ -15,8 +15,6 @@ from typing import IO, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.types import Edges, Solution, SolverIteration
-
 T = TypeVar("T")
 
 
@@ -100,60 +98,3 @@ def load(path: Path, cls: type[T]) -> T:
     """The dataclass that `save` wrote; a scalar field comes back as a Python scalar."""
     arrays = load_arrays(path)
     return cls(**{name: array.item() if array.ndim == 0 else array for name, array in arrays.items()})
-
-
-def save_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic]) -> None:
-    """Write a round's edges with the names of the vertices."""
-    save_arrays(path, {"vertex_ids": vertex_ids, **vars(edges)})
-
-
-def load_edges(path: Path) -> tuple[Edges, NDArray[np.generic]]:
-    """The edges and the names of the vertices that `save_edges` wrote."""
-    arrays: dict[str, NDArray[Any]] = load_arrays(path)
-    vertex_ids = arrays.pop("vertex_ids")
-    return Edges(**arrays), vertex_ids
-
-
-def save_solution(path: Path, solution: Solution) -> None:
-    """Write a solution with its history."""
-    history = solution.history
-    text = {
-        "metrics": dict(solution.metrics),
-        "notes": list(solution.notes),
-        "confirmed": solution.confirmed,
-        "history": [{"objective": step.objective, "metrics": dict(step.metrics)} for step in history],
-    }
-    poses = np.array([step.world_from_cam for step in history]).reshape(-1, *solution.world_from_cam.shape)
-    save_arrays(
-        path,
-        {
-            "world_from_cam": solution.world_from_cam,
-            "component": solution.component,
-            "weights": solution.weights,
-            "history": poses,
-            "text": np.array(json.dumps(_finite(text))),
-        },
-    )
-
-
-def load_solution(path: Path) -> Solution:
-    """The solution that `save_solution` wrote."""
-    arrays = load_arrays(path)
-    text = json.loads(arrays["text"].item())
-    steps = zip(arrays["history"], text["history"], strict=True)
-    return Solution(
-        world_from_cam=arrays["world_from_cam"],
-        component=arrays["component"],
-        weights=arrays["weights"],
-        history=tuple(
-            SolverIteration(poses, _number(step["objective"]), {k: _number(v) for k, v in step["metrics"].items()})
-            for poses, step in steps
-        ),
-        metrics={name: _number(value) for name, value in text["metrics"].items()},
-        notes=tuple(text["notes"]),
-        confirmed=text.get("confirmed"),
-    )
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
