@@ -18,18 +18,15 @@ from pathlib import Path
 from typing import Any
 
 SCRIPT = """
-import sys
+import dataclasses, sys
 from pathlib import Path
 import hodge_pipeline
 from hodge_pipeline.recipe.schema import load_recipe
-import hodge_pipeline.steps as steps, dataclasses
-recipe, source, out, count, *overrides = sys.argv[1:]
-read = steps.read
-def first_frames(job):
-    whole = read(job)
-    return dataclasses.replace(whole, frames=whole.frames[: int(count)])
-steps.read = first_frames
-hodge_pipeline.run(load_recipe(recipe, overrides, Path(source)), out)
+from hodge_pipeline.sources.opening import open_source
+name, path, out, count, *overrides = sys.argv[1:]
+recipe = load_recipe(name, overrides, Path(path))
+whole, _ = open_source(Path(path), recipe.source.reader)
+hodge_pipeline.run(recipe, out, source=dataclasses.replace(whole, frames=whole.frames[: int(count)]))
 """
 
 

@@ -18,11 +18,11 @@ import numpy as np
 from hodge_pipeline.evaluation.scores import score_table
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 SEEDS = 20
@@ -41,16 +41,12 @@ class Problem:
 
 def read_problem(run: Path, round_number: int) -> Problem:
     """The problem that a round of a finished run solved."""
-    recipe = load_recipe(str(run / "recipe.yaml"))
-    assert recipe.source.path is not None and recipe.source.reader is not None
-    source = recipe.source.reader.open(recipe.source.path)
-    stages = run / "stages"
-    edges, ids = artifacts.load_edges(stages / f"solve-{round_number}" / "edges.npz")
-    if round_number == 1:
-        start = artifacts.load_arrays(stages / "odometry" / "poses.npz")["world_from_cam"]
-    else:
-        start = artifacts.load_solution(stages / f"solve-{round_number - 1}" / "solution.npz").world_from_cam
-    return Problem(edges.select(edges.counts).as_graph(ids), start, true_poses(source), stages / "clouds")
+    found = Run.load(run)
+    solved = found.rounds[round_number]
+    graph = solved.edges.select(solved.edges.counts).as_graph(solved.vertex_ids)
+    truth, clouds = true_poses(found.source)[found.key_frames.rows], found.clouds.folder
+    assert clouds is not None
+    return Problem(graph, found.rounds[round_number - 1].world_from_cam, truth, clouds)
 
 
 def solve_all(problem: Problem, make: Callable[[int], ConsistencySolver], seeds: int) -> tuple[list[Solution], float]:
