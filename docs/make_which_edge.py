@@ -24,8 +24,9 @@ from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.report import splat
 from hodge_pipeline.report.diagnosis_plots import draw
 from hodge_pipeline.report.edge_pictures import edge_pictures
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
-from hodge_pipeline.types import CloudSet, Floats, ViewGraph
+from hodge_pipeline.types import Floats, ViewGraph
 from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
 
 PICTURES = Path(__file__).parent / "pictures"
@@ -52,7 +53,7 @@ def write_loops(path: Path, source: Path) -> None:
 
 def from_above(path: Path, folder: Path, world_from_cam: Floats, stand: splat.Stand | None) -> splat.Stand:
     """A picture of all clouds laid together by these poses, and where it was taken from."""
-    clouds = CloudSet.open(folder / "stages" / "clouds")
+    clouds = Run.load(folder).clouds
     scene = splat.merged(clouds, world_from_cam, np.arange(len(clouds)))
     stand = stand or splat.stands(scene, world_from_cam)["front"]
     path.write_bytes(splat.jpeg(splat.picture(scene, stand)))

@@ -39,12 +39,14 @@ class Problem:
     clouds: Path
 
 
-def read_problem(folder: Path, round_number: int) -> Problem:
-    """The problem that a round of a finished run solved; each of its frames is a key frame."""
-    run = Run.load(folder)
-    before, solved = run.rounds[round_number - 1 : round_number + 1]
+def read_problem(run: Path, round_number: int) -> Problem:
+    """The problem that a round of a finished run solved."""
+    found = Run.load(run)
+    solved = found.rounds[round_number]
     graph = solved.edges.select(solved.edges.counts).as_graph(solved.vertex_ids)
-    return Problem(graph, before.world_from_cam, true_poses(run.source), run.clouds.folder)
+    truth, clouds = true_poses(found.source)[found.key_frames.rows], found.clouds.folder
+    assert clouds is not None
+    return Problem(graph, found.rounds[round_number - 1].world_from_cam, truth, clouds)
 
 
 def solve_all(problem: Problem, make: Callable[[int], ConsistencySolver], seeds: int) -> tuple[list[Solution], float]:
