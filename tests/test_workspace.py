@@ -105,3 +105,11 @@ def test_solution_round_trip(tmp_path: Path) -> None:
     assert again.confirmed is False
     assert again.history[0].metrics["step"] == 1e-9
     assert np.isnan(again.history[0].metrics["mean_deviation"])
+
+
+def test_a_second_name_leaves_no_draft_behind(tmp_path: Path) -> None:
+    (tmp_path / "one").write_text("bytes")
+    for _ in range(2):
+        artifacts.link_or_copy(tmp_path / "one", tmp_path / "two")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "two"]
+    assert (tmp_path / "two").read_text() == "bytes"

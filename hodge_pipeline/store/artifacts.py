@@ -48,6 +48,8 @@ def write_json(path: Path, data: Any) -> None:
 
 def link_or_copy(existing: Path, path: Path) -> None:
     """Give a file another name atomically: no second copy where the file system can link."""
+    if path.exists() and os.path.samefile(existing, path):
+        return  # a rename of one name of a file onto another does nothing and would leave the draft behind
     draft = path.with_name(f".{path.name}.draft")
     draft.unlink(missing_ok=True)
     try:
