@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.store import artifacts
+from hodge_pipeline.store import artifacts, codec
 from hodge_pipeline.store.workspace import Workspace
 from hodge_pipeline.types import Solution, SolverIteration, ViewGraph
 
@@ -98,8 +98,8 @@ def test_solution_round_trip(tmp_path: Path) -> None:
     poses = np.stack([np.eye(4)] * 3)
     step = SolverIteration(poses, 0.5, {"mean_deviation": float("nan"), "step": 1e-9})
     solution = Solution(poses, np.zeros(3, np.int64), np.ones(2), (step, step), {"cost": 1.0}, ("one piece",), False)
-    artifacts.save_solution(tmp_path / "solution.npz", solution)
-    again = artifacts.load_solution(tmp_path / "solution.npz")
+    codec.save(tmp_path, solution)
+    again = codec.load(tmp_path, Solution)
     np.testing.assert_array_equal(again.history[1].world_from_cam, poses)
     assert again.notes == ("one piece",)
     assert again.confirmed is False
