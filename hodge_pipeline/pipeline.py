@@ -21,6 +21,7 @@ from hodge_pipeline.recipe.scale import with_scale
 from hodge_pipeline.recipe.schema import Recipe, load_recipe, with_source
 from hodge_pipeline.recording.run import Recording
 from hodge_pipeline.refine import verdict
+from hodge_pipeline.refine.poses import refine_poses
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report import run_files
 from hodge_pipeline.rounds.by_hand import edited_rounds
@@ -34,7 +35,7 @@ from hodge_pipeline.store.log import logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.store.workspace import RECIPE_FILE, Workspace
-from hodge_pipeline.types import Source, ViewGraph
+from hodge_pipeline.types import Floats, Source, ViewGraph
 
 
 def run(
@@ -107,10 +108,11 @@ class _Job:
                 rounds, scores = job.compute(work, recording)
                 refined = verdict.finish(work, job.workspace.folder, rounds) if scene.is_given else None
                 pool.close()  # fusing needs their memory
-                keys_only, poses = job.again and rounds[-1].edited, rounds[-1].world_from_cam
+                poses = job.refine(scene, rounds[-1], refined)
+                keys_only = job.again and rounds[-1].edited
                 models = fuse_all(job.recipe.fusion, scene, poses, job.store, keys_only=keys_only)
                 recording.models(models)
-        return job.finish(scene, rounds, models, scores, refined)
+        return job.finish(scene, rounds, poses, models, scores, refined)
 
     def read(self) -> Source:
         """The source, opened; its images stay on disk."""
@@ -170,17 +172,28 @@ class _Job:
         scale = float(self.recipe.scale)
         return score_rounds(work.scene.source, work.scene.clouds, rounds, scale, self.store, work.workers)
 
+    def refine(self, scene: Scene, last: Round, refined: Refined | None) -> Floats:
+        """The final poses (N, 4, 4) of all frames: those that follow from the last round, or that its guard kept,
+        refined where the recipe says how.
+        """
+        poses = scene.key_frames.expand(last.world_from_cam) if refined is None else refined.world_from_cam
+        if self.recipe.refiner is None:
+            return poses
+        title, total = "refine", len(poses)
+        return self.store.step(refine_poses, self.recipe.refiner, scene.whole, poses, title=title, total=total)
+
     def finish(
         self,
         scene: Scene,
         rounds: list[Round],
+        poses: Floats,
         models: Mapping[str, Path],
         scores: ScoreTable | None,
         refined: Refined | None,
     ) -> Run:
         """What the run leaves in its folder."""
-        poses = scene.key_frames.expand(rounds[-1].world_from_cam) if refined is None else refined.world_from_cam
-        report = run_files.write(self.workspace.folder, self.recipe, self.store, scene, rounds, models, scores, refined)
+        folder, recipe = self.workspace.folder, self.recipe
+        report = run_files.write(folder, recipe, self.store, scene, rounds, poses, models, scores, refined)
         ending = self.store.step(end, poses, report, refined, title="report")
         return Run(
             self.workspace.folder, scene.whole, scene.key_frames, scene.clouds, tuple(rounds), poses, models, scores,

@@ -97,7 +97,9 @@ def test_graph_round_trip(tmp_path: Path) -> None:
 def test_solution_round_trip(tmp_path: Path) -> None:
     poses = np.stack([np.eye(4)] * 3)
     step = SolverIteration(poses, 0.5, {"mean_deviation": float("nan"), "step": 1e-9})
-    solution = Solution(poses, np.zeros(3, np.int64), np.ones(2), (step, step), {"cost": 1.0}, ("one piece",), confirmed=False)
+    solution = Solution(
+        poses, np.zeros(3, np.int64), np.ones(2), (step, step), {"cost": 1.0}, ("one piece",), confirmed=False
+    )
     codec.save(tmp_path, solution)
     again = codec.load(tmp_path, Solution)
     np.testing.assert_array_equal(again.history[1].world_from_cam, poses)

@@ -14,19 +14,20 @@ from hodge_pipeline.types import Bools, Floats, Source
 
 
 def fuse_all(
-    fusers: Sequence[Fuser], scene: Scene, world_from_key: Floats, steps: Steps, *, keys_only: bool = False
+    fusers: Sequence[Fuser], scene: Scene, world_from_cam: Floats, steps: Steps, *, keys_only: bool = False
 ) -> dict[str, Path]:
-    """The PLY file of each model by its name, from the poses (K, 4, 4) of the key frames.
+    """The PLY file of each model by its name, from the poses (N, 4, 4) of all frames.
 
     Every frame with a pose of its own is fused, key frame or not; of `keys_only` the key frames alone, which is faster.
     """
     if keys_only and not scene.key_frames.are_all:
-        source, poses, placed = scene.source, world_from_key, scene.clouds.sizes > 0
+        rows = scene.key_frames.rows
+        source, poses, placed = scene.source, world_from_cam[rows], scene.clouds.sizes > 0
         steps.note(
             f"fused after an edit: the {len(source.frames)} key frames alone; hodge run, as before, fuses all frames"
         )
     else:
-        source, poses = scene.whole, scene.key_frames.expand(world_from_key)
+        source, poses = scene.whole, world_from_cam
         placed = _placed(scene.key_frames, scene.clouds.sizes > 0)
     poses = np.asarray(np.where(placed[:, None, None], poses, np.nan))
     files = [

@@ -186,6 +186,7 @@ def write(
     store: Store,
     scene: Scene,
     rounds: Sequence[Round],
+    world_from_cam: Floats,
     models: Mapping[str, Path],
     scores: ScoreTable | None,
     refined: Refined | None = None,
@@ -195,10 +196,8 @@ def write(
     Of a refinement the poses of all frames; where nothing could be refined the report alone.
     """
     if refined is None or refined.decision.outcome != "nothing":
-        last = rounds[-1]
-        poses = scene.key_frames.expand(last.world_from_cam) if refined is None else refined.world_from_cam
-        write_poses(folder, scene.whole, poses)
-        write_graph(folder, scene.source, last)
+        write_poses(folder, scene.whole, world_from_cam)
+        write_graph(folder, scene.source, rounds[-1])
         for name, path in models.items():
             artifacts.link_or_copy(path, folder / f"{name}.ply")
     report = make_report(recipe, store, scene, rounds, scores, refined)
