@@ -18,8 +18,8 @@ from hodge_pipeline.report.contents import Report
 from hodge_pipeline.rounds.one_round import judge_edges, solve_edges
 from hodge_pipeline.scene import KeyFrames, Round, Scene
 from hodge_pipeline.stages import Step
-from hodge_pipeline.store.store import stored, stored_folders
-from hodge_pipeline.store.workspace import RECIPE_FILE, RUN, is_run_folder
+from hodge_pipeline.store.store import stored, stored_clouds
+from hodge_pipeline.store.workspace import OLD_KEY_FILE, RECIPE_FILE, RUN, is_run_folder
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, Source
 
 
@@ -113,7 +113,7 @@ class Run:
         check_layout(folder)
         steps = folder / RUN
         opening = stored(steps, begin)
-        clouds = [path / "clouds" for path in stored_folders(steps) if (path / "clouds" / "offsets.npy").is_file()]
+        clouds = stored_clouds(steps)
         if not opening or not clouds:
             raise WorkspaceError(f"{folder}: the run has not begun to register: run the same command again")
         judged, ended = stored(steps, judge_edges), stored(steps, end)
@@ -125,7 +125,7 @@ class Run:
             folder=folder,
             source=opening[-1].frames.source(),
             key_frames=key_frames,
-            clouds=CloudSet.open(clouds[-1]),
+            clouds=clouds[-1],
             rounds=tuple(rounds),
             poses=ended[-1].world_from_cam if ended else key_frames.expand(rounds[-1].world_from_cam),
             models={path.stem: path for path in stored(steps, fuse)},
@@ -187,7 +187,7 @@ def check_layout(folder: Path) -> None:
     """Raise `WorkspaceError` where a folder is none of a run, or was left by a version with another layout."""
     if not is_run_folder(folder):
         raise WorkspaceError(f"{folder}: is no run folder: there is no {RECIPE_FILE} with steps in it")
-    if any((folder / RUN).glob("*/key.json")):
+    if any((folder / RUN).glob(f"*/{OLD_KEY_FILE}")):
         again = f"hodge run {folder / RECIPE_FILE} --out {folder} --overwrite"
         raise WorkspaceError(f"{folder}: was made in the layout of an earlier version: '{again}' makes it again")
 

@@ -137,6 +137,39 @@ def test_a_killed_registration_keeps_its_blocks(run: Run, tmp_path: Path) -> Non
     np.testing.assert_array_equal(resumed.result.world_from_cam, run.result.world_from_cam)
 
 
+def test_a_run_that_is_killed_again_and_again_ends_with_the_same_poses(run: Run, tmp_path: Path) -> None:
+    """Killed while its third step, from where it went on, gets its name: in turn just before and just after."""
+    alone = ("executor.workers=0", "recording.level=off")
+    script = textwrap.dedent(f"""
+        import os, signal, sys
+        import hodge_pipeline
+        from hodge_pipeline.recipe.schema import load_recipe
+        from hodge_pipeline.store import store
+        left, commit, after = [3], store._commit, sys.argv[1] == "after"
+        def commit_and_die(part, path):
+            left[0] -= 1
+            if left[0] or after:
+                commit(part, path)
+            if not left[0]:
+                os.kill(os.getpid(), signal.SIGKILL)
+        store._commit = commit_and_die
+        recipe = load_recipe("demo", {[*SMALL, *alone]!r}, {str(run.source.path)!r})
+        hodge_pipeline.run(recipe, {str(tmp_path / "run")!r})
+    """)
+    ended = list[int]()
+    while 0 not in ended:
+        assert len(ended) < 9, "every start goes on by two steps at least"
+        when = ("before", "after")[len(ended) % 2]
+        done = subprocess.run([sys.executable, "-c", script, when], check=False, capture_output=True)
+        ended.append(done.returncode)
+        assert ended[-1] in (0, -signal.SIGKILL), done.stderr.decode()
+    assert len(ended) > 3
+    found = Run.load(tmp_path / "run")
+    np.testing.assert_array_equal(found.poses, run.poses)
+    np.testing.assert_array_equal(found.edges.i_from_j, run.edges.i_from_j)
+    assert not [path for path in (tmp_path / "run").rglob("*") if path.suffix in (".part", ".draft")]
+
+
 def test_a_later_stage_alone_is_repeated_when_its_option_changes(run: Run, tmp_path: Path) -> None:
     folder, log = tmp_path / "copy", Log()
     shutil.copytree(run.folder, folder)

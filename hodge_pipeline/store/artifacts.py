@@ -57,6 +57,7 @@ def link_or_copy(existing: Path, path: Path) -> None:
     except OSError:
         shutil.copyfile(existing, draft)
     os.replace(draft, path)
+    draft.unlink(missing_ok=True)  # two names of one file are not replaced
 
 
 def _finite(value: Any) -> Any:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet
 
-TEXT, ARRAYS = "value.json", "value.npz"
-"""The shape of a value with its texts and numbers, and its arrays by their place in it."""
+TEXT, ARRAYS, CLOUDS = "value.json", "value.npz", "clouds"
+"""The shape of a value with its texts and numbers; its arrays by their place in it; the folder of a value's clouds."""
 
 
 def save(folder: Path, value: Any) -> None:
@@ -55,7 +55,7 @@ def _plain(folder: Path, value: Any, place: str, arrays: dict[str, NDArray[Any]]
         arrays[place or "bytes"] = np.frombuffer(value, np.uint8)
         return {"bytes": place or "bytes"}
     if isinstance(value, CloudSet):
-        own = folder / (place or "clouds")
+        own = folder / (place or CLOUDS)
         if value.folder is None or value.folder != own:
             own.mkdir(exist_ok=True)
             value.save(own)

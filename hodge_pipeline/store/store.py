@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.stages import Step
 from hodge_pipeline.store import artifacts, codec
+from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.store.cost import Cost, Monitor
 from hodge_pipeline.store.log import log
 from hodge_pipeline.store.progress import Nobody, Watcher
@@ -71,8 +72,7 @@ class Store:
             log.info("%s: already done", title)
         else:
             self._compute(path, key, title, total, partial(function, *inputs, **resources))
-        record = artifacts.read_json(path / RECORD)
-        for message in record["notes"]:
+        for message in _unsealed(path / RECORD)["notes"]:
             self.note(message)
         value: T = codec.load(path, kind)
         self.remember(value, key)
@@ -100,7 +100,7 @@ class Store:
         """Title, wall_s, cpu_s and peak_mb of each step so far, whenever it was computed; those of one title added."""
         found: dict[str, dict[str, Any]] = {}
         for entry in self._index:
-            own = artifacts.read_json(self.folder / entry["name"] / RECORD)["cost"]
+            own = _unsealed(self.folder / entry["name"] / RECORD)["cost"]
             sums = found.pop(entry["title"], {"title": entry["title"], **vars(Cost())})
             added = {part: sums[part] + own[part] for part in ("wall_s", "cpu_s")}
             found[entry["title"]] = {**sums, **added, "peak_mb": max(sums["peak_mb"], own["peak_mb"])}
@@ -132,16 +132,17 @@ class Store:
 
     def _is_whole(self, path: Path, key: str) -> bool:
         """Whether the step is finished under this key and each of its files is as it was written."""
+        if not path.exists():
+            return False
         try:
-            record = artifacts.read_json(path / RECORD)
+            record = _unsealed(path / RECORD)
             if record["key"] != key:
                 return False
-            changed = next((name for name, known in record["files"].items() if _facts(path / name) != known), None)
-        except (OSError, ValueError, KeyError, TypeError):
+            _check_files(path, record["files"])
+        except (OSError, ValueError) as error:
+            self.note(f"{path.name}: {error}: the step is computed again")
             return False
-        if changed is not None:
-            self.note(f"{path.name}/{changed} has changed since it was written: the step is computed again")
-        return changed is None
+        return True
 
     def _compute(self, path: Path, key: str, title: str, total: int, function: Callable[..., Any]) -> None:
         part = path.with_name(f"{path.name}.part")
@@ -157,14 +158,14 @@ class Store:
             (part / KEY).unlink()
             files = {str(file.relative_to(part)): _facts(file) for file in sorted(part.rglob("*")) if file.is_file()}
             facts = {"key": key, "title": title, "files": files, "notes": list(dict.fromkeys(notes))}
-            artifacts.write_json(part / RECORD, {**facts, "versions": versions(), "cost": vars(cost)})
+            _seal(part / RECORD, {**facts, "versions": versions(), "cost": vars(cost)})
             _commit(part, path)
         log.info("%s: %.1f s wall, %.1f s CPU, %.0f MB", title, cost.wall_s, cost.cpu_s, cost.peak_mb)
 
     def _listed(self, name: str, function: str, title: str) -> None:
         """Keep the list of the steps so far, in order, without those that another run of this folder left."""
         self._index.append({"name": name, "function": function, "title": title})
-        artifacts.write_json(self.folder / INDEX, self._index)
+        _seal(self.folder / INDEX, {"steps": self._index})
 
 
 def stored(folder: Path, function: Callable[..., T]) -> list[T]:
@@ -173,29 +174,74 @@ def stored(folder: Path, function: Callable[..., T]) -> list[T]:
 
     Raises `WorkspaceError` where a file has changed since it was written.
     """
-    kind, name, found = get_type_hints(function)["return"], function.__name__, []
-    try:
-        index = artifacts.read_json(folder / INDEX)
-    except (OSError, ValueError):
-        return []
-    for path in (folder / entry["name"] for entry in index if entry["function"] == name):
+    kind, found = get_type_hints(function)["return"], []
+    for path, files in _steps(folder, function.__name__):
         try:
-            files: Mapping[str, Sequence[Any]] = artifacts.read_json(path / RECORD)["files"]
-            changed = next((file for file, known in files.items() if _facts(path / file) != known), None)
-            if changed is not None:
-                raise ValueError(f"{changed} has changed since it was written")
+            _check_files(path, files)
             found.append(codec.load(path, kind))
-        except (OSError, ValueError, KeyError) as error:
-            raise WorkspaceError(f"{path}: {error}: the same hodge run computes it again") from error
+        except (OSError, ValueError) as error:
+            raise _damaged(path, error) from error
     return found
 
 
-def stored_folders(folder: Path) -> list[Path]:
-    """The folders of the steps of the latest run, in order, as far as it came."""
+def stored_clouds(folder: Path) -> list[CloudSet]:
+    """The clouds that steps of the latest run made, in order, whichever step it was: see `stored`."""
+    found = []
+    for path, files in _steps(folder):
+        if f"{CLOUDS}/offsets.npy" in files:
+            try:
+                _check_files(path, files)
+            except (OSError, ValueError) as error:
+                raise _damaged(path, error) from error
+            found.append(CloudSet.open(path / CLOUDS))
+    return found
+
+
+def _steps(folder: Path, function: str = "") -> Iterator[tuple[Path, Mapping[str, list[Any]]]]:
+    """Folder and files of each step of the latest run, or of this function's calls alone."""
+    if not (folder / INDEX).exists():
+        return
+    path = folder / INDEX
     try:
-        return [folder / entry["name"] for entry in artifacts.read_json(folder / INDEX)]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
+        for entry in _unsealed(path)["steps"]:
+            if function in ("", entry["function"]):
+                path = folder / entry["name"]
+                yield path, _unsealed(path / RECORD)["files"]
+    except (OSError, ValueError) as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> WorkspaceError:
+    return WorkspaceError(f"{path}: {error}: the same hodge run computes it again")
+
+
+def _check_files(path: Path, files: Mapping[str, list[Any]]) -> None:
+    """Raise `ValueError` where a file of a step is not as it was written."""
+    for name, known in files.items():
+        if not (path / name).is_file():
+            raise ValueError(f"{name} is gone")
+        if _facts(path / name) != known:
+            raise ValueError(f"{name} has changed since it was written")
+
+
+def _seal(path: Path, content: dict[str, Any]) -> None:
+    """Write JSON with a hash of itself."""
+    content = json.loads(artifacts.json_text(content))
+    artifacts.write_json(path, {**content, "seal": _hash(content)})
+
+
+def _unsealed(path: Path) -> dict[str, Any]:
+    """What `_seal` wrote. Raises `ValueError` where it has changed since, `OSError` where it cannot be read."""
+    try:
+        content: dict[str, Any] = artifacts.read_json(path)
+        seal = content.pop("seal")
+    except FileNotFoundError as error:
+        raise ValueError(f"{path.name} is gone") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path.name} has changed since it was written") from error
+    if _hash(content) != seal:
+        raise ValueError(f"{path.name} has changed since it was written")
+    return content
 
 
 def _facts(path: Path) -> list[Any]:

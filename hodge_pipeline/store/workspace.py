@@ -1,10 +1,11 @@
-"""The run folder: stage artifacts and their keys, atomic commits, resume."""
+"""The run folder: whose it is, and who holds it."""
 
 from __future__ import annotations
 
 import errno
 import hashlib
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,8 +14,9 @@ from typing import IO, Any
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.store import artifacts, yaml_file
 
-KEY_FILE = "key.json"
 RECIPE_FILE = "recipe.yaml"
+OLD_KEY_FILE = "key.json"
+"""In each stage of the layout before `Store`."""
 RUN, REFINEMENT = "stages", "refinement"
 """The folder of the stages of a run, and of the refinement of a model."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, None)
@@ -69,6 +71,8 @@ class Workspace:
             _check_kind(folder, kind)
             _check_recipe(folder, recipe, overwrite, refusal, kind)
             (folder / kind).mkdir(exist_ok=True)
+            for old in (folder / kind).glob(f"*/{OLD_KEY_FILE}"):
+                shutil.rmtree(old.parent)
         except BaseException:
             lock.close()
             raise

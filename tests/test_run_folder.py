@@ -1,0 +1,194 @@
+"""`Run.load`: a run folder as an object, without its source, by whatever version, and only where it is whole."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import hodge_pipeline
+from hodge_adapters.poses_text import read_tum, write_tum
+from hodge_adapters.tum import TumReader
+from hodge_pipeline import se3
+from hodge_pipeline.cli.main import app
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.pipeline import Run
+from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.report.write import as_json
+from hodge_pipeline.store import store as store_module
+from hodge_pipeline.store.artifacts import json_text
+from hodge_pipeline.types import Trajectory
+from hodge_pipeline.uses.record_again import record_again
+from synthetic import tiny_sequence  # noqa: F401 - a fixture
+from test_pipeline import Log
+
+FRAMES = 24
+SMALL = (
+    "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary",
+    "outer_iterations=1", "edges.max_edges_per_frame=4",
+)  # fmt: skip
+KEY_FRAMES = ("start.whole_up_to=10", "start.distance_m=0.4", "start.angle_deg=12")
+
+
+@pytest.fixture(scope="module")
+def sequence(tiny_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
+    """One of our own, which will be gone."""
+    return Path(shutil.copytree(tiny_sequence, tmp_path_factory.mktemp("source") / "sequence"))
+
+
+@pytest.fixture(scope="module")
+def recipe(sequence: Path) -> Recipe:
+    return load_recipe("demo", [*SMALL, *KEY_FRAMES], sequence)
+
+
+@pytest.fixture(scope="module")
+def run(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Of key frames."""
+    return hodge_pipeline.run(recipe, tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture
+def alone(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The run in another place, under other versions, its source gone."""
+    folder = Path(shutil.copytree(run.folder, tmp_path / "moved"))
+    text = (folder / "recipe.yaml").read_text()
+    (folder / "recipe.yaml").write_text(text.replace(str(run.source.path), str(tmp_path / "gone")))
+    monkeypatch.setattr(store_module, "versions", lambda: {"numpy": "99"})
+    return folder
+
+
+def test_what_a_run_gave_is_what_its_folder_gives(run: Run, alone: Path) -> None:
+    found = Run.load(alone)
+    assert not run.key_frames.are_all and found.poses.shape == (FRAMES, 4, 4)
+    np.testing.assert_array_equal(found.poses, run.poses)
+    np.testing.assert_array_equal(found.clouds.points, run.clouds.points)
+    assert len(found.rounds) == len(run.rounds) == 2
+    for one, other in zip(found.rounds, run.rounds, strict=True):
+        for name, column in vars(one.edges).items():
+            np.testing.assert_array_equal(column, getattr(other.edges, name), err_msg=name)
+        np.testing.assert_array_equal(one.world_from_cam, other.world_from_cam)
+    assert (found.edges.verdict != "").any()
+    assert json_text(as_json(found.report)) == json_text(as_json(run.report)) and found.refined is None
+    assert {name: path.read_bytes() for name, path in found.models.items()} == {
+        name: path.read_bytes() for name, path in run.models.items()
+    }
+    assert list(found.models) == ["cloud"]
+    assert found.scores is not None and found.scores.names == run.scores.names  # type: ignore[union-attr]
+    frames = [(frame.frame_id, frame.stamp_s, frame.camera) for frame in found.source.frames]
+    assert frames == [(frame.frame_id, frame.stamp_s, frame.camera) for frame in run.source.frames]
+    assert repr(found).endswith(f"24 frames, {run.result.graph.edge_count} edges)")
+
+
+def hodge(*arguments: object) -> str:
+    done = CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def test_every_reader_works_where_the_source_is_gone(run: Run, alone: Path, tmp_path: Path) -> None:
+    steps = {path: path.stat().st_mtime_ns for path in (alone / "stages").rglob("*")}
+    answer = json.loads(hodge("diagnose", alone, "--out", tmp_path / "why", "--json"))
+    assert sum(answer["counts"].values()) == run.result.graph.edge_count
+    assert "no edits" in hodge("edit", alone, "--list")
+    assert "compare.html" in hodge("compare", alone, run.folder, "--out", tmp_path / "both").replace("\n", "")
+    path, is_whole = record_again(alone, {})
+    assert is_whole and path == alone / "recording.rrd"
+    assert {path: path.stat().st_mtime_ns for path in (alone / "stages").rglob("*")} == steps
+
+
+def poses_of(run: Run) -> Path:
+    return run.folder / "poses.tum"
+
+
+def test_poses_are_of_all_frames_wherever_they_come_from(run: Run, sequence: Path, tmp_path: Path) -> None:
+    np.testing.assert_allclose(read_tum(poses_of(run)).world_from_cam, run.poses, atol=1e-9)
+    quick = [*SMALL, "fusion=[]", "recording.level=off", "evaluation.tables=false"]
+    frames = TumReader().open(sequence).frames
+    true = np.array([frame.world_from_cam for frame in frames])
+    drift = se3.exp(np.linspace(0, 1, FRAMES)[:, None] * np.array([0, 0.05, 0, 0.05, 0, 0]))
+    write_tum(tmp_path / "slam.txt", Trajectory(np.array([frame.stamp_s for frame in frames]), true @ drift))
+    given = load_recipe("slam-refine", [*quick, f"start.path={tmp_path / 'slam.txt'}", "start.every=3"], sequence)
+    unordered = load_recipe("demo", [*quick, "start={stage: unordered, use: geometry}"], sequence)
+    for name, recipe in (("given", given), ("unordered", unordered)):
+        made = hodge_pipeline.run(recipe, tmp_path / name)
+        for one in (made, Run.load(made.folder)):
+            assert one.poses.shape == (FRAMES, 4, 4) and len(one.source.frames) == FRAMES
+            np.testing.assert_array_equal(one.poses, made.poses)
+        assert made.key_frames.are_all == (name == "unordered")
+        np.testing.assert_allclose(read_tum(poses_of(made)).world_from_cam, made.poses, atol=1e-9)
+        assert (made.refined is not None) == (name == "given")
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [
+        ("track-1/clouds/points.npy", "tracking"),
+        ("begin-1/value.npz", "frames"),
+        ("solve_edges-1/value.json", "solve, round 1"),
+        ("judge_edges-1/step.json", "diagnosis"),
+        ("evaluate-1/value.npz", "evaluation"),
+        ("fuse-1/cloud.ply", "fusion 1"),
+        ("end-1/value.json", "report"),
+    ],
+)
+def test_a_changed_byte_is_refused_and_the_same_command_heals_it(
+    run: Run, recipe: Recipe, tmp_path: Path, name: str, title: str
+) -> None:
+    folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
+    damaged = folder / "stages" / name
+    data = bytearray(damaged.read_bytes())
+    data[len(data) // 2] ^= 4
+    damaged.write_bytes(bytes(data))
+    with pytest.raises(WorkspaceError, match=f"{damaged.name} has changed .* the same hodge run computes it again"):
+        Run.load(folder)
+    log = Log()
+    again = hodge_pipeline.run(recipe, folder, watcher=log)
+    assert log.stages[0] == title and set(log.stages) <= {title, "report"}
+    assert any(f"{damaged.name} has changed" in said for said in log.said)
+    for found in (again, Run.load(folder)):
+        np.testing.assert_array_equal(found.poses, run.poses)
+
+
+def test_a_run_in_progress_is_read_as_far_as_it_came(recipe: Recipe, run: Run, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        hodge_pipeline.run(recipe, tmp_path / "run", watcher=Log(stop_at="fusion 1"))
+    found = Run.load(tmp_path / "run")
+    np.testing.assert_array_equal(found.poses, run.poses)
+    assert found.models == {} and repr(found).endswith("unfinished)")
+    with pytest.raises(WorkspaceError, match="is not finished: run the same command again"):
+        _ = found.report
+    shutil.copytree(run.folder, tmp_path / "early")
+    shutil.rmtree(tmp_path / "early/stages")
+    (tmp_path / "early/stages").mkdir()
+    with pytest.raises(WorkspaceError, match="has not begun to register"):
+        Run.load(tmp_path / "early")
+
+
+def test_the_layout_of_an_earlier_version_is_refused_and_made_again(recipe: Recipe, run: Run, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
+    shutil.rmtree(folder / "stages")
+    old = folder / "stages" / "clouds"
+    old.mkdir(parents=True)
+    (old / "key.json").write_text('{"key": "k"}')
+    again = f"'hodge run {folder / 'recipe.yaml'} --out {folder} --overwrite' makes it again"
+    for command in ("diagnose", "record", "solve"):
+        done = CliRunner().invoke(app, [command, str(folder)])
+        assert isinstance(done.exception, WorkspaceError) and again in str(done.exception), command
+        assert "layout of an earlier version" in str(done.exception)
+    assert old.is_dir()
+    hodge_pipeline.run(load_recipe(str(folder / "recipe.yaml")), folder, overwrite=True)
+    assert not old.exists()
+    np.testing.assert_array_equal(Run.load(folder).poses, run.poses)
+
+
+def test_nothing_is_left_behind(run: Run, recipe: Recipe) -> None:
+    hodge_pipeline.run(recipe, run.folder)
+    assert sorted(path.name for path in run.folder.rglob(".*")) == [".lock"]
+    assert not [path for path in run.folder.rglob("*") if path.suffix in (".part", ".draft", ".tmp")]
+    steps = {path.name for path in (run.folder / "stages").iterdir()} - {"index.json"}
+    listed = json.loads((run.folder / "stages/index.json").read_text())["steps"]
+    assert steps == {entry["name"] for entry in listed}

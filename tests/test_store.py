@@ -1,0 +1,355 @@
+"""Steps that are computed once: what decides their key, what survives a kill, and what a changed file costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.stages import Step
+from hodge_pipeline.store import artifacts, codec
+from hodge_pipeline.store import store as store_module
+from hodge_pipeline.store.store import Store, stored, stored_clouds
+from hodge_pipeline.types import CloudSet, Edges, Floats, PointCloud
+
+CALLS: list[str] = []
+
+
+@dataclass(frozen=True)
+class Inner:
+    poses: Floats
+    name: str | None
+    words: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Value:
+    number: float
+    inner: Inner | None
+    rows: dict[str, Floats]
+    image: bytes = b""
+    many: tuple[Inner, ...] = ()
+    pair: tuple[int, str] = (0, "")
+
+
+@dataclass(frozen=True)
+class Made:
+    clouds: CloudSet
+    file: Path
+
+
+def doubled(value: Floats, *, step: Step) -> Floats:
+    """A step that is counted, and has something to say."""
+    CALLS.append("doubled")
+    step.note(f"doubled {len(value)}")
+    return 2 * value
+
+
+def total(value: Floats, factor: float, *, step: Step) -> float:
+    CALLS.append("total")
+    return float(factor * value.sum())
+
+
+def any_of(*inputs: Any, step: Step) -> int:
+    CALLS.append("any_of")
+    return len(inputs)
+
+
+def made_files(seed: int, *, step: Step) -> Made:
+    CALLS.append("made_files")
+    (step.folder / "model.txt").write_text("model")
+    return Made(clouds(seed), step.folder / "model.txt")
+
+
+def halting(value: Floats, *, step: Step) -> Floats:
+    """Fails halfway the first time in its folder."""
+    half = step.folder / "half"
+    if not half.exists():
+        half.write_text("half")
+        raise KeyboardInterrupt
+    half.unlink()
+    return value
+
+
+def full(*, step: Step) -> int:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def clouds(seed: int) -> CloudSet:
+    points = np.random.default_rng(seed).normal(size=(30, 3)).astype(np.float32)
+    return CloudSet.from_clouds([PointCloud(points[:10]), PointCloud(points[10:])])
+
+
+@pytest.fixture(autouse=True)
+def no_calls() -> None:
+    CALLS.clear()
+
+
+ONE = np.arange(3.0)
+
+
+def test_a_step_is_computed_once_and_its_notes_are_told_again(tmp_path: Path) -> None:
+    for _ in range(2):
+        store = Store(tmp_path)
+        np.testing.assert_array_equal(store.step(doubled, ONE, title="a"), 2 * ONE)
+        assert store.notes == ["doubled 3"]
+    assert CALLS == ["doubled"]
+    assert not list(tmp_path.rglob("*.part")) and not list(tmp_path.rglob(".*"))
+    np.testing.assert_array_equal(stored(tmp_path, doubled), [2 * ONE])
+    assert stored(tmp_path, total) == [] == stored(tmp_path / "nothing", total)
+
+
+def test_each_call_of_a_run_is_a_step_of_its_own(tmp_path: Path) -> None:
+    for _ in range(2):
+        store = Store(tmp_path)
+        assert [store.step(total, ONE, factor, title="t") for factor in (1.0, 2.0, 1.0)] == [3.0, 6.0, 3.0]
+    assert CALLS == ["total"] * 3 and stored(tmp_path, total) == [3.0, 6.0, 3.0]
+
+
+INPUTS: list[tuple[Any, Any]] = [
+    (ONE, ONE + 1e-12),
+    (ONE, ONE.astype(np.float32)),
+    (ONE, ONE[:, None]),
+    (1.0, 2.0),
+    ("1", 1),
+    (None, 0),
+    (b"a", b"b"),
+    ([1, 2], [2, 1]),
+    ({"a": 1}, {"a": 2}),
+    (Gicp(), Gicp(distances_m=(0.3,), source_points=(100,))),
+    (Inner(ONE, "a"), Inner(ONE, "b")),
+    (Edges.of([[0, 1]]), Edges.of([[0, 2]])),
+    (clouds(0), clouds(1)),
+]
+
+
+@pytest.mark.parametrize("pair", INPUTS, ids=lambda pair: type(pair[0]).__name__)
+def test_every_input_and_its_type_is_part_of_the_key(tmp_path: Path, pair: tuple[Any, Any]) -> None:
+    for value in (*pair, pair[1]):
+        Store(tmp_path).step(any_of, value, title="a")
+    assert CALLS == ["any_of"] * 2
+
+
+def test_a_file_counts_by_its_contents(tmp_path: Path) -> None:
+    file = tmp_path / "input.txt"
+    for text in ("one", "two", "two"):
+        file.write_text(text)
+        Store(tmp_path / "s").step(any_of, file, title="a")
+    assert CALLS == ["any_of"] * 2
+
+
+def test_another_version_of_a_library_computes_again_but_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Store(tmp_path).step(doubled, ONE, title="a")
+    monkeypatch.setattr(store_module, "versions", lambda: {"numpy": "99"})
+    np.testing.assert_array_equal(stored(tmp_path, doubled), [2 * ONE])
+    Store(tmp_path).step(doubled, ONE, title="a")
+    assert CALLS == ["doubled"] * 2
+
+
+def test_what_would_have_another_key_in_every_process_is_refused(tmp_path: Path) -> None:
+    for value in (object(), lambda: 0, np.array([object()]), Inner(ONE, print)):  # type: ignore[arg-type]
+        with pytest.raises(TypeError, match="has no key"):
+            Store(tmp_path).step(any_of, value, title="a")
+    store, unnamed = Store(tmp_path), object()
+    store.remember(unnamed, "its key")
+    assert store.step(any_of, unnamed, title="a") == 1
+
+
+def test_the_key_of_a_steps_result_stands_for_its_contents(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    first = store.step(doubled, ONE, title="a")
+    assert store.key(first) != store.key(first.copy())
+    store.step(total, first, 1.0, title="b")
+    store = Store(tmp_path)
+    store.step(total, store.step(doubled, ONE, title="a"), 1.0, title="b")
+    assert CALLS == ["doubled", "total"]
+    store = Store(tmp_path)
+    store.step(total, store.step(doubled, ONE + 1, title="a"), 1.0, title="b")
+    assert CALLS == ["doubled", "total"] * 2
+
+
+def test_a_killed_step_goes_on_in_its_folder_under_its_key_alone(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        Store(tmp_path).step(halting, ONE, title="a")
+    assert (tmp_path / "halting-1.part" / "half").is_file()
+    with pytest.raises(KeyboardInterrupt):
+        Store(tmp_path).step(halting, ONE + 1, title="a")
+    np.testing.assert_array_equal(Store(tmp_path).step(halting, ONE + 1, title="a"), ONE + 1)
+    assert sorted(path.name for path in (tmp_path / "halting-1").iterdir()) == ["step.json", "value.json", "value.npz"]
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_the_old_result_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
+    def last() -> Floats:
+        return np.load(tmp_path / "halting-1/value.npz")["array"]
+
+    for _ in range(2):
+        try:
+            Store(tmp_path).step(halting, ONE, title="a")
+        except KeyboardInterrupt:
+            continue
+    with pytest.raises(KeyboardInterrupt):
+        Store(tmp_path).step(halting, ONE + 1, title="a")
+    np.testing.assert_array_equal(last(), ONE)
+
+
+def test_a_full_disk_keeps_what_was_finished(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.step(doubled, ONE, title="a")
+    with pytest.raises(WorkspaceError, match="make room"):
+        store.step(full, title="b")
+    np.testing.assert_array_equal(stored(tmp_path, doubled), [2 * ONE])
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+DAMAGE: list[Callable[[Path], None]] = [flip, empty, Path.unlink]
+
+
+@pytest.mark.parametrize("damage", DAMAGE, ids=lambda damage: damage.__name__)
+def test_a_damaged_file_of_a_step_is_said_refused_and_healed(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    Store(tmp_path).step(made_files, 1, title="a")
+    files = sorted(path for path in (tmp_path / "made_files-1").rglob("*") if path.is_file())
+    assert {path.name for path in files} >= {"model.txt", "step.json", "value.json", "points.npy", "offsets.npy"}
+    for file in files:
+        CALLS.clear()
+        if file.stat().st_size:
+            damage(file)
+        for read in (lambda: stored(tmp_path, made_files), lambda: stored_clouds(tmp_path)):
+            with pytest.raises(WorkspaceError, match=f"{file.name} .*the same hodge run computes it again") as refused:
+                read()
+            assert "\n" not in str(refused.value)
+        store = Store(tmp_path)
+        made = store.step(made_files, 1, title="a")
+        assert CALLS == ["made_files"]
+        assert len(store.notes) == 1 and file.name in store.notes[0] and "computed again" in store.notes[0]
+        assert made.file.read_text() == "model"
+        np.testing.assert_array_equal(made.clouds.points, clouds(1).points)
+    assert len(stored(tmp_path, made_files)) == len(stored_clouds(tmp_path)) == 1
+
+
+@pytest.mark.parametrize("damage", [flip, empty])
+def test_a_damaged_list_of_steps_is_refused(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    Store(tmp_path).step(doubled, ONE, title="a")
+    damage(tmp_path / "index.json")
+    with pytest.raises(WorkspaceError, match="index.json has changed"):
+        stored(tmp_path, doubled)
+
+
+def test_costs_are_those_of_the_run_that_computed_it_and_are_added_by_title(tmp_path: Path) -> None:
+    for _ in range(2):
+        store = Store(tmp_path)
+        for factor in (1.0, 2.0):
+            store.step(total, ONE, factor, title="t")
+    (cost,) = store.costs()
+    parts = [json.loads(path.read_text())["cost"] for path in tmp_path.glob("*/step.json")]
+    assert cost["title"] == "t" and len(parts) == 2
+    assert cost["wall_s"] == pytest.approx(sum(part["wall_s"] for part in parts))
+    assert cost["peak_mb"] == max(part["peak_mb"] for part in parts) > 1
+
+
+VALUES: list[tuple[Any, Any]] = [
+    (Value(np.nan, None, {}), Value),
+    (Value(-np.inf, Inner(ONE, None), {"a b": ONE[:0]}, b"\x00\xff", (Inner(ONE, "é", ("x",)),), (1, "q")), Value),
+    (ONE.astype(np.int8), Floats),
+    (b"", bytes),
+    (None, float | None),
+    (1.5, float | None),
+    (("a", ["b"]), tuple[str, list[str]]),
+    (True, bool),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("value", "kind"), VALUES, ids=lambda one: type(one).__name__)
+def test_values_come_back_as_they_were(tmp_path: Path, value: Any, kind: Any) -> None:
+    codec.save(tmp_path, value)
+    found = codec.load(tmp_path, kind)
+    assert type(found) is type(value)
+    np.testing.assert_equal(as_plain(found), as_plain(value))
+
+
+def as_plain(value: Any) -> Any:
+    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value  # type: ignore[arg-type]
+
+
+def test_clouds_and_paths_lie_in_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "file").touch()
+    codec.save(tmp_path / "a", Made(clouds(2), tmp_path / "a" / "file"))
+    (tmp_path / "a").rename(tmp_path / "b")
+    found = codec.load(tmp_path / "b", Made)
+    assert found.file == tmp_path / "b" / "file" and found.clouds.folder == tmp_path / "b" / "clouds"
+    for name in CloudSet.FILES:
+        np.testing.assert_array_equal(getattr(found.clouds, name), getattr(clouds(2), name))
+
+
+@pytest.mark.parametrize("theirs", ["../outside", "/etc/passwd", "link"])
+def test_a_path_outside_its_folder_is_refused(tmp_path: Path, theirs: str) -> None:
+    folder = tmp_path / "step"
+    folder.mkdir()
+    (folder / "link").symlink_to(tmp_path)
+    for name, kind in (("file", Path), ("clouds", CloudSet)):
+        (folder / "value.json").write_text(json.dumps(theirs if kind is Path else {"clouds": theirs}))
+        with pytest.raises(ValueError, match="names a path outside its folder"):
+            codec.load(folder, kind)
+        assert name
+
+
+def test_a_path_elsewhere_and_an_unknown_type_are_not_stored(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not in the subpath"):
+        codec.save(tmp_path, Path("/etc/passwd"))
+    for value in (object(), {"a": {1, 2}}, np.array([object()])):
+        with pytest.raises(TypeError, match="cannot be stored"):
+            codec.save(tmp_path, value)
+
+
+class Pickled:
+    """What would write a file if it were unpickled."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (Path(self.path),)
+
+
+def test_a_pickle_in_an_array_file_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "value.npz", array=np.array([Pickled(str(tmp_path / "ran"))], dtype=object))
+    (tmp_path / "value.json").write_text('{"array": "array"}')
+    with pytest.raises(ValueError, match="allow_pickle"):
+        codec.load(tmp_path, Floats)
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"number": 1}', '{"array": "gone"}', '{"unknown": 1}', "3"])
+def test_another_shape_than_the_code_expects_is_a_value_error(tmp_path: Path, text: str) -> None:
+    (tmp_path / "value.json").write_text(text)
+    with pytest.raises(ValueError):
+        codec.load(tmp_path, Value)
+
+
+def test_a_file_of_two_names_leaves_no_draft(tmp_path: Path) -> None:
+    (tmp_path / "made").write_text("x")
+    for _ in range(2):
+        artifacts.link_or_copy(tmp_path / "made", tmp_path / "shown")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["made", "shown"]
