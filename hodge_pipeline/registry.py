@@ -75,9 +75,14 @@ def origin(kind: str, name: str) -> str:
     return f"{dist.name} {dist.version}" if dist else "unknown package"
 
 
+FORMER_NAMES = {"hodge": "maximum_likelihood"}
+"""Names of stages that were renamed: an old recipe is told the new one."""
+
+
 def suggestion(given: str, known: list[str]) -> str:
     """`" (did you mean 'x'?)"`, or the known names where nothing is close."""
-    close = difflib.get_close_matches(given, known, n=1)
+    renamed = [name for name in (FORMER_NAMES.get(given),) if name in known]
+    close = renamed or difflib.get_close_matches(given, known, n=1)
     return f" (did you mean '{close[0]}'?)" if close else f" (known: {', '.join(known) or 'none'})"
 
 
