@@ -148,7 +148,9 @@ def test_a_component_without_a_fixed_vertex_keeps_its_first_one(solver):
 def test_solvers_without_a_term_for_priors_refuse_them(solver):
     graph, truth = ladder(0.1)
     priors = Priors(np.array([0]), truth[:1], np.eye(6)[None])
-    with pytest.raises(GraphError, match=r"no term for priors of single poses \(1 given\): take solver maximum_likelihood"):
+    with pytest.raises(
+        GraphError, match=r"no term for priors of single poses \(1 given\): take solver maximum_likelihood"
+    ):
         solver.solve(dataclasses.replace(graph, priors=priors), truth)
     none = Priors(np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
     solver.solve(dataclasses.replace(graph, priors=none), truth)

@@ -92,7 +92,9 @@ def without_usable_edges(what: str) -> ViewGraph:
 
 
 @pytest.mark.parametrize("what", ["one vertex", "isolated vertices", "self-loops", "zero information"])
-@pytest.mark.parametrize("solver", [MaximumLikelihoodSolver(), RobustSolver(), RobustSolver("geman_mcclure"), DiagnosedSolver()])
+@pytest.mark.parametrize(
+    "solver", [MaximumLikelihoodSolver(), RobustSolver(), RobustSolver("geman_mcclure"), DiagnosedSolver()]
+)
 def test_without_usable_edges_the_poses_are_as_given_and_a_note_says_so(solver, what):
     graph = without_usable_edges(what)
     start = se3.exp(np.random.default_rng(1).normal(size=(graph.vertex_count, 6)))
