@@ -134,6 +134,12 @@ class Source:
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
 
+    def __repr__(self) -> str:
+        parts = [f"{len(self.frames)} frames"]
+        parts += [] if self.trajectory is None else [f"a trajectory of {len(self.trajectory)} poses"]
+        parts += [] if self.graph is None else [repr(self.graph)]
+        return f"Source({self.name!r}: {', '.join(parts)})"
+
 
 @dataclass(frozen=True)
 class Match:
@@ -173,6 +179,13 @@ class Solution:
     metrics: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     confirmed: bool | None = None
+
+    def __repr__(self) -> str:
+        pieces = int(self.component.max(initial=-1)) + 1
+        used = int(np.count_nonzero(self.weights))
+        return (
+            f"Solution({len(self.component)} poses in {pieces} components, {used} of {len(self.weights)} edges count)"
+        )
 
 
 @dataclass(frozen=True)
@@ -270,6 +283,9 @@ class CloudSet(Sequence[PointCloud]):
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
+
+    def __repr__(self) -> str:
+        return f"CloudSet({len(self)} clouds, {int(self.offsets[-1])} points)"
 
     def __getitem__(self, row: int) -> PointCloud:  # type: ignore[override]
         """The cloud of one frame (a view, not a copy)."""
