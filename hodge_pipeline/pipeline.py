@@ -97,9 +97,10 @@ class _Job:
         job = _Job(**{**vars(self), "recipe": with_scale(self.recipe, source, self.store)})
         with ExitStack() as pool:
             workers = pool.enter_context(open_workers(job.recipe.executor, job.dask))
-            scene = job.recipe.start.begin(source, job.recipe.clouds, job.store, workers)
-            job.store.step(begin, *opening_of(scene), title="frames")
-            with Recording(job.store, job.workspace.folder, job.recipe, scene.source, job.live) as recording:
+            with Recording(job.store, job.workspace.folder, job.recipe, source, job.live) as recording:
+                scene = job.recipe.start.begin(source, job.recipe.clouds, job.store, workers)
+                job.store.step(begin, *opening_of(scene), title="frames")
+                recording.begin(scene.source, scene.clouds, scene.first)
                 work = Work(job.recipe, job.store, scene, job.measured(scene), workers)
                 rounds, scores = job.compute(work, recording)
                 refined = verdict.finish(work, job.workspace.folder, rounds) if scene.is_given else None
@@ -132,8 +133,7 @@ class _Job:
 
     def compute(self, work: Work, recording: Recording) -> tuple[list[Round], ScoreTable | None]:
         """The rounds and their scores."""
-        scene, rounds = work.scene, [work.scene.first]
-        recording.begin(scene.clouds, scene.first)
+        rounds = [work.scene.first]
         for number in range(1, self.recipe.outer_iterations + 1):
             rounds.append(work.round(number, rounds[-1]))
             recording.round(number, rounds[-1])

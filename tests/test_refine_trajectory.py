@@ -15,7 +15,7 @@ from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.types import Floats, Trajectory
 
 SMALL = (
-    "clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1", "key_frames.every=2",
+    "clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1", "start.every=2",
     "edges.builders=[{stage: sequential}, {stage: overlap, min_iou: 0.15}]",
 )  # fmt: skip
 ROOM = DemoOptions(frames=16, width=160, height=120, noise=0.3)

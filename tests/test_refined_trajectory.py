@@ -5,8 +5,6 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from hodge_pipeline.refine.given_poses import GivenOptions, match_poses
-from hodge_pipeline.refine.key_frames import KeyFrameOptions, choose_key_frames
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,6 +18,8 @@ from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.start.choose_key_frames import choose_key_frames
+from hodge_pipeline.start.match_poses import match_poses
 from hodge_pipeline.types import Floats, Frame, Source, Trajectory
 
 SMALL = ("clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1")
@@ -139,8 +139,8 @@ def test_key_frames_are_the_ends_every_nth_and_where_it_moved() -> None:
     poses[3:, 0, 3] = 0.2
     poses[8:] = poses[8:] @ se3.exp(np.array([0, 0, 0.3, 0, 0, 0]))
     rows = [np.arange(10), np.arange(10, 12)]
-    assert choose_key_frames(poses, rows, KeyFrameOptions(every=0)).tolist() == [0, 3, 8, 9, 10, 11]
-    assert choose_key_frames(poses, rows, KeyFrameOptions(every=4)).tolist() == [0, 3, 4, 8, 9, 10, 11]
+    assert choose_key_frames(poses, rows, 0.1, 8.0, 0).tolist() == [0, 3, 8, 9, 10, 11]
+    assert choose_key_frames(poses, rows, 0.1, 8.0, 4).tolist() == [0, 3, 4, 8, 9, 10, 11]
 
 
 def numbered(stamps: list[float]) -> list[Frame]:
@@ -150,16 +150,16 @@ def numbered(stamps: list[float]) -> list[Frame]:
 def test_poses_find_their_frames_by_stamp_number_or_row() -> None:
     poses = se3.exp(np.arange(24).reshape(4, 6) / 100)
     clock = Trajectory(np.array([10.0, 10.1, 10.2, 11.0]), poses)
-    found = match_poses(clock, numbered([10.05, 10.2, 10.6]), GivenOptions(), "x")
+    found = match_poses(clock, numbered([10.05, 10.2, 10.6]), "auto", 0.1, "x")
     assert found.how == "stamp" and np.isfinite(found.world_from_cam[:, 0, 0]).tolist() == [True, True, False]
     rows = Trajectory(np.arange(4.0), poses)
-    assert match_poses(rows, numbered([7.0, 8.0, 9.0, 9.5]), GivenOptions(), "x").how == "row"
+    assert match_poses(rows, numbered([7.0, 8.0, 9.0, 9.5]), "auto", 0.1, "x").how == "row"
     halves = Trajectory(np.array([0.0, 2.0]), poses[:2])
-    assert match_poses(halves, numbered([7.0, 8.0, 9.0, 9.5]), GivenOptions(), "x").how == "number"
+    assert match_poses(halves, numbered([7.0, 8.0, 9.0, 9.5]), "auto", 0.1, "x").how == "number"
     with pytest.raises(SourceError, match="4 poses at 10 to 11, 3 frames at 70 to 90"):
-        match_poses(clock, numbered([70.0, 80.0, 90.0]), GivenOptions(), "x")
+        match_poses(clock, numbered([70.0, 80.0, 90.0]), "auto", 0.1, "x")
     with pytest.raises(SourceError, match="by row"):
-        match_poses(clock, numbered([10.0, 11.0]), GivenOptions(match="row"), "x")
+        match_poses(clock, numbered([10.0, 11.0]), "row", 0.1, "x")
 
 
 FILES = {
@@ -237,6 +237,6 @@ def test_a_graph_is_sent_to_solve(tmp_path: Path) -> None:
     )
     depth = np.full((24, 32), 2.0, np.float32)
     made = hodge_pipeline.frames_from_images([depth, depth], np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]))
-    recipe = load_recipe("slam-refine", [f"given.path={tmp_path / 'graph.g2o'}"])
+    recipe = load_recipe("slam-refine", [f"start.path={tmp_path / 'graph.g2o'}"])
     with pytest.raises(SourceError, match="give it to hodge solve"):
         hodge_pipeline.run(recipe, tmp_path / "run", source=Source("memory", Path("memory"), made))

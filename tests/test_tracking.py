@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,22 +16,30 @@ from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.executors.local import InProcess
+from hodge_pipeline.fusion.cloud import CloudFuser
+from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
-from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, frame_blocks, track_block
-from hodge_pipeline.scene import Round
-from hodge_pipeline.start import first_poses as starting
+from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, TrackingOptions, frame_blocks, track_block
+from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source
+from hodge_pipeline.sources.opening import remembered
+from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start import key_frames as tracked
-from hodge_pipeline.start.key_frames import Tracked, tracking_options
+from hodge_pipeline.start import odometry as odometry_start
+from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, followers
+from hodge_pipeline.start.odometry import OdometryStart
+from hodge_pipeline.start.unordered.join import _stays
 from hodge_pipeline.start.unordered.start import Start
-from hodge_pipeline.types import CloudSet, Edges, Floats32, Frame, Source, ViewGraph
+from hodge_pipeline.store.store import Store
+from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Source, ViewGraph
 
 FRAMES = 64
 SMALL = (
     "clouds.voxel_m=0.06", "fusion=[]", "executor.workers=0", "recording.level=off", "evaluation.tables=false",
-    "outer_iterations=1", "edges.max_edges_per_frame=4", "key_frames.whole_up_to=20",
+    "outer_iterations=1", "edges.max_edges_per_frame=4", "start.whole_up_to=20",
 )  # fmt: skip
 
 
@@ -49,10 +58,40 @@ def run(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> hodge_pipel
     return hodge_pipeline.run(small_recipe(sequence), tmp_path_factory.mktemp("runs") / "run")
 
 
-def track(source: Source, folder: Path) -> tuple[Tracked, tuple[str, ...]]:
+def tracking_options(recipe: Recipe) -> TrackingOptions:
+    assert isinstance(recipe.start, KeyFrameStart)
+    return recipe.start._tracking(recipe.clouds)
+
+
+def track(source: Source, folder: Path) -> tuple[Tracked, list[str]]:
     folder.mkdir()
-    options = tracking_options(small_recipe(source.path))
-    return tracked._track(source, options, folder, InProcess(), lambda done: None)
+    options, notes = tracking_options(small_recipe(source.path)), list[str]()
+    found = tracked.track(source, options, workers=InProcess(), step=Step(folder, no_progress, notes.append))
+    return found, notes
+
+
+def all_poses(source: Source, found: Tracked, world_from_key: Floats) -> Floats:
+    return followers(source, found).expand(world_from_key)
+
+
+class Told:
+    """Steps that compute nothing: they keep what they are asked for, and answer the same to all."""
+
+    def __init__(self, answer: object) -> None:
+        self.answer, self.asked = answer, list[tuple[Any, ...]]()
+
+    def step(self, *function_and_inputs: Any, **_: Any) -> Any:
+        self.asked.append(function_and_inputs)
+        return self.answer
+
+    def note(self, message: str) -> None:
+        pass
+
+    def key(self, value: object) -> str:
+        return "key"
+
+    def remember(self, value: object, key: str) -> None:
+        pass
 
 
 def empty_depth(shape: tuple[int, int]) -> Floats32:
@@ -80,12 +119,13 @@ def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeli
 
 
 def test_every_frame_that_was_found_is_fused(run: hodge_pipeline.Run) -> None:
-    assert run.tracked is not None
-    job = hodge_pipeline.store.job.Job(small_recipe(run.folder), None, hodge_pipeline.store.progress.Nobody())  # type: ignore[arg-type]
     found = np.arange(FRAMES) != 5
-    job.tracked = replace(run.tracked, found=found)
-    frames, poses = tracked.frames_to_fuse(job, run.source, run.result)
-    assert len(frames) == FRAMES
+    keys = replace(run.key_frames, found=found)
+    scene = Scene(run.source, key_source(run.source, keys.rows), keys, run.clouds, run.rounds[0])
+    steps = Told(Path("cloud.ply"))
+    fuse_all((CloudFuser(),), scene, run.result.world_from_cam, steps)  # type: ignore[arg-type]
+    ((_, _, source, poses),) = steps.asked
+    assert len(source.frames) == FRAMES
     np.testing.assert_array_equal(np.isfinite(poses).all((1, 2)), found)
 
 
@@ -102,19 +142,22 @@ def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(sequence: Path,
     np.testing.assert_array_equal(again.result.world_from_cam, edited.result.world_from_cam)
 
 
-def test_a_source_that_is_short_enough_is_registered_whole(sequence: Path) -> None:
-    recipe = small_recipe(sequence, "key_frames.whole_up_to=64")
-    source = TumReader().open(sequence)
-    job = hodge_pipeline.store.job.Job(recipe, None, hodge_pipeline.store.progress.Nobody())  # type: ignore[arg-type]
-    assert tracked.key_frames(job, source) is source
+def test_a_source_that_is_short_enough_is_registered_whole(sequence: Path, tmp_path: Path) -> None:
+    recipe = small_recipe(sequence, "start.whole_up_to=64")
+    steps, reader = Store(tmp_path), TumReader()
+    source = remembered(reader.open(sequence), reader, steps)
+    scene = recipe.start.begin(source, recipe.clouds, steps, InProcess())
+    assert scene.key_frames.are_all and len(scene.first.world_from_cam) == len(scene.clouds) == FRAMES
+    assert scene.source.frames == scene.whole.frames
 
 
 def test_frames_follow_their_key_frames(sequence: Path, tmp_path: Path) -> None:
-    found, _ = track(TumReader().open(sequence), tmp_path / "t")
-    before = found.all_poses(found.world_from_key)
+    source = TumReader().open(sequence)
+    found, _ = track(source, tmp_path / "t")
+    before = all_poses(source, found, found.world_from_key)
     np.testing.assert_allclose(before[found.key_rows], found.world_from_key, atol=1e-12)
     change = se3.exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -0.5]))
-    np.testing.assert_allclose(found.all_poses(change @ found.world_from_key), change @ before, atol=1e-9)
+    np.testing.assert_allclose(all_poses(source, found, change @ found.world_from_key), change @ before, atol=1e-9)
     assert found.found.all()
     assert (found.anchors[found.key_rows] == np.arange(len(found.key_rows))).all()
 
@@ -136,7 +179,7 @@ def test_frames_without_depth_are_bridged_and_said(sequence: Path, tmp_path: Pat
     assert np.flatnonzero(~found.found).tolist() == list(dark)
     assert any(f"tracking was lost at {len(dark)} frames" in note for note in notes)
     assert not any("for good" in note for note in notes)
-    poses, expected = (one.all_poses(one.world_from_key) for one in (found, whole))
+    poses, expected = (all_poses(source, one, one.world_from_key) for one in (found, whole))
     seen = found.found
     first = int(np.flatnonzero(seen)[0])
     apart = se3.inverse(se3.inverse(poses[first]) @ poses) @ (se3.inverse(expected[first]) @ expected)
@@ -150,11 +193,19 @@ def test_frames_without_depth_are_bridged_and_said(sequence: Path, tmp_path: Pat
     ("edges", "apart"),
     [([[0, 1], [1, 2], [2, 3]], False), ([[0, 1], [2, 3]], True), ([[0, 1], [1, 2]], False)],  # the last: a lone frame
 )
-def test_relocalisation_is_automatic_where_odometry_left_parts(edges: list[list[int]], apart: bool) -> None:
-    graph = ViewGraph.from_edges(np.arange(4), np.array(edges), np.broadcast_to(np.eye(4), (len(edges), 4, 4)))
-    assert (
-        starting._apart(Round(Edges.measured(graph), graph.vertex_ids, np.broadcast_to(np.eye(4), (4, 4, 4)))) == apart
-    )
+def test_relocalisation_is_automatic_where_odometry_left_parts(
+    edges: list[list[int]], apart: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses, source = np.tile(np.eye(4), (4, 1, 1)), source_at([0, 1, 2, 3])
+    graph = ViewGraph.from_edges(np.arange(4), np.array(edges), poses[: len(edges)])
+    joined = Round(Edges.of([]), graph.vertex_ids, poses, name="joined")
+    monkeypatch.setattr(odometry_start, "join_parts", lambda *_: joined)
+    found = Odometry(poses, Edges.measured(graph), ())
+    for relocalise, expected in (("auto", apart), (True, True), (False, False)):
+        scene = OdometryStart(relocalise=relocalise).joined(  # type: ignore[arg-type]
+            source, CloudSet.from_clouds([]), found, KeyFrames.all_of(source, poses), Told(None), InProcess()
+        )  # type: ignore[arg-type]
+        assert (scene.first is joined) == expected
 
 
 def source_at(stamps_s: list[float]) -> Source:
@@ -164,13 +215,13 @@ def source_at(stamps_s: list[float]) -> Source:
 def test_parts_that_nothing_joins_stay_where_they_are_guessed_to_be_unless_over_a_hole() -> None:
     edges, poses = np.array([[0, 1], [2, 3]]), np.broadcast_to(np.eye(4), (4, 4, 4))
     graph = ViewGraph.from_edges(np.arange(4), edges, poses[:2])
-    known = Round(Edges.measured(graph), graph.vertex_ids, poses)
-    apart = Start(poses, graph, np.array([0, 0, 1, 1]), ())
-    joined = Start(poses, graph, np.zeros(4, np.int64), ())
+    known = Edges.measured(graph)
+    apart = Start(poses, known, np.array([0, 0, 1, 1]), ())
+    joined = Start(poses, known, np.zeros(4, np.int64), ())
     steady, hole = source_at([0, 1, 2, 3]), source_at([0, 1, 2, 30])
-    assert starting._stays(steady, known, apart)
-    assert not starting._stays(steady, known, joined)
-    assert not starting._stays(hole, known, apart)
+    assert _stays(steady, known, apart)
+    assert not _stays(steady, known, joined)
+    assert not _stays(hole, known, apart)
 
 
 def test_a_killed_tracking_keeps_its_blocks(
@@ -190,13 +241,13 @@ def test_a_killed_tracking_keeps_its_blocks(
     again = hodge_pipeline.run(small_recipe(sequence), tmp_path / "run")
     assert written == [0, 1]
     np.testing.assert_array_equal(again.result.world_from_cam, run.result.world_from_cam)
-    assert not (again.folder / "stages" / "clouds" / "blocks").exists()
+    assert not (again.folder / "stages" / "track-1" / "blocks").exists()
 
 
 def test_clouds_are_joined_without_the_border_twice(sequence: Path, tmp_path: Path) -> None:
     source = TumReader().open(sequence)
     found, _ = track(source, tmp_path / "t")
-    clouds = CloudSet.open(tmp_path / "t")
+    clouds = found.clouds
     assert len(clouds) == len(found.key_rows) == len(set(found.key_rows.tolist()))
     options = tracking_options(small_recipe(sequence))
     (first, *_) = frame_blocks(np.arange(FRAMES), tuple(source.frames), tracked.stamps_of(source))
@@ -209,7 +260,7 @@ def test_the_same_command_again_computes_nothing(
 ) -> None:
     folder = tmp_path / "again"
     shutil.copytree(run.folder, folder)
-    monkeypatch.setattr(tracked, "_track", None)
+    monkeypatch.setattr(tracked, "_track_missing", None)
     again = hodge_pipeline.run(small_recipe(sequence), folder)
     np.testing.assert_array_equal(again.result.world_from_cam, run.result.world_from_cam)
     stages = [stage["name"] for stage in json.loads((folder / "report.json").read_text())["stages"]]

@@ -23,7 +23,7 @@ from hodge_pipeline.start.unordered.hypotheses import allowed_hue_conflict, allo
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
-from hodge_pipeline.start.unordered.start import Scene, Start, find_start
+from hodge_pipeline.start.unordered.start import Frames, Start, find_start
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
 from hodge_pipeline.types import Camera, CloudSet, Floats, Frame, PointCloud, ViewGraph
 from test_global_registration import furnished_corner
@@ -43,7 +43,7 @@ def started(folder: Path, frames: list[Frame]) -> Start:
     clouds = folder / "clouds"
     clouds.mkdir()
     CloudSet.from_clouds([make_cloud(frame, OPTIONS)[0] for frame in frames]).save(clouds)
-    scene = Scene(frames, clouds, np.array([frame.frame_id for frame in frames]))
+    scene = Frames(frames, clouds, np.array([frame.frame_id for frame in frames]))
     with LocalExecutor(workers=0).open() as workers:
         return find_start(scene, GlobalStart(use="geometry"), folder / "scratch", workers, no_progress)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hodge_pipeline.cli import run as running
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.refine.given_poses import recipe_for
+from hodge_pipeline.start.match_poses import recipe_for
 
 
 def refine(
@@ -28,6 +28,7 @@ def refine(
     """Run the recipe and print what came out; `CheckError`, exit code 3, where the poses given are kept as better."""
     if not poses.exists():
         raise SourceError(f"{poses}: no such file or folder: give the poses to refine")
-    ours = [f"given.path={json.dumps(str(poses))}", f"given.match={match}", f"guard.force={str(force).lower()}"]
+    start = ["start.stage=given", f"start.path={json.dumps(str(poses))}", f"start.match={match}"]
+    ours = [*start, f"guard.force={str(force).lower()}"]
     chosen = recipe or recipe_for(frames)
     running.run(chosen, frames, out, [*ours, *overrides], overwrite=overwrite, quiet=quiet, as_json=as_json, dask=dask)

@@ -42,6 +42,7 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
         store = Store(folder / PARTS, watcher)
         source = _with_images(run, recipe, store)
         with Recording(store, folder, changed, source) as recording:
+            recording.begin(source, run.clouds, run.rounds[0])
             _record(run, recording)
     return folder / FILE, run.ending is not None
 
@@ -58,13 +59,12 @@ def _with_images(run: Run, recipe: Recipe, store: Store) -> Source:
                 store.note(f"{opened.path}: holds other frames by now: recorded without images")
         except (HodgeError, OSError) as error:
             store.note(f"recorded without images: {error}")
-    keys = source if run.key_frames.are_all else key_source(source, run.key_frames.rows)
-    store.remember(keys, store.key([store.key(source), run.key_frames.rows]))
+    keys = key_source(source, run.key_frames.rows)
+    store.remember(keys, store.key([source, run.key_frames.rows]))
     return keys
 
 
 def _record(run: Run, recording: Recording) -> None:
-    recording.begin(run.clouds, run.rounds[0])
     for number, one in enumerate(run.rounds[1:], start=1):
         recording.round(number, one)
     if (run.result.edges.verdict != "").any():

@@ -22,9 +22,11 @@ from hodge_pipeline.recording.options import RecordingOptions
 from hodge_pipeline.recording.recorder import APPLICATION, Recorder
 from hodge_pipeline.scene import Round, has_truth, pose_sets, true_poses
 from hodge_pipeline.stages import Step, Steps
+from hodge_pipeline.start.clouds import clouds as clouds_step
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.log import log
-from hodge_pipeline.store.workspace import identity_of
+from hodge_pipeline.store.store import stored
+from hodge_pipeline.store.workspace import RUN, identity_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
 
 FILE = "recording.rrd"
@@ -37,8 +39,8 @@ class Recording:
     """The recording of a run in progress: a context that ends with `recording.rrd` in the run folder.
 
     Each method records one part, as a step of its own: a resumed run records only what it computes again. Where the run
-    is stopped or fails, what was recorded so far is merged and the error goes on. With the level `off` nothing is
-    written.
+    is stopped or fails, what was recorded so far is merged and the error goes on; before `begin` that is the whole
+    `source`. With the level `off` nothing is written.
     """
 
     def __init__(self, steps: Steps, folder: Path, recipe: Recipe, source: Source, live: str | None = None) -> None:
@@ -50,8 +52,6 @@ class Recording:
         self._live = None if live is None else Live(live, APPLICATION, self._identity)
 
     def __enter__(self) -> Recording:
-        source = self._source
-        self._part("frames", (source,), lambda to: to.frames(source.name, source.frames, source.notes))
         return self
 
     def __exit__(
@@ -66,12 +66,18 @@ class Recording:
         if self._live is not None:
             self._live.close()
 
-    def begin(self, clouds: CloudSet, first: Round) -> None:
-        """The frames' clouds, and the poses that the run starts from."""
-        self._clouds, self._rounds, frames = clouds, [first], self._source.frames
-        self._part("clouds", (self._source, clouds), lambda to: to.clouds(frames, clouds))
+    def begin(self, source: Source, clouds: CloudSet, first: Round) -> None:
+        """The frames that are registered, their clouds, and the poses that the run starts from."""
+        self._seen(source, clouds)
+        self._rounds, frames = [first], source.frames
         name, poses = first.name, first.world_from_cam
         self._part("first_poses", (self._source, name, poses), lambda to: to.poses(name, poses, frames))
+
+    def _seen(self, source: Source, clouds: CloudSet | None) -> None:
+        self._source, self._clouds, frames = source, clouds, source.frames
+        self._part("frames", (source,), lambda to: to.frames(source.name, frames, source.notes))
+        if clouds is not None:
+            self._part("clouds", (source, clouds), lambda to: to.clouds(frames, clouds))
 
     def _registration(self, number: int, this: Round) -> None:
         """What registration found in outer round `number`, from the poses before it."""
@@ -142,6 +148,10 @@ class Recording:
     def _rescue(self) -> None:
         """Merge what there is; an error of this is logged, so that the one that stopped the run is seen."""
         try:
+            if not self._parts:
+                whole = len(self._source.frames)
+                made = [found for found in stored(self._folder / RUN, clouds_step) if len(found) == whole]
+                self._seen(self._source, made[-1] if made else None)
             with tempfile.TemporaryDirectory(dir=self._folder, prefix=".recording-") as scratch:
                 self._merge(Path(scratch), self._folder / FILE)
         except Exception as error:

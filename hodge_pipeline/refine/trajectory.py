@@ -14,11 +14,11 @@ import numpy as np
 from hodge_pipeline import pipeline
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.refine.given_poses import RECIPE, recipe_for
 from hodge_pipeline.refine.guard import Decision
 from hodge_pipeline.refine.open3d_objects import poses_of, with_poses
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.start.match_poses import RECIPE, recipe_for
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source
 
@@ -88,7 +88,8 @@ def refine_trajectory(
     given = poses_of(poses) if open3d else np.asarray(poses, float)
     source = _source(frames, given)
     chosen = recipe or (recipe_for(Path(frames)) if isinstance(frames, (str, Path)) else RECIPE)
-    loaded = load_recipe(chosen, ["given.poses=frames", f"guard.force={str(force).lower()}", *overrides])
+    ours = ["start.stage=given", "start.poses=frames", f"guard.force={str(force).lower()}"]
+    loaded = load_recipe(chosen, [*ours, *overrides])
     with tempfile.TemporaryDirectory(prefix="hodge-refine-") as scratch:
         folder = Path(scratch) / "run" if out is None else Path(out)
         run = pipeline.run(loaded, folder, source=source, watcher=watcher, dask=dask)

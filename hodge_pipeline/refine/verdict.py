@@ -44,11 +44,13 @@ HEADLINES = {
 
 @dataclass(frozen=True)
 class Refined:
-    """What a refinement came to: the decision, poses (N, 4, 4) of all frames, and the written file of poses."""
+    """What a refinement came to: the decision, poses (N, 4, 4) of all frames, and the name, in the run folder, of the
+    written file of poses, or of the folder; empty where nothing is written.
+    """
 
     decision: Decision
     world_from_cam: Floats
-    file: Path | None
+    file: str
 
 
 def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
@@ -61,7 +63,7 @@ def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
     work.steps.note(decision.reason)
     poses = key_frames.first if decision.keeps_input else key_frames.expand(last.world_from_cam)
     file = None if decision.outcome == "nothing" else _write(work, folder, decision, last)
-    return Refined(decision, poses, file)
+    return Refined(decision, poses, "" if file is None else file.name)
 
 
 def summary(decision: Decision) -> RefinementSummary:

@@ -100,7 +100,9 @@ class GivenStart:
             key_of_frame=np.clip(np.searchsorted(rows, np.arange(count), side="right") - 1, 0, None),
         )
         keys = replace(key_source(whole, rows), graph=None)
-        steps.remember(keys, steps.key([steps.key(source), rows, poses]))
+        steps.remember(keys, steps.key([source, rows, poses]))
+        if whole is not source:
+            steps.remember(whole, steps.key([source, poses]))
         made = make_clouds(keys, clouds, steps, workers)
         first = Round(Edges.of([]), vertex_ids(keys), poses[rows], name=START)
         return Scene(whole, keys, key_frames, made, first, is_given=True, given=file)

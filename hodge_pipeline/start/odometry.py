@@ -60,6 +60,7 @@ class OdometryStart(OdometryOptions):
     ) -> Scene:
         """The scene of the key frames of `source`, its parts joined as `relocalise` says."""
         keys = key_source(source, key_frames.rows)
+        steps.remember(keys, steps.key([source, key_frames.rows]))
         part = connected_components(found.steps.pairs, len(found.world_from_cam))
         drift, first = (
             Drift(found.world_from_cam, part, self.max_drift),

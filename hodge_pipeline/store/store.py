@@ -229,4 +229,11 @@ def _text(path: Path) -> str:
 
 
 def _hash(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:32]
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=_number).encode()).hexdigest()[:32]
+
+
+def _number(value: Any) -> Any:
+    """A numpy scalar as Python's; any other object would have another key in every process."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a {type(value).__name__} has no key: let the store remember what holds it")
