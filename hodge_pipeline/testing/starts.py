@@ -82,7 +82,7 @@ def _repeats_itself(start: Start) -> None:
     for _ in range(2):
         with tempfile.TemporaryDirectory() as folder:
             poses.append(_begun(start, room().source, Path(folder)).first.world_from_cam)
-    assert np.array_equal(*poses), "the same source gives other bits when started again"
+    assert np.array_equal(poses[0], poses[1]), "the same source gives other bits when started again"
 
 
 def _computes_once(start: Start) -> None:
