@@ -145,7 +145,7 @@ def robust_rows(count: int, share: float) -> Iterator[list[str]]:
     """A cylinder with wrong edges: this solver, which trusts no edge, and GTSAM's GNC, which is told whom to trust."""
     graph, wrong = with_wrong_edges(synthetic("cylinder", count), share)
     own_s, solution = timed(lambda: solve_robust(graph), 1)
-    yield robust_row("hodge, robust", graph, wrong, solution.weights > 0.5, own_s)
+    yield robust_row("robust", graph, wrong, solution.weights > 0.5, own_s)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cylinder.g2o"
         write_g2o(path, graph)

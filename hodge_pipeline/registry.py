@@ -77,6 +77,7 @@ def origin(kind: str, name: str) -> str:
 
 FORMER_NAMES = {
     "global": "unordered",
+    "hodge": "maximum_likelihood",
     "given": "start",
     "global_start": "start",
     "key_frames": "start",

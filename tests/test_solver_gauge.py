@@ -9,7 +9,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.editing import GraphEditor
-from hodge_pipeline.solvers.maximum_likelihood import HodgeSolver, solve
+from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver, solve
 from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.solvers.robust import RobustSolver
@@ -61,7 +61,7 @@ def test_limits_give_the_best_so_far_and_say_so():
 
 def test_the_stage_keeps_its_protocol_and_history():
     graph, truth = ladder(0.1)
-    stage = HodgeSolver()
+    stage = MaximumLikelihoodSolver()
     assert isinstance(stage, ConsistencySolver)
     solution = stage.solve(graph, truth)
     np.testing.assert_allclose(solution.world_from_cam[0], truth[0], atol=1e-12)
@@ -116,7 +116,7 @@ def stretched() -> tuple[ViewGraph, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    "solver", [HodgeSolver(), PoissonSolver(robust="none"), PaperSolver(), RobustSolver(threshold=1e3)]
+    "solver", [MaximumLikelihoodSolver(), PoissonSolver(robust="none"), PaperSolver(), RobustSolver(threshold=1e3)]
 )
 def test_between_fixed_ends_the_disagreement_is_shared(solver):
     graph, start = stretched()
@@ -148,7 +148,9 @@ def test_a_component_without_a_fixed_vertex_keeps_its_first_one(solver):
 def test_solvers_without_a_term_for_priors_refuse_them(solver):
     graph, truth = ladder(0.1)
     priors = Priors(np.array([0]), truth[:1], np.eye(6)[None])
-    with pytest.raises(GraphError, match=r"no term for priors of single poses \(1 given\): take solver hodge"):
+    with pytest.raises(
+        GraphError, match=r"no term for priors of single poses \(1 given\): take solver maximum_likelihood"
+    ):
         solver.solve(dataclasses.replace(graph, priors=priors), truth)
     none = Priors(np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
     solver.solve(dataclasses.replace(graph, priors=none), truth)

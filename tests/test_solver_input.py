@@ -13,7 +13,7 @@ from hodge_pipeline.diagnosis.solver import DiagnosedSolver
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.editing import GraphEditor
-from hodge_pipeline.solvers.maximum_likelihood import HodgeSolver, solve
+from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver, solve
 from hodge_pipeline.solvers.robust import RobustSolver, solve_robust
 from hodge_pipeline.types import Priors, ViewGraph
 from solver_graphs import ladder
@@ -76,7 +76,7 @@ def test_no_edges_and_one_pose():
     for count in (1, 3):
         graph = ViewGraph.from_edges(np.arange(count), np.zeros((0, 2)), np.zeros((0, 4, 4)))
         start = np.tile(se3.exp(np.arange(6.0)), (count, 1, 1))
-        solution = HodgeSolver().solve(graph, start)
+        solution = MaximumLikelihoodSolver().solve(graph, start)
         np.testing.assert_allclose(solution.world_from_cam, start, atol=1e-12)
         assert solution.metrics["objective"] == 0
 
@@ -92,7 +92,9 @@ def without_usable_edges(what: str) -> ViewGraph:
 
 
 @pytest.mark.parametrize("what", ["one vertex", "isolated vertices", "self-loops", "zero information"])
-@pytest.mark.parametrize("solver", [HodgeSolver(), RobustSolver(), RobustSolver("geman_mcclure"), DiagnosedSolver()])
+@pytest.mark.parametrize(
+    "solver", [MaximumLikelihoodSolver(), RobustSolver(), RobustSolver("geman_mcclure"), DiagnosedSolver()]
+)
 def test_without_usable_edges_the_poses_are_as_given_and_a_note_says_so(solver, what):
     graph = without_usable_edges(what)
     start = se3.exp(np.random.default_rng(1).normal(size=(graph.vertex_count, 6)))

@@ -14,7 +14,7 @@ from hodge_pipeline.testing import SOLVER_PROPERTIES, check_solver
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 LACKS = {
-    "hodge": {"wrong copy of an edge"},  # least squares: every edge counts
+    "maximum_likelihood": {"wrong copy of an edge"},  # least squares: every edge counts
     "paper": {"wrong copy of an edge", "zero information"},  # every edge counts, and each as much as the others
     "poisson": {"zero information", "units x 1000"},  # unit weights by default; a lever arm of 1 m
     "robust": {"reversed edges"},  # its gate's weight of a rotation is the block's, which a lever arm makes larger
@@ -29,16 +29,16 @@ def test_every_solver_keeps_the_contract(name: str, what: str) -> None:
 
 @dataclass(frozen=True)
 class Spoiled:
-    """The solver `hodge` with something spoiled: what it is given, or what it gives."""
+    """The solver `maximum_likelihood` with something spoiled: what it is given, or what it gives."""
 
     before: Callable[[ViewGraph, Floats], tuple[ViewGraph, Floats]] = lambda graph, start: (graph, start)
     after: Callable[[Solution, Floats], Solution] = lambda solution, start: solution
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
-        return self.after(HODGE().solve(*self.before(graph, world_from_cam)), world_from_cam)
+        return self.after(PLAIN().solve(*self.before(graph, world_from_cam)), world_from_cam)
 
 
-HODGE = registry.load("solvers", "hodge")
+PLAIN = registry.load("solvers", "maximum_likelihood")
 
 
 def in_place(graph: ViewGraph, start: Floats) -> tuple[ViewGraph, Floats]:
@@ -104,7 +104,7 @@ def without_notes(solution: Solution, start: Floats) -> Solution:
         (Spoiled(after=without_notes), "no edges", "no note says that nothing was solved"),
         (Spoiled(after=without_notes), "zero information", "no note tells of edges without information"),
         (Spoiled(after=without_notes), "disconnected graph", "no note tells of the pieces"),
-        (HODGE(), "wrong copy of an edge", "is believed"),
+        (PLAIN(), "wrong copy of an edge", "is believed"),
     ],
 )
 def test_a_solver_that_breaks_the_contract_is_noticed(solver: object, what: str, why: str) -> None:
@@ -122,6 +122,6 @@ def test_an_error_that_is_no_assertion_is_named() -> None:
 
 def test_what_is_declared_as_lacking_must_be_lacking() -> None:
     with pytest.raises(AssertionError, match="priors: declared as lacking, but it holds"):
-        check_solver(HODGE(), lacks=["priors"], properties=["priors"])
+        check_solver(PLAIN(), lacks=["priors"], properties=["priors"])
     with pytest.raises(AssertionError, match=r"no such property: \['speed'\]"):
-        check_solver(HODGE(), lacks=["speed"])
+        check_solver(PLAIN(), lacks=["speed"])

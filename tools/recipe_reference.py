@@ -20,7 +20,7 @@ HEAD = """# Recipes
 Written by `python tools/recipe_reference.py` from the code. A recipe is YAML, and data: it never executes anything.
 
 - `extends: NAME` takes everything from another recipe and changes what follows.
-- A stage is its name (`solver: hodge`) or `{stage: hodge, option: value}`; an option not given has its default.
+- A stage is its name (`solver: robust`) or `{stage: robust, option: value}`; an option not given has its default.
 - `--set a.b=c` changes one option from the command line, `--source PATH` the input.
 - A Dask cluster is named on the command line, never by a recipe: `--dask tcp://HOST:8786` ([security.md](security.md)).
 - `hodge recipes NAME` prints a recipe with every default; `hodge recipes --schema` is a JSON schema for an editor.

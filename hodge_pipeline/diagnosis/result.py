@@ -57,6 +57,11 @@ class Diagnosis:
     world_from_cam: Floats
     notes: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        verdicts = (CONSISTENT, SUSPECT, WRONG, UNTESTABLE)
+        counts = ", ".join(f"{int((self.verdict == name).sum())} {name}" for name in verdicts)
+        return f"Diagnosis({len(self.verdict)} edges: {counts})"
+
     def put_into(self, edges: Edges) -> Edges:
         """The table with the verdict on each edge of its graph, and why."""
         return edges.put(

@@ -82,6 +82,19 @@ def bind_stage(kind: str, value: Any, where: Where, keys: Keys, seed: int | None
     return bind(cls, {key: item for key, item in options.items() if key != "stage"}, where, keys, seed=seed)
 
 
+def stage_of(kind: str, given: Any, options: Mapping[str, Any], where: str) -> Any:
+    """The stage that a caller in Python gives, by name with options or as it is; errors (`RecipeError`) begin with
+    `where`.
+    """
+    if isinstance(given, str):
+        return bind_stage(kind, {**options, "stage": given}, lambda keys: where, (kind,))
+    if not isinstance(given, registry.KINDS[kind].protocol):
+        raise RecipeError(f"{where}: {given!r} is no stage of kind '{kind}': give one, or a name of those registered")
+    if options:
+        raise RecipeError(f"{where}: options ({', '.join(options)}) go with a name: set them on the stage itself")
+    return given
+
+
 def unbind(value: Any) -> Any:
     """Options as plain data that `bind` reads back: every default written out, a stage as `{stage: name, …}`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -65,6 +65,12 @@ class ColouredIcp(PointToPlaneIcp):
     geometric_share: float = Field(
         default=0.968, ge=0, le=1, description="Weight of geometry against colour; open3d's and the authors' own value."
     )
+    min_distance_m: float = Field(
+        default=0.1,
+        gt=0,
+        description="Metres: levels with colour match at least so far apart, since open3d fits the gradients of colour "
+        "within twice that; at 5 cm some points have too few neighbours, and their gradients threw pairs off by 0.4 m.",
+    )
 
     def _align(self, target: Open3dCloud, source: Open3dCloud, distance_m: float, guess: Floats) -> Any:
         if not (target.has_colours and source.has_colours):
@@ -72,7 +78,7 @@ class ColouredIcp(PointToPlaneIcp):
         return o3d_registration.registration_colored_icp(
             source.geometry,
             target.geometry,
-            distance_m,
+            max(distance_m, self.min_distance_m),
             guess,
             o3d_registration.TransformationEstimationForColoredICP(lambda_geometric=self.geometric_share),
             o3d_registration.ICPConvergenceCriteria(max_iteration=self.max_iterations),

@@ -142,7 +142,7 @@ def _certify(setup: Setup, point: Point) -> Certificate:
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))
-class HodgeSolver:
+class MaximumLikelihoodSolver:
     """Maximum-likelihood poses: the default solver."""
 
     objective: ObjectiveName = Field(

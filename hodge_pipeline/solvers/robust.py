@@ -238,7 +238,9 @@ class RobustSolver:
     threshold: float | None = Field(
         None, gt=0, description="χ² above which an edge is wrong; the default is the 99 % quantile of right edges"
     )
-    objective: ObjectiveName = Field("full", description="what the edges that are kept are solved with, as in hodge")
+    objective: ObjectiveName = Field(
+        "full", description="what the edges that are kept are solved with, as in `maximum_likelihood`"
+    )
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """The poses; the first vertex of each component of all edges keeps its start pose."""

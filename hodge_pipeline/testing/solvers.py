@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.testing.stage import check_stage
+from hodge_pipeline.testing.stage import check_kind, check_properties
 from hodge_pipeline.types import Floats, Priors, Solution, ViewGraph
 
 SIGMA, START_OFF = 1e-3, 0.02
@@ -30,17 +30,7 @@ def check_solver(
     priors may be refused by a `GraphError` that names them, but not ignored. Raises `AssertionError` that says which
     property does not hold, and why.
     """
-    unknown = {*lacks, *(properties or ())} - {*SOLVER_PROPERTIES}
-    assert not unknown, f"no such property: {sorted(unknown)}; there are {list(SOLVER_PROPERTIES)}"
-    for name in SOLVER_PROPERTIES if properties is None else properties:
-        try:
-            SOLVER_PROPERTIES[name](solver)
-        except Exception as error:
-            if name in lacks:
-                continue
-            why = str(error) if isinstance(error, AssertionError) else f"raises {type(error).__name__}: {error}"
-            raise AssertionError(f"{name}: {why}") from error
-        assert name not in lacks, f"{name}: declared as lacking, but it holds: take it out of `lacks`"
+    check_properties(SOLVER_PROPERTIES, solver, lacks, properties)
 
 
 def _ring(noise: float = SIGMA, count: int = 12) -> tuple[ViewGraph, Floats, Floats]:
@@ -97,8 +87,7 @@ def _refuses(solver: ConsistencySolver, graph: ViewGraph, start: Floats, words: 
 
 
 def _is_a_stage(solver: ConsistencySolver) -> None:
-    assert isinstance(solver, ConsistencySolver), "it has no method `solve`"
-    check_stage(solver)
+    check_kind(solver, ConsistencySolver)
 
 
 def _gives_back_exact_poses(solver: ConsistencySolver) -> None:

@@ -134,6 +134,12 @@ class Source:
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
 
+    def __repr__(self) -> str:
+        parts = [f"{len(self.frames)} frames"]
+        parts += [] if self.trajectory is None else [f"a trajectory of {len(self.trajectory)} poses"]
+        parts += [] if self.graph is None else [repr(self.graph)]
+        return f"Source({self.name!r}: {', '.join(parts)})"
+
 
 @dataclass(frozen=True)
 class Match:
@@ -178,6 +184,13 @@ class Solution:
     stopped_by: str = ""
     certified: bool | None = None
     confirmed: bool | None = None
+
+    def __repr__(self) -> str:
+        pieces = int(self.component.max(initial=-1)) + 1
+        used = int(np.count_nonzero(self.weights))
+        return (
+            f"Solution({len(self.component)} poses in {pieces} components, {used} of {len(self.weights)} edges count)"
+        )
 
 
 @dataclass(frozen=True)
@@ -275,6 +288,9 @@ class CloudSet(Sequence[PointCloud]):
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
+
+    def __repr__(self) -> str:
+        return f"CloudSet({len(self)} clouds, {int(self.offsets[-1])} points)"
 
     def __getitem__(self, row: int) -> PointCloud:  # type: ignore[override]
         """The cloud of one frame (a view, not a copy)."""

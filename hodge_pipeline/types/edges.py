@@ -74,6 +74,9 @@ class ViewGraph:
     fixed: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     priors: Priors | None = None
 
+    def __repr__(self) -> str:
+        return f"ViewGraph({self.vertex_count} vertices, {self.edge_count} edges)"
+
     @property
     def vertex_count(self) -> int:
         """How many vertices there are, isolated ones included."""
@@ -176,6 +179,11 @@ class Edges:
 
     def __len__(self) -> int:
         return len(self.pairs)
+
+    def __repr__(self) -> str:
+        words, counts = np.unique(self.status, return_counts=True)
+        parts = [f"{count} {word}" for word, count in zip(words.tolist(), counts.tolist(), strict=True)]
+        return f"Edges({len(self)} pairs{': ' * bool(parts)}{', '.join(parts)})"
 
     @classmethod
     def of(cls, pairs: Ints | Sequence[Sequence[int]], proposed_by: str | Words = "") -> Edges:

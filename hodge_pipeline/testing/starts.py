@@ -1,0 +1,132 @@
+"""The contract of starts, one named property after the other."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.executors.local import InProcess
+from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.scene import Scene
+from hodge_pipeline.stages import Start
+from hodge_pipeline.store.store import Store
+from hodge_pipeline.testing.data import CLOUD_VOXEL_M, off_by, room
+from hodge_pipeline.testing.stage import check_kind, check_properties
+from hodge_pipeline.types import Source
+
+CLOUDS = CloudOptions(stride=1, voxel_m=CLOUD_VOXEL_M)
+NEAR = 0.1, 0.1
+"""Radians and metres that first poses may be off at the end of half a metre's way."""
+
+
+def check_start(start: Start, *, lacks: Collection[str] = (), properties: Collection[str] | None = None) -> None:
+    """Check a start's properties, those of `START_PROPERTIES` unless some are named, on twelve frames of a room.
+
+    The frames have poses of their own, for a start that takes them. A property that a start does not have by its
+    nature is declared in `lacks`, and must then fail. Raises `AssertionError` that says which property does not hold,
+    and why.
+    """
+    check_properties(START_PROPERTIES, start, lacks, properties)
+
+
+def _begun(start: Start, source: Source, folder: Path) -> Scene:
+    """The scene, after asserting that its parts fit each other."""
+    store = Store(folder)
+    store.remember(source, "the source of the check")
+    scene = start.begin(source, CLOUDS, store, InProcess())
+    assert isinstance(scene, Scene), f"begin gives a {type(scene).__name__}"
+    keys, count = scene.key_frames, len(source.frames)
+    names = [frame.frame_id for frame in scene.whole.frames]
+    assert names == [frame.frame_id for frame in source.frames], "`whole` has other frames than the source, or an order"
+    assert len(keys.rows) and (np.diff(keys.rows) > 0).all(), "the rows of the key frames do not ascend"
+    chosen = [source.frames[row].frame_id for row in keys.rows]
+    assert [frame.frame_id for frame in scene.source.frames] == chosen, "`source` is not that of the key frames"
+    assert len(scene.clouds) == len(chosen), f"{len(scene.clouds)} clouds of {len(chosen)} key frames"
+    first = scene.first
+    assert first.vertex_ids.tolist() == chosen, "the first round's vertices are not the key frames"
+    assert first.world_from_cam.shape == (len(chosen), 4, 4), f"first poses are {first.world_from_cam.shape}"
+    assert se3.is_motion(first.world_from_cam, 1e-6).all(), "a first pose is not a rigid motion"
+    pairs = first.edges.pairs
+    assert not len(pairs) or pairs.max() < len(chosen), "an edge of the first round has no key frame"
+    every = keys.expand(first.world_from_cam)
+    assert every.shape == (count, 4, 4) and se3.is_motion(every, 1e-6).all(), "not every frame follows the key frames"
+    return scene
+
+
+def _is_a_stage(start: Start) -> None:
+    check_kind(start, Start)
+
+
+def _finds_poses(start: Start) -> None:
+    scene = room()
+    with tempfile.TemporaryDirectory() as folder:
+        begun = _begun(start, scene.source, Path(folder))
+        poses = begun.key_frames.expand(begun.first.world_from_cam)
+    truth = scene.world_from_cam
+    for row in range(1, len(truth)):
+        angle, distance_m = off_by(se3.inverse(poses[0]) @ poses[row], se3.inverse(truth[0]) @ truth[row])
+        off = f"frame {row}: off by {angle:.2g} rad and {distance_m:.2g} m from the first"
+        assert angle <= NEAR[0] and distance_m <= NEAR[1], off
+
+
+def _repeats_itself(start: Start) -> None:
+    poses = []
+    for _ in range(2):
+        with tempfile.TemporaryDirectory() as folder:
+            poses.append(_begun(start, room().source, Path(folder)).first.world_from_cam)
+    assert np.array_equal(poses[0], poses[1]), "the same source gives other bits when started again"
+
+
+def _computes_once(start: Start) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        first = _begun(start, room().source, folder)
+        before = _steps(folder)
+        assert before, "it computes no step: a run that is killed begins anew"
+        again = _begun(start, room().source, folder)
+        assert _steps(folder) == before, "a step is computed again when the run goes on: its inputs have other keys"
+    assert np.array_equal(first.first.world_from_cam, again.first.world_from_cam), "read back, the poses are others"
+
+
+def _steps(folder: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in sorted(folder.glob("*/step.json"))}
+
+
+def _reports_frames_without_points(start: Start) -> None:
+    source = room().source
+    dark = tuple(replace(frame, read_depth=_dark) if row == 5 else frame for row, frame in enumerate(source.frames))
+    with tempfile.TemporaryDirectory() as folder:
+        _begun(start, replace(source, frames=dark), Path(folder))
+
+
+def _dark() -> Any:
+    camera = room().frames[0].camera
+    assert camera is not None
+    return np.zeros((camera.height, camera.width), np.float32)
+
+
+def _refuses_a_source_without_points(start: Start) -> None:
+    source = room().source
+    dark = replace(source, frames=tuple(replace(frame, read_depth=_dark) for frame in source.frames))
+    with tempfile.TemporaryDirectory() as folder, suppress(SourceError):
+        _begun(start, dark, Path(folder))
+        raise AssertionError("a source without a point must raise SourceError")
+
+
+START_PROPERTIES: dict[str, Callable[[Start], None]] = {
+    "is a stage": _is_a_stage,
+    "first poses": _finds_poses,
+    "the same bits again": _repeats_itself,
+    "computed once": _computes_once,
+    "a frame without points": _reports_frames_without_points,
+    "no points at all": _refuses_a_source_without_points,
+}
+"""What a start is checked for, by name."""
