@@ -40,13 +40,11 @@ if TYPE_CHECKING:
     from hodge_pipeline.pipeline import run, solve_again
     from hodge_pipeline.recipe.schema import Recipe, load_recipe
     from hodge_pipeline.refine.open3d_objects import solve_pose_graph
-    from hodge_pipeline.registration.in_memory import register, register_clouds
     from hodge_pipeline.run_folder import Run
     from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
     from hodge_pipeline.solvers.editing import GraphEditor
     from hodge_pipeline.solvers.maximum_likelihood import solve
     from hodge_pipeline.solvers.robust import solve_robust
-    from hodge_pipeline.sources.by_name import open_source
     from hodge_pipeline.types import (
         Camera,
         Edges,
@@ -60,6 +58,8 @@ if TYPE_CHECKING:
         ViewGraph,
     )
     from hodge_pipeline.uses.colmap import refine_colmap
+    from hodge_pipeline.uses.registration import register, register_clouds
+    from hodge_pipeline.uses.sources import open_source
     from hodge_pipeline.uses.trajectory import frames_from_images, refine_trajectory
 
 __all__ = [
@@ -78,13 +78,13 @@ _NAMES_IN = {
     "uses.colmap": ("refine_colmap",),
     "refine.open3d_objects": ("solve_pose_graph",),
     "uses.trajectory": ("frames_from_images", "refine_trajectory"),
-    "registration.in_memory": ("register", "register_clouds"),
+    "uses.registration": ("register", "register_clouds"),
     "run_folder": ("Run",),
     "solvers.covariance": ("marginal_covariances", "relative_covariances"),
     "solvers.editing": ("GraphEditor",),
     "solvers.maximum_likelihood": ("solve",),
     "solvers.robust": ("solve_robust",),
-    "sources.by_name": ("open_source",),
+    "uses.sources": ("open_source",),
     "types": (
         "Camera", "Edges", "Frame", "PointCloud", "Priors", "Registration", "Solution", "Source", "Trajectory",
         "ViewGraph",
