@@ -87,10 +87,10 @@ def stopped(run: Run, out: Path, signal_name: str) -> subprocess.CompletedProces
         from hodge_pipeline.cli.main import main
         from hodge_pipeline.rounds.one_round import Work
         solve = Work.solve
-        def solve_and_stop(work, number, *rest):
-            if number == 2:
+        def solve_and_stop(work, registered, *rest):
+            if registered.name == "round 2":
                 os.kill(os.getpid(), signal.{signal_name})
-            return solve(work, number, *rest)
+            return solve(work, registered, *rest)
         Work.solve = solve_and_stop
         sys.argv[1:] = ["run", "demo", "--source", {str(run.source.path)!r}, "--out", {str(out)!r}, "--quiet"]
         for change in {[*SMALL, *NORMAL]!r}:
