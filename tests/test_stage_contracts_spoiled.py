@@ -99,13 +99,21 @@ class Builder:
 # Registrars ---------------------------------------------------------------------------------------------------------
 
 
+def as_it_is(result: Any, *given: Any) -> Any:
+    return result
+
+
+def what_is_given(*given: Any) -> Any:
+    return given
+
+
 @dataclass(frozen=True)
 class Spoiled:
     """A stage with something spoiled: what one of its methods is given, or what it gives."""
 
     inner: Any
-    after: Callable[..., Any] = lambda result, *given: result
-    before: Callable[..., Any] = lambda *given: given
+    after: Callable[..., Any] = as_it_is
+    before: Callable[..., Any] = what_is_given
 
     def prepare(self, cloud: PointCloud) -> Any:
         return self.inner.prepare(cloud)
