@@ -127,7 +127,13 @@ def tiny(workplace: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "language"), [("far_loops.py", "python"), ("pyproject.toml", "toml"), ("far_loops.yaml", "yaml")]
+    ("name", "language"),
+    [
+        ("far_loops.py", "python"),
+        ("pyproject.toml", "toml"),
+        ("far_loops.yaml", "yaml"),
+        ("test_far_loops.py", "python"),
+    ],
 )
 def test_the_page_shows_the_example_as_it_is(name: str, language: str) -> None:
     assert (EXAMPLE / name).read_text("utf-8") in blocks(DOCS / "writing-a-plugin.md", language)

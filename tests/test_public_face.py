@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -138,6 +139,29 @@ def test_open_source(tmp_path: Path) -> None:
     for reader in (None, "tum_poses"):
         with pytest.raises(RecipeError, match="readers.evry: unknown option"):
             hodge_pipeline.open_source(path, reader, evry=2)
+
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def test_the_clouds_of_the_readme(capsys: pytest.CaptureFixture[str]) -> None:
+    blocks = README.read_text("utf-8").split("```python\n")[1:]
+    code = next(block.partition("```")[0] for block in blocks if "register_clouds" in block)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    steps = names["solution"].world_from_cam[:, :3, 3] - names["solution"].world_from_cam[0, :3, 3]
+    np.testing.assert_allclose(steps, [[0, 0, 0], [0.05, 0, 0.02], [0.1, 0, 0.04]], atol=2e-3)
+    assert "Edges(3 pairs: 3 used)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/quick-start.md"])
+def test_pages_use_public_names_alone(page: str) -> None:
+    text = (README.parent / page).read_text("utf-8")
+    named = set(re.findall(r"hodge_pipeline\.(\w+)(?!\w*/)", text)) | set(
+        re.findall(r"from hodge_pipeline import (\w+)", text)
+    )
+    assert named and named <= set(hodge_pipeline.__all__), named - set(hodge_pipeline.__all__)
+    assert not re.search(r"(from|import) hodge_pipeline\.", text)
 
 
 def frames() -> tuple[Frame, ...]:

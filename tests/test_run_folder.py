@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
-from hodge_adapters.poses_text import read_tum, write_tum
+from hodge_adapters.poses_text import parse_tum, write_tum
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
@@ -105,7 +105,7 @@ def poses_of(run: Run) -> Path:
 
 
 def test_poses_are_of_all_frames_wherever_they_come_from(run: Run, sequence: Path, tmp_path: Path) -> None:
-    np.testing.assert_allclose(read_tum(poses_of(run)).world_from_cam, run.poses, atol=1e-9)
+    np.testing.assert_allclose(parse_tum(poses_of(run)).trajectory.world_from_cam, run.poses, atol=1e-9)
     quick = [*SMALL, "fusion=[]", "recording.level=off", "evaluation.tables=false"]
     frames = TumReader().open(sequence).frames
     true = np.array([frame.world_from_cam for frame in frames])
@@ -119,7 +119,7 @@ def test_poses_are_of_all_frames_wherever_they_come_from(run: Run, sequence: Pat
             assert one.poses.shape == (FRAMES, 4, 4) and len(one.source.frames) == FRAMES
             np.testing.assert_array_equal(one.poses, made.poses)
         assert made.key_frames.are_all == (name == "unordered")
-        np.testing.assert_allclose(read_tum(poses_of(made)).world_from_cam, made.poses, atol=1e-9)
+        np.testing.assert_allclose(parse_tum(poses_of(made)).trajectory.world_from_cam, made.poses, atol=1e-9)
         assert (made.refined is not None) == (name == "given")
 
 

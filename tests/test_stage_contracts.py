@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -120,3 +122,11 @@ def test_every_reader_of_models_keeps_its_contract(name: str, what: str, tmp_pat
 def test_every_kind_has_a_check() -> None:
     assert list(testing.CHECKS) == list(registry.KINDS)
     assert {*PROPERTIES, "readers", "solvers"} == {*registry.KINDS}
+
+
+@pytest.mark.parametrize("page", ["docs/examples/far_loops/test_far_loops.py", "tests/plugin_package/test_ring.py"])
+def test_the_examples_of_plugins_pass_their_own_tests(page: str) -> None:
+    path = Path(__file__).parents[1] / page
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(path)]
+    done = subprocess.run(command, cwd=path.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout

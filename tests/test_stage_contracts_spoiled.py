@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from hodge_adapters.colmap_refining import ColmapModels
-from hodge_adapters.poses_text import TumWriter, read_tum
+from hodge_adapters.poses_text import TumWriter, parse_tum
 from hodge_adapters.rewriting import TumRewriter
 from hodge_adapters.trajectory_files import TumPosesReader
 from hodge_pipeline import se3, testing
@@ -99,13 +99,21 @@ class Builder:
 # Registrars ---------------------------------------------------------------------------------------------------------
 
 
+def as_it_is(result: Any, *given: Any) -> Any:
+    return result
+
+
+def what_is_given(*given: Any) -> Any:
+    return given
+
+
 @dataclass(frozen=True)
 class Spoiled:
     """A stage with something spoiled: what one of its methods is given, or what it gives."""
 
     inner: Any
-    after: Callable[..., Any] = lambda result, *given: result
-    before: Callable[..., Any] = lambda *given: given
+    after: Callable[..., Any] = as_it_is
+    before: Callable[..., Any] = what_is_given
 
     def prepare(self, cloud: PointCloud) -> Any:
         return self.inner.prepare(cloud)
@@ -542,7 +550,7 @@ def test_a_writer_that_breaks_its_contract_is_noticed(writer: Any, what: str, wh
 def test_a_rewriter_that_breaks_its_contract_is_noticed(rewriter: Any, what: str, why: str, tmp_path: Path) -> None:
     path = tmp_path / "poses.tum"
     TumWriter().write(path, whole_source())
-    assert len(read_tum(path)) == 12
+    assert len(parse_tum(path).trajectory) == 12
     with pytest.raises(AssertionError, match=f"^{what}: .*{why}"):
         testing.check_rewriter(rewriter, path, TumPosesReader(), properties=[what])
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.stages import Registrar
 from hodge_pipeline.testing.data import nothing, off_by, room, seen_from
 from hodge_pipeline.testing.stage import check_kind, check_properties
@@ -86,19 +88,32 @@ def _starts_at_the_guess(registrar: Registrar) -> None:
 
 
 def _repeats_itself(registrar: Registrar) -> None:
-    target, source, _ = _pair()
-    one, two = (_registered(registrar, target, source, np.eye(4)) for _ in range(2))
-    assert pickle.dumps(one) == pickle.dumps(two), "the same pair gives other bits when registered again"
+    one, two, _ = _answers(registrar)
+    assert one == two, "the same pair gives other bits when registered again"
 
 
 def _keeps_nothing_of_a_pair(registrar: Registrar) -> None:
-    target, source, _ = _pair()
-    fresh = _registered(registrar, target, source, np.eye(4))
-    kept = [registrar.prepare(cloud) for cloud in (target, source, room().clouds[PAIR[1] + 1])]
+    fresh, _, kept = _answers(registrar)
+    assert kept == fresh, "prepared clouds that were registered before give other bits"
+
+
+def _answers(registrar: Registrar) -> list[bytes]:
+    """The same pair registered twice from clouds prepared anew, and from clouds that met others before.
+
+    In a worker process, where a run registers: open3d may differ by last bits in a process that loaded it otherwise.
+    """
+    clouds = [room().clouds[row] for row in (*PAIR, PAIR[1] + 1)]
+    with LocalExecutor(workers=1, retries=0).open() as workers:
+        ((_, answers),) = workers.map(partial(_answered, registrar), [clouds])
+    return answers
+
+
+def _answered(registrar: Registrar, clouds: list[PointCloud]) -> list[bytes]:
+    fresh = [_registered(registrar, clouds[0], clouds[1], np.eye(4)) for _ in range(2)]
+    kept = [registrar.prepare(cloud) for cloud in clouds]
     registrar.register(kept[2], kept[1], np.eye(4))
     registrar.register(kept[0], kept[2], np.eye(4))
-    again = registrar.register(kept[0], kept[1], np.eye(4))
-    assert pickle.dumps(again) == pickle.dumps(fresh), "prepared clouds that were registered before give other bits"
+    return [pickle.dumps(found) for found in (*fresh, registrar.register(kept[0], kept[1], np.eye(4)))]
 
 
 def _passes_over_points_that_are_not_finite(registrar: Registrar) -> None:

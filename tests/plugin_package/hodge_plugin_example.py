@@ -16,7 +16,8 @@ class RingEdges:
     reach: int = Field(1, ge=1, description="frames from one end of a pair to the other")
 
     def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
-        """The pairs of the ring."""
-        rows = np.arange(len(frames))
-        pairs = np.unique(np.sort(np.stack([rows, (rows + self.reach) % len(rows)], axis=1), axis=1), axis=0)
+        """The pairs of the ring; frames without points get none."""
+        rows = np.flatnonzero(clouds.sizes)
+        pairs = np.stack([rows, np.roll(rows, -self.reach)], axis=1)
+        pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
         return Edges.proposed(pairs, "ring")
