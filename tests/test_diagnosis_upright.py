@@ -41,9 +41,9 @@ def test_a_part_laid_on_its_head_stands_out_of_what_its_neighbourhoods_show() ->
     over = np.arange(60) >= 40
     rotations[over] = se3.so3_exp(np.array([[0.0, np.pi, 0.0]])) @ rotations[over]
     law = learn_upright(rotations, np.zeros(60, int), _groups(60))
-    nats = law.nats(rotations, law.world_up(rotations, np.zeros(60, int)))
+    nats = law.log_evidence(rotations, law.world_up(rotations, np.zeros(60, int)))
     assert nats[over].max() < -3 and np.median(nats[~over]) > -1.5
-    apart = law.nats(rotations, law.world_up(rotations, over.astype(int)))
+    apart = law.log_evidence(rotations, law.world_up(rotations, over.astype(int)))
     assert np.median(apart[over]) > -1.5, "in a piece of its own it stands as well as any"
 
 
@@ -51,14 +51,14 @@ def test_cameras_that_turn_freely_say_nothing() -> None:
     rotations = se3.so3_exp(np.random.default_rng(1).normal(0, 2, (60, 3)))
     law = learn_upright(rotations, np.zeros(60, int), _groups(60))
     assert law.share == 0
-    np.testing.assert_array_equal(law.nats(rotations, law.world_up(rotations, np.zeros(60, int))), 0)
+    np.testing.assert_array_equal(law.log_evidence(rotations, law.world_up(rotations, np.zeros(60, int))), 0)
 
 
 def test_single_views_and_frames_of_one_rotation_are_no_trouble() -> None:
     rotations = np.tile(np.eye(3), (4, 1, 1))
     for piece in (np.arange(4), np.zeros(4, int)):
         law = learn_upright(rotations, piece, piece)
-        assert np.abs(law.nats(rotations, law.world_up(rotations, piece))).max() < 0.1
+        assert np.abs(law.log_evidence(rotations, law.world_up(rotations, piece))).max() < 0.1
 
 
 def _hung_on_its_head(seed: int) -> tuple[ViewGraph, Bools]:

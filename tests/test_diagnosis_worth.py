@@ -8,13 +8,13 @@ import pytest
 from diagnosis_graphs import every_pair_tried
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis import consensus
+from hodge_pipeline.diagnosis.arrangement_evidence import arrangement_log_evidence
 from hodge_pipeline.diagnosis.arrangements import FAIR_SHARES, best_arrangement
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.improve import improved
-from hodge_pipeline.diagnosis.laws import learned
 from hodge_pipeline.diagnosis.robust_poses import Fit
-from hodge_pipeline.diagnosis.worth import worth
+from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.types import ViewGraph
 
 PART = np.arange(50) < 15
@@ -40,13 +40,15 @@ def solved() -> tuple[Evidence, ViewGraph, Fit]:
 
 def test_a_scene_is_worth_less_with_a_part_of_it_elsewhere_or_apart(solved: tuple[Evidence, ViewGraph, Fit]) -> None:
     evidence, _, found = solved
-    laws = [learned(evidence, found)]
-    value = worth(evidence, found.poses, found.component, laws)
+    models = [learn_scene_model(evidence, found)]
+    value = arrangement_log_evidence(evidence, found.poses, found.component, models)
     moved = np.where(PART[:, None, None], ASIDE @ found.poses, found.poses)
-    assert worth(evidence, moved, found.component, laws) < value - 5
+    assert arrangement_log_evidence(evidence, moved, found.component, models) < value - 5
     apart = np.where(PART, 1, 0)
-    assert worth(evidence, found.poses, apart, laws) < value - 5
-    assert worth(evidence, moved, apart, laws) == pytest.approx(worth(evidence, found.poses, apart, laws))
+    assert arrangement_log_evidence(evidence, found.poses, apart, models) < value - 5
+    assert arrangement_log_evidence(evidence, moved, apart, models) == pytest.approx(
+        arrangement_log_evidence(evidence, found.poses, apart, models)
+    )
 
 
 @pytest.mark.parametrize("in_one_piece", [False, True])

@@ -1,4 +1,4 @@
-"""What every solver asks of a graph before it computes anything."""
+"""Checks of a graph that every solver makes before it computes anything."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def refuse_priors(graph: ViewGraph, solver: str) -> None:
 def check_motions(motions: Floats, kind: str, name: Callable[[int], str]) -> None:
     """Raises `GraphError` with what is wrong with the first of the motions (N, 4, 4) that is not finite and rigid.
 
-    `name` says which row that is, `kind` what there may be several of.
+    `name` gives the name of a row, `kind` the plural of what the rows are.
     """
     wrong = ~se3.is_motion(motions)
     if wrong.any():

@@ -1,4 +1,4 @@
-"""How well a graph hangs together: Algorithm 1 asks for a 3-connected one."""
+"""The vertex connectivity of a graph: Algorithm 1 needs a 3-connected one."""
 
 from __future__ import annotations
 

@@ -227,7 +227,7 @@ def adjusted_edges(edges: Ints, world_from_cam: Floats, correction: Floats, pair
 
     `world_from_cam` are the poses before the step and `correction (V, 6)` is its f. Their loop deviation says how far
     the exponential of the sum is from the product of the exponentials; from the poses after the step it would be 0 by
-    construction, and mean nothing.
+    construction.
     """
     i, j = edges.T
     step = correction[j] - correction[i]

@@ -1,4 +1,4 @@
-"""A cycle basis of least total length, for small graphs (Horton 1987): the loops that say most about single edges."""
+"""A cycle basis of least total length, for small graphs (Horton 1987): short loops localise errors best."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class _Masks:
     def __init__(self, horton: _Horton, bit_of_chord: dict[int, int]) -> None:
         self.horton, self.bit = horton, bit_of_chord
         self.ends: list[list[int]] = horton.edges.tolist()
-        self.known: dict[int, int] = {}
+        self.masks: dict[int, int] = {}
 
     def of_candidate(self, candidate: int) -> int:
         root, edge = divmod(candidate, len(self.ends))
@@ -105,13 +105,13 @@ class _Masks:
 
     def _path(self, root: int, vertex: int) -> int:
         base, climbed = root * self.horton.count, []
-        while vertex != root and base + vertex not in self.known:
+        while vertex != root and base + vertex not in self.masks:
             climbed.append(vertex)
             vertex = int(self.horton.parent[root, vertex])
-        mask = self.known.get(base + vertex, 0)
+        mask = self.masks.get(base + vertex, 0)
         for below in reversed(climbed):
             mask ^= self.bit.get(self.horton.edge_between(vertex, below), 0)
-            self.known[base + below] = mask
+            self.masks[base + below] = mask
             vertex = below
         return mask
 

@@ -1,4 +1,4 @@
-"""Edges in series: those that exactly the same cycles pass, so that no cycle tells one of them from another."""
+"""Edges in series: those that exactly the same cycles pass, so that no cycle distinguishes them."""
 
 from __future__ import annotations
 

@@ -14,19 +14,21 @@ SPLITS = 1 - 1e-6
 def ranked(diagnosis: Diagnosis) -> Ints:
     """Rows of all edges, the worst first: wrong, suspect, untestable, consistent; in each the least probable."""
     place = np.array([ORDER.index(str(verdict)) for verdict in diagnosis.verdict], np.int64)
-    known = np.nan_to_num(diagnosis.probability, nan=0.5)
-    return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), known.round(1), place))
+    probability = np.nan_to_num(diagnosis.probability, nan=0.5)
+    return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), probability.round(1), place))
 
 
 def advice(diagnosis: Diagnosis, disabled: Bools) -> tuple[str, ...]:
     """What to do about each edge, in a few words; `disabled (E,)` are off already."""
-    alone = np.ones(len(disabled), bool)
-    alone[diagnosis.cycles.loops.edge] = False
-    columns = zip(diagnosis.verdict.tolist(), disabled.tolist(), alone.tolist(), diagnosis.leverage, strict=True)
+    in_no_listed_cycle = np.ones(len(disabled), bool)
+    in_no_listed_cycle[diagnosis.cycles.loops.edge] = False
+    columns = zip(
+        diagnosis.verdict.tolist(), disabled.tolist(), in_no_listed_cycle.tolist(), diagnosis.leverage, strict=True
+    )
     return tuple(_advice(*each) for each in columns)
 
 
-def _advice(verdict: str, is_disabled: bool, is_alone: bool, leverage: float) -> str:
+def _advice(verdict: str, is_disabled: bool, in_no_listed_cycle: bool, leverage: float) -> str:
     if is_disabled:
         return "is disabled; nothing speaks against it: enable it again" if verdict == CONSISTENT else "is disabled"
     if verdict == WRONG:
@@ -35,6 +37,8 @@ def _advice(verdict: str, is_disabled: bool, is_alone: bool, leverage: float) ->
         return "look at it; disable it where the views do not meet"
     if verdict == UNTESTABLE:
         return (
-            "register another pair across it" if is_alone else "look at the loop's edges, or register a pair across it"
+            "register another pair across it"
+            if in_no_listed_cycle
+            else "look at the loop's edges, or register a pair across it"
         )
     return "keep it: without it the scene falls apart" if leverage >= SPLITS else "keep it"

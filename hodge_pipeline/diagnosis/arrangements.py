@@ -1,9 +1,9 @@
 """The best of several arrangements of a scene in which every pair was tried.
 
 Growing pieces best first can take a place for another that looks like it, and from there no single move leads back. So
-a second start knows only the edges between consecutive views, which are wrong more rarely; and from both the views are
-moved with two opinions on how many of the expected edges a placement must show. Of all arrangements on the way the one
-of most worth is taken, and improved while that makes it worth more.
+a second start uses only the edges between consecutive views, which are wrong more rarely; and from both the views are
+moved with two thresholds on the share of expected edges that a placement must have. Of all arrangements on the way the
+one with the largest log-evidence is taken, and improved while its log-evidence grows.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from hodge_pipeline.diagnosis.arrangement_evidence import arrangement_log_evidence
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.improve import improved
-from hodge_pipeline.diagnosis.laws import learned
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.pieces import Alignment, align
 from hodge_pipeline.diagnosis.rearrange import rearranged
 from hodge_pipeline.diagnosis.robust_poses import ONCE, TWICE, Fit, fit
-from hodge_pipeline.diagnosis.worth import worth
+from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.types import Floats, ViewGraph
 
 FAIR_SHARES = (0.75, 0.5)
@@ -30,9 +30,9 @@ LARGEST = 150
 def best_arrangement(
     evidence: Evidence, graph: ViewGraph, start: Fit, weight: Floats, cluster_gain: float, rng: np.random.Generator
 ) -> Fit:
-    """The arrangement that most speaks for, from `start` and from the order of the views where that tells.
+    """The arrangement with the largest log-evidence, from `start` and, where it is informative, the order.
 
-    `start` itself where there are too many views. `graph` has the recentred edges, `weight` (E,) what each counts.
+    `start` itself where there are too many views. `graph` has the recentred edges, `weight (E,)` the weight of each.
     """
     if not 2 < evidence.vertex_count <= LARGEST:
         return start
@@ -40,8 +40,8 @@ def best_arrangement(
     if np.ptp(evidence.prior) > 0:
         starts.append(_in_order(evidence, graph, weight, cluster_gain, rng))
     found = [one for begun in starts for share in FAIR_SHARES for one in rearranged(evidence, graph, begun, share)]
-    laws = [learned(evidence, found[0]), learned(evidence, found[-1])]
-    values = [worth(evidence, one.poses, one.component, laws) for one in found]
+    models = [learn_scene_model(evidence, found[0]), learn_scene_model(evidence, found[-1])]
+    values = [arrangement_log_evidence(evidence, one.poses, one.component, models) for one in found]
     best = improved(evidence, graph, found[int(np.argmax(values))], FAIR_SHARES)
     return fit(evidence, graph, Alignment(best.component, best.poses), ONCE)
 
@@ -59,7 +59,7 @@ def _in_order(
         prior=evidence.prior[rows],
         noise=noise,
         support=evidence.support[rows],
-        alone=evidence.alone[rows],
+        in_no_listed_cycle=evidence.in_no_listed_cycle[rows],
     )
     chained = fit(chain, graph.select(rows), align(chain, weight[rows], cluster_gain, rng), ONCE)
     return fit(evidence, graph, Alignment(chained.component, chained.poses), TWICE)

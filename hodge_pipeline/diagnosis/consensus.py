@@ -1,4 +1,4 @@
-"""The solution that the edges agree on, and how likely each edge is to be right in its light."""
+"""The solution that most edges agree with, and the probability that each edge is right, given that solution."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Consensus:
 
 
 def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptions) -> Consensus:
-    """The alignment that the edges speak for; `graph` holds the recentred edges with the information of their noise."""
+    """The alignment with the largest log-evidence; `graph` holds the recentred edges with their noise."""
     rng = np.random.default_rng(options.seed)
     weight = edge_weight(evidence)
     grown = align(evidence, weight, options.cluster_gain, rng)
@@ -91,15 +91,15 @@ def _of_all(evidence: Evidence, graph: ViewGraph) -> Fit:
 
 
 def _unvouched(probability: Floats, fit: Fit, evidence: Evidence) -> Floats:
-    """An edge that alone holds two parts together, against edges that would hold them otherwise, is no more likely
-    than its order makes it: no cycle of edges that agree vouches for it.
+    """The probabilities, no larger than the prior for a used edge that is the only connection between two parts which
+    edges left out connect otherwise: no cycle of edges that agree confirms it.
     """
-    bridge = fit.bridge & ~evidence.alone
+    bridge = fit.bridge & ~evidence.in_no_listed_cycle
     return np.where(bridge, np.minimum(probability, UNVOUCHED * evidence.prior), probability)
 
 
 def edge_weight(evidence: Evidence) -> Floats:
-    """What an edge's own vote counts (E,): its odds by order, and half of that where no cycle closes over it."""
+    """The weight (E,) of an edge's vote: its odds by order, and half of that where no cycle closes over it."""
     odds = evidence.prior / (1 - evidence.prior)
     return np.asarray(odds * (0.5 + evidence.support) / (1 + evidence.support))
 

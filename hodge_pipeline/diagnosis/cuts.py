@@ -1,8 +1,8 @@
-"""What speaks for laying one set of views against the rest: sums over the pairs that the cut between them separates.
+"""Log-evidence for a relative placement of two sets of views: sums over the pairs that the cut between them separates.
 
 Edges that agree on one placement are one event, since places that look alike give many wrong edges that agree: they
-count by the logarithm of their number. Against a placement speaks that views which it lays upon each other are not
-joined, although their pair was tried. Views that follow each other in a sequence are near each other.
+count by the logarithm of their number. Evidence against a placement are pairs of views that it makes overlap and that
+were tried but have no edge. Consecutive views of a sequence are near each other.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.laws import Laws
+from hodge_pipeline.diagnosis.scene_model import SceneModel
 from hodge_pipeline.types import Bools, Floats, Ints
 
 GATE = 60.0
@@ -31,43 +31,43 @@ ALIKE = 0.5
 JUMP = 1e-4
 """Share of consecutive views that do not see the same place."""
 SURE = 5.0
-"""Nats, the most that a single edge between consecutive views counts."""
+"""Nats, the most log-evidence of a single edge between consecutive views."""
 UNSUPPORTED, SUPPORTED = 0.05, 0.3
-"""Closing cycles over an edge: what counts for none, and what leaves its odds as they are."""
+"""Closing cycles over an edge: added to each count, and the count that leaves the odds unchanged."""
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What a placement is judged by.
+class PlacementCriteria:
+    """The model and thresholds that a placement is scored with.
 
-    - `laws`: how views are joined, and how cameras are held; `usual`: the mean probability that views of one piece are
-      joined, 0 where views have no order.
-    - `fair_share`: of the edges that a placement makes expected, those from which on they speak for it.
+    - `model`: the probability of edges by poses, and the distribution of up.
+    - `usual`: the mean probability that views of one piece are joined, 0 where views have no order.
+    - `fair_share`: share of the edges expected under a placement from which on it has evidence in its favour.
     """
 
     evidence: Evidence
-    laws: Laws
+    model: SceneModel
     usual: float
     fair_share: float
 
-    def nats(self, sums: Floats) -> Floats:
-        """What speaks for cuts with these sums (3, ...) of their layers."""
+    def log_evidence(self, sums: Floats) -> Floats:
+        """Log-evidence for cuts with these sums (3, ...) of their layers."""
         agreeing, expected, order = sums
         share = np.clip((agreeing / np.maximum(expected, 1e-9) - self.fair_share) / SHARE_SPREAD, -1, 1)
         return np.asarray(PER_FOLD * np.log1p(agreeing) + PER_EXPECTED_FOLD * share * np.log1p(expected) + order)
 
     def layers(self, still: Floats, moved: Floats) -> Floats:
         """For each ordered pair of views (3, V, V), the first where it is and the second moved: whether an edge agrees
-        (from 1 down to 0), the probability that one would, and the nats of their order.
+        (from 1 down to 0), the probability that one would, and the log-evidence of their order.
         """
-        agreeing, expected = self._agreeing(still, moved), self.laws.joining.between(still, moved)
+        agreeing, expected = self._agreeing(still, moved), self.model.joining.between(still, moved)
         order = np.zeros_like(expected)
         if self.usual:
             rows = np.flatnonzero(np.abs(self.evidence.edges[:, 1] - self.evidence.edges[:, 0]) == 1)
             sure = np.zeros_like(expected)
             i, j = self.evidence.edges[rows].T
             for pair in ((i, j), (j, i)):
-                np.maximum.at(sure, pair, consecutive_nats(self.evidence)[rows])
+                np.maximum.at(sure, pair, consecutive_log_evidence(self.evidence)[rows])
             order = sure * agreeing
             first = np.arange(len(still) - 1)
             for pair in ((first, first + 1), (first + 1, first)):
@@ -90,21 +90,23 @@ class Scene:
         return np.asarray(np.sqrt(np.maximum(0.0, 1 - squares / GATE)))
 
 
-def scene_of(evidence: Evidence, laws: Laws, poses: Floats, piece: Ints, fair_share: float = 1.0) -> Scene:
-    """What moves of poses (V, 4, 4) in pieces (V,) are judged by."""
+def placement_criteria(
+    evidence: Evidence, model: SceneModel, poses: Floats, piece: Ints, fair_share: float = 1.0
+) -> PlacementCriteria:
+    """The criteria for moves of poses (V, 4, 4) in pieces (V,)."""
     same = piece[:, None] == piece[None]
-    usual = float(laws.joining.between(poses, poses)[same].mean()) if np.ptp(evidence.prior) > 0 else 0.0
-    return Scene(evidence, laws, usual, fair_share)
+    usual = float(model.joining.between(poses, poses)[same].mean()) if np.ptp(evidence.prior) > 0 else 0.0
+    return PlacementCriteria(evidence, model, usual, fair_share)
 
 
-def consecutive_nats(evidence: Evidence) -> Floats:
-    """What each edge (E,) counts if it joins consecutive views: its odds by order, and by the cycles over it."""
+def consecutive_log_evidence(evidence: Evidence) -> Floats:
+    """Log-evidence of each edge (E,) if it joins consecutive views: by its prior odds, and by the cycles over it."""
     odds = evidence.prior / (1 - evidence.prior) * (evidence.support + UNSUPPORTED) / SUPPORTED
     return np.minimum(np.log1p(odds), SURE)
 
 
-def pair_nats(layers: Floats) -> Floats:
-    """Each pair (V, V) for itself: an agreeing edge, a missing one against places that only look alike, the order."""
+def pair_log_evidence(layers: Floats) -> Floats:
+    """Log-evidence of each single pair (V, V): an agreeing edge, a missing one, the order of the views."""
     agreeing, expected, order = layers
     missing = np.log((1 - expected) / (1 - ALIKE * expected))
     return np.asarray(agreeing * np.log1p(np.expm1(AGREEING) * expected) + (1 - agreeing) * missing + order)

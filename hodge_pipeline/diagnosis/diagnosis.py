@@ -47,14 +47,14 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     point, reach_m = working_point(graph.i_from_j, prior)
     motions = recentred(graph.i_from_j, point)
     loops = short_cycles(graph.edges, graph.vertex_count, options.max_cycles_per_edge)
-    angle, moved = cycle_errors(loops, motions)
-    noise = edge_noise(graph, loops, angle, moved, prior, reach_m)
-    cycles = judge_cycles(loops, angle, moved, noise, reach_m)
+    angle, displacement_m = cycle_errors(loops, motions)
+    noise = edge_noise(graph, loops, angle, displacement_m, prior, reach_m)
+    cycles = judge_cycles(loops, angle, displacement_m, noise, reach_m)
     exhaustive = every_pair_tried(graph.edges, graph.vertex_count)
     if exhaustive and options.order_prior and np.ptp(prior) == 0:
         prior = prior_by_cycles(graph.edges, graph.vertex_count, cycles)
-        noise = edge_noise(graph, loops, angle, moved, prior, reach_m)
-        cycles = judge_cycles(loops, angle, moved, noise, reach_m)
+        noise = edge_noise(graph, loops, angle, displacement_m, prior, reach_m)
+        cycles = judge_cycles(loops, angle, displacement_m, noise, reach_m)
     if not exhaustive:
         # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
         usual = usual_share(cycles)
@@ -68,7 +68,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
         prior=prior,
         noise=noise,
         support=closing_support(cycles, prior),
-        alone=in_no_cycle(graph.edges, graph.vertex_count, cycles),
+        in_no_listed_cycle=in_no_cycle(graph.edges, graph.vertex_count, cycles),
         exhaustive=exhaustive,
         reach_m=reach_m,
     )
@@ -77,7 +77,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     undecided = unattributable(graph.edges, graph.vertex_count, cycles)
     blame = share_blame(cycles, consensus.fit, evidence)
     unvouched = blame.unvouched & (consensus.probability >= options.consistent_from)
-    untestable = evidence.alone | (undecided >= 0) | unvouched
+    untestable = evidence.in_no_listed_cycle | (undecided >= 0) | unvouched
     probability = np.where(untestable, np.nan, np.maximum(consensus.probability, blame.probability))
     undecided = np.where(undecided >= 0, undecided, np.where(unvouched | (blame.probability > 0), blame.cycle, -1))
     verdict = _verdicts(probability, untestable, consensus.fit.used, options)
@@ -91,7 +91,7 @@ def _with_witnesses(graph: ViewGraph, cycles: Cycles, used: Bools, evidence: Evi
     """The cycles, and more where none that closes passes an edge in use, though others in use close one over it."""
     told = np.zeros(graph.edge_count, bool)
     told[cycles.loops.select(np.flatnonzero(cycles.closes)).edge] = True
-    wanted = used & ~told & ~evidence.alone
+    wanted = used & ~told & ~evidence.in_no_listed_cycle
     if not wanted.any():
         return cycles
     loops = with_cycles_of(used, cycles.loops, graph.edges, graph.vertex_count, wanted)
@@ -123,8 +123,8 @@ def _report(
 ) -> Diagnosis:
     piece = connected_components(graph.edges[kept], graph.vertex_count)
     same = piece[graph.edges[:, 0]] == piece[graph.edges[:, 1]]
-    angle, moved = left_over(graph, world_from_cam)
-    residual = np.where(same, moved, np.nan), np.where(same, np.degrees(angle), np.nan)
+    angle, displacement_m = left_over(graph, world_from_cam)
+    residual = np.where(same, displacement_m, np.nan), np.where(same, np.degrees(angle), np.nan)
     telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
     share = 1 - 1 / (1 + fit.resistance)
     counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))

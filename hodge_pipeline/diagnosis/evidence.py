@@ -1,4 +1,4 @@
-"""What the alignment of a scene works with, in arrays."""
+"""The inputs of an alignment, in arrays."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Evidence:
-    """Edges between recentred frames, and what is known of them before any alignment.
+    """Edges between recentred frames, and what can be computed of them before any alignment.
 
-    - `i_from_j (E, 4, 4)`: at the working point; `prior (E,)`: probability by order; `noise`: of each edge.
+    - `i_from_j (E, 4, 4)`: at the working point; `prior (E,)`: probability of being right by the order of the views;
+      `noise`: of each edge.
     - `support (E,)`: how many cycles close over the edge, whose edges are likely right.
-    - `alone (E,)`: edges in no cycle.
+    - `in_no_listed_cycle (E,)`: edges that no listed cycle passes.
     - `exhaustive`: whether registration seems to have been tried on all pairs.
     - `reach_m`: how far overlapping views lie apart.
     """
@@ -25,6 +26,6 @@ class Evidence:
     prior: Floats
     noise: Noise
     support: Floats
-    alone: Bools
+    in_no_listed_cycle: Bools
     exhaustive: bool
     reach_m: float

@@ -1,7 +1,7 @@
-"""How likely two views are joined by a right edge, from where they lie: learned from the graph itself.
+"""The probability that a right edge joins two views, by their relative pose: a model fitted to the graph itself.
 
-Where every pair was tried, nearly all views that look at the same place are joined, and few others are. A logistic law
-in the distance between the points that two views look at, and in the angle between them, says how nearly.
+Where every pair was tried, nearly all views that look at the same place are joined, and few others are. The model
+is logistic in the distance between the points that two views look at, and in the angle between them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hodge_pipeline.types import Bools, Floats, Ints
 CEILING = 0.97
 """Even views that lie upon each other are not always joined."""
 BASE, PER_REACH, PER_RADIAN = 6.0, 2.5, 2.7
-"""What such graphs show before one of them is looked at; the spread of what is learned about them follows."""
+"""The means of the prior on the parameters; their standard deviations follow."""
 SPREAD = np.array([2.0, 2.0, 2.0, 2.0, 0.5, 0.5])
 DEPTHS = (0.0, 2.0, -2.0)
 """Of the point that is seen, along the viewing axis, to begin with."""
@@ -30,7 +30,7 @@ def _usual() -> Floats:
 
 @dataclass(frozen=True)
 class Joining:
-    """The law: x holds the point that a view looks at (in units of `reach_m`), the log odds of two views in the same
+    """The model: `x` holds the point that a view looks at (in units of `reach_m`), the log odds of two views in one
     place, and the logarithms of how they fall with each reach and each radian.
     """
 
@@ -49,8 +49,11 @@ class Joining:
         return np.asarray(poses[:, :3, :3] @ (self.reach_m * self.x[:3]) + poses[:, :3, 3])
 
 
-def learn_joining(poses: Floats, piece: Ints, joined: Bools, reach_m: float, known: Joining | None = None) -> Joining:
-    """The likeliest law for poses (V, 4, 4) in pieces (V,) of which these pairs (V, V) are joined; from `known` on."""
+def learn_joining(poses: Floats, piece: Ints, joined: Bools, reach_m: float, before: Joining | None = None) -> Joining:
+    """The most probable model for poses (V, 4, 4) in pieces (V,), of which the pairs `joined (V, V)` have an edge.
+
+    The search starts at `before`, where it is given.
+    """
     a, b = np.triu_indices(len(piece), 1)
     inside = piece[a] == piece[b]
     a, b = a[inside], b[inside]
@@ -69,7 +72,7 @@ def learn_joining(poses: Floats, piece: Ints, joined: Bools, reach_m: float, kno
         prior = float((((x - usual) / SPREAD) ** 2).sum()) / 2
         return float((np.logaddexp(0, odds) - there * odds).sum()) + prior, gradient
 
-    starts = [known.x] if known else [usual + np.array([0, 0, depth, 0, 0, 0]) for depth in DEPTHS]
+    starts = [before.x] if before else [usual + np.array([0, 0, depth, 0, 0, 0]) for depth in DEPTHS]
     found = [minimize(cost, x, jac=True, method="L-BFGS-B", options={"maxiter": STEPS}) for x in starts]
     return Joining(reach_m, min(found, key=lambda result: float(result.fun)).x)
 

@@ -1,9 +1,9 @@
-"""A solution mended where edges that it leaves out agree with each other and outweigh those that hold it together.
+"""A solution repaired where edges that it leaves out agree with each other and outweigh the edges it uses.
 
-Pieces that grew together are never parted again, and where several wrong edges that agree came first, the right ones
-stay outside. Each edge that is left out says by which motion of the world its second end should move. Those that say
-the same are held against the lightest set of used edges that separates their ends, a minimum cut (Ford and Fulkerson
-1956): where that is lighter, the side of the cut moves.
+Pieces that were merged are never parted again, and where several wrong edges that agree came first, the right ones
+stay outside. Each edge that is left out proposes a motion of the world for its second end. Edges that propose the
+same motion are weighed against the lightest set of used edges that separates their ends, a minimum cut (Ford and
+Fulkerson 1956): where that is lighter, the side of the cut moves.
 """
 
 from __future__ import annotations
@@ -51,30 +51,30 @@ class _Proposals:
 
 
 def mend(evidence: Evidence, graph: ViewGraph, start: Fit) -> Fit:
-    """The solution after the moves, a rough one of a large graph; `graph` has the recentred edges. An edge counts −log
-    of how likely it is wrong, and what it tells by agreeing.
+    """The solution after the moves, a rough one of a large graph; `graph` has the recentred edges. The log-evidence of
+    an edge is −log of its probability of being wrong, and AGREES.
     """
-    nats = AGREES - np.log1p(-evidence.prior)
+    log_evidence = AGREES - np.log1p(-evidence.prior)
     found = start
-    solver, gates = (rough_fit, GENTLE) if len(nats) > LARGE else (fit, TWICE)
-    for _ in range(ROUNDS if len(nats) <= LARGE else 1):
-        poses = _moved(evidence, graph, found, nats)
+    solver, gates = (rough_fit, GENTLE) if len(log_evidence) > LARGE else (fit, TWICE)
+    for _ in range(ROUNDS if len(log_evidence) <= LARGE else 1):
+        poses = _after_moves(evidence, graph, found, log_evidence)
         if poses is None:
             break
         tried = solver(evidence, graph, Alignment(found.component, poses), gates)
-        if nats[tried.used].sum() <= nats[found.used].sum():
+        if log_evidence[tried.used].sum() <= log_evidence[found.used].sum():
             break
         found = tried
     return found
 
 
-def _moved(evidence: Evidence, graph: ViewGraph, found: Fit, nats: Floats) -> Floats | None:
-    """Poses (V, 4, 4) after all moves that are worth it; None where none is."""
+def _after_moves(evidence: Evidence, graph: ViewGraph, found: Fit, log_evidence: Floats) -> Floats | None:
+    """Poses (V, 4, 4) after all moves that gain LEAST_GAIN; None where none does."""
     poses, moves = found.poses, 0
-    for _ in range(MOVES if len(nats) <= LARGE else SWEEPS_OF_LARGE):
+    for _ in range(MOVES if len(log_evidence) <= LARGE else SWEEPS_OF_LARGE):
         agreeing = np.maximum(0.0, 1 - chi2_at(evidence, graph, poses, found.component, found.resistance) / GATE)
-        proposals = _proposals(evidence, poses, found.component, agreeing, nats)
-        found_now = _good_moves(evidence, poses, found.component, agreeing, nats, proposals)
+        proposals = _proposals(evidence, poses, found.component, agreeing, log_evidence)
+        found_now = _good_moves(evidence, poses, found.component, agreeing, log_evidence, proposals)
         if not found_now:
             break
         poses, moves = poses.copy(), moves + len(found_now)
@@ -85,7 +85,9 @@ def _moved(evidence: Evidence, graph: ViewGraph, found: Fit, nats: Floats) -> Fl
     return poses if moves else None
 
 
-def _proposals(evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, nats: Floats) -> _Proposals:
+def _proposals(
+    evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, log_evidence: Floats
+) -> _Proposals:
     i, j = evidence.edges.T
     rows = np.flatnonzero((agreeing == 0) & (component[i] == component[j]) & (i != j))
     most = MOST_PROPOSALS if len(i) <= LARGE else PROPOSALS_OF_LARGE
@@ -111,12 +113,12 @@ def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints
 
 
 def _good_moves(
-    evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, nats: Floats, proposals: _Proposals
+    evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, log_evidence: Floats, proposals: _Proposals
 ) -> list[tuple[Bools, Floats]]:
     """The groups that outweigh their cuts, the weightiest first: the views (V,) that move, and how. No group has to do
     with views that move for another.
     """
-    weight = proposals.alike @ nats[proposals.edge]
+    weight = proposals.alike @ log_evidence[proposals.edge]
     left = np.diff(proposals.alike.indptr) > 1
     moved, moves = np.zeros(len(poses), bool), []
     for _ in range(TRIED):
@@ -128,8 +130,8 @@ def _good_moves(
         group, alike = proposals.alike.indices[entry], proposals.alike.data[entry]
         left[group[alike > 0.5]] = False
         left[row] = False
-        share = alike * nats[proposals.edge[group]]
-        inside = _cut(evidence, agreeing * nats, proposals, group, share)
+        share = alike * log_evidence[proposals.edge[group]]
+        inside = _cut(evidence, agreeing * log_evidence, proposals, group, share)
         if inside is None:
             continue
         whole = component == component[proposals.mover[row]]
@@ -157,8 +159,8 @@ def _cut(evidence: Evidence, held: Floats, proposals: _Proposals, group: Ints, s
     mover, stayer = proposals.mover[group], proposals.stayer[group]
     tail = np.concatenate([i, j, np.full(len(group), source), mover])
     head = np.concatenate([j, i, stayer, np.full(len(group), sink)])
-    nats = np.concatenate([held[used], held[used], share, share])
-    capacity = csr_matrix((np.ceil(UNIT * nats).astype(np.int32), (tail, head)), shape=(count + 2, count + 2))
+    weight = np.concatenate([held[used], held[used], share, share])
+    capacity = csr_matrix((np.ceil(UNIT * weight).astype(np.int32), (tail, head)), shape=(count + 2, count + 2))
     left = capacity - maximum_flow(capacity, source, sink).flow
     left.eliminate_zeros()
     inside = np.ones(count + 2, bool)

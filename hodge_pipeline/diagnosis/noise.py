@@ -1,4 +1,4 @@
-"""How exact right edges are, found from the cycles that close."""
+"""The noise of right edges, estimated from the cycles that close."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hodge_pipeline.types import Bools, Floats, ViewGraph
 MAXWELL_MEDIAN = 1.538
 DEFAULT_ANGLE_RAD = 0.03
 DEFAULT_SHARE = 0.05
-"""Of an edge's usual length: its error where no cycle tells."""
+"""Of an edge's usual length: its error where too few cycles close to estimate it."""
 ABOUT_A_POINT = 0.2
 """Of the usual step between views, where they all turn about one point, at which nothing moves."""
 FIRST_GATE_RAD = 0.35
@@ -21,7 +21,7 @@ FIRST_GATE_SHARE = 0.6
 LONGEST_CYCLE = 4
 FEWEST_CYCLES, SOME_CYCLES = 20, 4
 COPIES = 1e-5
-"""Of the gate: cycles that close so exactly join copies of one measurement, and tell nothing."""
+"""Of the gate: cycles that close so exactly join copies of one measurement, and are no evidence."""
 STATED = 3.0
 """Standard deviations of the graph's own information that explain a cycle."""
 NEARLY_ALL = 0.95
@@ -31,8 +31,8 @@ GAP = 5.0
 HEAVY_TAILS = 1.9
 """Errors of registration have heavier tails than a Gaussian of the same median."""
 LEAST_CREDIBLE, MOST_CREDIBLE, TOLD_FROM = 0.2, 2.5, 2.0
-"""Of the error where no cycle tells: what the information may state there, and be believed; and the factor from which
-it is told that it was not."""
+"""Of the default error: the bounds within which a stated error is believed; and the factor of correction from which
+a note reports it."""
 
 LEVER = 1.8
 """Of the reach: how far around the working point lies what is seen, which an error of rotation moves along."""
@@ -40,8 +40,8 @@ LEVER = 1.8
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations to an axis (E,) of each edge, radians and metres at the working point; and what of the
-    graph's information was not believed, in words.
+    """Standard deviations to an axis (E,) of each edge, radians and metres at the working point; and notes on
+    stated information that was not believed.
     """
 
     rotation_rad: Floats
@@ -49,18 +49,20 @@ class Noise:
     doubts: tuple[str, ...] = ()
 
 
-def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, prior: Floats, reach_m: float) -> Noise:
+def edge_noise(
+    graph: ViewGraph, loops: Loops, angle: Floats, displacement_m: Floats, prior: Floats, reach_m: float
+) -> Noise:
     """The noise of each edge: the graph's information gives the proportions, cycles that close give the scale.
 
     Where the information explains nearly all of these, the scale does so too: edges of several kinds make long tails,
-    and what they say of themselves is sound as far as anything shows. Where too few cycles close to tell, the
-    information is believed within reason: errors as large as the motions would let any loop close, and errors as small
-    as those of rounding none.
+    and their stated information fits the cycles. Where too few cycles close to estimate it, the information is believed
+    within bounds: errors as large as the motions would let any loop close, and errors as small as those of rounding
+    none.
     """
     rotation, translation, informed = _proportions(graph)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
     any_cycle, loops = len(loops) > 0, loops.select(short)
-    turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, moved[short])
+    turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, displacement_m[short])
     usual = DEFAULT_ANGLE_RAD, DEFAULT_SHARE * max(reach_m, ABOUT_A_POINT * _usual_step(graph))
     stated = usual if not informed else (_median(rotation), _median(translation))
     believed = tuple(map(_credible, stated, usual, (turned.shown(), shifted.shown())))
@@ -75,8 +77,8 @@ def edge_noise(graph: ViewGraph, loops: Loops, angle: Floats, moved: Floats, pri
         shift = max(shift, LEVER * turn * reach_m)
     taken = turn == believed[0], shift == believed[1]
     changed = any(own and not 1 / TOLD_FROM < by < TOLD_FROM for own, by in zip(taken, believed, strict=True))
-    told = informed and changed and any_cycle and not _is_unit(graph)
-    doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if told else ()
+    is_reported = informed and changed and any_cycle and not _is_unit(graph)
+    doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if is_reported else ()
     return Noise(turn * rotation, shift * translation, doubts)
 
 
@@ -96,14 +98,15 @@ def _credible(stated: float, usual: float, shown: float) -> float:
 
 
 def _doubt(stated: tuple[float, float], taken: tuple[float, float]) -> str:
-    said, used = (f"{np.degrees(turn):.2g}° and {shift:.2g} m" for turn, shift in (stated, taken))
+    before, after = (f"{np.degrees(turn):.2g}° and {shift:.2g} m" for turn, shift in (stated, taken))
     return (
-        f"the information states errors of {said} an edge, and too few short cycles close to tell: judged with {used}"
+        f"the information states errors of {before} an edge, and too few short cycles close to tell: "
+        f"judged with {after}"
     )
 
 
 def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
-    """Standard deviations from the information, or ones where it says the same of every edge (the identity)."""
+    """Standard deviations from the information, or ones where it is the identity for every edge."""
     same = graph.edge_count < 2 or bool((graph.information == graph.information[:1]).all())
     if same and (not graph.edge_count or np.array_equal(graph.information[0], np.eye(6))):
         return np.ones(graph.edge_count), np.ones(graph.edge_count), False
@@ -113,15 +116,15 @@ def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
 
 
 def _is_unit(graph: ViewGraph) -> bool:
-    """Whether all edges have the identity that files hold where nothing is known, of angles or of half angles."""
+    """Whether all edges have the identity that files hold for unknown information, of angles or of half angles."""
     diagonal = graph.information[:, range(6), range(6)]
     return bool(np.isin(diagonal[:, :3], (0, 0.25, 1)).all() and np.isin(diagonal[:, 3:], (0, 1)).all())
 
 
 def _deviation(precision: Floats) -> Floats:
-    known = precision > 0
-    usual = float(np.median(precision[known])) if known.any() else 1.0
-    return np.asarray(1 / np.sqrt(np.clip(np.where(known, precision, usual), usual / 10, usual * 10)))
+    positive = precision > 0
+    usual = float(np.median(precision[positive])) if positive.any() else 1.0
+    return np.asarray(1 / np.sqrt(np.clip(np.where(positive, precision, usual), usual / 10, usual * 10)))
 
 
 class _Errors:

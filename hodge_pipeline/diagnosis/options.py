@@ -1,4 +1,4 @@
-"""What the diagnosis can be told; the defaults serve every scene."""
+"""Options of the diagnosis; the defaults serve every scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the order of the vertices says about an edge before any geometry: nothing, unless the graph shows that it does.
+"""The prior probability that an edge is right, by the order of the vertices, where the graph shows that order matters.
 
 A wrong edge joins any two views; a right one joins views that overlap, in a sequence mostly neighbours, and takes the
 place of a wrong one. With f the share of all far pairs that are joined, a share r of near pairs holds q right edges and
@@ -14,13 +14,13 @@ from hodge_pipeline.types import Floats, Ints
 
 FLOOR, CEILING = 0.05, 0.98
 FAR_SHARE = 0.25
-"""Pairs further apart than this share of the vertices tell how often any two views are joined."""
+"""Pairs further apart than this share of the vertices give the rate at which any two views are joined."""
 LEAST_ODDS = 2.0
 """Of neighbours in order to be joined, in units of those of far pairs, for the order to count."""
 DOUBTED = 2
 SHARE_ROUNDS = 30
 FEW = 20
-"""Edges of a gap, for which the usual share of right edges says as much as their own."""
+"""Edges of a gap at which the usual share of right edges weighs as much as their own."""
 TRIED_FROM = 0.1
 """Share of the far pairs that are joined."""
 LEAST_DEGREE = 4
@@ -28,7 +28,7 @@ LEAST_DEGREE = 4
 
 
 def order_prior(edges: Ints, vertex_count: int) -> Floats:
-    """The probability (E,) that an edge is right, from its gap |i − j| alone.
+    """The probability (E,) that an edge is right, from its gap |i − j|.
 
     All are equal where neighbours are hardly more often joined than far pairs. Vertex rows are the order.
     """
@@ -39,7 +39,7 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
     pairs = np.array([_pairs(low, high, vertex_count) for low, high in zip(bounds[:-1], bounds[1:], strict=True)])
     rate = np.minimum(joined / np.maximum(pairs, 1), 1.0)
     far = _far_rate(gap, vertex_count)
-    # by odds, which tell also where most pairs are joined, and with some neighbours more that are not: it may be chance
+    # by odds, which work where most pairs are joined too, with a few more missing neighbours: it may be chance
     missed = 1 - rate[0] + DOUBTED / max(pairs[0], 1)
     if rate[0] * (1 - far) < LEAST_ODDS * far * missed or not joined.any():
         return np.full(len(edges), 0.5)
@@ -50,7 +50,7 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
 
 def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
     """The probability (E,) that an edge is right, from its gap and from the triangles that close: where all pairs are
-    joined, how often they are says nothing.
+    joined, the rate of joined pairs is uninformative.
 
     A triangle closes where its three edges are right, so that each gap's share is that of its triangles that close
     over what the other two edges let expect. All are equal where neighbours are hardly more often right.
@@ -64,18 +64,18 @@ def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
     for _ in range(SHARE_ROUNDS):
         others = share[sides[:, [1, 0, 0]]] * share[sides[:, [2, 2, 1]]]
         expected = np.bincount(sides.ravel(), others.ravel(), len(bounds))
-        told = np.clip(closing / np.maximum(expected, 1e-9), FLOOR, CEILING)
-        share = np.sqrt(share * told)  # half a step, since whole ones swing
+        observed = np.clip(closing / np.maximum(expected, 1e-9), FLOOR, CEILING)
+        share = np.sqrt(share * observed)  # half a step, since whole ones swing
     odds = share / (1 - share)
-    known = bool(len(triangles)) and odds[0] >= LEAST_ODDS * odds[place].mean()
-    return share[place] if known else np.full(len(edges), 0.5)
+    is_informative = bool(len(triangles)) and odds[0] >= LEAST_ODDS * odds[place].mean()
+    return share[place] if is_informative else np.full(len(edges), 0.5)
 
 
 def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -> Floats:
     """The probability (E,) that an edge is right, from the cycles that close over edges of its gap |i − j|.
 
-    For graphs of which registration has left out bad edges already, so that how often pairs are joined says nothing of
-    how many are right. `usual` holds where no cycle tells. Nothing is surer than as many edges of a gap can show: of n
+    For graphs of which registration has left out bad edges already, so that the rate of joined pairs is uninformative.
+    `usual` holds where no cycle passes. No share exceeds what the number of edges of a gap can support: of n
     edges none of which fails the next one is right with (n + 1) / (n + 2) (Laplace's rule of succession).
     """
     bounds = _bounds(vertex_count)
@@ -90,7 +90,7 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
         close = np.exp(np.bincount(row, np.log(share)[entry], len(loops)))
         wrong = np.bincount(entry, ((1 - share)[entry] / (1 - close[row])), len(bounds))
         share = np.clip(1 - (wrong + 1 - usual) / (passes + 1), FLOOR, (number + 1) / (number + 2))
-    # few edges say little of their gap: one that is in doubt would tell against itself
+    # few edges give a poor estimate for their gap: a doubtful edge would count as evidence against itself
     trust = number / (number + FEW)
     usual = float(np.clip(usual, FLOOR, CEILING))
     logit = trust * np.log(share / (1 - share)) + (1 - trust) * np.log(usual / (1 - usual))

@@ -1,9 +1,9 @@
-"""Align a scene from its edges: pieces grow together where most edges agree on how, best first.
+"""Align a scene from its edges: pieces are merged greedily, those with the largest log-evidence first.
 
-Each round every piece picks the neighbour that the agreeing edges speak for most and is joined to it, unless that
-neighbour has much better joins of its own to come (Borůvka's scheme for trees, with patience). Once joined, all their
+Each round every piece picks the neighbour with the largest log-evidence and is merged with it, unless that neighbour
+has much better merges of its own to come (Borůvka's scheme for trees, with patience). Once joined, all their
 edges vote together, so that long cycles are tested without ever being listed. No edge is trusted: one that agrees with
-nothing is simply left out.
+no other is left out.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TIE_BREAK = 1e-3
 SINGLE_VOTE_FROM = 0.3
 """The weight from which one edge, which no other confirms, may join two pieces."""
 PATIENCE = 0.7
-"""Of the best score that a piece has: weaker joins to it wait, since more edges may then say where they go."""
+"""Of the best score that a piece has: weaker merges wait, since more edges may then vote on their placement."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def align(
 
 
 def _gains(evidence: Evidence, votes: Votes, weight: Floats, cluster_gain: float) -> Floats:
-    """What speaks for each hypothesis (N,), in nats: the weights of the edges that agree, and a term that grows with
+    """Log-evidence (nats) for each hypothesis (N,): the weights of the edges that agree, and a term that grows with
     the logarithm of their number. 0 for a vote that is no hypothesis, or may not join two pieces on its own.
     """
     size = len(votes.edge)
@@ -70,15 +70,15 @@ def _gains(evidence: Evidence, votes: Votes, weight: Floats, cluster_gain: float
     gain: Floats = np.bincount(votes.hypothesis, strength, size).astype(np.float64)
     gain += cluster_gain * np.log1p(np.bincount(votes.hypothesis, counted, size))
     agreeing = np.bincount(votes.hypothesis, votes.agreement > 0, size)
-    alone: Bools = evidence.alone[votes.edge] | (weight[votes.edge] > SINGLE_VOTE_FROM)
-    return np.where((agreeing >= 2) | ((agreeing == 1) & alone), gain, 0.0)
+    suffices: Bools = evidence.in_no_listed_cycle[votes.edge] | (weight[votes.edge] > SINGLE_VOTE_FROM)
+    return np.where((agreeing >= 2) | ((agreeing == 1) & suffices), gain, 0.0)
 
 
 def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
     """The hypotheses to join by, and whether it is the lower of the two pieces that moves.
 
-    A piece moves to the one that most speaks for, if that one stays where it is in this round and has no much better
-    join of its own to wait for.
+    A piece moves to the one with the largest log-evidence, if that one stays where it is in this round and has no much
+    better join of its own to wait for.
     """
     order = np.lexsort((-gain, votes.pair))
     best = order[votes.start]
@@ -89,12 +89,12 @@ def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
     np.minimum.at(first, low, np.arange(len(real)))
     np.minimum.at(first, high, np.arange(len(real)))
     chosen, moves_low = [], []
-    moved, base = np.zeros(count, bool), np.zeros(count, bool)
+    has_moved, base = np.zeros(count, bool), np.zeros(count, bool)
     for row in np.unique(first[first < len(real)]).tolist():
         for mover, other, lower in ((high[row], low[row], False), (low[row], high[row], True)):
             wanted = first[mover] == row and score[row] >= PATIENCE * score[first[other]]
-            if wanted and not (moved[mover] or base[mover] or moved[other]):
-                moved[mover] = base[other] = True
+            if wanted and not (has_moved[mover] or base[mover] or has_moved[other]):
+                has_moved[mover] = base[other] = True
                 chosen.append(real[row])
                 moves_low.append(lower)
     return best[np.array(chosen, np.int64)], np.array(moves_low, bool)

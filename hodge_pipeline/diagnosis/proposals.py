@@ -1,4 +1,4 @@
-"""Where else views could be: what the edges that disagree with a solution propose, and how far they agree."""
+"""Motions of views proposed by the edges that disagree with a solution, and how far these agree with each other."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.cuts import GATE, Scene, consecutive_nats
+from hodge_pipeline.diagnosis.cuts import GATE, PlacementCriteria, consecutive_log_evidence
 from hodge_pipeline.diagnosis.robust_poses import Fit
 from hodge_pipeline.diagnosis.votes import mean_motion
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -41,21 +41,21 @@ class Proposals:
         return mean_motion(self.motion[used], poses[self.mover[used], :3, 3], self.alike[row, used])
 
 
-def propose(scene: Scene, found: Fit) -> Proposals:
+def propose(criteria: PlacementCriteria, found: Fit) -> Proposals:
     """The proposals of all edges that disagree with a solution, of the likeliest where they are very many."""
-    evidence, poses = scene.evidence, found.poses
+    evidence, poses = criteria.evidence, found.poses
     i, j = evidence.edges.T
-    agreeing = np.where(found.component[i] == found.component[j], scene.agreement(poses[i], poses[j]), 0.0)
+    agreeing = np.where(found.component[i] == found.component[j], criteria.agreement(poses[i], poses[j]), 0.0)
     rows = np.flatnonzero((agreeing == 0) & (i != j))
-    value = consecutive_nats(evidence)[rows]
+    value = consecutive_log_evidence(evidence)[rows]
     rows = np.sort(rows[np.argsort(-value, kind="stable")[: MOST // 2]])
     i, j = i[rows], j[rows]
     forward = poses[i] @ evidence.i_from_j[rows] @ se3.inverse(poses[j])
     mover, motion = np.concatenate([j, i]), np.concatenate([forward, se3.inverse(forward)])
     rows = np.concatenate([rows, rows])
     alike = _alike(motion, poses[mover, :3, 3], evidence.noise.rotation_rad[rows], evidence.noise.translation_m[rows])
-    in_order = (np.abs(evidence.edges[rows, 1] - evidence.edges[rows, 0]) == 1) & (scene.usual > 0)
-    urgent = 2.0 * np.log1p(alike.sum(1)) + np.where(in_order, consecutive_nats(evidence)[rows], 0.0)
+    in_order = (np.abs(evidence.edges[rows, 1] - evidence.edges[rows, 0]) == 1) & (criteria.usual > 0)
+    urgent = 2.0 * np.log1p(alike.sum(1)) + np.where(in_order, consecutive_log_evidence(evidence)[rows], 0.0)
     return Proposals(mover, np.concatenate([i, j]), motion, alike, urgent)
 
 

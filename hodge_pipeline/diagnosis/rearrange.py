@@ -1,8 +1,8 @@
-"""A solution changed by moving sets of views to where more speaks for them, until none wants to move.
+"""A solution improved by moving sets of views to where their log-evidence is larger, until no move gains enough.
 
-Pieces that grew together best first are never parted again, also where one wrong edge between consecutive views came
-before many right ones between others. Here each edge that disagrees proposes a motion; with the edges that propose the
-same it says where a set of views should be. The sets are runs of consecutive views, whole pieces, and those that grow
+Pieces that were merged greedily are never parted again, even where one wrong edge between consecutive views came
+before many right ones. Here each edge that disagrees proposes a motion; edges that propose the same motion together
+propose a new place for a set of views. The sets are runs of consecutive views, whole pieces, and those that grow
 from the ends of the proposing edges.
 """
 
@@ -12,12 +12,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hodge_pipeline.diagnosis.cuts import Scene, interval_sums, pair_nats, scene_of, sums_of
+from hodge_pipeline.diagnosis.cuts import (
+    PlacementCriteria,
+    interval_sums,
+    pair_log_evidence,
+    placement_criteria,
+    sums_of,
+)
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.laws import learned
 from hodge_pipeline.diagnosis.pieces import Alignment
 from hodge_pipeline.diagnosis.proposals import Proposals, propose
 from hodge_pipeline.diagnosis.robust_poses import ONCE, Fit, fit
+from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 ROUNDS = 10
@@ -29,7 +35,7 @@ LEAST_GAIN = 2.0
 
 @dataclass(frozen=True)
 class Move:
-    """Views `inside (V,)` that are moved by `motion (4, 4)` into a piece, and the nats that are gained."""
+    """Views `inside (V,)` that are moved by `motion (4, 4)` into a piece, and the log-evidence that is gained."""
 
     gain: float
     inside: Bools
@@ -45,79 +51,92 @@ class Move:
 
 @dataclass(frozen=True)
 class _Now:
-    """A solution before a move: its layers (3, V, V), the nats of each run of views, where up is (V, 3), and the nats
-    (V,) of how each camera is held.
+    """A solution before a move: its layers (3, V, V), the log-evidence of each run of views, the direction of up
+    (V, 3), and the log-evidence (V,) of each camera's orientation.
     """
 
     found: Fit
     layers: Floats
     runs: Floats
     up: Floats
-    held: Floats
+    upright: Floats
 
 
 def rearranged(evidence: Evidence, graph: ViewGraph, start: Fit, fair_share: float) -> list[Fit]:
-    """The solutions after each move, `start` first; `graph` has the recentred edges, for `fair_share` see `Scene`."""
-    found, laws = [start], None
+    """The solutions after each move, `start` first; `graph` has the recentred edges.
+
+    See `PlacementCriteria` for `fair_share`.
+    """
+    found, model = [start], None
     for _ in range(ROUNDS):
-        laws = learned(evidence, found[-1], laws)
-        scene = scene_of(evidence, laws, found[-1].poses, found[-1].component, fair_share)
-        best = best_moves(scene, found[-1], propose(scene, found[-1]))[:1]
+        model = learn_scene_model(evidence, found[-1], model)
+        criteria = placement_criteria(evidence, model, found[-1].poses, found[-1].component, fair_share)
+        best = best_moves(criteria, found[-1], propose(criteria, found[-1]))[:1]
         if not best or best[0].gain <= LEAST_GAIN:
             break
         found.append(fit(evidence, graph, best[0].made(found[-1]), ONCE))
     return found
 
 
-def best_moves(scene: Scene, found: Fit, proposals: Proposals) -> list[Move]:
+def best_moves(criteria: PlacementCriteria, found: Fit, proposals: Proposals) -> list[Move]:
     """For each motion that is proposed the best set of views to move, by what they gain, the best first."""
-    now = _before(scene, found)
+    now = _before(criteria, found)
     moves, left = [], np.ones(len(proposals.mover), bool)
     for _ in range(TRIED):
         if not left.any():
             break
-        moves.append(_move(scene, now, proposals, proposals.next(left)))
+        moves.append(_move(criteria, now, proposals, proposals.next(left)))
     return sorted((move for move in moves if move.inside.any()), key=lambda move: -move.gain)
 
 
-def _before(scene: Scene, found: Fit) -> _Now:
-    poses, piece, upright = found.poses, found.component, scene.laws.upright
+def _before(criteria: PlacementCriteria, found: Fit) -> _Now:
+    poses, piece, upright = found.poses, found.component, criteria.model.upright
     together = (piece[:, None] == piece[None]) & ~np.eye(len(piece), dtype=bool)
-    layers = scene.layers(poses, poses) * together
+    layers = criteria.layers(poses, poses) * together
     up = upright.world_up(poses[:, :3, :3], piece)
-    return _Now(found, layers, scene.nats(interval_sums(layers)[2]), up, upright.nats(poses[:, :3, :3], up))
+    runs = criteria.log_evidence(interval_sums(layers)[2])
+    return _Now(found, layers, runs, up, upright.log_evidence(poses[:, :3, :3], up))
 
 
-def _move(scene: Scene, now: _Now, proposals: Proposals, row: int) -> Move:
+def _move(criteria: PlacementCriteria, now: _Now, proposals: Proposals, row: int) -> Move:
     """The best set of views to move as one proposal has it."""
     poses, piece = now.found.poses, now.found.component
     home, movable = piece[proposals.stayer[row]], piece == piece[proposals.mover[row]]
     motion = proposals.mean_motion(row, poses)
-    moved = scene.layers(poses, motion @ poses) * ((piece == home)[:, None] & ~np.eye(len(piece), dtype=bool))
+    moved = criteria.layers(poses, motion @ poses) * ((piece == home)[:, None] & ~np.eye(len(piece), dtype=bool))
     then = np.where(movable[None, None], moved, now.layers)
     up = np.broadcast_to(now.up[proposals.stayer[row]], now.up.shape)
-    held = scene.laws.upright.nats(motion[:3, :3] @ poses[:, :3, :3], up) - now.held
-    sets = [_grown(pair_nats(then) - pair_nats(now.layers), held, movable, proposals.mover[proposals.alike[row] > 0])]
+    held = criteria.model.upright.log_evidence(motion[:3, :3] @ poses[:, :3, :3], up) - now.upright
+    sets = [
+        _grown(
+            pair_log_evidence(then) - pair_log_evidence(now.layers),
+            held,
+            movable,
+            proposals.mover[proposals.alike[row] > 0],
+        )
+    ]
     if not movable[proposals.stayer[row]]:
         sets.append(movable)
-    if scene.usual:
-        sets.append(_best_run(scene, then, now.runs, held, movable))
-    gains = [_gain(scene, now.layers, then, held, inside) for inside in sets]
+    if criteria.usual:
+        sets.append(_best_run(criteria, then, now.runs, held, movable))
+    gains = [_gain(criteria, now.layers, then, held, inside) for inside in sets]
     best = int(np.argmax(gains))
     return Move(gains[best], sets[best], motion, int(home))
 
 
-def _gain(scene: Scene, now: Floats, then: Floats, held: Floats, inside: Bools) -> float:
+def _gain(criteria: PlacementCriteria, now: Floats, then: Floats, held: Floats, inside: Bools) -> float:
     if not inside.any():
         return 0.0
-    return float(scene.nats(sums_of(then, inside)) - scene.nats(sums_of(now, inside)) + held[inside].sum())
+    return float(
+        criteria.log_evidence(sums_of(then, inside)) - criteria.log_evidence(sums_of(now, inside)) + held[inside].sum()
+    )
 
 
-def _best_run(scene: Scene, then: Floats, runs_now: Floats, held: Floats, movable: Bools) -> Bools:
+def _best_run(criteria: PlacementCriteria, then: Floats, runs_now: Floats, held: Floats, movable: Bools) -> Bools:
     low, high, after = interval_sums(then)
     blocked = np.concatenate([[0], np.cumsum(~movable)])
     upright = np.concatenate([[0.0], np.cumsum(held)])
-    gain = scene.nats(after) - runs_now + upright[high] - upright[low]
+    gain = criteria.log_evidence(after) - runs_now + upright[high] - upright[low]
     gain = np.where(blocked[high] > blocked[low], -np.inf, gain)
     best, inside = int(np.argmax(gain)), np.zeros(len(movable), bool)
     if np.isfinite(gain[best]):

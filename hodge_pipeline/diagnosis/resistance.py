@@ -1,4 +1,4 @@
-"""How loosely the poses at an edge's two ends hang together without it: the effective resistance of the others."""
+"""Effective resistance between the ends of an edge without that edge: the variance of their relative pose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BRIDGE = 1e-3
 
 @dataclass(frozen=True)
 class Network:
-    """Edges as resistors of one: how loosely it holds any two vertices together.
+    """Edges as unit resistors, and the effective resistance between any two vertices.
 
     `component (V,)`; `grounded (V,)` one vertex of each; `d0` of the edges, `factor` of their Laplacian without those.
     """
@@ -31,7 +31,7 @@ class Network:
 
     @classmethod
     def of(cls, edges: Ints, vertex_count: int) -> Network:
-        """The network of these edges; self-loops hold nothing."""
+        """The network of these edges; self-loops are left out."""
         proper = edges[edges[:, 0] != edges[:, 1]]
         component = connected_components(proper, vertex_count)
         grounded = first_of_component(component)
@@ -39,7 +39,7 @@ class Network:
         return cls(component, grounded, d0, factorise(grounded_laplacian(d0, np.ones(len(proper)), grounded)))
 
     def between(self, pairs: Ints) -> Floats:
-        """The resistance (P,) of each pair: the variance of its relative pose in units of an edge's. ∞ where nothing
+        """The resistance (P,) of each pair: the variance of its relative pose in units of an edge's. ∞ where no path
         joins the two.
 
         Exact up to 1500 vertices, beyond that by random projections (Spielman and Srivastava 2008), within a third or
@@ -50,7 +50,7 @@ class Network:
         return np.where(self.component[i] == self.component[j], through, np.inf)
 
     def potentials(self, i: int, j: int) -> Floats:
-        """What a unit current from j to i makes of each vertex (V,) of their component."""
+        """The potential (V,) of each vertex for a unit current from j to i."""
         current = np.zeros((len(self.grounded), 1))
         current[i], current[j] = 1, -1
         out = np.zeros(len(self.grounded))

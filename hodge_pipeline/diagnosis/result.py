@@ -1,4 +1,4 @@
-"""What a diagnosis says."""
+"""The result of a diagnosis."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Diagnosis:
       untestable; `reason`: one line for each edge.
     - `kept (E,)`: edges that are neither wrong nor suspect.
     - `residual_m`, `residual_deg (E,)`: against the robust poses; NaN between two pieces.
-    - `leverage (E,)`: the share of an edge's own say in where its ends lie, 1 where removing it splits its piece;
-      0 for one that is not kept.
+    - `leverage (E,)`: an edge's share in determining the relative pose of its ends, 1 where removing it splits its
+      piece; 0 for one that is not kept.
     - `cycles`; `witnesses_for`, `witnesses_against (E, 3)`: their rows, the most telling first, −1 for none.
     - `piece (V,)`: 0 the largest; `world_from_cam (V, 4, 4)`: each piece in a frame of its own.
     - `notes`: counts and caveats, one line each.

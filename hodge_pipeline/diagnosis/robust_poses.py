@@ -45,7 +45,7 @@ class Fit:
 
     @property
     def bridge(self) -> Bools:
-        """Edges (E,) in use that alone hold two parts together."""
+        """Used edges (E,) that are the only connection between two parts."""
         return self.used & np.isinf(self.resistance)
 
 
@@ -59,8 +59,8 @@ def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple
         used = found.chi2 < gate
         if following < gate and np.array_equal(used, found.chi2 < following):
             continue
-        poses, say = _solve(evidence, graph, found.poses, used)
-        found = _refitted(evidence, graph, poses, used, say)
+        poses, student_weight = _solve(evidence, graph, found.poses, used)
+        found = _refitted(evidence, graph, poses, used, student_weight)
     return found
 
 
@@ -75,8 +75,8 @@ def rough_fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates:
         if np.array_equal(used, found.chi2 < following):
             continue
         poses = Springs.of(evidence, used, cluster).settled(evidence, found.poses, found.chi2, widened)
-        say = np.where(used, FREEDOM / (FREEDOM + _squares(evidence, graph, poses) / widened), 0.0)
-        found = _refitted(evidence, graph, poses, used, say)
+        student_weight = np.where(used, FREEDOM / (FREEDOM + _squares(evidence, graph, poses) / widened), 0.0)
+        found = _refitted(evidence, graph, poses, used, student_weight)
     return found
 
 
@@ -88,15 +88,15 @@ def _as_grown(evidence: Evidence, graph: ViewGraph, alignment: Alignment) -> Fit
     return Fit(poses, component, chi2, chi2 < GATE, resistance)
 
 
-def _refitted(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools, say: Floats) -> Fit:
+def _refitted(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools, student_weight: Floats) -> Fit:
     component = connected_components(evidence.edges[used], evidence.vertex_count)
     resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
-    chi2 = _chi2(evidence, graph, poses, component, resistance, say)
+    chi2 = _chi2(evidence, graph, poses, component, resistance, student_weight)
     return Fit(poses, component, chi2, chi2 < GATE, resistance)
 
 
 def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> tuple[Floats, Floats]:
-    """Poses, and what each edge (E,) weighed, 1 for one that fits and 0 for one that is not used."""
+    """Poses, and the Student weight (E,) of each edge: 1 for one that fits exactly, 0 for one that is not used."""
     chosen = graph.select(np.flatnonzero(used))
     rough = graph.edge_count > LARGE
     limits = Limits(3 if rough else 20, 1e-3 if rough else 1e-6)
@@ -113,34 +113,35 @@ def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> 
 
 
 def _squares(evidence: Evidence, graph: ViewGraph, poses: Floats) -> Floats:
-    """χ² (E,) in the noise of the edges alone."""
-    angle, moved = left_over(graph, poses)
-    return np.asarray((angle / evidence.noise.rotation_rad) ** 2 + (moved / evidence.noise.translation_m) ** 2)
+    """χ² (E,) by the noise of the edges, without that of the poses."""
+    angle, displacement_m = left_over(graph, poses)
+    return np.asarray((angle / evidence.noise.rotation_rad) ** 2 + (displacement_m / evidence.noise.translation_m) ** 2)
 
 
 def left_over(graph: ViewGraph, poses: Floats) -> tuple[Floats, Floats]:
     """The angle (E,) in radians and distance (E,) in metres between each edge and the poses."""
-    moved, angle = edge_residuals(graph, poses)
-    return angle, moved
+    displacement_m, angle = edge_residuals(graph, poses)
+    return angle, displacement_m
 
 
 def chi2_at(evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats) -> Floats:
-    """χ² (E,) of each edge at poses in which none of them had a say, held as loosely as `resistance (E,)` says."""
+    """χ² (E,) of each edge at poses that none of these edges was used for; `resistance (E,)`: see `Network.between`."""
     return _chi2(evidence, graph, poses, component, resistance, np.zeros(graph.edge_count))
 
 
 def _chi2(
-    evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats, say: Floats
+    evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats, student_weight: Floats
 ) -> Floats:
     """χ² (E,) in the edge's noise and the poses' own: angles drift as a random walk, positions with them.
 
-    Of an edge that has its say in the poses, what it would be without that.
+    For an edge that was used with `student_weight (E,)` the χ² is what it would be at poses solved without it.
     """
-    angle, moved = left_over(graph, poses)
-    known = np.where(np.isfinite(resistance), resistance, 0.0)
-    angle, moved = (1 + say * known) * angle, (1 + say * known) * moved
+    angle, displacement_m = left_over(graph, poses)
+    finite_resistance = np.where(np.isfinite(resistance), resistance, 0.0)
+    without = 1 + student_weight * finite_resistance
+    angle, displacement_m = without * angle, without * displacement_m
     turn, shift = evidence.noise.rotation_rad**2, evidence.noise.translation_m**2
-    swing = turn * evidence.reach_m**2 * known**3 / 3
-    chi2 = angle**2 / (turn * (1 + known)) + moved**2 / (shift * (1 + known) + swing)
+    swing = turn * evidence.reach_m**2 * finite_resistance**3 / 3
+    chi2 = angle**2 / (turn * (1 + finite_resistance)) + displacement_m**2 / (shift * (1 + finite_resistance) + swing)
     apart = component[graph.edges[:, 0]] != component[graph.edges[:, 1]]
     return np.where(apart, np.inf, chi2)

@@ -1,4 +1,4 @@
-"""Edges that share the blame for a loop: one of them is wrong, and nothing in the graph says which."""
+"""Edges that share the blame for a loop: one of them is wrong, and no cycle of the graph decides which."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class SharedBlame:
     """Where an alignment had to leave out one of several edges that no cycle tells apart.
 
     - `unvouched (E,)`: edges in use because another one was left out, and either may be the wrong one: those that the
-      same cycles pass as that one, and those that alone hold two parts together, over which no cycle closes.
+      same cycles pass as that one, and the only connections between two parts, over which no cycle closes.
     - `cycle (E,)`: the shortest failing cycle of each such edge, and of each that was left out for it; −1 elsewhere.
     - `probability (E,)`: of being right, of an edge left out that shares the blame: by its prior among those it shares
       it with, of which one is wrong; 0 elsewhere.
@@ -34,11 +34,11 @@ def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
     loops, count = cycles.loops, len(evidence.edges)
     row, edge = np.repeat(np.arange(len(loops)), loops.lengths), loops.edge
     untold = np.bincount(edge, cycles.closes[row], count) == 0
-    untold &= ~evidence.alone
+    untold &= ~evidence.in_no_listed_cycle
     doubted = _in_series_with(~fit.used, evidence)
     unvouched = fit.used & ((np.isinf(fit.resistance) & untold) | doubted)
     holds = np.bincount(row, unvouched[edge], len(loops)) > 0
-    # an edge that was left out shares the blame where each of its cycles has an edge that nothing vouches for
+    # an edge that was left out shares the blame where each of its cycles has an edge that no closing cycle confirms
     left_out = ~fit.used & ((untold & (np.bincount(edge, ~holds[row], count) == 0)) | doubted)
     concerned = unvouched | left_out
     cycle = _shortest(loops.lengths, row, edge, concerned)
@@ -53,12 +53,12 @@ def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
 def _in_series_with(chosen: Bools, evidence: Evidence) -> Bools:
     """Edges (E,) that the same cycles pass as another one, where one of these is chosen (E,)."""
     classes = series_classes(evidence.edges, evidence.vertex_count)
-    known = classes >= 0
+    in_class = classes >= 0
     count = int(classes.max(initial=-1)) + 1
-    several = np.bincount(classes[known], minlength=count) > 1
-    struck = np.bincount(classes[known], chosen[known], count) > 0
+    several = np.bincount(classes[in_class], minlength=count) > 1
+    struck = np.bincount(classes[in_class], chosen[in_class], count) > 0
     out = np.zeros(len(classes), bool)
-    out[known] = (several & struck)[classes[known]]
+    out[in_class] = (several & struck)[classes[in_class]]
     return out
 
 

@@ -49,8 +49,8 @@ def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
     """
     products = loop_products(loops, i_from_j)
     middle = _middles(loops, i_from_j)
-    moved = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
-    return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(moved, axis=1)
+    displacement_m = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
+    return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(displacement_m, axis=1)
 
 
 def _middles(loops: Loops, i_from_j: Floats) -> Floats:

@@ -21,7 +21,7 @@ from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 MEDIAN_CHI2 = {2: 2.366, 3: 5.348}
 """Of χ² with 3 and 6 degrees of freedom."""
 TAILS = 1.6
-"""Where rotation or translation alone makes most of χ², its tail is as long as that of half the degrees of freedom."""
+"""Where only rotation, or only translation, makes most of χ², its tail is that of half the degrees of freedom."""
 LEAST_WEIGHT = 0.1
 ROUNDS = 3
 
@@ -70,11 +70,11 @@ def _attempt(
     graph: ViewGraph, found: Diagnosis, share: Floats, rows: Ints, start: Floats, objective: ObjectiveName
 ) -> _Attempt:
     chosen = graph.select(rows)
-    # information is often right in its proportions alone: the gate is set in units of what the kept edges show
+    # information is often right only in its proportions: the gate is scaled by the median χ² of the kept edges
     size = 2 if graph.dimension == 2 else 3
     usual = _chi2(graph, found.world_from_cam, found.piece)
-    known = usual[rows][np.isfinite(usual[rows])]
-    scale = max(float(np.median(known)) / MEDIAN_CHI2[size], 1e-12) if len(known) else 1.0
+    finite = usual[rows][np.isfinite(usual[rows])]
+    scale = max(float(np.median(finite)) / MEDIAN_CHI2[size], 1e-12) if len(finite) else 1.0
     limit = TAILS * (CHI2_99_PLANAR if size == 2 else CHI2_99_SPATIAL) * scale
     solution = solve_robust(chosen, start=start, confidence=share[rows], threshold=limit, objective=objective)
     chi2 = _chi2(graph, solution.world_from_cam, solution.component)
@@ -84,10 +84,10 @@ def _attempt(
 def _chi2(graph: ViewGraph, poses: Floats, piece: Ints) -> Floats:
     """χ² (E,) with isotropic weights; ∞ between two pieces."""
     weights = edge_weights(graph, 2 if graph.dimension == 2 else 3)
-    angle, moved = left_over(graph, poses)
+    angle, displacement_m = left_over(graph, poses)
     kappa = weights.kappa if graph.dimension == 2 else 2 * weights.kappa
     apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
-    return np.where(apart, np.inf, kappa * angle**2 + weights.tau * moved**2)
+    return np.where(apart, np.inf, kappa * angle**2 + weights.tau * displacement_m**2)
 
 
 def _whole(graph: ViewGraph, found: Diagnosis, attempt: _Attempt) -> Solution:

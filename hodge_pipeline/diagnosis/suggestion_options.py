@@ -17,14 +17,14 @@ class SuggestionOptions:
         default=0,
         ge=0,
         le=20,
-        description="rounds after the outer iterations, each: diagnose, register the pairs that would tell most, solve "
+        description="rounds after the outer iterations, each: diagnose, register the most informative pairs, solve "
         "with them; they end early once no pair is worth it. 0: none are registered, `hodge diagnose` names them",
     )
     pairs: int = Field(default=40, ge=1, description="pairs that a round registers at most, no frame in more than two")
     min_gain: float = Field(
         default=0.5,
         ge=0,
-        description="nats: what a pair must tell, as log(1 + resistance) of the kept edges between its frames, and 1 "
+        description="nats: what a pair must gain, as log(1 + resistance) of the kept edges between its frames, and 1 "
         "more for each untestable edge that it tests; 0.5 takes 39 % of the variance between its frames away",
     )
     among: EdgeBuilder = Field(

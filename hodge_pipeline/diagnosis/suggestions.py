@@ -1,4 +1,4 @@
-"""Which pairs to register next: those whose edge would tell, or hold, the most."""
+"""Which pairs to register next: those whose edge would add the most information."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from hodge_pipeline.diagnosis.result import UNTESTABLE, Diagnosis
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 NEAREST = 6
-"""Nearest views of each view that are candidates, whatever the graph says."""
+"""Nearest views of each view that are candidates, whatever edges there are."""
 TESTED_GAIN = 1.0
-"""What an untestable edge that becomes testable counts, in nats, beside the logarithm of the variance saved."""
+"""Nats for each untestable edge that becomes testable, added to the logarithm of the variance saved."""
 EACH_VERTEX = 2
-"""Suggestions that share a view tell much the same."""
+"""Suggestions that share a view add nearly the same information."""
 
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Pairs (K, 2) of vertex rows to register, the most telling first, and why.
+    """Pairs (K, 2) of vertex rows to register, the most informative first, and why.
 
     - `score (K,)` nats: the log-determinant that an edge adds, and what it tests.
     - `resistance (K,)`: the variance of the pair's relative pose in units of an edge's; ∞ between pieces.
@@ -49,7 +49,7 @@ def suggest_pairs(
     overlapping: Ints | None = None,
     tried: Ints | None = None,
 ) -> Suggestions:
-    """The most telling pairs that no kept edge joins yet, ranked; each view occurs at most twice.
+    """The most informative pairs that no kept edge joins yet, ranked; each view occurs at most twice.
 
     Candidates are the pairs (N, 2) that see something in common, `overlapping`; where that is not known, the missing
     sides of triangles and views that lie near each other. And neighbours in order that lie in different pieces. Pairs
@@ -64,8 +64,8 @@ def suggest_pairs(
     keys = np.unique(low * count + high)
     pairs = np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    known = graph.edges if tried is None else np.concatenate([graph.edges, tried])
-    pairs = pairs[~_contains(known, pairs, count)]
+    registered = graph.edges if tried is None else np.concatenate([graph.edges, tried])
+    pairs = pairs[~_contains(registered, pairs, count)]
     gains = _Gains.of(graph.edges[kept], graph.edges[diagnosis.verdict == UNTESTABLE], pairs, count)
     return _best_first(pairs, gains, most)
 
@@ -92,9 +92,9 @@ def _near(diagnosis: Diagnosis) -> Ints:
         rows = np.flatnonzero(diagnosis.piece == piece)
         if len(rows) < 2:
             break  # pieces come by size
-        known = min(NEAREST + 1, len(rows))
-        _, found = cKDTree(diagnosis.world_from_cam[rows, :3, 3]).query(diagnosis.world_from_cam[rows, :3, 3], known)
-        parts.append(np.stack([np.repeat(rows, known), rows[found.ravel()]], axis=1))
+        number = min(NEAREST + 1, len(rows))
+        _, found = cKDTree(diagnosis.world_from_cam[rows, :3, 3]).query(diagnosis.world_from_cam[rows, :3, 3], number)
+        parts.append(np.stack([np.repeat(rows, number), rows[found.ravel()]], axis=1))
     return np.concatenate(parts)
 
 
@@ -111,8 +111,8 @@ def _contains(edges: Ints, pairs: Ints, count: int) -> Bools:
 class _Gains:
     """What an edge of each pair would add to the kept edges and to the pairs taken so far."""
 
-    def __init__(self, joined: csr_matrix, alone: csr_matrix, network: Network, pairs: Ints) -> None:
-        self._joined, self._alone, self._network, self._pairs = joined, alone, network, pairs
+    def __init__(self, joined: csr_matrix, untestable: csr_matrix, network: Network, pairs: Ints) -> None:
+        self._joined, self._untestable, self._network, self._pairs = joined, untestable, network, pairs
         self._taken: list[Floats] = []
         self.resistance = network.between(pairs)
         self.tests = self._tested(np.arange(len(pairs)))
@@ -126,8 +126,8 @@ class _Gains:
     def score(self) -> Floats:
         """Nats of each pair."""
         count = self._joined.shape[0]
-        known = np.where(np.isfinite(self.resistance), self.resistance, count)
-        return np.asarray(np.log1p(known) + TESTED_GAIN * self.tests)
+        finite_resistance = np.where(np.isfinite(self.resistance), self.resistance, count)
+        return np.asarray(np.log1p(finite_resistance) + TESTED_GAIN * self.tests)
 
     def take(self, row: int) -> None:
         """Count the pair among the edges: the variances fall by what it holds, and what it tests is tested."""
@@ -145,26 +145,26 @@ class _Gains:
             self.resistance = np.maximum(self.resistance - falls, 0.0)
 
     def _test(self, i: int, j: int) -> None:
-        alone, joined = self._alone.tolil(), self._joined
+        untestable, joined = self._untestable.tolil(), self._joined
         touched = {i, j}
         for a, b in ((i, j), (j, i)):
-            for k in self._alone[a].multiply(joined[b]).indices.tolist():
-                alone[a, k] = alone[k, a] = 0
-                alone[b, k] = alone[k, b] = 0
+            for k in self._untestable[a].multiply(joined[b]).indices.tolist():
+                untestable[a, k] = untestable[k, a] = 0
+                untestable[b, k] = untestable[k, b] = 0
                 touched.add(k)
-        self._alone = alone.tocsr()
-        self._alone.eliminate_zeros()
+        self._untestable = untestable.tocsr()
+        self._untestable.eliminate_zeros()
         again = np.flatnonzero(np.isin(self._pairs, list(touched)).any(axis=1))
         self.tests[again] = self._tested(again)
 
     def _tested(self, rows: Ints) -> Ints:
         """How many untestable edges would have a triangle with each pair (K,) and one joined side."""
-        if not self._alone.nnz or not len(rows):
+        if not self._untestable.nnz or not len(rows):
             return np.zeros(len(rows), np.int64)
         i, j = self._pairs[rows].T
         # a common neighbour k over one untestable and one joined edge; both untestable counts both
-        through = np.asarray(self._alone[i].multiply(self._joined[j]).sum(axis=1)).ravel()
-        through += np.asarray(self._joined[i].multiply(self._alone[j]).sum(axis=1)).ravel()
+        through = np.asarray(self._untestable[i].multiply(self._joined[j]).sum(axis=1)).ravel()
+        through += np.asarray(self._joined[i].multiply(self._untestable[j]).sum(axis=1)).ravel()
         return np.asarray(through, np.int64)
 
 
@@ -173,17 +173,17 @@ def _best_first(pairs: Ints, gains: _Gains, most: int) -> Suggestions:
     named = np.zeros(int(pairs.max(initial=-1)) + 1, np.int64)
     free = np.ones(len(pairs), bool)
     rows: list[int] = []
-    told: list[tuple[float, float, int]] = []
+    gained: list[tuple[float, float, int]] = []
     while free.any() and len(rows) < most:
         score = np.where(free, gains.score, -np.inf)
         row = int(np.argmax(score))
         rows.append(row)
-        told.append((float(score[row]), float(gains.resistance[row]), int(gains.tests[row])))
+        gained.append((float(score[row]), float(gains.resistance[row]), int(gains.tests[row])))
         named[pairs[row]] += 1
         free[row] = False
         free &= (named[pairs] < EACH_VERTEX).all(axis=1)
         gains.take(row)
-    score, resistance, tests = np.array(told, float).reshape(-1, 3).T
+    score, resistance, tests = np.array(gained, float).reshape(-1, 3).T
     reason = np.array(_reasons(resistance, tests.astype(np.int64)), dtype=np.str_)
     return Suggestions(pairs[np.array(rows, np.int64)], score, resistance, tests.astype(np.int64), reason)
 

@@ -1,4 +1,4 @@
-"""Which cycles close, which edges they can test, and which of them speak for or against each edge."""
+"""Which cycles close, which edges they can test, and which of them are evidence for or against each edge."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ GATE = 30.0
 LONGEST_ENTRIES = 5_000_000
 
 
-def judge_cycles(loops: Loops, angle: Floats, moved: Floats, noise: Noise, reach_m: float) -> Cycles:
+def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
     """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
     row = _rows(loops)
     turn = np.bincount(row, noise.rotation_rad[loops.edge] ** 2, len(loops))
     shift = np.bincount(row, noise.translation_m[loops.edge] ** 2, len(loops))
     swing = turn * (reach_m * loops.lengths) ** 2 / 12
-    chi2 = angle**2 / np.maximum(turn, 1e-300) + moved**2 / np.maximum(shift + swing, 1e-300)
-    return Cycles(loops, angle, moved, chi2, chi2 < GATE)
+    chi2 = angle**2 / np.maximum(turn, 1e-300) + displacement_m**2 / np.maximum(shift + swing, 1e-300)
+    return Cycles(loops, angle, displacement_m, chi2, chi2 < GATE)
 
 
 def usual_share(cycles: Cycles) -> float:
-    """The share of right edges that the share of closing cycles tells of; 1 where there is no cycle.
+    """The share of right edges, estimated from the share of closing cycles; 1 where there is no cycle.
 
     A cycle closes where all its edges are right: p to the power of its length.
     """
@@ -47,14 +47,14 @@ def in_no_cycle(edges: Ints, vertex_count: int, cycles: Cycles) -> Bools:
     """Where (E,) no listed cycle passes an edge: bridges, edges of loops too long to list, and self-loops, which are no
     measurement of anything.
     """
-    alone = np.ones(len(edges), bool)
-    alone[cycles.loops.edge] = False
-    return alone
+    unlisted = np.ones(len(edges), bool)
+    unlisted[cycles.loops.edge] = False
+    return unlisted
 
 
 def unattributable(edges: Ints, vertex_count: int, cycles: Cycles) -> Ints:
-    """For each edge (E,) the row of the failing cycle that alone tests it and all its other edges; −1 where there is
-    none. One of its edges is wrong, and nothing says which.
+    """For each edge (E,) the row of the failing cycle that is the only test of all its edges; −1 where there is none.
+    One of these edges is wrong, and no other cycle decides which.
     """
     forest = spanning_forest(edges, vertex_count)
     depth = forest.depth[edges[forest.chords]].sum(axis=1) + 1
@@ -66,11 +66,11 @@ def unattributable(edges: Ints, vertex_count: int, cycles: Cycles) -> Ints:
     passes = np.bincount(basis.edge, minlength=len(edges))
     # a loop of the basis that shares no edge with another is a block of its own: no other cycle passes its edges
     single = np.bincount(_rows(basis), passes[basis.edge] == 1, len(basis)) == basis.lengths
-    lonely = np.zeros(len(edges), bool)
-    lonely[basis.edge[single[_rows(basis)]]] = True
+    in_block = np.zeros(len(edges), bool)
+    in_block[basis.edge[single[_rows(basis)]]] = True
     chosen = cycles.loops.select(failing)
     row = _rows(chosen)
-    once = np.bincount(row, lonely[chosen.edge], len(chosen)) == chosen.lengths
+    once = np.bincount(row, in_block[chosen.edge], len(chosen)) == chosen.lengths
     out[chosen.edge[once[row]]] = failing[row[once[row]]]
     return out
 

@@ -1,9 +1,9 @@
-"""Which way is up to a camera, learned from the scene: people and vehicles carry them much the same way throughout, so
-that a part laid on its head is hardly ever laid rightly.
+"""The distribution of the world's up in camera axes, fitted to the scene: people and vehicles carry cameras much the
+same way throughout, so that a part of the scene placed upside down is nearly always wrong.
 
-Each piece has a direction that is up in the world. Seen in the axes of its cameras it is drawn from one law for all: a
-Gaussian in the tangent plane of its mean, wider where cameras are tilted than where they are rolled, or, for the share
-of cameras held in any way, uniform on the sphere.
+Each piece has a direction that is up in the world. In the axes of its cameras it follows one mixture for all pieces: a
+Gaussian in the tangent plane of its mean, wider in pitch than in roll, and, for the other cameras, uniform on the
+sphere.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ DENSE = 10.0
 LEAST_SPREAD_RAD = 0.2
 """Poses drift: chained edges are not upright to less, however the cameras were."""
 FEWEST = 6
-"""Views of a piece that tell of the law: up is not known in the world, and suits fewer too well."""
+"""Views of a piece that the model is fitted to: with fewer, the unknown up of the piece fits too well."""
 ROUNDS, STEPS = 8, 3
 OUTLYING = 4.0
-"""Standard deviations beyond which a camera does little to say where up is."""
+"""Standard deviations beyond which a camera hardly counts in the estimate of up."""
 CLEAR_SHARE, CLEAR_SPREAD_RAD = 0.8, 0.42
-"""Of neighbours, from and up to which cameras are carried upright; where they are not, nothing follows."""
+"""Of neighbours, the least share and the largest spread of a model that is used; else its share becomes 0."""
 
 
 @dataclass(frozen=True)
 class Upright:
-    """The law of the world's up in camera axes: `up (3,)`, `tangent (2, 3)`, `precision (2, 2)`, and the `share` of
-    cameras that follow it, 0 where the law says nothing.
+    """The distribution of the world's up in camera axes: `up (3,)`, `tangent (2, 3)`, `precision (2, 2)`, and the
+    `share` of cameras in the Gaussian, 0 where the model carries no evidence.
     """
 
     up: Floats
@@ -39,8 +39,8 @@ class Upright:
     precision: Floats
     share: float
 
-    def nats(self, rotations: Floats, up: Floats) -> Floats:
-        """What speaks (V,) for cameras of these rotations (V, 3, 3) where up is (V, 3): 0 for the best, negative."""
+    def log_evidence(self, rotations: Floats, up: Floats) -> Floats:
+        """Log-evidence (V,) of camera rotations (V, 3, 3) where up is (V, 3): 0 for the best, else negative."""
         return self._log_density(np.einsum("nji,nj->ni", rotations, up)) - self._log_of(np.zeros(1))
 
     def world_up(self, rotations: Floats, piece: Ints) -> Floats:
@@ -61,11 +61,11 @@ class Upright:
         return local, np.einsum("...a,ab,...b->...", local, self.precision, local)
 
     def following(self, seen: Floats) -> Floats:
-        """The probability (V,) that cameras which see up in these directions (V, 3) follow the law."""
+        """The probability (V,) that cameras which see up in these directions (V, 3) follow the model."""
         return 1 - (1 - self.share) / np.exp(self._log_density(seen))
 
     def _settled(self, rotations: Floats, up: Floats) -> Floats:
-        """Gauss–Newton steps to where up (3,) suits the cameras that nearly follow the law."""
+        """Gauss–Newton steps to where up (3,) suits the cameras that nearly follow the model."""
         for _ in range(STEPS):
             local, squares = self.local(np.einsum("nji,j->ni", rotations, up))
             weight, across = 1 / (1 + squares / OUTLYING**2), _tangent(up)
@@ -86,38 +86,38 @@ class Upright:
 
 
 def learn_upright(rotations: Floats, piece: Ints, neighbours: Ints) -> Upright:
-    """The law that cameras (V, 3, 3) in pieces (V,) follow, if groups (V,) of neighbours show that there is one.
+    """The model of cameras (V, 3, 3) in pieces (V,); its share is 0 unless groups (V,) of neighbours confirm it.
 
-    Pieces may be laid wrongly, so that all cameras together show none; and cameras that turn freely follow one by
-    chance. Neighbours do neither.
+    Pieces may be placed wrongly, so that all cameras together fit none; and cameras that turn freely may fit one by
+    chance. Groups of neighbours do neither.
     """
-    law, nearby = _law(rotations, piece), _law(rotations, neighbours)
+    model, nearby = _fitted(rotations, piece), _fitted(rotations, neighbours)
     spread = np.sqrt(1 / np.linalg.eigvalsh(nearby.precision)[0])
     clear = nearby.share >= CLEAR_SHARE and spread <= CLEAR_SPREAD_RAD
-    return law if clear else replace(law, share=0.0)
+    return model if clear else replace(model, share=0.0)
 
 
-def _law(rotations: Floats, piece: Ints) -> Upright:
-    """The likeliest law, by expectation and maximisation."""
+def _fitted(rotations: Floats, piece: Ints) -> Upright:
+    """The most probable model, by expectation and maximisation."""
     size = np.bincount(piece)[piece]
-    told = (size >= FEWEST) | (size == size.max())
-    rotations, piece, size = rotations[told], piece[told], size[told]
-    law = _densest(rotations[piece == piece[np.argmax(size)]])
+    enough = (size >= FEWEST) | (size == size.max())
+    rotations, piece, size = rotations[enough], piece[enough], size[enough]
+    model = _densest(rotations[piece == piece[np.argmax(size)]])
     for _ in range(ROUNDS):
-        seen = np.einsum("nji,nj->ni", rotations, law.world_up(rotations, piece))
-        follows = law.following(seen)
+        seen = np.einsum("nji,nj->ni", rotations, model.world_up(rotations, piece))
+        follows = model.following(seen)
         total = max(float(follows.sum()), 1e-9)
         up = follows @ seen
         up /= max(float(np.linalg.norm(up)), 1e-12)
-        law = Upright(up, _tangent(up), np.eye(2), (total + 1) / (len(piece) + 2))
-        local = law.local(seen)[0]
+        model = Upright(up, _tangent(up), np.eye(2), (total + 1) / (len(piece) + 2))
+        local = model.local(seen)[0]
         spread = np.einsum("n,na,nb->ab", follows, local, local) / total + LEAST_SPREAD_RAD**2 * np.eye(2)
-        law = replace(law, precision=np.linalg.inv(spread))
-    return law
+        model = replace(model, precision=np.linalg.inv(spread))
+    return model
 
 
 def _densest(rotations: Floats) -> Upright:
-    """A wide law about the direction in camera axes that most cameras of one piece can share."""
+    """A wide model about the direction in camera axes that most cameras of one piece can share."""
     seen = np.tensordot(_directions(), rotations, (1, 1))
     near = np.exp(DENSE * (seen @ seen.swapaxes(1, 2) - 1))
     world, view = np.unravel_index(int(np.argmax(near.sum(2))), near.shape[:2])

@@ -36,9 +36,9 @@ def reasons(
     undecided: Ints,
     bridge: Bools,
 ) -> tuple[str, ...]:
-    """One line for each edge: what the cycles say, and how far it is from the poses.
+    """One line for each edge: which cycles close, and how far it is from the poses.
 
-    `bridge (E,)`: edges in use that alone hold two parts together, against others that were left out.
+    `bridge (E,)`: used edges that are the only connection between two parts which edges left out would join too.
     """
     count = graph.edge_count
     passing = np.bincount(cycles.loops.edge, minlength=count)
@@ -90,7 +90,7 @@ def _over_what(closed: int, sound: int) -> str:
 
 
 def _against(is_bridge: bool, distance: str) -> str:
-    """What speaks against an edge none of whose cycles fails."""
+    """Evidence against an edge none of whose cycles fails."""
     if is_bridge:
         return "it alone holds two parts together, which edges that were left out would join otherwise"
     return f"against it speaks where all kept edges together lay its ends: {distance}"

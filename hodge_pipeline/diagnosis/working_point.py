@@ -1,4 +1,4 @@
-"""Where, in its own axes, a view looks: the point at which errors of rotation and translation are least entangled."""
+"""The point in a view's own axes at which errors of rotation and translation are least correlated: where it looks."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def working_point(i_from_j: Floats, probability: Floats) -> tuple[Floats, float]
     for _ in range(ROUNDS):
         normal = np.einsum("n,nij,nik->jk", weight, rotation, rotation) + 1e-3 * weight.sum() * np.eye(3)
         point = np.linalg.solve(normal, -np.einsum("n,nij,ni->j", weight, rotation, shift))
-        moved = np.linalg.norm(rotation @ point + shift, axis=1)
-        weight = 1 / (1 + (moved / max(float(np.median(moved)), 1e-12)) ** 2)
+        displacement_m = np.linalg.norm(rotation @ point + shift, axis=1)
+        weight = 1 / (1 + (displacement_m / max(float(np.median(displacement_m)), 1e-12)) ** 2)
     spread = float(np.median(np.linalg.norm(rotation @ point + shift, axis=1)))
     if np.linalg.norm(point) > FARTHEST * usual or spread > (1 - LEAST_GAIN) * usual:
         return np.zeros(3), usual

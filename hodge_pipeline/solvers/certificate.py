@@ -30,7 +30,7 @@ GAP_STEP = 4.0
 """The factor between the gaps that are tried for a bound: each costs a factorisation."""
 EIGENVALUE_TOLERANCE = 1e-3
 ABOVE = 1.01
-"""The first gap that is tried, over what the smallest eigenvalue says."""
+"""The first gap that is tried, relative to the one from the smallest eigenvalue."""
 FIRST_SHIFT = 1e-3
 """Over κ's scale: that of an inverse to precondition with; the smaller, the fewer steps, the more factorisations."""
 
@@ -149,8 +149,8 @@ def lower_bound(
 ) -> float:
     """What F is at least, whatever the rotations: from a point (n, r, d), (n, r) of a higher space that costs `cost`.
 
-    `smallest_eigenvalue`: about that of Q − Λ there, NaN where it is not known.
-    For all R, F(R) ≥ tr Λ + λ_min(Q − Λ) · n d, and tr Λ is the cost. −∞ where the bound would say nothing.
+    `smallest_eigenvalue`: about that of Q − Λ there, NaN where it was not computed.
+    For all R, F(R) ≥ tr Λ + λ_min(Q − Λ) · n d, and tr Λ is the cost. −∞ where there is no finite bound.
     """
     matrix, on_rotations = _reduced(
         problem, elimination_order(problem), certificate_matrix(problem, rotations, translations)

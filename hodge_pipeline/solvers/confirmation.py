@@ -1,4 +1,4 @@
-"""Whether anything confirms the edges that a robust solve keeps: their cycles close better than by chance."""
+"""Whether the cycles of the edges that a robust solve keeps close better than by chance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far each edge can be trusted before any solve, by its short cycles: triangles and pairs of parallel edges.
+"""A score of corruption for each edge before any solve, from its short cycles: triangles and pairs of parallel edges.
 
 Cycle-edge message passing (Lerman and Shi 2022): an edge is as bad as the cycles whose other edges are good.
 """
@@ -47,9 +47,9 @@ def short_loops(
     around = np.concatenate([triangle, twice])
     reach = np.einsum("ei,ei->e", i_from_j[:, :3, 3], i_from_j[:, :3, 3])
     levered = translation_variance + reach * rotation_variance
-    known = rows >= 0
-    turn = np.where(known, rotation_variance[rows], 0.0).sum(axis=1)
-    shift = np.where(known, levered[rows], 0.0).sum(axis=1)
+    present = rows >= 0
+    turn = np.where(present, rotation_variance[rows], 0.0).sum(axis=1)
+    shift = np.where(present, levered[rows], 0.0).sum(axis=1)
     xi = se3.log(around)
     chi2 = np.einsum("li,li->l", xi[:, :3], xi[:, :3]) / turn + np.einsum("li,li->l", xi[:, 3:], xi[:, 3:]) / shift
     return Loops(rows, chi2 / (chi2 + threshold))
@@ -81,13 +81,13 @@ def _parallel_pairs(first: Ints, order: Ints) -> Ints:
 
 def edge_corruption(loops: Loops, edge_count: int) -> Floats:
     """How bad (E,) each edge is, from 0 to 1; NaN where no short cycle tests it."""
-    known = loops.edges >= 0
-    member = loops.edges[known]
-    loop = np.nonzero(known)[0]
+    present = loops.edges >= 0
+    member = loops.edges[present]
+    loop = np.nonzero(present)[0]
     tested = np.bincount(member, minlength=edge_count) > 0
     score = np.full(edge_count, 0.5)
     for sharpness in np.geomspace(FIRST_SHARPNESS, LAST_SHARPNESS, ROUNDS):
-        others = np.where(known, score[loops.edges], 0.0).sum(axis=1)[loop] - score[member]
+        others = np.where(present, score[loops.edges], 0.0).sum(axis=1)[loop] - score[member]
         weight = np.exp(-sharpness * others)
         total = np.bincount(member, weight, edge_count)
         score = np.bincount(member, weight * loops.deviation[loop], edge_count) / np.where(total > 0, total, 1.0)

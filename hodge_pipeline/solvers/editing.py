@@ -1,4 +1,4 @@
-"""A pose graph under a person's hands: switch edges off and on, weigh or add them, solve again, take it back."""
+"""Interactive editing of a pose graph: disable, restore, reweight or add edges, solve again, undo."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ class GraphEditor:
         owed = self._state.owed + to_come
         descent = here(near, full)
         if owed > LIMITS.relative_tolerance * descent.point.cost:
-            descent, owed = minimise(near, "given", LIMITS, full, known=True), 0.0
+            descent, owed = minimise(near, "given", LIMITS, full, near_minimum=True), 0.0
         used = np.zeros(self.graph.edge_count)
         used[base.used] = scale[base.used]
         solution = replace(self._solution(base, descent), weights=used)

@@ -1,4 +1,4 @@
-"""Block elimination of a graph's vertices of low degree, many at a time: chains and ladders vanish without a library.
+"""Block elimination of a graph's vertices of low degree, many at a time: chains and ladders need no library.
 
 Each round takes an independent set of vertices of few neighbours. What is left, the core, is small on graphs that are
 like trajectories, and goes to a sparse direct solver. Rounds and fill depend on the graph alone: planned once, then

@@ -2,7 +2,7 @@
 
 Rung by rung the rotations may turn into one more dimension, where the certificate's eigenvector leads down; from the
 minimum there they are rounded back and the descent goes on. A lifted minimum that is certified bounds F from below,
-which says how much any poses could win at most.
+which limits how much any poses could still win.
 """
 
 from __future__ import annotations

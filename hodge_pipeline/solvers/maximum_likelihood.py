@@ -55,7 +55,7 @@ def solve(
       a cost that does not depend on the fill; `auto` takes what will be cheaper on this graph.
     - `dimension`: 2 for a graph in the plane; None takes the graph's, and 2 where every edge lies in the plane.
     - `fixed`: rows of vertices that stay at their start; None takes the graph's.
-    - `priors`: what is known of single poses; all that have one share the world's gauge. None takes the graph's.
+    - `priors`: unary pose priors; all poses that have one share the world's gauge. None takes the graph's.
 
     With arrays in hand, in metres and radians, `i_from_j[e]` moving points of frame `edges[e, 1]` into `edges[e, 0]`:
 

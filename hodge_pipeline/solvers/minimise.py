@@ -25,20 +25,26 @@ WARM_START_TOLERANCE = 1e-5
 
 
 def minimise(
-    setup: Setup, initial: InitialName, limits: Limits, full: bool, watch: Watch | None = None, *, known: bool = False
+    setup: Setup,
+    initial: InitialName,
+    limits: Limits,
+    full: bool,
+    watch: Watch | None = None,
+    *,
+    near_minimum: bool = False,
 ) -> Descent:
     """The descent of the isotropic objective and, where `full`, of the full one from its end.
 
-    `known`: the initial poses are near the full minimum already, so that it begins there; it does so too where CG is
-    not tried for the isotropic one.
+    `near_minimum`: the initial poses are near the full minimum already, so that the full descent begins there; it does
+    so too where CG is not tried for the isotropic one.
     """
     begin = setup.initial(initial)
-    found = _minimum(setup, begin, limits, full, watch, known)
+    found = _minimum(setup, begin, limits, full, watch, near_minimum)
     while found.converged or found.reason == ROUNDING_REACHED:
         off = turned_back(setup.problem, found.point.rotations, found.point.translations)
         if off is None:
             break
-        lower = _minimum(setup, off, limits.after(len(found.costs) - 1), full, watch, known=full)
+        lower = _minimum(setup, off, limits.after(len(found.costs) - 1), full, watch, near_minimum=full)
         if lower.point.cost >= found.point.cost:
             break
         found = replace(lower, costs=found.costs + lower.costs[1:], cg_steps=found.cg_steps + lower.cg_steps)
@@ -46,10 +52,10 @@ def minimise(
 
 
 def _minimum(
-    setup: Setup, begin: tuple[Floats, Floats], limits: Limits, full: bool, watch: Watch | None, known: bool
+    setup: Setup, begin: tuple[Floats, Floats], limits: Limits, full: bool, watch: Watch | None, near_minimum: bool
 ) -> Descent:
     """The descent from there, which may end at a saddle."""
-    if full and (known or full_at_once(setup.problem)):
+    if full and (near_minimum or full_at_once(setup.problem)):
         objective = full_objective(setup)
         return descend(objective, objective.at(*begin), limits, setup.rounding, watch)
     loose = replace(limits, relative_tolerance=max(limits.relative_tolerance, WARM_START_TOLERANCE))
@@ -120,7 +126,7 @@ def here(setup: Setup, full: bool) -> Descent:
 
 
 def metrics_of(descent: Descent, full: bool) -> dict[str, float]:
-    """What a solution says of its descent."""
+    """The metrics of a descent that a solution reports."""
     return {
         "objective": descent.point.cost,
         "chi2" if full else "isotropic": descent.point.cost,

@@ -104,19 +104,19 @@ class Multigrid:
 class Coarsening:
     """How the graphs of matrices are coarsened: found once for each pattern, for many matrices on it."""
 
-    known: list[tuple[csr_matrix, Ints | None]] = field(default_factory=list)
+    patterns: list[tuple[csr_matrix, Ints | None]] = field(default_factory=list)
 
     def of(self, matrix: bsr_matrix, finest: int) -> Ints | None:
         """The aggregate (n,) of each vertex; None where the matrix had better be factorised, `finest` being how many
         blocks the finest one has.
         """
-        for pattern, found in self.known:
+        for pattern, found in self.patterns:
             if np.array_equal(pattern.indptr, matrix.indptr) and np.array_equal(pattern.indices, matrix.indices):
                 return found
         aggregate = None if _worth_a_factor(matrix, finest) else aggregates(matrix)
         if aggregate is not None and aggregate.max() + 1 > LEAST_COARSENING * len(aggregate):
             aggregate = None
-        self.known.append((_pattern(matrix), aggregate))
+        self.patterns.append((_pattern(matrix), aggregate))
         return aggregate
 
 

@@ -86,7 +86,7 @@ def _coarsened(graph: RotationGraph, aggregate: Ints, inner: Floats) -> Rotation
 
 
 def _smoothed(graph: RotationGraph, rotations: Floats) -> Floats:
-    """The rotations after some damped steps, each to the mean of what the neighbours say."""
+    """The rotations after some damped steps, each towards the mean that the neighbours predict."""
     count, d = graph.count, rotations.shape[-1]
     rows, columns = np.concatenate([graph.head, graph.tail]), np.concatenate([graph.tail, graph.head])
     weighted = graph.weights[:, None, None] * graph.turns
@@ -98,6 +98,6 @@ def _smoothed(graph: RotationGraph, rotations: Floats) -> Floats:
     share = (DAMPING / np.where(degree > 0, degree, 1.0))[:, None, None]
     x = np.ascontiguousarray(np.swapaxes(rotations, 1, 2))
     for _ in range(SWEEPS):
-        told = (neighbours @ x.reshape(count * d, d)).reshape(x.shape)
-        x = (1 - DAMPING * (degree > 0))[:, None, None] * x + share * told
+        predicted = (neighbours @ x.reshape(count * d, d)).reshape(x.shape)
+        x = (1 - DAMPING * (degree > 0))[:, None, None] * x + share * predicted
     return project(np.swapaxes(x, 1, 2))

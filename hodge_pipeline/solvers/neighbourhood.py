@@ -1,4 +1,4 @@
-"""A descent in the neighbourhood of a few edges, all else held: most of what a change of them moves is near."""
+"""A descent in the neighbourhood of a few edges, all other poses held: a change of these edges moves few poses far."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class PaperProblem(CentredProblem):
         """What was ignored."""
         if not self.self_loops:
             return ()
-        return (f"{self.self_loops} edges join a vertex to itself and say nothing about poses: ignored",)
+        return (f"{self.self_loops} edges join a vertex to itself and hold no information on poses: ignored",)
 
 
 def make_problem(graph: ViewGraph, world_from_cam: Floats) -> PaperProblem:

@@ -199,7 +199,7 @@ def _kernel(ratio: Floats) -> Floats:
 def _edge_notes(proper: Bools, base_weights: Floats) -> tuple[str, ...]:
     notes = []
     if not proper.all():
-        notes.append(f"{int((~proper).sum())} edges join a vertex to itself and say nothing about poses: ignored")
+        notes.append(f"{int((~proper).sum())} edges join a vertex to itself and hold no information on poses: ignored")
     weightless = int((proper & (base_weights <= 0)).sum())
     if weightless:
         notes.append(f"{weightless} edges of weight 0 are ignored")

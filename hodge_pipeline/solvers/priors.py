@@ -1,4 +1,4 @@
-"""What is known of single poses: each prior is an edge from the world, one more vertex that is held at the identity."""
+"""Unary pose priors: each is an edge from the world, one more vertex that is held at the identity."""
 
 from __future__ import annotations
 

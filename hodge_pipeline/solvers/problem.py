@@ -33,14 +33,14 @@ CHUNK = 1 << 12
 class _Piece:
     """A chunk of edges: the blocks that they contribute to, and the matrix that sums their contributions into those.
 
-    Contributions `alone` are all there is of the blocks `places`.
+    Contributions `sole` are the only ones to the blocks `places`.
     """
 
     edges: slice
     targets: Ints
     scatter: csr_matrix
     places: Ints
-    alone: Ints
+    sole: Ints
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class BlockPattern:
         for piece in self.pieces:
             parts = blocks(piece.edges).reshape(-1, rows * columns)
             data[piece.targets] += piece.scatter @ parts
-            data[piece.places] = parts[piece.alone]
+            data[piece.places] = parts[piece.sole]
         shape = (self.shape[0] * rows, self.shape[1] * columns)
         return bsr_matrix((data.reshape(-1, rows, columns), self.indices, self.indptr), shape=shape)
 

@@ -1,7 +1,7 @@
-"""Poses in spite of wrong edges: graduated non-convexity from a start that short cycles have vouched for.
+"""Robust poses: graduated non-convexity from a start with edges that short cycles confirm.
 
 Yang, Antonante, Tzoumas and Carlone 2020. No edge is trusted for being sequential: where triangles test the edges they
-say which to begin with; where none does, every edge begins alike.
+give the initial weights; where none does, all edges begin with the same weight.
 """
 
 from __future__ import annotations
@@ -81,14 +81,14 @@ def solve_robust(
     # the isotropic objective counts a rotation of θ as 2 κ θ²; in the plane κ is the information itself, so twice
     setup = replace(setup, problem=replace(problem, kappa=problem.kappa / 2)) if setup.dimension == 2 else setup
     corruption = _corruption(graph, setup, limit)
-    say = np.ones(graph.edge_count) if confidence is None else np.asarray(confidence, float)
-    search = _Search(setup, say[setup.weights.used], limit, kernel)
+    share = np.ones(graph.edge_count) if confidence is None else np.asarray(confidence, float)
+    search = _Search(setup, share[setup.weights.used], limit, kernel)
     tried = [end for spread in TRUST_SPREADS for end in search.ends(_trust(corruption, spread))]
     last = min(tried, key=lambda end: search.truncated_cost(end.point))
     tested = int((~np.isnan(corruption)).sum())
     weights = np.zeros(graph.edge_count)
     weights[setup.weights.used] = np.round(last.weights) if kernel == "truncated" else last.weights
-    weights = np.where(weights > LEAST_WEIGHT, weights * say, 0.0)
+    weights = np.where(weights > LEAST_WEIGHT, weights * share, 0.0)
     kept = np.flatnonzero(weights)
     chosen = graph.select(kept)
     chosen = replace(chosen, information=weights[kept, None, None] * chosen.information)
@@ -112,7 +112,7 @@ def solve_robust(
 
 
 def _with_confirmation(graph: ViewGraph, solution: Solution, setup: Setup) -> Solution:
-    """The solution that says whether anything confirms it."""
+    """The solution with `confirmed` set: whether cycles of its used edges close better than by chance."""
     left_out = int((setup.weights.used & (solution.weights == 0)).sum())
     if confirmed(graph, np.flatnonzero(solution.weights)):
         return replace(solution, confirmed=True)

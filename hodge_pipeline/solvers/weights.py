@@ -17,14 +17,14 @@ INDEFINITE_TOLERANCE = 1e-9
 EARTH_M = 1.2742e7
 """The earth's diameter: a longer edge is a unit or a measurement gone wrong."""
 FLOOR = 1e-9
-"""Of the median weight: what an edge that says nothing on rotation, or on translation, gets in its place."""
+"""Of the median weight: for a used edge without information on rotation, or on translation."""
 
 
 @dataclass(frozen=True)
 class Weights:
     """Isotropic weights κ, τ (E,), the full information over (φ, ρ), 3x3 for a planar graph, and what was found.
 
-    `used (E,)`: edges that say anything. `definite`: whether every used matrix is positive semi-definite.
+    `used (E,)`: edges with any information. `definite`: whether every used matrix is positive semi-definite.
     """
 
     kappa: Floats
@@ -36,7 +36,7 @@ class Weights:
 
 
 def is_planar(graph: ViewGraph) -> bool:
-    """Whether every edge lies in the plane z = 0 and says nothing out of it: a lifted 2-D graph."""
+    """Whether every edge lies in the plane z = 0 and has no information out of it: a lifted 2-D graph."""
     if not graph.edge_count:
         return False
     motion = graph.i_from_j
@@ -134,10 +134,12 @@ def _all_definite(matrices: Floats) -> bool:
 
 
 def _floor(weights: Floats, used: Bools, what: str, notes: list[str]) -> Floats:
-    """The weights with the zeros of used edges raised to almost nothing, so that every Laplacian is connected."""
-    silent = used & (weights <= 0)
-    if not silent.any():
+    """The weights with the zeros of used edges raised to almost zero, so that every Laplacian is connected."""
+    uninformed = used & (weights <= 0)
+    if not uninformed.any():
         return weights
-    said = weights[used & (weights > 0)]
-    notes.append(f"{int(silent.sum())} edges say nothing definite on {what}: they count as next to nothing there")
-    return np.where(silent, FLOOR * np.median(said) if len(said) else 1.0, weights)
+    positive = weights[used & (weights > 0)]
+    notes.append(
+        f"{int(uninformed.sum())} edges have no definite information on {what}: their weight there is almost zero"
+    )
+    return np.where(uninformed, FLOOR * np.median(positive) if len(positive) else 1.0, weights)

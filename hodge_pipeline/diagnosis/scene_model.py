@@ -1,4 +1,4 @@
-"""What a solution shows of its scene, and by what any other arrangement of the scene is then judged."""
+"""A model of the scene fitted to a solution, by which other arrangements of the views are then judged."""
 
 from __future__ import annotations
 
@@ -13,25 +13,24 @@ from hodge_pipeline.diagnosis.upright import Upright, learn_upright
 from hodge_pipeline.types import Floats, Ints
 
 NEIGHBOURS = 12
-"""Views of a group that are laid together rightly nearly always."""
+"""Views of a group: few enough that nearly all groups are placed rightly."""
 
 
 @dataclass(frozen=True)
-class Laws:
-    """How views are joined, by where they lie, and how cameras are held."""
+class SceneModel:
+    """The probability of an edge by the poses of its views, and the distribution of up in camera axes."""
 
     joining: Joining
     upright: Upright
 
 
-def learned(evidence: Evidence, found: Fit, known: Laws | None = None) -> Laws:
-    """The laws that a solution shows by its poses and the edges it uses; from `known` on."""
+def learn_scene_model(evidence: Evidence, found: Fit, before: SceneModel | None = None) -> SceneModel:
+    """The model fitted to the poses of a solution and the edges it uses, started at `before`."""
     joined = np.zeros((evidence.vertex_count, evidence.vertex_count), bool)
     i, j = evidence.edges[found.used].T
     joined[i, j] = joined[j, i] = True
-    before = known.joining if known else None
-    joining = learn_joining(found.poses, found.component, joined, evidence.reach_m, before)
-    return Laws(joining, learn_upright(found.poses[:, :3, :3], found.component, _neighbours(evidence, found)))
+    joining = learn_joining(found.poses, found.component, joined, evidence.reach_m, before.joining if before else None)
+    return SceneModel(joining, learn_upright(found.poses[:, :3, :3], found.component, _neighbours(evidence, found)))
 
 
 def _neighbours(evidence: Evidence, found: Fit) -> Ints:
