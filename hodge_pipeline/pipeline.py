@@ -9,7 +9,7 @@ from itertools import chain
 from pathlib import Path
 
 from hodge_pipeline.complex.parts import decompose, energies, one_form
-from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.errors import GraphError, RecipeError, SourceError
 from hodge_pipeline.evaluation.evaluate import score_rounds
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.executors.dask import open_workers
@@ -157,9 +157,13 @@ class _Job:
     def consistent(self, work: Work, registered: Registered) -> Round:
         """The poses consistent with a round's edges: the complex of their graph, ω on it, its parts, the solve."""
         graph = registered.graph(work.scene.first.vertex_ids)
-        complex_ = self.recipe.complex.of(graph, work.scene.clouds, registered.start)
-        omega = one_form(graph, registered.start)
-        found = None if complex_ is None else energies(complex_, decompose(complex_, omega))
+        found = None
+        try:
+            complex_ = self.recipe.complex.of(graph, work.scene.clouds, registered.start)
+            omega = one_form(graph, registered.start)
+            found = energies(complex_, decompose(complex_, omega))
+        except GraphError as error:  # the poses do not depend on it
+            self.store.note(f"{registered.name}: without its decomposition: {error}")
         return work.solve(registered, graph, found)
 
     def score(self, work: Work, rounds: list[Round]) -> ScoreTable | None:

@@ -30,7 +30,7 @@ def hodge(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(home, with_pip=False)
     python = home / "bin" / "python"
     install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps", str(wheel)]
-    subprocess.run(install, check=True, capture_output=True)
+    subprocess.run(install, check=True, capture_output=True, env=ALONE)
     (site,) = home.glob("lib/python*/site-packages")
     # as plain paths their own .pth files are not read, so the checkout's editable install stays out
     libraries = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]

@@ -62,6 +62,8 @@ def picture(recording: Path, png: Path, *, story_s: float | None = None, wait_s:
                     client.set_time(layout.STORY, duration=story_s, play_state="paused")
                     time.sleep(wait_s / 2)
                 _save(client, png)
+            except ConnectionError as error:
+                raise WorkspaceError(f"the headless Rerun viewer ended ({error}): is there a Vulkan driver?") from error
             finally:
                 viewer.kill()
 

@@ -19,6 +19,7 @@ from hodge_pipeline.complex.cech import (
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.decomposition import HodgeDecomposition, hodge_decomposition
 from hodge_pipeline.complex.one_form import centroids, residual_form, shifted
+from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import CloudSet, Floats, ViewGraph
 
 MOST_TRIANGLES = 200_000
@@ -36,10 +37,10 @@ class ComplexOptions:
     )
     voxel_m: float = Field(default=0.1, gt=0, description="metres: side of the voxels that three clouds must share")
 
-    def of(self, graph: ViewGraph, clouds: CloudSet, world_from_cam: Floats) -> SimplicialComplex | None:
-        """Vertices, edges and triangles of a graph under poses (V, 4, 4); None where there are too many triangles."""
-        if clique_counts(graph.edges, graph.vertex_count)[2] > MOST_TRIANGLES:
-            return None
+    def of(self, graph: ViewGraph, clouds: CloudSet, world_from_cam: Floats) -> SimplicialComplex:
+        """Vertices, edges, triangles of a graph under poses (V, 4, 4). Raises `GraphError` for too many triangles."""
+        if (count := clique_counts(graph.edges, graph.vertex_count)[2]) > MOST_TRIANGLES:
+            raise GraphError(f"its complex has {count} triangles, more than {MOST_TRIANGLES}")
         flag = flag_complex(graph.edges, graph.vertex_count)
         return nerve(flag, voxel_occupancy(clouds, world_from_cam, self.voxel_m)) if self.nerve else flag
 
