@@ -123,7 +123,7 @@ def test_every_frame_that_was_found_is_fused(run: hodge_pipeline.Run) -> None:
     keys = replace(run.key_frames, found=found)
     scene = Scene(run.source, key_source(run.source, keys.rows), keys, run.clouds, run.rounds[0])
     steps = Told(Path("cloud.ply"))
-    fuse_all((CloudFuser(),), scene, run.result.world_from_cam, steps)  # type: ignore[arg-type]
+    fuse_all((CloudFuser(),), scene, run.poses, steps)  # type: ignore[arg-type]
     ((_, _, source, poses),) = steps.asked
     assert len(source.frames) == FRAMES
     np.testing.assert_array_equal(np.isfinite(poses).all((1, 2)), found)
