@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -85,14 +84,6 @@ def without_measured(candidates: Edges, measured: ViewGraph) -> Edges:
         return candidates
     kept = np.array([(i, j) not in known for i, j in candidates.pairs.tolist()], bool)
     return candidates.select(kept)
-
-
-def digest(graph: ViewGraph) -> str:
-    """The same word for the same edges, to tell whether a finished stage is still good."""
-    hashed = hashlib.sha256()
-    for array in (graph.edges, graph.i_from_j, graph.information, graph.source):
-        hashed.update(np.ascontiguousarray(array).tobytes())
-    return hashed.hexdigest()
 
 
 def _no_edges(frames: Sequence[Frame]) -> ViewGraph:
