@@ -1,0 +1,146 @@
+"""Gauss–Newton on a chain with some of its loops: exact on all poses, at the cost of the loops' ends alone.
+
+In the world frame a step's residual ρ and covariance C add up along a path, so that a run of steps between two ends of
+loops is one edge (Σρ, ΣC), and the poses inside follow from those of its ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.sparse import Factored, Network
+from hodge_pipeline.types import Bools, Floats, Ints
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The chain at some poses, in world axes: sums over positions of the steps' residuals `residual (n, p)` and 
+    covariances `covariance (n, p, p)`; of each loop `loop_residual (M, p)` and `loop_covariance (M, p, p)`.
+    """
+
+    poses: Floats
+    residual: Floats
+    covariance: Floats
+    loop_residual: Floats
+    loop_covariance: Floats
+
+    def path(self, a: Ints, b: Ints) -> Floats:
+        """The stated covariance (K, p, p) of the path between two positions of one path, in either order."""
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        return np.asarray(self.covariance[high] - self.covariance[low])
+
+
+def linearise(chain: Chain, poses: Floats) -> Linear:
+    """The chain's sums at these poses (n, 4, 4)."""
+    before = np.concatenate([poses[:1], poses[:-1]])
+    inner = (chain.step_edge >= 0)[:, None]
+    frame = chain.adjoint(poses)
+    left = chain.log(se3.inverse(chain.step) @ se3.inverse(before) @ poses)
+    residual = np.where(inner, np.einsum("nij,nj->ni", frame, left), 0.0)
+    covariance = frame @ chain.step_covariance @ np.swapaxes(frame, 1, 2)
+    loop_residual, loop_covariance = loops_at(chain, poses, frame)
+    return Linear(poses, np.cumsum(residual, axis=0), np.cumsum(covariance, axis=0), loop_residual, loop_covariance)
+
+
+def loops_at(chain: Chain, poses: Floats, frame: Floats) -> tuple[Floats, Floats]:
+    """Residuals (M, p) and covariances (M, p, p) of the loops in world axes."""
+    a, b = chain.ends.T
+    left = chain.log(se3.inverse(chain.motion) @ se3.inverse(poses[a]) @ poses[b])
+    turned = frame[b]
+    return np.einsum("nij,nj->ni", turned, left), turned @ chain.covariance @ np.swapaxes(turned, 1, 2)
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """The ends of the active loops and the runs of steps between them.
+
+    - `ends (R,)`: positions, ascending; `runs (S, 2)`, `loops (L, 2)`: rows of it; `active (L,)`: rows of the loops.
+    - `network`: of the runs and then the loops.
+    """
+
+    ends: Ints
+    runs: Ints
+    loops: Ints
+    active: Ints
+    network: Network
+
+    @classmethod
+    def of(cls, chain: Chain, active: Ints) -> Reduced:
+        """The network of these loops."""
+        ends = np.unique(chain.ends[active])
+        after = np.flatnonzero(chain.path[ends[1:]] == chain.path[ends[:-1]])
+        runs = np.stack([after, after + 1], axis=1)
+        loops = np.searchsorted(ends, chain.ends[active])
+        return cls(ends, runs, loops, active, Network.of(np.concatenate([runs, loops]), len(ends)))
+
+    def precisions(self, linear: Linear) -> tuple[Floats, Floats]:
+        """Of the runs (S, p, p) and the active loops (L, p, p)."""
+        runs = linear.path(*self.ends[self.runs].T)
+        return np.linalg.inv(runs), np.linalg.inv(linear.loop_covariance[self.active])
+
+    def residuals(self, linear: Linear) -> tuple[Floats, Floats]:
+        """Of the runs (S, p) and the active loops (L, p)."""
+        low, high = self.ends[self.runs].T
+        return linear.residual[high] - linear.residual[low], linear.loop_residual[self.active]
+
+    def factor(self, linear: Linear) -> Factored:
+        """The factorised normal equations."""
+        return self.network.factor(np.concatenate(self.precisions(linear)))
+
+    def force(self, precision: Floats, residual: Floats) -> Floats:
+        """Minus half the gradient (R, p, c) for residuals (S + L, p, c)."""
+        pushed = precision @ residual
+        out = np.zeros((len(self.ends), *pushed.shape[1:]))
+        np.add.at(out, self.network.edges[:, 0], pushed)
+        np.add.at(out, self.network.edges[:, 1], -pushed)
+        return out
+
+    def moves(self, linear: Linear) -> Floats:
+        """The Gauss–Newton move (R, p) of the ends."""
+        precision = np.concatenate(self.precisions(linear))
+        residual = np.concatenate(self.residuals(linear))
+        factored = self.network.factor(precision)
+        return np.asarray(factored.solve(self.force(precision, residual[..., None]))[..., 0])
+
+
+def moved(chain: Chain, reduced: Reduced, linear: Linear, moves: Floats) -> Floats:
+    """The poses (n, 4, 4) after a move (R, p) of the loops' ends: runs bend by their covariance, what lies beyond the
+    outermost ends follows them rigidly.
+    """
+    count, ends = chain.size, reduced.ends
+    where = np.arange(count)
+    right = np.searchsorted(ends, where)
+    left = np.maximum(right - 1, 0)
+    right = np.minimum(right, len(ends) - 1)
+    has_left = chain.path[ends[left]] == chain.path
+    has_left &= ends[left] <= where
+    has_right = (chain.path[ends[right]] == chain.path) & (ends[right] >= where)
+    left, right = np.where(has_left, left, right), np.where(has_right, right, left)
+    low, high = ends[left], ends[right]
+    touched = has_left | has_right
+    bent = has_left & has_right & (low < high)
+    out = moves[left] - (linear.residual - linear.residual[low])
+    out[~touched] = 0.0
+    k = np.flatnonzero(bent)
+    run = low[k]
+    gap = moves[right[k]] - moves[left[k]] + linear.residual[high[k]] - linear.residual[run]
+    whole = np.linalg.solve(linear.covariance[high[k]] - linear.covariance[run], gap[..., None])
+    out[k] += ((linear.covariance[k] - linear.covariance[run]) @ whole)[..., 0]
+    return np.asarray(chain.exp(out) @ linear.poses)
+
+
+def settled(chain: Chain, reduced: Reduced, poses: Floats, steps: int, tolerance: float) -> Linear:
+    """The chain at the poses of least cost with the active loops, or after as many steps."""
+    linear = linearise(chain, poses)
+    if not len(reduced.active):
+        return linear
+    for _ in range(steps):
+        moves = reduced.moves(linear)
+        linear = linearise(chain, moved(chain, reduced, linear, moves))
+        if float(np.abs(moves).max(initial=0.0)) < tolerance:
+            break
+    return linear

@@ -1,0 +1,184 @@
+"""Which loops of a trusted chain are right: Bayes factors at the poses that the others lead to, scales learned as well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.evidence import Wrong, student
+from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, linearise, settled
+from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales, mixture
+from hodge_pipeline.types import Bools, Floats, Ints
+
+ROUNDS = 12
+SAMPLES = 64
+MOST_STEPS = 4
+TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Loops judged at some poses: `log_odds (M,)` that each is right, by all others; `factor (M,)` its log Bayes factor
+    without the share of right ones; `chi2 (M,)` of its residual in its own uncertainty and that of the poses without it.
+    """
+
+    log_odds: Floats
+    factor: Floats
+    chi2: Floats
+    log_density: Floats
+
+
+@dataclass(frozen=True)
+class Inferred:
+    """The result: loops that are `used (M,)`, how they were judged, the poses, and the scales."""
+
+    used: Bools
+    judged: Judged
+    linear: Linear
+    scales: Scales
+    shares: Floats
+
+
+def infer(chain: Chain, *, always: Bools | None = None) -> Inferred:
+    """Judge the loops of a chain; those of `always (M,)` count whatever they say."""
+    poses = chain.poses()
+    wrong = Wrong.of(chain, poses)
+    scales, shares = learn_scales(chain, poses, wrong)
+    chain = scales.applied(chain)
+    start = linearise(chain, poses)
+    always = np.zeros(len(chain.loop_edge), bool) if always is None else always
+    judged = _judge(chain, start, None, shares, wrong)
+    limit = np.log(max(len(always), 1))
+    used = (judged.factor > limit) | always
+    linear = start
+    seen: list[bytes] = []
+    for number in range(ROUNDS):
+        reduced = Reduced.of(chain, np.flatnonzero(used))
+        linear = settled(chain, reduced, start.poses if number % 4 == 3 else linear.poses, MOST_STEPS, TOLERANCE)
+        judged = _judge(chain, linear, reduced, shares, wrong)
+        shares, _ = mixture(judged.log_density)
+        limit = limit / 2 if number < 2 else 0.0
+        new = (judged.log_odds > limit) & (judged.factor > limit) | always
+        key = np.packbits(new).tobytes()
+        if key in seen[-2:]:
+            used = new
+            break
+        seen.append(key)
+        used = new
+    used = (judged.factor > np.log(max(len(always), 1))) & (judged.log_odds > 0) | always
+    return Inferred(used, judged, polished(chain, used, linear), scales, shares)
+
+
+LOCAL = 0.4
+FREEDOM_SOLVE = 4.0
+REWEIGHTED = 5
+
+
+def polished(chain: Chain, used: Bools, linear: Linear) -> Linear:
+    """The poses of the used loops."""
+    rows = np.flatnonzero(used)
+    reduced = Reduced.of(chain, rows)
+    chain = replace(chain, step_covariance=LOCAL**2 * chain.step_covariance)
+    weights = np.ones(len(used))
+    for _ in range(REWEIGHTED):
+        linear = settled(
+            replace(chain, covariance=chain.covariance / weights[:, None, None]), reduced, linear.poses, 2, TOLERANCE
+        )
+        own = linear.loop_covariance[rows] * weights[rows, None, None]
+        _, chi2 = student(linear.loop_residual[rows], own)
+        weights[rows] = (FREEDOM_SOLVE + own.shape[1]) / (FREEDOM_SOLVE + chi2)
+    return linear
+
+
+def _judge(chain: Chain, linear: Linear, reduced: Reduced | None, shares: Floats, wrong: Wrong) -> Judged:
+    covariance = uncertainty(chain, linear, reduced)
+    known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
+    residual = linear.loop_residual.copy()
+    if reduced is not None and len(reduced.active):
+        residual[reduced.active] = left_out(linear, reduced, residual, covariance)
+    log_density = np.zeros((2, len(covariance)))
+    chi2 = np.full(len(covariance), np.nan)
+    log_density[0, known], chi2[known] = student(residual[known], covariance[known])
+    log_density[1, known] = wrong.log_density(chain, linear.poses)[known]
+    factor = log_density[0] - log_density[1]
+    return Judged(factor + np.log(shares[0] / shares[1]), factor, chi2, log_density)
+
+
+def left_out(linear: Linear, reduced: Reduced, residual: Floats, covariance: Floats) -> Floats:
+    """Residuals of the active loops at poses solved without them: `V S⁻¹ r` with the covariances V there and S of r."""
+    own = linear.loop_covariance[reduced.active]
+    ahead = np.linalg.solve(own, residual[reduced.active][..., None])
+    return np.asarray((covariance[reduced.active] @ ahead)[..., 0])
+
+
+def uncertainty(chain: Chain, linear: Linear, reduced: Reduced | None) -> Floats:
+    """The covariance (M, p, p) of each loop's residual at poses solved without it; infinite where nothing else tells."""
+    own = linear.loop_covariance
+    a, b = chain.ends.T
+    same = chain.path[a] == chain.path[b]
+    out = np.where(same[:, None, None], linear.path(a, b), np.inf)
+    if reduced is None or not len(reduced.active):
+        return out + own
+    factored = reduced.factor(linear)
+    through = _between(chain, linear, reduced, factored)
+    out = np.where((_size(through) < _size(out))[:, None, None], through, out) + own
+    across = factored.across()[len(reduced.runs) :]
+    out[reduced.active] = _without(own[reduced.active], across)
+    return out
+
+
+def _size(covariance: Floats) -> Floats:
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(covariance[:, 0, 0]), np.einsum("mii->m", covariance), np.inf)
+
+
+LEAST_LEFT = 1e-6
+
+
+def _without(own: Floats, across: Floats) -> Floats:
+    """`S (S − K)⁻¹ S` for the covariances S of loops and K of the same motions with all loops, S among them."""
+    factor = np.linalg.cholesky(own)
+    inverse = np.linalg.inv(factor)
+    values, vectors = np.linalg.eigh(inverse @ across @ np.swapaxes(inverse, 1, 2))
+    left = np.maximum(1 - values, LEAST_LEFT)
+    wide = factor @ vectors
+    return np.asarray((wide / left[:, None]) @ np.swapaxes(wide, 1, 2))
+
+
+def _between(chain: Chain, linear: Linear, reduced: Reduced, factored: object) -> Floats:
+    """The covariance of the motion between the ends of every loop by the nearest ends of active ones."""
+    samples = _samples(linear, reduced, factored)
+    near, gap = [], np.zeros_like(linear.loop_covariance)
+    for end in chain.ends.T:
+        right = np.clip(np.searchsorted(reduced.ends, end), 0, len(reduced.ends) - 1)
+        left = np.maximum(right - 1, 0)
+        distance = [
+            np.where(chain.path[reduced.ends[k]] == chain.path[end], np.abs(reduced.ends[k] - end), np.inf)
+            for k in (left, right)
+        ]
+        nearest = np.where(distance[0] < distance[1], left, right)
+        apart = np.isinf(np.minimum(*distance))
+        gap += np.where(apart[:, None, None], np.inf, linear.path(end, reduced.ends[nearest]))
+        near.append(nearest)
+    component = reduced.network.component
+    difference = samples[near[1]] - samples[near[0]]
+    joint = difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
+    out = joint + gap
+    out[component[near[0]] != component[near[1]]] = np.inf
+    return np.asarray(out)
+
+
+def _samples(linear: Linear, reduced: Reduced, factored: object) -> Floats:
+    """Moves (R, p, SAMPLES) of the ends drawn from their joint distribution: solves with noisy measurements."""
+    precision = np.concatenate(reduced.precisions(linear))
+    noise = np.random.default_rng(0).standard_normal((len(precision), precision.shape[-1], SAMPLES))
+    factor = np.linalg.cholesky(precision)
+    pushed = factor @ noise
+    force = np.zeros((len(reduced.ends), *pushed.shape[1:]))
+    np.add.at(force, reduced.network.edges[:, 0], pushed)
+    np.add.at(force, reduced.network.edges[:, 1], -pushed)
+    return factored.solve(force)  # type: ignore[attr-defined,no-any-return]
+
+
