@@ -50,24 +50,45 @@ class Scales:
 
 
 def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Floats]:
-    """The scales at which the loops' residuals against the bare chain are likeliest, and the shares of right and wrong loops.
+    """The scales at which the loops' residuals against the bare chain are likeliest, and the shares of right and wrong
+    loops.
 
     Each loop counts by itself: that loops at one place err alike, and steps too, would else be taken for small errors.
+    As many decoys, motions of loops between other places, tell what chance explains at each scale.
     """
-    model = _Model.of(chain, poses, wrong)
+    own, decoys = _Model.of(chain, poses, wrong), _Model.of(decoyed(chain), poses, wrong)
+
+    def value(logs: Floats) -> float:
+        ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
+        if (np.abs(ratios) > MOST_RATIO + 1e-9).any():
+            return -np.inf
+        prior = -0.5 * float(logs @ logs) / FOLD**2
+        return own.value(logs)[0] - max(decoys.value(logs)[0], 0.0) + prior
+
     best, width = np.zeros(4), FIRST
-    value, share = model.value(best)
+    top = value(best)
     while width >= FINEST:
         improved = False
         for axis in range(4):
             for sign in (-1, 1):
                 tried = best.copy()
                 tried[axis] += sign * width
-                found, its_share = model.value(tried)
-                if found > value:
-                    best, value, share, improved = tried, found, its_share, True
+                if (found := value(tried)) > top:
+                    best, top, improved = tried, found, True
         width = width if improved else width / 2
-    return Scales(*map(float, np.exp(best))), share
+    return Scales(*map(float, np.exp(best))), own.value(best)[1]
+
+
+def decoyed(chain: Chain) -> Chain:
+    """The chain with each loop's motion between two other places of one path, at random."""
+    rng = np.random.default_rng(1)
+    count = len(chain.loop_edge)
+    first = rng.integers(0, chain.size, count)
+    begin = np.searchsorted(chain.path, chain.path[first])
+    length = np.searchsorted(chain.path, chain.path[first], side="right") - begin
+    second = begin + np.minimum((rng.random(count) * length).astype(np.int64), length - 1)
+    ends = np.sort(np.stack([first, second], axis=1), axis=1)
+    return replace(chain, ends=ends)
 
 
 @dataclass(frozen=True)
@@ -80,7 +101,6 @@ class _Model:
     path: Floats
     own: Floats
     away: Floats
-    most_ratio: float
 
     @classmethod
     def of(cls, chain: Chain, poses: Floats, wrong: Wrong) -> _Model:
@@ -96,20 +116,16 @@ class _Model:
         path, own = (np.stack(each) for each in zip(*parts, strict=True))
         for part in (path, own):
             part[2] -= part[0] + part[1]
-        return cls(linear.loop_residual[rows], path, own, wrong.log_density(chain, poses)[rows], MOST_RATIO)
+        return cls(linear.loop_residual[rows], path, own, wrong.log_density(chain, poses)[rows])
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
-        """The log-likelihood of scales and their prior, and the shares of right and wrong loops."""
+        """The log-likelihood of scales, against that of all loops being wrong, and the shares of right and wrong loops."""
         if not len(self.residual):
             return 0.0, EVEN
         turn, shift, own_turn, own_shift = np.exp(logs)
-        ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
-        if (np.abs(ratios) > self.most_ratio + 1e-9).any():
-            return -np.inf, EVEN
-        path, own = _weighed(self.path, turn, shift), _weighed(self.own, own_turn, own_shift)
-        densities = [student(self.residual, path + own)[0], self.away]
-        shares, likelihood = mixture(np.stack(densities))
-        return likelihood - 0.5 * float(logs @ logs) / FOLD**2, shares
+        covariance = _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
+        factor = student(self.residual, covariance)[0] - self.away
+        return mixture(np.stack([factor, np.zeros_like(factor)]))[::-1]
 
 
 def _weighed(parts: Floats, turn: float, shift: float) -> Floats:
