@@ -9,6 +9,7 @@ from scipy.special import gammaln
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.fit import scaled
 from hodge_pipeline.types import Floats
 
 PAIRS = 4000
@@ -67,16 +68,10 @@ def _floored(second_moment: Floats) -> Floats:
     return np.asarray((vectors * values) @ vectors.T)
 
 
-ROUNDING = 1e-12
-"""Of a diagonal of ones: what the differences of long sums may have wrong."""
-
-
 def gaussian(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     """The log-density (M,) and χ² (M,) of residuals (M, p) with covariances (M, p, p)."""
-    covariance = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
-    unit = 1 / np.sqrt(np.einsum("mii->mi", covariance))
-    scaled = covariance * unit[:, :, None] * unit[:, None, :] + ROUNDING * np.eye(covariance.shape[-1])
-    factor = np.linalg.cholesky(scaled) / unit[:, :, None]
+    ones, unit = scaled(covariance)
+    factor = np.linalg.cholesky(ones) * unit[:, :, None]
     white = np.linalg.solve(factor, residual[..., None])[..., 0]
     chi2 = np.einsum("mi,mi->m", white, white)
     half_log = np.log(np.einsum("mii->mi", factor)).sum(axis=1) + 0.5 * residual.shape[1] * np.log(2 * np.pi)

@@ -31,7 +31,7 @@ class Linear:
     def path(self, a: Ints, b: Ints) -> Floats:
         """The stated covariance (K, p, p) of the path between two positions of one path, in either order."""
         low, high = np.minimum(a, b), np.maximum(a, b)
-        return np.asarray(self.covariance[high] - self.covariance[low])
+        return np.asarray(self.covariance[high] - self.covariance[low], float)
 
 
 def linearise(chain: Chain, poses: Floats) -> Linear:
@@ -43,7 +43,7 @@ def linearise(chain: Chain, poses: Floats) -> Linear:
     residual = np.where(inner, np.einsum("nij,nj->ni", frame, left), 0.0)
     covariance = frame @ chain.step_covariance @ np.swapaxes(frame, 1, 2)
     loop_residual, loop_covariance = loops_at(chain, poses, frame)
-    return Linear(poses, np.cumsum(residual, axis=0), np.cumsum(covariance, axis=0), loop_residual, loop_covariance)
+    return Linear(poses, np.cumsum(residual, axis=0), np.cumsum(covariance, axis=0, dtype=np.longdouble), loop_residual, loop_covariance)
 
 
 def loops_at(chain: Chain, poses: Floats, frame: Floats) -> tuple[Floats, Floats]:
@@ -52,6 +52,24 @@ def loops_at(chain: Chain, poses: Floats, frame: Floats) -> tuple[Floats, Floats
     left = chain.log(se3.inverse(chain.motion) @ se3.inverse(poses[a]) @ poses[b])
     turned = frame[b]
     return np.einsum("nij,nj->ni", turned, left), turned @ chain.covariance @ np.swapaxes(turned, 1, 2)
+
+
+ROUNDING = 1e-12
+"""Of a diagonal of ones: what differences of long sums may have wrong."""
+
+
+def scaled(covariance: Floats) -> tuple[Floats, Floats]:
+    """Covariances (M, p, p) in units (M, p) that make their diagonals one, positive definite for certain."""
+    unit = np.sqrt(np.maximum(np.einsum("mii->mi", covariance), np.finfo(float).tiny))
+    ones = covariance / (unit[:, :, None] * unit[:, None, :])
+    return 0.5 * (ones + np.swapaxes(ones, 1, 2)) + ROUNDING * np.eye(covariance.shape[-1]), unit
+
+
+def inverse(covariance: Floats) -> Floats:
+    """The inverses (M, p, p), symmetric."""
+    ones, unit = scaled(covariance)
+    found = np.linalg.inv(ones) / (unit[:, :, None] * unit[:, None, :])
+    return np.asarray(0.5 * (found + np.swapaxes(found, 1, 2)))
 
 
 @dataclass(frozen=True)
@@ -80,7 +98,7 @@ class Reduced:
     def precisions(self, linear: Linear) -> tuple[Floats, Floats]:
         """Of the runs (S, p, p) and the active loops (L, p, p)."""
         runs = linear.path(*self.ends[self.runs].T)
-        return np.linalg.inv(runs), np.linalg.inv(linear.loop_covariance[self.active])
+        return inverse(runs), inverse(linear.loop_covariance[self.active])
 
     def residuals(self, linear: Linear) -> tuple[Floats, Floats]:
         """Of the runs (S, p) and the active loops (L, p)."""
@@ -128,8 +146,8 @@ def moved(chain: Chain, reduced: Reduced, linear: Linear, moves: Floats) -> Floa
     k = np.flatnonzero(bent)
     run = low[k]
     gap = moves[right[k]] - moves[left[k]] + linear.residual[high[k]] - linear.residual[run]
-    whole = np.linalg.solve(linear.covariance[high[k]] - linear.covariance[run], gap[..., None])
-    out[k] += ((linear.covariance[k] - linear.covariance[run]) @ whole)[..., 0]
+    whole = inverse(linear.path(run, high[k])) @ gap[..., None]
+    out[k] += (linear.path(run, k) @ whole)[..., 0]
     return np.asarray(chain.exp(out) @ linear.poses)
 
 

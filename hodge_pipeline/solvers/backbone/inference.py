@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import Wrong, student
-from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, linearise, settled
+from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, linearise, scaled, settled
+from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales, mixture
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -83,27 +84,6 @@ BY_CHANCE, BY_CHANCE_EACH_FOLD = float(np.log(100.0)), 3.0
 """Log-evidence that chance reaches in one graph of a hundred, and what each e-fold of loops adds to it: measured with
 random loops in simulated graphs and in those of Bicocca and RobotCar, whose best reach half of it.
 """
-LOCAL = 0.4
-FREEDOM_SOLVE = 4.0
-REWEIGHTED = 5
-
-
-def polished(chain: Chain, used: Bools, linear: Linear) -> Linear:
-    """The poses of the used loops."""
-    rows = np.flatnonzero(used)
-    reduced = Reduced.of(chain, rows)
-    chain = replace(chain, step_covariance=LOCAL**2 * chain.step_covariance)
-    weights = np.ones(len(used))
-    for _ in range(REWEIGHTED):
-        linear = settled(
-            replace(chain, covariance=chain.covariance / weights[:, None, None]), reduced, linear.poses, 2, TOLERANCE
-        )
-        own = linear.loop_covariance[rows] * weights[rows, None, None]
-        _, chi2 = student(linear.loop_residual[rows], own)
-        weights[rows] = (FREEDOM_SOLVE + own.shape[1]) / (FREEDOM_SOLVE + chi2)
-    return linear
-
-
 def _judge(chain: Chain, linear: Linear, reduced: Reduced | None, shares: Floats, wrong: Wrong) -> Judged:
     covariance = uncertainty(chain, linear, reduced)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
@@ -151,7 +131,8 @@ LEAST_LEFT = 1e-6
 
 def _without(own: Floats, across: Floats) -> Floats:
     """`S (S − K)⁻¹ S` for the covariances S of loops and K of the same motions with all loops, S among them."""
-    factor = np.linalg.cholesky(own)
+    ones, unit = scaled(own)
+    factor = np.linalg.cholesky(ones) * unit[:, :, None]
     inverse = np.linalg.inv(factor)
     values, vectors = np.linalg.eigh(inverse @ across @ np.swapaxes(inverse, 1, 2))
     left = np.maximum(1 - values, LEAST_LEFT)
@@ -186,7 +167,8 @@ def _samples(linear: Linear, reduced: Reduced, factored: object) -> Floats:
     """Moves (R, p, SAMPLES) of the ends drawn from their joint distribution: solves with noisy measurements."""
     precision = np.concatenate(reduced.precisions(linear))
     noise = np.random.default_rng(0).standard_normal((len(precision), precision.shape[-1], SAMPLES))
-    factor = np.linalg.cholesky(precision)
+    ones, unit = scaled(precision)
+    factor = np.linalg.cholesky(ones) * unit[:, :, None]
     pushed = factor @ noise
     force = np.zeros((len(reduced.ends), *pushed.shape[1:]))
     np.add.at(force, reduced.network.edges[:, 0], pushed)
