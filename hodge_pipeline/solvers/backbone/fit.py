@@ -1,7 +1,9 @@
 """Gauss–Newton on a chain with some of its loops: exact on all poses, at the cost of the loops' ends alone.
 
 In the world frame a step's residual ρ and covariance C add up along a path, so that a run of steps between two ends of
-loops is one edge (Σρ, ΣC), and the poses inside follow from those of its ends.
+loops is one edge (Σρ, ΣC), and the poses inside follow from those of its ends. Loops, ends and what is solved for are
+in axes parallel to the world's with the origin at the pose itself: far from the world's origin, its own lever arm would
+make every block of the normal equations ill-conditioned.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from hodge_pipeline.types import Bools, Floats, Ints
 @dataclass(frozen=True)
 class Linear:
     """The chain at some poses, in world axes: sums over positions of the steps' residuals `residual (n, p)` and 
-    covariances `covariance (n, p, p)`; of each loop `loop_residual (M, p)` and `loop_covariance (M, p, p)`.
+    covariances `covariance (n, p, p)`; of each loop, at its later end, `loop_residual (M, p)` and `loop_covariance
+    (M, p, p)`; `shift (n, p, p)` takes a twist from the world's origin to a pose's own.
     """
 
     poses: Floats
@@ -27,11 +30,22 @@ class Linear:
     covariance: Floats
     loop_residual: Floats
     loop_covariance: Floats
+    shift: Floats
 
-    def path(self, a: Ints, b: Ints) -> Floats:
-        """The stated covariance (K, p, p) of the path between two positions of one path, in either order."""
+    def path(self, a: Ints, b: Ints, at: Ints | None = None) -> Floats:
+        """The covariance (K, p, p) of the path between two positions of one path, in either order: in the axes of a
+        third position, by default the second.
+        """
         low, high = np.minimum(a, b), np.maximum(a, b)
-        return np.asarray(self.covariance[high] - self.covariance[low], float)
+        carry = self.shift[b if at is None else at].astype(np.longdouble)
+        return np.asarray(carry @ (self.covariance[high] - self.covariance[low]) @ np.swapaxes(carry, 1, 2), float)
+
+    def carry(self, a: Ints, b: Ints) -> Floats:
+        """What takes twists (K, p, p) at one position's origin to another's."""
+        out = np.broadcast_to(np.eye(self.shift.shape[-1]), (len(a), *self.shift.shape[1:])).copy()
+        split = out.shape[-1] - (2 if out.shape[-1] == 3 else 3)
+        out[:, split:, :split] = self.shift[b, split:, :split] - self.shift[a, split:, :split]
+        return out
 
 
 def linearise(chain: Chain, poses: Floats) -> Linear:
@@ -39,18 +53,23 @@ def linearise(chain: Chain, poses: Floats) -> Linear:
     before = np.concatenate([poses[:1], poses[:-1]])
     inner = (chain.step_edge >= 0)[:, None]
     frame = chain.adjoint(poses)
+    moved_origin = np.broadcast_to(np.eye(4), poses.shape).copy()
+    moved_origin[:, :3, 3] = -poses[:, :3, 3]
+    shift = chain.adjoint(moved_origin)
     left = chain.log(se3.inverse(chain.step) @ se3.inverse(before) @ poses)
     residual = np.where(inner, np.einsum("nij,nj->ni", frame, left), 0.0)
     covariance = frame @ chain.step_covariance @ np.swapaxes(frame, 1, 2)
-    loop_residual, loop_covariance = loops_at(chain, poses, frame)
-    return Linear(poses, np.cumsum(residual, axis=0), np.cumsum(covariance, axis=0, dtype=np.longdouble), loop_residual, loop_covariance)
+    loop_residual, loop_covariance = loops_at(chain, poses)
+    return Linear(poses, np.cumsum(residual, axis=0), np.cumsum(covariance, axis=0, dtype=np.longdouble), loop_residual, loop_covariance, shift)
 
 
-def loops_at(chain: Chain, poses: Floats, frame: Floats) -> tuple[Floats, Floats]:
-    """Residuals (M, p) and covariances (M, p, p) of the loops in world axes."""
+def loops_at(chain: Chain, poses: Floats) -> tuple[Floats, Floats]:
+    """Residuals (M, p) and covariances (M, p, p) of the loops, in the world's directions at their later ends."""
     a, b = chain.ends.T
+    turned = poses[b].copy()
+    turned[:, :3, 3] = 0.0
     left = chain.log(se3.inverse(chain.motion) @ se3.inverse(poses[a]) @ poses[b])
-    turned = frame[b]
+    turned = chain.adjoint(turned)
     return np.einsum("nij,nj->ni", turned, left), turned @ chain.covariance @ np.swapaxes(turned, 1, 2)
 
 
@@ -103,26 +122,36 @@ class Reduced:
     def residuals(self, linear: Linear) -> tuple[Floats, Floats]:
         """Of the runs (S, p) and the active loops (L, p)."""
         low, high = self.ends[self.runs].T
-        return linear.residual[high] - linear.residual[low], linear.loop_residual[self.active]
+        along = linear.shift[high] @ (linear.residual[high] - linear.residual[low])[..., None]
+        return along[..., 0], linear.loop_residual[self.active]
+
+    def carry(self, linear: Linear) -> Floats:
+        """From the first end of each run and active loop to its second (S + L, p, p)."""
+        return linear.carry(*self.ends[self.network.edges].T)
 
     def factor(self, linear: Linear) -> Factored:
         """The factorised normal equations."""
-        return self.network.factor(np.concatenate(self.precisions(linear)))
+        return self.network.factor(np.concatenate(self.precisions(linear)), self.carry(linear))
 
-    def force(self, precision: Floats, residual: Floats) -> Floats:
-        """Minus half the gradient (R, p, c) for residuals (S + L, p, c)."""
-        pushed = precision @ residual
+    def force(self, linear: Linear, pushed: Floats) -> Floats:
+        """Minus half the gradient (R, p, c) for residuals times precisions (S + L, p, c)."""
         out = np.zeros((len(self.ends), *pushed.shape[1:]))
-        np.add.at(out, self.network.edges[:, 0], pushed)
+        np.add.at(out, self.network.edges[:, 0], np.swapaxes(self.carry(linear), 1, 2) @ pushed)
         np.add.at(out, self.network.edges[:, 1], -pushed)
         return out
 
+    def cost(self, linear: Linear) -> float:
+        """χ² of the chain and the active loops."""
+        residual, precision = np.concatenate(self.residuals(linear)), np.concatenate(self.precisions(linear))
+        return float(np.einsum("mi,mij,mj->", residual, precision, residual))
+
     def moves(self, linear: Linear) -> Floats:
-        """The Gauss–Newton move (R, p) of the ends."""
+        """The Gauss–Newton move (R, p) of the ends, about the world's origin."""
         precision = np.concatenate(self.precisions(linear))
         residual = np.concatenate(self.residuals(linear))
-        factored = self.network.factor(precision)
-        return np.asarray(factored.solve(self.force(precision, residual[..., None]))[..., 0])
+        factored = self.network.factor(precision, self.carry(linear))
+        at_ends = factored.solve(self.force(linear, precision @ residual[..., None]))
+        return np.asarray((np.linalg.inv(linear.shift[self.ends]) @ at_ends)[..., 0])
 
 
 def moved(chain: Chain, reduced: Reduced, linear: Linear, moves: Floats) -> Floats:
@@ -146,19 +175,31 @@ def moved(chain: Chain, reduced: Reduced, linear: Linear, moves: Floats) -> Floa
     k = np.flatnonzero(bent)
     run = low[k]
     gap = moves[right[k]] - moves[left[k]] + linear.residual[high[k]] - linear.residual[run]
-    whole = inverse(linear.path(run, high[k])) @ gap[..., None]
-    out[k] += (linear.path(run, k) @ whole)[..., 0]
+    here = linear.shift[k]
+    whole = inverse(linear.path(run, high[k], k)) @ here @ gap[..., None]
+    out[k] += np.linalg.solve(here, linear.path(run, k) @ whole)[..., 0]
     return np.asarray(chain.exp(out) @ linear.poses)
 
 
 def settled(chain: Chain, reduced: Reduced, poses: Floats, steps: int, tolerance: float) -> Linear:
-    """The chain at the poses of least cost with the active loops, or after as many steps."""
+    """The chain at the poses of least cost with the active loops, or after as many steps: until a step wins less than
+    this share of the cost. A step that wins nothing is halved.
+    """
     linear = linearise(chain, poses)
     if not len(reduced.active):
         return linear
+    cost = reduced.cost(linear)
     for _ in range(steps):
-        moves = reduced.moves(linear)
-        linear = linearise(chain, moved(chain, reduced, linear, moves))
-        if float(np.abs(moves).max(initial=0.0)) < tolerance:
+        moves, before = reduced.moves(linear), cost
+        for _ in range(HALVINGS):
+            tried = linearise(chain, moved(chain, reduced, linear, moves))
+            if (found := reduced.cost(tried)) < cost:
+                linear, cost = tried, found
+                break
+            moves = moves / 2
+        if not cost < (1 - tolerance) * before:
             break
     return linear
+
+
+HALVINGS = 4

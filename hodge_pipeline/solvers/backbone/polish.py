@@ -21,7 +21,7 @@ ALIKE = 0.5
 1 for the same error in all.
 """
 ROUNDS = 5
-STEPS, TOLERANCE = 2, 1e-4
+STEPS, TOLERANCE = 3, 1e-3
 
 
 def polished(chain: Chain, used: Bools, linear: Linear) -> Linear:

@@ -51,14 +51,17 @@ class Network:
         slot = np.where(high < len(free), np.searchsorted(plan.keys, low * len(free) + high), -1)
         return cls(edges, component, place, slot, plan)
 
-    def factor(self, precision: Floats) -> Factored:
-        """The normal equations' factor, `precision (E, p, p)` that of each edge's `x_j − x_i`."""
+    def factor(self, precision: Floats, carry: Floats) -> Factored:
+        """The normal equations' factor, `precision (E, p, p)` that of each edge's `x_j − A x_i`, `carry (E, p, p)` A."""
         size, p = self.plan.size, precision.shape[-1]
         diagonal, rows = np.zeros((size + 1, p, p)), np.zeros((len(self.plan.slot_rows), p, p))
-        for end in np.minimum(self.place[self.edges], size).T:
-            np.add.at(diagonal, end, precision)
+        tail, head = np.minimum(self.place[self.edges], size).T
+        pulled = np.swapaxes(carry, 1, 2) @ precision
+        np.add.at(diagonal, head, precision)
+        np.add.at(diagonal, tail, pulled @ carry)
         inside = self.slot >= 0
-        np.add.at(rows, self.slot[inside], -precision[inside])
+        off = np.where((tail < head)[:, None, None], pulled, np.swapaxes(pulled, 1, 2))
+        np.add.at(rows, self.slot[inside], -off[inside])
         core: list[Floats] = [np.zeros((0, 0))]
 
         def invert(matrix: csc_matrix) -> object:
@@ -66,7 +69,7 @@ class Network:
             return lambda rhs: core[0] @ rhs
 
         factor = eliminate_blocks(self.plan, diagonal[:size], rows, invert)  # type: ignore[arg-type]
-        return Factored(self, factor, core[0])
+        return Factored(self, carry, factor, core[0])
 
 
 def _as_they_are(pattern: csc_matrix) -> Ordering:
@@ -78,6 +81,7 @@ class Factored:
     """A factorised network: `core` is the inverse of what the rounds leave."""
 
     network: Network
+    carry: Floats
     blocks: BlockFactor
     core: Floats
 
@@ -93,14 +97,15 @@ class Factored:
         return out
 
     def across(self) -> Floats:
-        """The covariance (E, p, p) of `x_j − x_i` of each edge: only those entries of the inverse that the factor has
+        """The covariance (E, p, p) of `x_j − A x_i` of each edge: only those entries of the inverse that the factor has
         are computed (Takahashi et al. 1973).
         """
         network = self.network
         diagonal, rows = self._inverse()
         i, j = np.minimum(network.place[network.edges], network.plan.size).T
-        own = diagonal[i] + diagonal[j]
         off = np.where((network.slot >= 0)[:, None, None], rows[network.slot], 0.0)
+        off = self.carry @ np.where((i < j)[:, None, None], off, np.swapaxes(off, 1, 2))
+        own = diagonal[j] + self.carry @ diagonal[i] @ np.swapaxes(self.carry, 1, 2)
         return np.asarray(own - off - np.swapaxes(off, 1, 2))
 
     def _inverse(self) -> tuple[Floats, Floats]:
