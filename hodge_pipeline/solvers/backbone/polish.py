@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, turns
 from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, settled
-from hodge_pipeline.types import Bools, Floats
+from hodge_pipeline.types import Bools, Floats, Ints
 
 LOCAL = 0.5
 """Of the scale of the steps' errors over long paths, that over short ones: these errors are alike from step to step.
@@ -24,11 +24,11 @@ ROUNDS = 5
 STEPS, TOLERANCE = 3, 1e-3
 
 
-def polished(chain: Chain, used: Bools, linear: Linear) -> Linear:
-    """The chain at the poses of the used loops (M,)."""
+def polished(chain: Chain, used: Bools, linear: Linear) -> tuple[Linear, Floats]:
+    """The chain at the poses of the used loops (M,), and the factors (M,) on their standard deviations."""
     rows = np.flatnonzero(used)
     if not len(rows):
-        return linear
+        return linear, np.ones(len(used))
     reduced = Reduced.of(chain, rows)
     chain = replace(chain, step_covariance=LOCAL**2 * chain.step_covariance)
     wide = np.ones(len(used))
@@ -40,10 +40,10 @@ def polished(chain: Chain, used: Bools, linear: Linear) -> Linear:
         linear = settled(weighted, reduced, linear.poses, STEPS, TOLERANCE)
         _, chi2 = gaussian(linear.loop_residual[rows], linear.loop_covariance[rows] * weights[rows, None, None])
         weights[rows] = (FREEDOM + len(chain.axes)) / (FREEDOM + chi2)
-    return linear
+    return linear, np.sqrt(wide / weights)
 
 
-def crowding(chain: Chain, rows: Floats) -> Floats:
+def crowding(chain: Chain, rows: Ints) -> Floats:
     """How many of these loops, each itself included, join the same two places: so near along the paths that the steps
     between them err less than a loop.
     """
