@@ -25,6 +25,7 @@ def image_frame(
     world_from_cam: Floats,
     sequence: str = "",
     lens: Lens | None = None,
+    colour_delay_s: float = 0.0,
 ) -> Frame:
     """A frame that reads its images when asked, and then refuses those of another size than the camera.
 
@@ -41,6 +42,7 @@ def image_frame(
         encoded_colour=partial(images.encoded_colour, colour) if colour else None,
         world_from_cam=world_from_cam if np.isfinite(world_from_cam).all() else None,
         sequence=sequence,
+        colour_delay_s=colour_delay_s,
     )
     return frame if lens is None else _straight(frame, lens, units_per_metre)
 

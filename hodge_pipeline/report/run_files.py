@@ -68,10 +68,11 @@ def make_report(
     store: Store,
     scene: Scene,
     rounds: Sequence[Round],
+    world_from_cam: Floats,
     scores: ScoreTable | None,
     refined: Refined | None,
 ) -> Report:
-    """Everything that the run measured."""
+    """Everything that the run measured; `world_from_cam (N, 4, 4)` are the final poses of all frames."""
     last, whole, source = rounds[-1], scene.whole, scene.source
     sets = pose_sets(rounds)
     assert last.solution is not None
@@ -92,7 +93,7 @@ def make_report(
             unordered=not scene.in_order,
         ),
         scores=scores,
-        trajectories=_trajectories(recipe, scene, sets, component),
+        trajectories=_trajectories(recipe, scene, sets, None if refined else world_from_cam, component),
         loops=_loop_rows(last.solution),
         energies=_energy_rows(rounds),
         graph=graph_summary(last.edges, last.vertex_ids, component),
@@ -122,12 +123,14 @@ def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
 
 
 def _trajectories(
-    recipe: Recipe, scene: Scene, sets: Mapping[str, Floats], component: Ints
+    recipe: Recipe, scene: Scene, sets: Mapping[str, Floats], final: Floats | None, component: Ints
 ) -> tuple[TrajectoryRow, ...]:
-    """The errors of each set of poses, over all frames, those that are not key frames included."""
+    """The errors of each set of poses, over all frames, those that are not key frames included; `final`: the last."""
     if not has_truth(scene.whole):
         return ()
     every = {name: scene.key_frames.expand(poses) for name, poses in sets.items()}
+    if final is not None:
+        every["result"] = final
     sequences = [frame.sequence for frame in scene.whole.frames]
     delta_frames = recipe.evaluation.rpe_delta_frames
     component = component[scene.key_frames.key_of_frame]
@@ -200,6 +203,6 @@ def write(
         write_graph(folder, scene.source, rounds[-1])
         for name, path in models.items():
             artifacts.link_or_copy(path, folder / f"{name}.ply")
-    report = make_report(recipe, store, scene, rounds, scores, refined)
+    report = make_report(recipe, store, scene, rounds, world_from_cam, scores, refined)
     write_report(folder, report)
     return report

@@ -22,7 +22,10 @@ from hodge_pipeline.types.edges import ViewGraph as ViewGraph
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: `u = fx x / z + cx`, `v = fy y / z + cy`, in pixels; `fy` is negative where y points up."""
+    """A pinhole camera: `u = fx x / z + cx`, `v = fy y / z + cy`, in pixels; `fy` is negative where y points up.
+
+    `readout_s` is how much later its last row is read than its first one, by a rolling shutter; 0: all at once.
+    """
 
     width: int
     height: int
@@ -30,6 +33,7 @@ class Camera:
     fy: float
     cx: float
     cy: float
+    readout_s: float = 0.0
 
     @property
     def matrix(self) -> Floats:
@@ -90,6 +94,7 @@ class Frame:
 
     - `read_depth()` gives (H, W) float32 metres, 0 where there is no measurement.
     - `read_colour()` gives (H, W, 3) uint8 RGB.
+    - `stamp_s` is the moment of the depth image; the colour image was taken `colour_delay_s` later.
     - `world_from_cam` is the pose that the source gives (a benchmark's truth, a SLAM estimate); None where it has
       none. The pipeline evaluates against it and never starts from it unless a recipe says so.
     """
@@ -104,6 +109,7 @@ class Frame:
     encoded_colour: Callable[[], EncodedImage] | None = None
     world_from_cam: Floats | None = None
     sequence: str = ""
+    colour_delay_s: float = 0.0
 
 
 @dataclass(frozen=True)
