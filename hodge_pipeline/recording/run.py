@@ -28,6 +28,7 @@ from hodge_pipeline.store.log import log
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.store.workspace import RUN, identity_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
+from hodge_pipeline.types.input_files import read_input_text
 
 FILE = "recording.rrd"
 RECORDING = "recording"
@@ -161,7 +162,7 @@ class Recording:
         """Truth, recipe and log, which belong to the run as a whole, then all parts as one file."""
         recorder = self._recorder(folder)
         notes = _record_truth(recorder, self._source, self._rounds)
-        lines = (self._folder / "log.txt").read_text("utf-8").splitlines()
+        lines = read_input_text(self._folder / "log.txt", errors="replace").splitlines()
         recorder.text(yaml_file.dump(binding.unbind(self._recipe)), lines)
         parts = [*self._parts, *find_parts(folder)]
         if self._live is not None:
