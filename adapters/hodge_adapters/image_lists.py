@@ -70,8 +70,11 @@ def read_pairs(folder: Path, max_difference_s: float, notes: list[str]) -> Stamp
         notes.append(f"{len(lost)} colour images listed but not there: {listed(lost)}")
     rows = np.flatnonzero(there).tolist()
     return StampedImages(
-        found.stamps_s[rows], [found.depth[row] for row in rows], [colour[row] for row in rows],
-        found.colour_delays_s[rows], found.files,
+        found.stamps_s[rows],
+        [found.depth[row] for row in rows],
+        [colour[row] for row in rows],
+        found.colour_delays_s[rows],
+        found.files,
     )
 
 

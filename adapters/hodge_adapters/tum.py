@@ -29,7 +29,12 @@ READOUT_S = 0.0225
 """Of the first Kinect's rolling shutter: where landmarks of fr1/xyz and fr1/rpy fit best, 22.2 and 23.1 ms."""
 CAMERAS = {
     "fr1": Intrinsics(
-        517.3, 516.5, 318.6, 255.3, (640, 480), distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+        517.3,
+        516.5,
+        318.6,
+        255.3,
+        (640, 480),
+        distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
         readout_s=READOUT_S,
     ),  # fmt: skip
     "fr2": Intrinsics(520.9, 521.0, 325.1, 249.7, (640, 480), distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),

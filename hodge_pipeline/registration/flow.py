@@ -51,9 +51,9 @@ class Corners:
 
 @dataclass(frozen=True)
 class Followed:
-    """What a frame shows of its key frame's corners: rows (m,) of those that agree on its motion, and where it saw them,
-    `seen (m, 3)`, columns u, v, z (NaN: no depth there); the motion, its information, and the `share` of those followed
-    that agree.
+    """What a frame shows of its key frame's corners: rows (m,) of those that agree on its motion, and where it saw
+    them, `seen (m, 3)`, columns u, v, z (NaN: no depth there); the motion, its information, and the `share` of those
+    followed that agree.
     """
 
     rows: Any

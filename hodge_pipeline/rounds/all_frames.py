@@ -14,6 +14,7 @@ from hodge_pipeline.scene import KeyFrames, Scene, stamps_of, vertex_ids
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Source
+from hodge_pipeline.types.notes import Note
 
 
 def pose_all_frames(scene: Scene, world_from_key: Floats, steps: Steps, workers: Workers) -> Floats:
@@ -51,5 +52,5 @@ def pose_frames(
         step.advance(len(found.rows) + len(found.misfits))
     if misfits:
         names = in_runs(np.array(sorted(misfits)), vertex_ids(source))
-        step.note(f"{len(misfits)} frames fit nothing that their key frame saw ({names}): their poses follow from it")
+        step.note(Note("misfits", len(misfits), names))
     return poses
