@@ -133,6 +133,9 @@ def _trajectory_changes(report: Report) -> Iterator[Change]:
     before, after = rows[report.before], rows[report.after]
     floor = floor_m(report)
     yield Change("the error of the trajectory (ATE)", "ATE", before.ate_rmse_m, after.ate_rmse_m, floor)
+    largest = Change("the largest error of a position", "largest error", before.ate_max_m, after.ate_max_m, floor)
+    if largest.sign < 0:
+        yield largest
     if not np.isfinite(before.rpe_translation_m):
         return
     step = "from frame to frame" if before.rpe_delta_frames == 1 else f"over {before.rpe_delta_frames} frames"
@@ -229,6 +232,6 @@ def _unmatched(report: Report) -> Iterator[str]:
 
 def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[str]:
     if row.left_out:
-        yield f"{row.name}: {row.left_out} frames without a true pose, or joined to no other, are not in its error."
+        yield f"{row.name}: {row.left_out} {row.of} without a true pose, or joined to no other, are not in its error."
     if row.degenerate:
         yield f"{row.name}: its positions lie on a line (or are fewer than three): its orientations aligned it."
