@@ -13,6 +13,7 @@ from hodge_pipeline.stages import Steps
 from hodge_pipeline.start.given import read_trajectory
 from hodge_pipeline.start.match_poses import match_poses
 from hodge_pipeline.types import Bools, Source
+from hodge_pipeline.types.notes import Note
 
 OWN = "frames"
 MAX_GAP_S = 0.1
@@ -36,7 +37,7 @@ def with_truth(source: Source, truth: Path | None, steps: Steps) -> Source:
         poses = matched.world_from_cam
         trajectory = trajectory if matched.how == "stamp" else None
     known: Bools = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    steps.note(f"{known.sum()} of {len(known)} frames have a true pose, by the truth that was named")
+    steps.note(Note("truth", int(known.sum()), str(len(known))))
     frames = tuple(
         replace(frame, true_world_from_cam=pose if true else None)
         for frame, pose, true in zip(source.frames, poses, known, strict=True)
