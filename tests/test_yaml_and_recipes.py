@@ -52,6 +52,26 @@ def test_a_merge_key_is_read_and_cannot_multiply() -> None:
     assert (document.origins["b", "x"], document.origins["c", "y"]) == ("x.yaml:2", "x.yaml:5")
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a: " + "[" * 5000 + "]" * 5000, "more than 50 levels"),
+        ("a: " + "{a: " * 5000 + "1" + "}" * 5000, "more than 50 levels"),
+        ("a:\n  " + "- " * 5000 + "1", "more than 50 levels"),
+        ("&a {b: *a}", "50 levels"),
+        ("a: &a {<<: *a}", "merged into itself"),
+        ("a: 0x" + "f" * 90_000, "a whole number of 360000 bits"),
+        ("a: 9223372036854775808", "a whole number of 64 bits"),
+        ("a: " + "9" * 90_000, "digits"),
+    ],
+)
+def test_what_would_fill_the_stack_or_a_line_is_refused(text: str, expected: str) -> None:
+    with pytest.raises(RecipeError, match=expected) as refused:
+        yaml_file.parse(text, "file")
+    assert len(str(refused.value)) < 200
+    assert "\n" not in str(refused.value)
+
+
 def test_a_huge_file_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "huge.yaml"
     path.write_text("a: " + "x" * yaml_file.MAX_BYTES)
