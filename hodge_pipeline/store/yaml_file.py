@@ -75,7 +75,7 @@ def parse(text: str, name: str) -> Document:
 
 
 def _check_depth(text: str, name: str) -> None:
-    """Refuse what is nested deeper than any recipe, before it is built: 5000 levels take seconds and the whole stack."""
+    """Refuse what is nested deeper than any recipe before it is built: 5000 levels take seconds and the stack."""
     depth = 0
     for event in YAML(typ="rt", pure=True).parse(text):
         depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
