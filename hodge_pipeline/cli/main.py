@@ -11,7 +11,7 @@ import typer
 
 from hodge_pipeline.cli import refine as refining
 from hodge_pipeline.cli.guard import guard_streams, shown
-from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet
+from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet, Truth
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -67,6 +67,7 @@ def run(
     recipe: Annotated[str, typer.Argument(help="A recipe by name (see `hodge recipes`) or a .yaml file.")],
     out: Out,
     source: Annotated[Path | None, typer.Option(help="What to read; overrides source.path.")] = None,
+    truth: Truth = None,
     overrides: Overrides = None,
     overwrite: Overwrite = False,
     dask: Dask = None,
@@ -77,9 +78,8 @@ def run(
     """Run a recipe on a source: poses, fused model, report and recording in --out."""
     from hodge_pipeline.cli import run as running
 
-    running.run(
-        recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask
-    )
+    sets = [*(overrides or []), *running.named_truth(truth)]
+    running.run(recipe, source, out, sets, overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask)
 
 
 @app.command()
