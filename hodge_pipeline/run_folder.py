@@ -21,6 +21,7 @@ from hodge_pipeline.stages import Step
 from hodge_pipeline.store.store import stored, stored_clouds
 from hodge_pipeline.store.workspace import OLD_KEY_FILE, RECIPE_FILE, RUN, is_run_folder
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, Source
+from hodge_pipeline.types.text import command
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,7 @@ def check_layout(folder: Path) -> None:
     if not is_run_folder(folder):
         raise WorkspaceError(f"{folder}: is no run folder: there is no {RECIPE_FILE} with steps in it")
     if any((folder / RUN).glob(f"*/{OLD_KEY_FILE}")):
-        again = f"hodge run {folder / RECIPE_FILE} --out {folder} --overwrite"
+        again = command("hodge", "run", folder / RECIPE_FILE, "--out", folder, "--overwrite")
         raise WorkspaceError(f"{folder}: was made in the layout of an earlier version: '{again}' makes it again")
 
 

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from hodge_pipeline.cli import refine as refining
+from hodge_pipeline.cli.guard import guard_streams, shown
 from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet, Truth
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
@@ -269,12 +270,13 @@ def compare(
 
 def main() -> None:
     """Run the command; what a user can mend is one line and exit code 1 (3: a result that failed its checks)."""
+    guard_streams()
     try:
         app(standalone_mode=True)  # which ends with 130 on Ctrl-C
     except OSError as error:
         if error.filename is None and error.errno is None:
             raise
-        print(f"error: {error.filename or 'a file'}: {error.strerror}", file=sys.stderr)
+        print(f"error: {shown(str(error.filename or 'a file'))}: {error.strerror}", file=sys.stderr)
         sys.exit(1)
     except MemoryError:
         print("error: this needs more memory than there is: give less data, or free some", file=sys.stderr)
@@ -284,7 +286,7 @@ def main() -> None:
 
         if not isinstance(error, HodgeError):
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shown(str(error))}", file=sys.stderr)
         sys.exit(error.exit_code)
 
 

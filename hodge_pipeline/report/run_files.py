@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -48,20 +47,22 @@ from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import Store, versions
 from hodge_pipeline.types import Floats, Ints, Solution, Source, Trajectory
+from hodge_pipeline.types.text import file_stems
 
 
 def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
     """`poses.tum` and `poses.kitti`; of several sequences `poses-<sequence>.*` each, since their stamps may repeat.
 
-    A sequence named by folders, as a rig's cameras are, becomes one name: no file lies outside the folder.
+    A sequence named by folders, as a rig's cameras are, becomes one name: no file lies outside the folder, and no two
+    sequences have one file.
     """
     sequences = sequences_of(source)
-    for name, rows in sequences.items():
+    for stem, rows in zip(file_stems(list(sequences)), sequences.values(), strict=True):
         stamps = np.array([source.frames[row].stamp_s for row in rows])
         part = Source(source.name, source.path, trajectory=Trajectory(stamps, world_from_cam[rows]))
-        stem = "poses" if len(sequences) == 1 else "poses-" + re.sub(r"[/\\]", "_", name)
+        name = "poses" if len(sequences) == 1 else f"poses-{stem}"
         for writer in ("tum", "kitti"):
-            registry.load("writers", writer)().write(folder / f"{stem}.{writer}", part)
+            registry.load("writers", writer)().write(folder / f"{name}.{writer}", part)
 
 
 def write_graph(folder: Path, source: Source, last: Round) -> None:
