@@ -144,6 +144,7 @@ class TumReader:
                     units_per_metre=scale,
                     no_depth=self.no_depth,
                     world_from_cam=poses[row],
+                    is_true=True,
                     lens=lens,
                     colour_delay_s=float(listing.colour_delays_s[row]),
                 )
