@@ -143,7 +143,7 @@ class _Job:
         rounds = [work.scene.first]
         for number in range(1, self.recipe.outer_iterations + 1):
             proposed = work.propose(number, rounds[-1])
-            registered = work.register(number, proposed, rounds[-1].world_from_cam)
+            registered = work.register(number, proposed, rounds[-1])
             rounds.append(self.consistent(work, registered))
             recording.round(number, rounds[-1])
         for more in chain(suggested_rounds(work, rounds), edited_rounds(work, self.workspace.folder, rounds)):
