@@ -23,13 +23,16 @@ def image_frame(
     units_per_metre: float,
     no_depth: tuple[int, ...] = (0, 65535),
     world_from_cam: Floats,
+    is_true: bool = False,
     sequence: str = "",
     lens: Lens | None = None,
 ) -> Frame:
     """A frame that reads its images when asked, and then refuses those of another size than the camera.
 
-    With a lens they are bent straight first. A pose (4, 4) that is not finite means none.
+    With a lens they are bent straight first. A pose (4, 4) that is not finite means none; `is_true` says that it is
+    a benchmark's.
     """
+    pose = world_from_cam if np.isfinite(world_from_cam).all() else None
     size = camera.width, camera.height
     frame = Frame(
         frame_id=frame_id,
@@ -39,7 +42,8 @@ def image_frame(
         read_colour=partial(images.read_colour, colour, size=size) if colour else None,
         encoded_depth=partial(images.encoded_depth, depth, units_per_metre=units_per_metre),
         encoded_colour=partial(images.encoded_colour, colour) if colour else None,
-        world_from_cam=world_from_cam if np.isfinite(world_from_cam).all() else None,
+        world_from_cam=pose,
+        true_world_from_cam=pose if is_true else None,
         sequence=sequence,
     )
     return frame if lens is None else _straight(frame, lens, units_per_metre)

@@ -165,6 +165,7 @@ class SevenScenesReader:
             units_per_metre=UNITS_PER_METRE,
             no_depth=self.no_depth,
             world_from_cam=pose,
+            is_true=True,
             sequence=files.sequence,
         )
         colour = self._colour(camera)

@@ -51,7 +51,10 @@ class SourceSummary:
 
 @dataclass(frozen=True)
 class TrajectoryRow:
-    """Absolute (ATE) and relative (RPE, over `rpe_delta_frames`) error of one set of poses against the truth."""
+    """Absolute (ATE) and relative (RPE, over `rpe_delta_frames`) error of one set of poses against the truth.
+
+    `of` says what is counted in `frames` and `left_out`: the frames of the source, or the poses of a file.
+    """
 
     name: str
     frames: int
@@ -63,6 +66,7 @@ class TrajectoryRow:
     rpe_rotation_deg: float
     degenerate: bool = False
     rpe_delta_frames: int = 1
+    of: str = "frames"
 
 
 @dataclass(frozen=True)

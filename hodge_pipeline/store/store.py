@@ -25,6 +25,7 @@ from hodge_pipeline.store.log import log
 from hodge_pipeline.store.progress import Nobody, Watcher
 from hodge_pipeline.store.workspace import disk_errors
 from hodge_pipeline.types import CloudSet
+from hodge_pipeline.types.input_files import open_input, read_input_text
 from hodge_pipeline.types.notes import Note
 
 T = TypeVar("T")
@@ -250,7 +251,7 @@ def _unsealed(path: Path) -> dict[str, Any]:
 def _facts(path: Path) -> list[Any]:
     """Size and SHA-256 of a file."""
     total, size = hashlib.sha256(), 0
-    with path.open("rb") as stream:
+    with open_input(path) as stream:
         while block := stream.read(HASHED_AT_ONCE):
             total.update(block)
             size += len(block)
@@ -276,7 +277,7 @@ def _commit(part: Path, path: Path) -> None:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text("utf-8")
+        return read_input_text(path)
     except (OSError, UnicodeDecodeError):
         return ""
 
