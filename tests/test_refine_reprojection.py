@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from hodge_pipeline.refine.reprojection import reprojection_measures
 
 import hodge_pipeline
 from hodge_adapters.colmap_refining import ColmapModels
 from hodge_adapters.colmap_reprojection import error_cap
 from hodge_adapters.colmap_uncertainty import standard_errors
 from hodge_pipeline import se3
-from hodge_pipeline.refine.reprojection import reprojection_measures
 from hodge_pipeline.types import ModelQuality
 from test_refine_colmap import FREE, noisy
 
