@@ -4,11 +4,11 @@
     python benchmarks/colmap.py scene/sparse/0 --seeds 1 --kinds noise wrong
     python benchmarks/colmap.py --write                          # benchmarks/colmap.md
 
-Each model is taken for good and disturbed: `noise`: 0.5° and 2 % of the scene for each image; `big`: 8° and 15 %; `wrong`:
-15 % of the images 15° and 25 % off; `halves`: two overlapping models, each in a gauge and unit of its own; `renamed`,
-`no_images`, `no_database`: noise, and images under other names than the database's, or without images or database.
-The peer is pycolmap's bundle adjustment with cameras held. Centres are root mean squares after a similarity, in % of the
-extent of the good model's cameras; CPU seconds are those of whole processes.
+Each model is taken for good and disturbed: `noise`: 0.5° and 2 % of the scene for each image; `big`: 8° and 15 %;
+`wrong`: 15 % of the images 15° and 25 % off; `halves`: two overlapping models, each in a gauge and unit of its own;
+`renamed`, `no_images`, `no_database`: noise, and images under other names than the database's, or without images or
+database. The peer is pycolmap's bundle adjustment with cameras held. Centres are root mean squares after a similarity,
+in % of the extent of the good model's cameras; CPU seconds are those of whole processes.
 """
 
 from __future__ import annotations
@@ -212,7 +212,8 @@ def label(good: Path) -> str:
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
     """A table in Markdown, one line for each disturbed model."""
-    yield "| model | disturbed | seed | input % | peer % | ours % | input px | peer px | ours px | peer s | ours s | kept | |"
+    names = [f"{who} {unit}" for unit in ("%", "px") for who in ("input", "peer", "ours")]
+    yield f"| model | disturbed | seed | {' | '.join(names)} | peer s | ours s | kept | |"
     yield "|" + "---|" * 13
     for row in rows:
         numbers = [*(f"{one:.4f}" for one in row[3:6]), *(f"{one:.3f}" for one in row[6:9])]
@@ -239,7 +240,9 @@ def main() -> int:
     failed = sum(bool(row.failure) for row in rows)
     print(f"{len(rows)} cases, {failed} not as promised")
     if options.write:
-        text = "\n".join(["# `hodge refine colmap` against its input and plain bundle adjustment", "", *table(rows), ""])
+        text = "\n".join(
+            ["# `hodge refine colmap` against its input and plain bundle adjustment", "", *table(rows), ""]
+        )
         Path(__file__).with_suffix(".md").write_text(text, "utf-8")
     return 1 if failed else 0
 

@@ -334,7 +334,7 @@ class TrackedModel(Protocol):
 
     def held_out_errors(self, entries: Bools, *, move_bodies: bool) -> Floats:
         """Errors (H,) in pixels of the observations chosen from the N of `quality`, after an adjustment of the points,
-        and of the bodies where those move, without them.
+        and of the bodies where those move, without them; those that their points cannot spare are left out.
         """
         ...
 

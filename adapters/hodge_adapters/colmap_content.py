@@ -57,7 +57,7 @@ def _image(image: pycolmap.Image) -> ImageRecord:
 def _points(reconstruction: pycolmap.Reconstruction, posed: set[int]) -> Points:
     """The points; what an image without a pose saw of them tells nothing."""
     ids, xyz, counts, image_ids, columns = [], [], [], [], []
-    for key, point in reconstruction.points3D.items():
+    for key, point in sorted(reconstruction.points3D.items()):
         ids.append(key)
         xyz.append(point.xyz)
         seen = [(one.image_id, one.point2D_idx) for one in point.track.elements if one.image_id in posed]

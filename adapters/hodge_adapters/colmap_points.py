@@ -81,7 +81,7 @@ def _rays(model: Model, world_from_cam: Floats) -> tuple[Ints, Floats, Floats, I
 
 
 def _sum(values: Floats, owner: Ints, count: int) -> Floats:
-    return np.stack([np.bincount(owner, column, minlength=count) for column in values.T], axis=1)
+    return np.stack([np.bincount(owner, column, minlength=count) for column in values.T], axis=1).astype(float)
 
 
 def _mean(values: Floats, owner: Ints, count: int) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +60,7 @@ def _placed(model: Model, bodies: Bodies, rows: Ints) -> Floats | None:
 
 def _estimate(
     pixels: Floats, xyz: Floats, row_of: Ints, cameras: Sequence[pycolmap.Camera], body_from_cam: Sequence[Floats]
-) -> dict[str, object] | None:
+) -> dict[str, Any] | None:
     """What pycolmap finds: for one image its own estimator, for several of a rig the generalised one."""
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.random_seed = SEED

@@ -21,6 +21,8 @@ NEAR_SHARE = 0.03
 LEAST_PARALLAX = 1e-4
 LEAST_TIES = 12
 LEAST_TIE_SHARE = 0.15
+REFITS = 5
+"""Each to the better half, as least trimmed squares concentrate."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,22 @@ def similarity(
     found: Any = pycolmap.estimate_sim3d_robust(there, here, options)
     if found is None or found["num_inliers"] < max(LEAST_TIES, LEAST_TIE_SHARE * len(ties.ids)):
         return None
-    return found["tgt_from_src"], int(found["num_inliers"])
+    return _refitted(found["tgt_from_src"], there, here, found["inlier_mask"]), int(found["num_inliers"])
+
+
+def _refitted(motion: pycolmap.Sim3d, there: Floats, here: Floats, mask: Any) -> pycolmap.Sim3d:
+    """Fitted again to the ties that agree best: those of a keypoint in both models are far better than matched ones."""
+    kept = np.asarray(mask, bool)
+    for _ in range(REFITS):
+        away: Floats = np.linalg.norm(here - np.array([motion * point for point in there]), axis=1)
+        near = kept & (away <= np.median(away[kept]))
+        if near.sum() < LEAST_TIES:
+            break
+        again = pycolmap.estimate_sim3d(there[near], here[near])
+        if again is None:
+            break
+        motion = again
+    return motion
 
 
 def _matched_points(

@@ -30,6 +30,9 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bools, Floats, Frame, Ints, ModelQuality, PositionPriors, ViewGraph
 
+LEAST_LEFT = 3
+"""Entries of a track: two would meet in a point wherever the images are."""
+
 
 @dataclass(frozen=True)
 class DepthOptions:
@@ -157,7 +160,7 @@ class ColmapModel:
         return 0 if database is None else held_apart(self.reconstruction, database, self.edges.min_shared)
 
     def resected(self, bodies: Bools | None = None) -> Floats:
-        """The poses (B, 4, 4) that the points give each of these bodies (B,), all by default; see `colmap_resection`."""
+        """Poses (B, 4, 4): those of these bodies (B,), all by default, by the points; see `colmap_resection`."""
         return resected(self.records, self.bodies, bodies)
 
     def scaled(self, factor: float) -> ColmapModel:
@@ -201,13 +204,21 @@ class ColmapModel:
         return standard_errors(self.records, self.bodies)
 
     def held_out_errors(self, entries: Bools, *, move_bodies: bool) -> Floats:
-        """Errors (H,) of these entries of tracks (T,) after an adjustment without them, of the points alone or of all."""
+        """Errors (H,) of these entries of tracks (T,) after an adjustment without them, of the points or of all.
+
+        An entry whose point too few others would place is left in, and out of the answer.
+        """
         copy, records = self._copy(), self.records
-        points, images = records.points, records.images
+        left, held = np.diff(records.points.offsets), []
         for at in np.flatnonzero(entries):
-            copy.delete_observation(images[records.image_rows[at]].image_id, int(points.columns[at]))
+            owner = records.points.owners[at]
+            if left[owner] > LEAST_LEFT:
+                left[owner] -= 1
+                held.append(at)
+                image = records.images[records.image_rows[at]]
+                copy.delete_observation(image.image_id, int(records.points.columns[at]))
         adjust(copy, self.bodies, None, move_bodies=move_bodies)
-        return reprojection_errors(refreshed(records, copy))[1][entries]
+        return reprojection_errors(refreshed(records, copy))[1][held]
 
     def write(self, folder: Path) -> None:
         """Five files, binary or text as the model was."""

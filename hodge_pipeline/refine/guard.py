@@ -31,6 +31,11 @@ class Measure:
         """Whether it got worse by more than the tolerance; a measure that is lost (NaN) is worse."""
         return sign_of(self.before, self.after, self.tolerance, self.better) < 0
 
+    @property
+    def is_better(self) -> bool:
+        """Whether it got better by more than the tolerance."""
+        return sign_of(self.before, self.after, self.tolerance, self.better) > 0
+
     def __str__(self) -> str:
         return f"{self.name} {self.before:.4g} -> {self.after:.4g}{self.unit and ' '}{self.unit}"
 

@@ -74,7 +74,8 @@ _PARTS = ("errors_px", "parallaxes_deg", "track_lengths")
 
 def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, names: Sequence[str]) -> list[Cost]:
     if not len(weights):
-        return [Cost(*[float("nan")] * 3, 0, 0, 0, 1.0, ()) for _ in errors_px]
+        nan = float("nan")
+        return [Cost(nan, nan, nan, 0, 0, 0, 1.0, ()) for _ in errors_px]
     behind = np.isinf(errors_px)
     effective = np.where(distant | behind, np.inf, errors_px)
     medians = np.median(effective, axis=1)
@@ -93,7 +94,7 @@ def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, name
                 behind=int(behind[row].sum()),
                 distant=int((distant[row] & ~behind[row]).sum()),
                 beyond=float(weights @ beyond / weights.sum()),
-                images_off=tuple(names[at] for at in np.flatnonzero(off)),
+                images_off=tuple(name for name, is_off in zip(names, off.tolist(), strict=True) if is_off),
             )
         )
     return out

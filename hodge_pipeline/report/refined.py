@@ -10,6 +10,7 @@ from hodge_pipeline.recipe import binding
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.report.contents import (
+    CandidateRow,
     EdgeRow,
     Path3D,
     Pictures,
@@ -30,6 +31,23 @@ def _scales(result: RefinedModel) -> str:
     before = "; ".join(str(scale) for scale in dict.fromkeys(result.scales))
     after = "" if not result.final_scale.is_observable else f". After: {result.final_scale}"
     return f"Before: {before}{after}."
+
+
+def _candidates(result: RefinedModel) -> tuple[CandidateRow, ...]:
+    return tuple(
+        CandidateRow(
+            name=name,
+            mean_px=cost.px,
+            median_px=cost.median_px,
+            observations=cost.observations,
+            behind=cost.behind,
+            distant=cost.distant,
+            beyond=cost.beyond,
+            images_off=len(cost.images_off),
+            is_kept=row == result.kept_row,
+        )
+        for row, (name, cost) in enumerate(result.candidates)
+    )
 
 
 def model_report(results: Sequence[RefinedModel], options: ModelRefinement, source: str, cost: Cost) -> Report:
@@ -58,7 +76,7 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
         title=f"{source}, refined",
         source=SourceSummary(f"COLMAP model, {quality.points} points", source, quality.images),
         before="start",
-        refinement=replace(summary(first.decision), scale=_scales(first)),
+        refinement=replace(summary(first.decision), scale=_scales(first), candidates=_candidates(first)),
         graph=graph,
         worst_edges=worst,
         stages=(StageRow("refine", cost.wall_s, cost.cpu_s, cost.peak_mb),),

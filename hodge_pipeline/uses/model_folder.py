@@ -14,7 +14,6 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recipe import binding
-from hodge_pipeline.recording.run import FILE
 from hodge_pipeline.recording.solved import record_graph
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
@@ -85,11 +84,10 @@ def _write_models(out: Path, models: Sequence[TrackedModel]) -> None:
 
 def _record(out: Path, first: RefinedModel) -> None:
     """The recording of the first result, which has most images: its poses before and after, its edges, the solve."""
-    if first.solved is None:
-        (out / FILE).unlink(missing_ok=True)
-        return
     sets = {"start": first.start.world_from_body, "refined": first.model.world_from_body}
-    record_graph(out, first.model.name, first.solved.graph, sets["start"], first.solved.solution, sets, first.notes)
+    solved = first.solved
+    graph, solution = (None, None) if solved is None else (solved.graph, solved.solution)
+    record_graph(out, first.model.name, graph, sets["start"], solution, sets, first.notes)
 
 
 def _write_tables(out: Path, results: Sequence[RefinedModel]) -> None:
