@@ -31,6 +31,7 @@ from hodge_pipeline.run_folder import Run, begin, check_layout, end, opening_of
 from hodge_pipeline.scene import Round, Scene
 from hodge_pipeline.sources.measured_edges import measured_edges
 from hodge_pipeline.sources.opening import open_source, remembered
+from hodge_pipeline.start.truth import with_truth
 from hodge_pipeline.store.log import logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
@@ -128,7 +129,7 @@ class _Job:
         self.store.note(*notes_of("reader", source.notes))
         if len(source.frames) == 1:
             self.store.note(Note("single frame", detail=str(path)))
-        return remembered(source, reader, self.store)
+        return with_truth(remembered(source, reader, self.store), self.recipe.evaluation.truth, self.store)
 
     def measured(self, scene: Scene) -> ViewGraph:
         """The edges that come measured, over the key frames: they join every round's graph as they are."""

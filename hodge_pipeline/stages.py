@@ -223,10 +223,11 @@ class Fuser(Protocol):
 class Writer(Protocol):
     """Writes what another program reads."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> Sequence[str] | None:
         """One file or folder, written atomically, of what it can hold: a trajectory, a graph.
 
-        `SourceError` where the source has nothing of that kind.
+        Gives what was written, counted, and what the format cannot hold, a line each, or None. `SourceError` where the
+        source has nothing of that kind.
         """
         ...
 

@@ -226,6 +226,17 @@ def test_a_measure_that_got_worse_is_named_in_the_headline() -> None:
     assert "the error of the motion from frame to frame (RPE) rose from 17 mm to 20 mm (+18 %)" in verdict.details
 
 
+def test_a_largest_error_that_got_worse_is_named_too() -> None:
+    report = told((0.5, 0.020), (0.4, 0.017))
+    start, result = report.trajectories
+    rows = (start, replace(result, ate_max_m=0.7))
+    verdict = judge(replace(report, trajectories=rows))
+    assert verdict.headline.endswith(", but largest error 50 cm → 70 cm") and verdict.outcome == "mixed"
+    refined = RefinementSummary("refined", "Better than the poses given", "clouds lie nearer")
+    verdict = judge(replace(report, trajectories=rows, refinement=refined))
+    assert verdict.headline == "Better than the poses given, but largest error 50 cm → 70 cm"
+
+
 def test_a_difference_below_what_was_measured_is_none(tmp_path: Path) -> None:
     report = told((1e-17, 3e-18), (3e-17, 1e-17))
     verdict = judge(report)
@@ -279,7 +290,7 @@ def test_a_refinement_whose_error_against_the_truth_rose_is_mixed() -> None:
     refinement = RefinementSummary("refined", "Better than the poses given", "edge chi2 2 -> 1")
     verdict = judge(replace(told((0.5, 0.017), (0.6, 0.017)), refinement=refinement))
     assert verdict.outcome == "mixed"
-    assert verdict.headline == "Better than the poses given, but ATE 50 cm → 60 cm"
+    assert verdict.headline == "Better than the poses given, but ATE 50 cm → 60 cm, largest error 50 cm → 60 cm"
 
 
 def test_the_worst_edge_is_the_wrong_one(report: Report) -> None:

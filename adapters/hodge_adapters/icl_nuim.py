@@ -133,6 +133,7 @@ class IclNuimReader:
                 listing.colour[row],
                 units_per_metre=self.units_per_metre or 5000.0,
                 world_from_cam=poses[row],
+                is_true=True,
             )
             for row in range(0, len(ids), self.every)
         )

@@ -45,7 +45,10 @@ class SourceSummary:
 
 @dataclass(frozen=True)
 class TrajectoryRow:
-    """Absolute (ATE) and relative (RPE, over `rpe_delta_frames`) error of one set of poses against the truth."""
+    """Absolute (ATE) and relative (RPE, over `rpe_delta_frames`) error of one set of poses against the truth.
+
+    `of` says what is counted in `frames` and `left_out`: the frames of the source, or the poses of a file.
+    """
 
     name: str
     frames: int
@@ -57,6 +60,7 @@ class TrajectoryRow:
     rpe_rotation_deg: float
     degenerate: bool = False
     rpe_delta_frames: int = 1
+    of: str = "frames"
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def _peak(report: Report) -> float:
 def score_tables(report: Report) -> Iterator[Table]:
     """Scores and trajectory errors of each set of poses, where they were measured."""
     if report.refinement is not None and report.refinement.measures:
-        yield _measures(report.refinement)
+        yield _measures(report.refinement, _of_key_frames(report))
         if report.refinement.candidates:
             yield _candidates(report.refinement)
     if report.scores is not None:
@@ -69,13 +69,18 @@ def graph_tables(report: Report) -> Iterator[Table]:
         yield _loops(report)
 
 
-def _measures(refinement: RefinementSummary) -> Table:
+def _of_key_frames(report: Report) -> str:
+    count = report.source.key_frames
+    return "" if count is None else f"Of the {count} key frames. "
+
+
+def _measures(refinement: RefinementSummary, of: str) -> Table:
     rows = tuple(
         (row.name, f"{row.before:.4g}", f"{row.after:.4g}", row.unit, row.better, "worse" if row.is_worse else "ok")
         for row in refinement.measures
     )
     header = ("measure", "before", "after", "unit", "better", "judgement")
-    caption = "Where one is worse by more than its own noise the input is kept. "
+    caption = f"{of}Where one is worse by more than its own noise the input is kept. "
     caption += " ".join(filter(None, (refinement.change, refinement.scale)))
     return Table("Measures", header, rows, caption)
 
@@ -103,7 +108,7 @@ def _scores(report: Report) -> Table:
         (name, *(cell for graph in table.graphs for cell in _score_cells(graph, row)))
         for row, name in enumerate(table.names)
     ]
-    caption = (
+    caption = _of_key_frames(report) + (
         f"How well overlapping clouds lie on each other, on the pairs of the {table.reference} poses ({counts}). "
         f"d: mean point-to-plane distance; score: mean of exp(−d / {table.scale * SIGMA_M * 1000:g} mm), 1 is perfect. "
         "Compare rows with each other: a score has no meaning alone."
@@ -131,11 +136,13 @@ def _trajectories(report: Report) -> Table:
         )
         for row in report.trajectories
     )
-    delta = report.trajectories[0].rpe_delta_frames if report.trajectories else 1
+    row = report.trajectories[0]
+    of = "Distance" if row.of == "frames" else f"Of the {row.frames} {row.of}: distance"
+    noun = row.of.split()[0].removesuffix("s")
+    step = "next" if row.rpe_delta_frames == 1 else f"one {row.rpe_delta_frames} {noun}s on"
     caption = (
-        "Distance from the true positions after the best rigid alignment (ATE, root mean square), and error of the "
-        f"motion from each frame to {'the next' if delta == 1 else f'the one {delta} frames on'} (RPE). The truth of a "
-        "benchmark has errors of its own."
+        f"{of} from the true positions after the best rigid alignment (ATE, root mean square), and error of the "
+        f"motion from each {noun} to the {step} (RPE). The truth of a benchmark has errors of its own."
     )
     return Table("Trajectory", header, rows, caption)
 

@@ -134,6 +134,9 @@ def _trajectory_changes(report: Report) -> Iterator[Change]:
     before, after = rows[report.before], rows[report.after]
     floor = floor_m(report)
     yield Change("the error of the trajectory (ATE)", "ATE", before.ate_rmse_m, after.ate_rmse_m, floor)
+    largest = Change("the largest error of a position", "largest error", before.ate_max_m, after.ate_max_m, floor)
+    if largest.sign < 0:
+        yield largest
     if not np.isfinite(before.rpe_translation_m):
         return
     step = "from frame to frame" if before.rpe_delta_frames == 1 else f"over {before.rpe_delta_frames} frames"
@@ -218,6 +221,6 @@ def _unmatched(report: Report) -> Iterator[Note]:
 
 def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[Note]:
     if row.left_out:
-        yield Note("not in the error", row.left_out, row.name)
+        yield Note("not in the error", row.left_out, f"{row.name}, {row.of}")
     if row.degenerate:
         yield Note("degenerate", detail=row.name)

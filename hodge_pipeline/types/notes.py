@@ -45,6 +45,8 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
     ),
+    "truth": (Rank.FACT, "{count} of {detail} frames have a true pose, by the truth that was named"),
+    "no truth near": (Rank.LOOK, "{detail}: no pose has a true one near in time: its error is not measured"),
     "carried": (Rank.LOOK, "{count} frames without a given pose are carried from the nearest ones by odometry"),
     "left apart": (Rank.LOOK, "nothing joins what tracking left apart: it starts where the guessed motion puts it"),
     "matched": (Rank.FACT, "{count} pairs between pieces matched, {detail}"),
@@ -96,7 +98,7 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "unmatched": (Rank.LOOK, "{detail} of each other."),
     "not in the error": (
         Rank.FACT,
-        "{detail}: {count} frames without a true pose, or joined to no other, are not in its error.",
+        "{detail}: {count} without a true pose, or joined to no other, are not in the error.",
     ),
     "degenerate": (
         Rank.FACT,

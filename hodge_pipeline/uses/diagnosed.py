@@ -32,6 +32,7 @@ from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, USED
+from hodge_pipeline.types.text import command
 
 PICTURED, LEAST_PICTURED = 6, 2
 SUGGESTED, REGISTERED = 12, 6
@@ -184,16 +185,16 @@ def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> t
     wrong = pair_names(subject.graph.vertex_ids, subject.graph.edges[rows])
     if not subject.is_run:
         if len(wrong) > COMMANDED:
-            return (f"hodge solve {subject.path} --out solved.g2o --robust",)
-        off = " ".join(f"--disable {pair}" for pair in wrong)
-        return (f"hodge solve {subject.path} --out solved.g2o {off}",) if wrong else ()
+            return (command("hodge", "solve", subject.path, "--out", "solved.g2o", "--robust"),)
+        off = [word for pair in wrong for word in ("--disable", pair)]
+        return (command("hodge", "solve", subject.path, "--out", "solved.g2o", *off),) if wrong else ()
     useful = suggestions.pairs[suggestions.score >= subject.suggestions.min_gain][:REGISTERED]
     if not wrong and not len(useful):
         return ()
-    edit = f"--disable {','.join(wrong) if len(wrong) <= COMMANDED else WRONG}"
+    edit = "--disable", ",".join(wrong) if len(wrong) <= COMMANDED else WRONG
     if not wrong:
-        edit = f"--register {','.join(pair_names(subject.graph.vertex_ids, useful))}"
-    return f"hodge edit {subject.path} {edit}", f"hodge solve {subject.path}"
+        edit = "--register", ",".join(pair_names(subject.graph.vertex_ids, useful))
+    return command("hodge", "edit", subject.path, *edit), command("hodge", "solve", subject.path)
 
 
 def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:
