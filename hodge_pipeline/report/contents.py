@@ -175,6 +175,21 @@ class MeasureRow:
 
 
 @dataclass(frozen=True)
+class CandidateRow:
+    """What one candidate for a refined model costs: see `refine.judge.Cost`; `images_off` counts them."""
+
+    name: str
+    mean_px: float
+    median_px: float
+    observations: int
+    behind: int
+    distant: int
+    beyond: float
+    images_off: int
+    is_kept: bool
+
+
+@dataclass(frozen=True)
 class RefinementSummary:
     """What became of a refinement: `outcome` is refined, optimal, worse or forced; why; and what it rests on."""
 
@@ -184,6 +199,7 @@ class RefinementSummary:
     measures: tuple[MeasureRow, ...] = ()
     change: str = ""
     scale: str = ""
+    candidates: tuple[CandidateRow, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from hodge_pipeline.refine.guard import Decision
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.report.contents import (
+    CandidateRow,
     EdgeRow,
     MeasureRow,
     Path3D,
@@ -49,6 +50,23 @@ def _scales(result: RefinedModel) -> str:
     return f"Before: {before}{after}."
 
 
+def _candidates(result: RefinedModel) -> tuple[CandidateRow, ...]:
+    return tuple(
+        CandidateRow(
+            name=name,
+            mean_px=cost.px,
+            median_px=cost.median_px,
+            observations=cost.observations,
+            behind=cost.behind,
+            distant=cost.distant,
+            beyond=cost.beyond,
+            images_off=len(cost.images_off),
+            is_kept=row == result.kept_row,
+        )
+        for row, (name, cost) in enumerate(result.candidates)
+    )
+
+
 def model_report(results: Sequence[RefinedModel], options: ModelRefinement, source: str, cost: Cost) -> Report:
     """The report of the first result, which has most images; the others in its notes."""
     first = results[0]
@@ -75,7 +93,7 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
         title=f"{source}, refined",
         source=SourceSummary(f"{quality.points} points", source, quality.images, format="colmap", kind="images"),
         before="start",
-        refinement=replace(summary(first.decision), scale=_scales(first)),
+        refinement=replace(summary(first.decision), scale=_scales(first), candidates=_candidates(first)),
         graph=graph,
         worst_edges=worst,
         stages=(StageRow("refine", cost.wall_s, cost.cpu_s, cost.peak_mb),),

@@ -37,6 +37,8 @@ def score_tables(report: Report) -> Iterator[Table]:
     """Scores and trajectory errors of each set of poses, where they were measured."""
     if report.refinement is not None and report.refinement.measures:
         yield _measures(report.refinement, _of_key_frames(report))
+        if report.refinement.candidates:
+            yield _candidates(report.refinement)
     if report.scores is not None:
         yield _scores(report)
     if report.trajectories:
@@ -71,6 +73,20 @@ def _measures(refinement: RefinementSummary, of: str) -> Table:
     caption = f"{of}Where one is worse by more than its own noise the input is kept. "
     caption += " ".join(filter(None, (refinement.change, refinement.scale)))
     return Table("Measures", header, rows, caption)
+
+
+def _candidates(refinement: RefinementSummary) -> Table:
+    rows = tuple(
+        (f"{row.name}{' (kept)' if row.is_kept else ''}", f"{row.mean_px:.4g}", f"{row.median_px:.4g}", str(row.behind),
+         str(row.distant), f"{row.beyond:.2%}", str(row.images_off))
+        for row in refinement.candidates
+    )  # fmt: skip
+    header = ("candidate", "mean, px", "median, px", "behind", "distant", "beyond the cap", "images off")
+    caption = (
+        f"Each on the same {refinement.candidates[0].observations} observations; a mean is of errors up to the cap. "
+        "Lost or behind a camera, or distant (with no parallax where most candidates have one) counts as the cap."
+    )
+    return Table("Candidates", header, rows, caption)
 
 
 def _scores(report: Report) -> Table:
