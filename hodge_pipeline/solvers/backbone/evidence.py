@@ -38,10 +38,13 @@ class Wrong:
         moment = residual.T @ residual / max(len(residual), 1)
         split = turns(chain)
         shape = np.zeros_like(moment)
-        shape[:split, :split], shape[split:, split:] = _floored(moment[:split, :split]), _floored(moment[split:, split:])
+        shape[:split, :split], shape[split:, split:] = (
+            _floored(moment[:split, :split]),
+            _floored(moment[split:, split:]),
+        )
         size = len(shape)
         norm = gammaln((1 + size) / 2) - gammaln(0.5) - 0.5 * size * np.log(np.pi)
-        return cls(np.linalg.inv(shape), 0.5 * float(np.linalg.slogdet(shape)[1]) - float(norm))
+        return cls(np.asarray(np.linalg.inv(shape), float), 0.5 * float(np.linalg.slogdet(shape)[1]) - float(norm))
 
     def log_density(self, chain: Chain, poses: Floats) -> Floats:
         """Of all loops (M,)."""
@@ -59,7 +62,7 @@ def turns(chain: Chain) -> int:
 def parallel(chain: Chain, motion: Floats, from_a: Floats, from_b: Floats) -> Floats:
     """Residuals (M, p) of motions between two poses, turned into the world's directions."""
     left = se3.log(se3.inverse(motion) @ se3.inverse(from_a) @ from_b).reshape(-1, 2, 3)
-    return np.einsum("nij,nkj->nki", from_b[:, :3, :3], left).reshape(-1, 6)[:, chain.axes]
+    return np.asarray(np.einsum("nij,nkj->nki", from_b[:, :3, :3], left).reshape(-1, 6)[:, chain.axes])
 
 
 def _floored(second_moment: Floats) -> Floats:

@@ -15,12 +15,12 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.sparse import Factored, Network
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Floats, Ints
 
 
 @dataclass(frozen=True)
 class Linear:
-    """The chain at some poses, in world axes: sums over positions of the steps' residuals `residual (n, p)` and 
+    """The chain at some poses, in world axes: sums over positions of the steps' residuals `residual (n, p)` and
     covariances `covariance (n, p, p)`; of each loop, at its later end, `loop_residual (M, p)` and `loop_covariance
     (M, p, p)`; `shift (n, p, p)` takes a twist from the world's origin to a pose's own.
     """
@@ -60,7 +60,14 @@ def linearise(chain: Chain, poses: Floats) -> Linear:
     residual = np.where(inner, np.einsum("nij,nj->ni", frame, left), 0.0)
     covariance = frame @ chain.step_covariance @ np.swapaxes(frame, 1, 2)
     loop_residual, loop_covariance = loops_at(chain, poses)
-    return Linear(poses, np.cumsum(residual, axis=0), np.cumsum(covariance, axis=0, dtype=np.longdouble), loop_residual, loop_covariance, shift)
+    return Linear(
+        poses,
+        np.cumsum(residual, axis=0),
+        np.cumsum(covariance, axis=0, dtype=np.longdouble),
+        loop_residual,
+        loop_covariance,
+        shift,
+    )
 
 
 def loops_at(chain: Chain, poses: Floats) -> tuple[Floats, Floats]:

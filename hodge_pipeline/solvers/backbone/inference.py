@@ -1,4 +1,4 @@
-"""Which loops of a trusted chain are right: Bayes factors at the poses that the others lead to, scales learned as well."""
+"""Which loops of a trusted chain are right: Bayes factors at the poses that the other loops lead to."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ TOLERANCE = 1e-3
 @dataclass(frozen=True)
 class Judged:
     """Loops judged at some poses: `log_odds (M,)` that each is right, by all others; `factor (M,)` its log Bayes factor
-    without the share of right ones; `chi2 (M,)` of its residual in its own uncertainty and that of the poses without it.
+    without the share of right ones; `chi2 (M,)` of its residual at poses solved without it; `log_density
+    (2, M)` of it, right and wrong.
     """
 
     log_odds: Floats
@@ -96,7 +97,8 @@ random loops in simulated graphs and in those of Bicocca and RobotCar, whose bes
 
 def _confirmed(factor: Floats, count: int) -> bool:
     """Whether used loops with these log Bayes factors, of so many loops, are more than chance finds."""
-    return float((factor - np.log(max(count, 1))).sum()) > BY_CHANCE + BY_CHANCE_EACH_FOLD * np.log(max(count, 1))
+    fold = float(np.log(max(count, 1)))
+    return float((factor - fold).sum()) > BY_CHANCE + BY_CHANCE_EACH_FOLD * fold
 
 
 def settled_globally(chain: Chain, reduced: Reduced, poses: Floats) -> Linear:
@@ -150,7 +152,7 @@ def left_out(linear: Linear, reduced: Reduced, residual: Floats, covariance: Flo
 
 
 def uncertainty(chain: Chain, linear: Linear, reduced: Reduced | None) -> Floats:
-    """The covariance (M, p, p) of each loop's residual at poses solved without it; infinite where nothing else tells."""
+    """The covariance (M, p, p) of each loop's residual at poses solved without it; infinite where nothing tells."""
     own = linear.loop_covariance
     a, b = chain.ends.T
     same = chain.path[a] == chain.path[b]
@@ -218,5 +220,3 @@ def _samples(linear: Linear, reduced: Reduced, factored: Factored) -> Floats:
     factor = np.linalg.cholesky(ones) * unit[:, :, None]
     force = reduced.force(linear, factor @ noise)
     return factored.solve(force)
-
-

@@ -1,8 +1,8 @@
-"""How large the errors of the backbone's steps and of its right loops are, as factors on what their information states."""
+"""How large the errors of a backbone's steps and of right loops are, as factors on what their information states."""
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,7 +63,7 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
         if (np.abs(ratios) > MOST_RATIO + 1e-9).any():
             return -np.inf
         prior = -0.5 * float(logs @ logs) / FOLD**2
-        return own.value(logs)[0] - max(decoys.value(logs)[0], 0.0) + prior
+        return float(own.value(logs)[0] - max(decoys.value(logs)[0], 0.0) + prior)
 
     best, width = np.zeros(4), FIRST
     top = value(best)
@@ -114,18 +114,19 @@ class _Model:
             linear = linearise(part, poses)
             parts.append((linear.path(a[rows], b[rows]), linear.loop_covariance[rows]))
         path, own = (np.stack(each) for each in zip(*parts, strict=True))
-        for part in (path, own):
-            part[2] -= part[0] + part[1]
+        for parted in (path, own):
+            parted[2] -= parted[0] + parted[1]
         return cls(linear.loop_residual[rows], path, own, wrong.log_density(chain, poses)[rows])
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
-        """The log-likelihood of scales, against that of all loops being wrong, and the shares of right and wrong loops."""
+        """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
         if not len(self.residual):
             return 0.0, EVEN
         turn, shift, own_turn, own_shift = np.exp(logs)
         covariance = _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
         factor = student(self.residual, covariance)[0] - self.away
-        return mixture(np.stack([factor, np.zeros_like(factor)]))[::-1]
+        shares, likelihood = mixture(np.stack([factor, np.zeros_like(factor)]))
+        return likelihood, shares
 
 
 def _weighed(parts: Floats, turn: float, shift: float) -> Floats:

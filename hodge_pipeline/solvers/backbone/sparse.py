@@ -26,8 +26,8 @@ MOST_NEIGHBOURS, FEWEST_IN_ROUND = 24, 6
 class Network:
     """Vertices joined by edges (E, 2), one of each `component (N,)` held still.
 
-    - `place (N,)`: of each vertex in the plan's order, those held still from `plan.size` on; `slot (E,)`: of each edge's
-      block above the diagonal, −1 where an end is held still.
+    - `place (N,)`: of each vertex in the plan's order, those held still from `plan.size` on; `slot (E,)`: of each
+      edge's block above the diagonal, −1 where an end is held still.
     """
 
     edges: Ints
@@ -57,7 +57,7 @@ class Network:
         return self.plan.size - self.plan.core
 
     def factor(self, precision: Floats, carry: Floats) -> Factored:
-        """The normal equations' factor, `precision (E, p, p)` that of each edge's `x_j − A x_i`, `carry (E, p, p)` A."""
+        """The normal equations' factor; `precision (E, p, p)` of each edge's `x_j − A x_i`, `carry (E, p, p)` is A."""
         size, p = self.plan.size, precision.shape[-1]
         diagonal, rows = np.zeros((size + 1, p, p)), np.zeros((len(self.plan.slot_rows), p, p))
         tail, head = np.minimum(self.place[self.edges], size).T

@@ -9,7 +9,7 @@ from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.types import Bools, Floats, Ints
 
 LONGEST = 3
-"""Steps of a cycle with one loop that tests them; with two loops it has at most one step at either end."""
+"""Steps of a cycle with one loop: cycles of several loops close too where these agree on a place that is wrong."""
 OF_STEPS = 3.0
 """Of the usual displacement and angle of steps: a cycle of right edges closes to less, and one of places at random
 seldom does.
@@ -17,7 +17,7 @@ seldom does.
 
 
 def tested_steps(chain: Chain, poses: Floats) -> Bools:
-    """Steps (n,) that lie in a cycle of at most four edges that closes to less than a step."""
+    """Steps (n,) that lie in a cycle with one loop that closes to less than a step."""
     inner = np.flatnonzero(chain.step_edge >= 0)
     out = np.zeros(chain.size, bool)
     if not len(inner) or not len(chain.ends):
@@ -32,33 +32,11 @@ def tested_steps(chain: Chain, poses: Floats) -> Bools:
     for ahead in range(1, LONGEST + 1):
         rows = good[high[good] - low[good] >= ahead]
         out[low[rows] + ahead] = True
-    return out | _between_two(chain, poses, gate)
+    return out
 
 
 TURN_RAD = 0.1
 """Where a backbone goes straight on, the angle that counts as a usual one."""
-
-
-def _between_two(chain: Chain, poses: Floats, gate: tuple[float, float]) -> Bools:
-    """Steps in cycles of two loops and the steps between neighbouring ends of them."""
-    out = np.zeros(chain.size, bool)
-    low, high = chain.ends.T
-    keys = low * chain.size + high
-    order = np.argsort(keys, kind="stable")
-    for down, up in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        moved = low + down, high + up
-        at = np.minimum(np.searchsorted(keys, moved[0] * chain.size + moved[1], sorter=order), len(keys) - 1)
-        other = order[at]
-        fits = (low[other] == moved[0]) & (high[other] == moved[1]) & (moved[1] < chain.size)
-        first = np.flatnonzero(fits & (chain.path[low] == chain.path[low[other]]) & (chain.path[high] == chain.path[high[other]]))
-        second = other[first]
-        way = _between(poses, low[first], low[second]) @ chain.motion[second] @ _between(poses, high[second], high[first])
-        good = first[_closes(chain.motion[first], way, gate)]
-        if down:
-            out[low[good] + 1] = True
-        if up:
-            out[high[good] + (1 if up > 0 else 0)] = True
-    return out
 
 
 def _between(poses: Floats, a: Ints, b: Ints) -> Floats:
@@ -68,4 +46,4 @@ def _between(poses: Floats, a: Ints, b: Ints) -> Floats:
 def _closes(motion: Floats, other: Floats, gate: tuple[float, float]) -> Bools:
     left = se3.inverse(motion) @ other
     near = np.linalg.norm(left[:, :3, 3], axis=1) < gate[0]
-    return near & (np.linalg.norm(se3.so3_log(left[:, :3, :3]), axis=1) < gate[1])
+    return np.asarray(near & (np.linalg.norm(se3.so3_log(left[:, :3, :3]), axis=1) < gate[1]))

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.chain import Chain, linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.backbone.inference import Inferred, infer
@@ -29,8 +31,8 @@ MOST_UNKNOWNS = 1500
 class Backbone:
     """The edges that are trusted and what they say of the others.
 
-    - `steps`, `used (E,)`: edges of the backbone, and all that count; `right (E,)`: the probability of each loop, NaN for
-      steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
+    - `steps`, `used (E,)`: edges of the backbone, and all that count; `right (E,)`: the probability of each loop, NaN
+      for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
     """
 
@@ -41,6 +43,18 @@ class Backbone:
     right: Floats
     chi2: Floats
     world_from_cam: Floats
+
+    def placed(self, start: Floats | None) -> Floats:
+        """The poses (V, 4, 4), the first vertex of each component where it starts."""
+        poses = self.world_from_cam
+        if start is None:
+            return poses
+        ends = self.chain.order[self.chain.ends[self.found.used]]
+        steps = np.flatnonzero(self.chain.step_edge >= 0)
+        joined = np.concatenate([np.stack([self.chain.order[steps - 1], self.chain.order[steps]], axis=1), ends])
+        component = connected_components(joined, len(poses))
+        first = np.unique(component, return_index=True)[1]
+        return np.asarray((start[first] @ se3.inverse(poses[first]))[component] @ poses)
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
         """The graph of the edges that count, with the information that their errors were found to have."""
@@ -79,6 +93,8 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
     steps = linear_forest(graph.edges, graph.vertex_count, chosen)
     chain = make_chain(graph, steps)
     if not len(chain.loop_edge):
+        return None
+    if trust == AUTO and (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         return None
     if trust == AUTO and tested_steps(chain, chain.poses()).sum() > TESTED * steps.sum():
         return None
