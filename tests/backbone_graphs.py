@@ -108,9 +108,7 @@ def _noise(rng: np.random.Generator, size: Floats, dimension: int) -> Floats:
     return xi
 
 
-def _wrong(
-    rng: np.random.Generator, truth: Floats, count: int, in_groups: bool, dimension: int
-) -> tuple[Ints, Floats]:
+def _wrong(rng: np.random.Generator, truth: Floats, count: int, in_groups: bool, dimension: int) -> tuple[Ints, Floats]:
     edges: list[tuple[int, int]] = []
     motion: list[Floats] = []
     while len(edges) < count:

@@ -11,7 +11,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.chain import Chain, linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.backbone.inference import Inferred, infer
-from hodge_pipeline.solvers.backbone.tested import tested_steps
+from hodge_pipeline.solvers.backbone.tested import tested_by_pairs, tested_steps
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
@@ -23,6 +23,8 @@ TESTED = 0.3
 """Of the steps in short cycles that close: from there on every edge is judged, none trusted. On graphs of rooms .77 to
 .98 are, on those of places visited again 0 to .1.
 """
+TESTED_BY_PAIRS = 0.75
+"""Of the steps between loops that agree with each other and with no backbone: .91 of a garage's five floors are."""
 MOST_UNKNOWNS = 1500
 """In a dense matrix: a lattice of loops, in which no edge needs to be trusted, has more."""
 
@@ -100,7 +102,14 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
         return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
     found = infer(chain, always, MOST_UNKNOWNS if trust == AUTO else None)
-    return None if found is None else _backbone(graph, chain, found, steps)
+    if found is None or (trust == AUTO and not found.confirmed and _loops_agree(chain, steps)):
+        return None
+    return _backbone(graph, chain, found, steps)
+
+
+def _loops_agree(chain: Chain, steps: Bools) -> bool:
+    """Whether nearly all steps lie between loops that agree: the backbone is what is wrong then."""
+    return bool(tested_by_pairs(chain, chain.poses()).sum() > TESTED_BY_PAIRS * steps.sum())
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
