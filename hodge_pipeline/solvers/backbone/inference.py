@@ -15,7 +15,7 @@ from hodge_pipeline.solvers.backbone.sparse import Factored
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
-ROUNDS = 8
+ROUNDS = 6
 SAMPLES = 64
 MOST_STEPS = 15
 TOLERANCE = 1e-3

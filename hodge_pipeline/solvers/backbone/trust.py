@@ -23,8 +23,11 @@ TESTED = 0.3
 """Of the steps in short cycles that close: from there on every edge is judged, none trusted. On graphs of rooms .77 to
 .98 are, on those of places visited again 0 to .1.
 """
-TESTED_BY_PAIRS = 0.75
-"""Of the steps between loops that agree with each other and with no backbone: .91 of a garage's five floors are."""
+LOOPS_AT_A_STEP, AGREEING = 0.5, 0.05
+"""From so many loops to a step on, of which no backbone confirms any, so large a share of the steps between loops that
+agree with each other says that the backbone is wrong. Fewer loops may be groups that take one place for another; among
+random ones hardly any agree.
+"""
 MOST_UNKNOWNS = 1500
 """In a dense matrix: a lattice of loops, in which no edge needs to be trusted, has more."""
 
@@ -108,8 +111,9 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
 
 
 def _loops_agree(chain: Chain, steps: Bools) -> bool:
-    """Whether nearly all steps lie between loops that agree: the backbone is what is wrong then."""
-    return bool(tested_by_pairs(chain, chain.poses()).sum() > TESTED_BY_PAIRS * steps.sum())
+    """Whether many loops agree with each other, though none with the backbone: it is what is wrong then."""
+    many = len(chain.loop_edge) > LOOPS_AT_A_STEP * steps.sum()
+    return many and bool(tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum())
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
