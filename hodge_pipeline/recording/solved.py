@@ -28,7 +28,7 @@ def record_graph(
     What was left out of it, in words.
     """
     identity = hashlib.sha256(np.ascontiguousarray(solution.world_from_cam).tobytes()).hexdigest()[:32]
-    with tempfile.TemporaryDirectory(dir=folder) as parts:
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".recording-") as parts:
         recorder = Recorder(Path(parts), identity)
         left_out = [*recorder.frames(name, (), tuple(notes))]
         left_out += [note for label, poses in sets.items() for note in recorder.poses(label, poses)]
