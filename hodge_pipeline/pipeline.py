@@ -170,7 +170,7 @@ class _Job:
         """The scores of every round, where they are wished for."""
         if not self.recipe.evaluation.tables:
             return None
-        if self.again:
+        if self.again and rounds[-1].edited:
             self.store.note(Note("scores of before"))
             return None
         scale = float(self.recipe.scale)

@@ -235,7 +235,8 @@ class ModelQuality:
     """How well the points of a model fit its images: of N observations, pixels between a point seen and projected.
 
     `keypoints (N, 2)`: the row in `image_names`, and which of the image's keypoints; `errors_px (N,)`: infinite where
-    the point lies behind the camera; beyond `cap_px` an observation is wrong, and how far off tells no more.
+    the point lies behind the camera; `parallaxes_deg (N,)` between the rays to the point, and in how many images it is
+    seen, `track_lengths (N,)`.
     """
 
     images: int
@@ -244,7 +245,8 @@ class ModelQuality:
     image_names: tuple[str, ...]
     keypoints: Ints
     errors_px: Floats
-    cap_px: float
+    parallaxes_deg: Floats
+    track_lengths: Ints
 
 
 @dataclass(frozen=True)
