@@ -45,6 +45,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
     ),
+    "misfits": (
+        Rank.LOOK,
+        "{count} frames fit nothing that their key frame saw ({detail}): their poses follow from its own",
+    ),
     "truth": (Rank.FACT, "{count} of {detail} frames have a true pose, by the truth that was named"),
     "no truth near": (Rank.LOOK, "{detail}: no pose has a true one near in time: its error is not measured"),
     "carried": (Rank.LOOK, "{count} frames without a given pose are carried from the nearest ones by odometry"),
