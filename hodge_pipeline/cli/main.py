@@ -205,11 +205,12 @@ def convert(
     to: Annotated[str | None, typer.Option("--to", help="The writer by name (see `hodge stages writers`).")] = None,
     reader: Reader = None,
     overrides: ReaderSet = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is at OUT.")] = False,
 ) -> None:
     """Write what a path holds in another format."""
     from hodge_pipeline.cli import convert as converting
 
-    converting.convert(source, out, to=to, reader=reader, settings=overrides or [])
+    converting.convert(source, out, to=to, reader=reader, settings=overrides or [], overwrite=overwrite)
 
 
 @app.command()
