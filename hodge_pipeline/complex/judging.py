@@ -13,6 +13,9 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
+UNMEASURED = 1e-9
+"""Of an eigenvalue, in units that make the information's diagonal one: where it is less, nothing was measured."""
+
 
 def left_over(graph: ViewGraph, world_from_cam: Floats) -> Floats:
     """ξ (E, 6), rotation and translation in j's axes: the motion that each edge and the poses (V, 4, 4) leave over."""
@@ -61,3 +64,22 @@ def has_unit_information(graph: ViewGraph) -> bool:
     diagonal = graph.information[:, range(6), range(6)]
     units = np.isin(diagonal[:, :3], (0, 0.25, 1)).all() and np.isin(diagonal[:, 3:], (0, 1)).all()
     return bool(units and np.count_nonzero(graph.information) == np.count_nonzero(diagonal))
+
+
+def mean_variances(graph: ViewGraph, planar: bool) -> tuple[Floats, Floats]:
+    """The mean variances (E,) of an axis of rotation and of translation that the information states, the latter of both
+    ends: an edge written the other way round has the same. A direction that nothing measured has a very large one.
+    """
+    axes = np.array([2, 3, 4]) if planar else np.arange(6)
+    stated = graph.information[:, axes[:, None], axes]
+    diagonal = np.einsum("eii->ei", stated)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(stated * scale[:, :, None] * scale[:, None])
+    spread = scale[:, :, None] * vectors / np.sqrt(np.maximum(values, UNMEASURED))[:, None]
+    turn = int((axes < 3).sum())
+    at_i = np.zeros((len(stated), 6, len(axes)))
+    at_i[:, axes] = spread
+    at_i = (se3.adjoint(graph.i_from_j) @ at_i)[:, axes]
+    rotation = (spread[:, :turn] ** 2).sum(axis=(1, 2)) / turn
+    both = (spread[:, turn:] ** 2).sum(axis=(1, 2)) + (at_i[:, turn:] ** 2).sum(axis=(1, 2))
+    return rotation, both / (2 * (len(axes) - turn))

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import Loops
-from hodge_pipeline.complex.judging import has_unit_information
-from hodge_pipeline.solvers.weights import PLANAR_AXES
+from hodge_pipeline.complex.judging import has_unit_information, mean_variances
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 MAXWELL_MEDIAN = 1.538
@@ -28,8 +26,6 @@ STATED = 3.0
 """Standard deviations of the graph's own information that explain a cycle."""
 NEARLY_ALL = 0.95
 MAXWELL_NEARLY_ALL = 2.795
-UNMEASURED = 1e-9
-"""Of an eigenvalue, in units that make the information's diagonal one: where it is less, nothing was measured."""
 GAP = 5.0
 """Of the error that nearly all cycles that close stay below."""
 HEAVY_TAILS = 1.9
@@ -114,27 +110,8 @@ def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
     same = graph.edge_count < 2 or bool((graph.information == graph.information[:1]).all())
     if same and (not graph.edge_count or np.array_equal(graph.information[0], np.eye(6))):
         return np.ones(graph.edge_count), np.ones(graph.edge_count), False
-    rotation, translation = _variances(graph)
+    rotation, translation = mean_variances(graph, graph.dimension == 2)
     return _deviation(1 / rotation), _deviation(1 / translation), True
-
-
-def _variances(graph: ViewGraph) -> tuple[Floats, Floats]:
-    """The mean variances (E,) of an axis of rotation and of translation that the information states, the latter of both
-    ends: an edge written the other way round has the same. A direction that nothing measured has a very large one.
-    """
-    axes = PLANAR_AXES if graph.dimension == 2 else np.arange(6)
-    stated = graph.information[:, axes[:, None], axes]
-    diagonal = np.einsum("eii->ei", stated)
-    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    values, vectors = np.linalg.eigh(stated * scale[:, :, None] * scale[:, None])
-    spread = scale[:, :, None] * vectors / np.sqrt(np.maximum(values, UNMEASURED))[:, None]
-    turn = int((axes < 3).sum())
-    at_i = np.zeros((len(stated), 6, len(axes)))
-    at_i[:, axes] = spread
-    at_i = (se3.adjoint(graph.i_from_j) @ at_i)[:, axes]
-    rotation = (spread[:, :turn] ** 2).sum(axis=(1, 2)) / turn
-    both = (spread[:, turn:] ** 2).sum(axis=(1, 2)) + (at_i[:, turn:] ** 2).sum(axis=(1, 2))
-    return rotation, both / (2 * (len(axes) - turn))
 
 
 def _deviation(precision: Floats) -> Floats:
