@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.diagnosis.consensus import find_consensus
 from hodge_pipeline.diagnosis.evidence import Evidence
@@ -88,7 +89,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
     cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))
     found = _report(stated, cycles, probability, verdict, kept, undecided, consensus.fit, world_from_cam)
-    return replace(found, notes=(*found.notes, *noise.doubts))
+    return replace(found, notes=(*found.notes, *noise.doubts, *free_direction_notes(stated)))
 
 
 def _with_witnesses(graph: ViewGraph, cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
