@@ -29,8 +29,8 @@ from benchmarks.paper.tables import (
 from complex_graphs import random_motions
 from hodge_pipeline import se3
 from hodge_pipeline.errors import RecipeError, SourceError
-from hodge_pipeline.recipe import load_recipe
-from hodge_pipeline.types import Bytes, Camera, Floats32, Frame
+from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.types import Bytes, Camera, Edges, Floats32, Frame
 
 KITCHEN = Measured(
     frames=250, pairs=1732, truth=0.86530, first=0.87421, third=0.87474,
@@ -106,7 +106,7 @@ def test_the_papers_recipes_reject_no_registered_pair(kind: str) -> None:
     recipe = load_recipe(f"paper-{kind}", [], "frames")
     assert recipe.start.relocalise is False and recipe.start.max_drift is None  # type: ignore[attr-defined]
     count = 3
-    poor = Edges.of_pairs(np.array([[0, 2], [0, 3], [1, 3]])).put(
+    poor = Edges.of(np.array([[0, 2], [0, 3], [1, 3]])).put(
         slice(None),
         i_from_j=np.tile(np.eye(4), (count, 1, 1)), information=np.zeros((count, 6, 6)),
         fitness=0.01, rmse_m=1.0, correspondences=1,

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,9 +22,10 @@ from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
-from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, TrackingOptions, frame_blocks, track_block
+from hodge_pipeline.registration.tracking import TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source
 from hodge_pipeline.sources.opening import remembered
 from hodge_pipeline.stages import Step, no_progress
@@ -35,12 +37,21 @@ from hodge_pipeline.start.unordered.join import _stays
 from hodge_pipeline.start.unordered.start import Start
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Source, ViewGraph
+from hodge_pipeline.types.notes import Note
 
-FRAMES = 64
+FRAMES, BLOCK = 64, 48
 SMALL = (
     "clouds.voxel_m=0.06", "fusion=[]", "executor.workers=0", "recording.level=off", "evaluation.tables=false",
     "outer_iterations=1", "edges.max_edges_per_frame=4", "start.whole_up_to=20",
 )  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_blocks() -> Iterator[None]:
+    """Two blocks of these sequences."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracking, "FRAMES_IN_BLOCK", BLOCK)
+        yield
 
 
 def small_recipe(source: Path, *overrides: str) -> Recipe:
@@ -66,8 +77,11 @@ def tracking_options(recipe: Recipe) -> TrackingOptions:
 def track(source: Source, folder: Path) -> tuple[Tracked, list[str]]:
     folder.mkdir()
     options, notes = tracking_options(small_recipe(source.path)), list[str]()
-    found = tracked.track(source, options, workers=InProcess(), step=Step(folder, no_progress, notes.append))
-    return found, notes
+
+    def tell(*told: Note) -> None:
+        notes.extend(map(str, told))
+
+    return tracked.track(source, options, workers=InProcess(), step=Step(folder, no_progress, tell)), notes
 
 
 def all_poses(source: Source, found: Tracked, world_from_key: Floats) -> Floats:
@@ -84,7 +98,7 @@ class Told:
         self.asked.append(function_and_inputs)
         return self.answer
 
-    def note(self, message: str) -> None:
+    def note(self, *notes: Note) -> None:
         pass
 
     def key(self, value: object) -> str:
@@ -109,7 +123,7 @@ def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeli
     assert 2 < len(run.result.world_from_cam) < FRAMES / 2
     poses = parse_tum(run.folder / "poses.tum").trajectory
     assert len(poses) == FRAMES
-    assert any("of 64 frames are key frames" in note for note in run.report.notes)
+    assert any("of 64 frames are key frames" in str(note) for note in run.report.notes)
     keys = len(run.result.world_from_cam)
     assert run.report.source.counted == f"64 frames, {keys} of them key frames"
     assert f"64 frames, {keys} of them key frames" in (run.folder / "report.html").read_text("utf-8")
@@ -136,9 +150,9 @@ def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(sequence: Path,
     i, j = before.result.graph.vertex_ids[before.result.graph.edges[0]]
     write_history(before.folder, History((Edit(disable=(f"{i}-{j}",)),)))
     edited = solve_again(before.folder)
-    assert any(f"the {keys} key frames alone" in note for note in edited.report.notes)
+    assert any(f"the {keys} key frames alone" in str(note) for note in edited.report.notes)
     again = hodge_pipeline.run(recipe, before.folder)
-    assert not any("key frames alone" in note for note in again.report.notes)
+    assert not any("key frames alone" in str(note) for note in again.report.notes)
     np.testing.assert_array_equal(again.result.world_from_cam, edited.result.world_from_cam)
 
 
@@ -163,7 +177,7 @@ def test_frames_follow_their_key_frames(sequence: Path, tmp_path: Path) -> None:
 
 
 def test_blocks_share_their_border_and_nothing_else() -> None:
-    rows = np.arange(10, 10 + 2 * FRAMES_IN_BLOCK + 5)
+    rows = np.arange(10, 10 + 2 * BLOCK + 5)
     blocks = frame_blocks(rows, tuple(range(200)), np.arange(200.0))  # type: ignore[arg-type]
     own = [block.rows[int(block.warm_up) :] for block in blocks]
     assert [int(part[0]) for part in own[1:]] == [int(part[-1]) for part in own[:-1]]

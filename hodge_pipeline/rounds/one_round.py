@@ -23,6 +23,7 @@ from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Step, Steps, W
 from hodge_pipeline.start.unordered.tour import propose_along_tour
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import HELD_OUT
+from hodge_pipeline.types.notes import notes_of
 
 EDITED = "edited"
 """The name of a round that a person's edits made."""
@@ -70,10 +71,11 @@ class Work:
         )  # fmt: skip
         return with_start_edges(proposed, scene.first)
 
-    def register(self, number: int, edges: Edges, world_from_cam: Floats) -> Registered:
-        """The candidates registered from these poses, and accepted or rejected."""
+    def register(self, number: int, edges: Edges, before: Round) -> Registered:
+        """The candidates registered from the poses of the round before, and accepted or rejected."""
+        world_from_cam, earlier = before.world_from_cam, before.registered(self.measured) if number > 1 else None
         registered = self.steps.step(
-            register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam,
+            register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,
             title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
         )  # fmt: skip
         fresh = np.flatnonzero(registered.status != HELD_OUT)
@@ -82,8 +84,12 @@ class Work:
 
     def accept(self, edges: Edges) -> Edges:
         """The table with the status of every registered pair."""
-        scale = self.recipe.scale if isinstance(self.recipe.scale, float) else 1.0
-        return accepted(edges, self.recipe.acceptance, self.scene.drift, scale)
+        return accepted(edges, self.recipe.acceptance, self.scene.drift, self.scale)
+
+    @property
+    def scale(self) -> float:
+        """What lengths that are written for rooms are multiplied by."""
+        return self.recipe.scale if isinstance(self.recipe.scale, float) else 1.0
 
     def with_measured(self, edges: Edges) -> Edges:
         """The table with the edges that came measured at its end."""
@@ -145,8 +151,7 @@ def solve_edges(
     weights = np.zeros(len(edges))
     weights[edges.counts] = solution.weights
     solution = replace(solution, weights=weights[edges.in_graph])
-    for note in solution.notes:
-        step.note(f"{registered.name}: {note}")
+    step.note(*notes_of("solver", (f"{registered.name}: {note}" for note in solution.notes)))
     return Round(
         with_residuals(edges, solution.world_from_cam, solution.weights), graph.vertex_ids, solution.world_from_cam,
         solution, registered.fresh, registered.before, found, edited=registered.name == EDITED,
