@@ -49,6 +49,7 @@ def list_edges(session: Session, query: Query) -> dict[str, Any]:
         revision, selected = session.decisions.revision, session.look.selected
     edges, ids = table.edges, table.graph.vertex_ids
     passing, closing = cycle_counts(judged, len(edges))
+    known = np.isin(np.arange(len(edges)), () if judged is None else judged.rows)
     rows = np.flatnonzero(_wanted(session, query))
     rows = rows[_order(session, query, rows, passing - closing)]
     total, rows = len(rows), rows[query.first : query.first + min(query.count, MOST)]
@@ -62,7 +63,7 @@ def list_edges(session: Session, query: Query) -> dict[str, Any]:
             "residual_deg": _number(np.degrees(settled.residual_rad[row])),
             "gap": int(abs(np.diff(table.graph.edges[row])[0])),
             "source": str(edges.proposed_by[row]),
-            "cycles": int(passing[row]),
+            "cycles": int(passing[row]) if known[row] else None,
             "closing": int(closing[row]),
             "counts": bool(settled.weights[row] > 0),
             "status": str(edges.status[row]),
@@ -89,11 +90,16 @@ def _wanted(session: Session, query: Query) -> Bools:
 
 
 def _order(session: Session, query: Query, rows: Ints, failing: Ints) -> Ints:
-    """The order of rows, the worst first unless `descending` turns it round."""
+    """The order of rows, the worst first unless `descending` turns it round.
+
+    Edges with the same score keep their order, that of the residuals at first, while decisions move the poses.
+    """
     edges, settled, pairs = session.table.edges, session.settled, session.table.graph.edges
     residual_m = np.nan_to_num(settled.residual_m[rows], nan=np.inf)
+    first_m = np.full(len(edges), np.inf)
+    first_m[: len(session.first.residual_m)] = np.nan_to_num(session.first.residual_m, nan=np.inf)
     keys: dict[str, tuple[Any, ...]] = {
-        "score": (-residual_m, _place(edges.probability[rows]), _ranks(edges.verdict[rows])),
+        "score": (-first_m[rows], _place(edges.probability[rows]), _ranks(edges.verdict[rows])),
         "residual": (-residual_m,),
         "turn": (-np.nan_to_num(settled.residual_rad[rows], nan=np.inf),),
         "gap": (-np.abs(pairs[rows, 0] - pairs[rows, 1]),),
@@ -184,7 +190,7 @@ def state(session: Session) -> dict[str, Any]:
             "seconds": round(settled.seconds, 4),
             "moved_m": _number(settled.moved_m),
             "error_m": None if settled.error_m is None else _number(settled.error_m),
-            "first_error_m": None if session.first_error_m is None else _number(session.first_error_m),
+            "first_error_m": None if session.first.error_m is None else _number(session.first.error_m),
             "converged": settled.converged,
             "latest": "" if latest is None else str(decisions.history.edits[latest]),
             "can_undo": latest is not None,

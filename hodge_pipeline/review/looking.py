@@ -72,6 +72,7 @@ def shown_pair(session: Session, flip: bool) -> Shown | None:
     else:
         return None
     middle, size_m = _extent(clouds[i])
+    inside = middle
     by_edge, by_solution = poses[i] @ motion, poses[j]
     share = {"edge": 0.0, "solution": 1.0, "blink": float(flip), "between": look.share}.get(look.mode, 0.0)
     world_from_j = by_edge if share == 0 else by_solution if share == 1 else _between(by_edge, by_solution, share)
@@ -80,7 +81,8 @@ def shown_pair(session: Session, flip: bool) -> Shown | None:
         beside = np.eye(4)
         beside[0, 3] = APART * 2 * size_m
         world_from_j, clicking = poses[i] @ beside, session.candidate
-    world = se3.transform(poses[i], middle[None])[0]
+        inside, size_m = middle + [APART * size_m, 0, 0], 2 * size_m
+    world = se3.transform(poses[i], inside[None])[0]
     return Shown(i, j, poses[i], world_from_j, world, size_m, look.cut, clicking)
 
 

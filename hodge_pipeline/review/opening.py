@@ -20,20 +20,20 @@ from hodge_pipeline.run_folder import Run
 
 
 class Review:
-    """A review that is open: its `session`, and the `address` of its page. Closed by `close`, or as a context."""
+    """A review that is open: its `session`, its 3-D `viewer` and the `address` of its page. Closed by `close`, or as a
+    context.
+    """
 
     def __init__(self, path: Path, *, port: int = 0, scene: bool = True, who: str | None = None) -> None:
         with ExitStack() as stack:
             stack.enter_context(_alone(path))
             self.session = Session(open_for_review(path), who=who)
             stack.callback(self.session.close)
-            viewer = None
-            if scene:
-                found = Viewer()
-                stack.callback(found.close)
-                stack.callback(Scene(self.session, found.server).close)
-                viewer = found.path
-            self._front = Front(site(self.session, viewer), port)
+            self.viewer = Viewer() if scene else None
+            if self.viewer is not None:
+                stack.callback(self.viewer.close)
+                stack.callback(Scene(self.session, self.viewer.server).close)
+            self._front = Front(site(self.session, None if self.viewer is None else self.viewer.path), port)
             stack.callback(self._front.close)
             self._stack = stack.pop_all()
 

@@ -42,6 +42,7 @@ class Scene:
         self._clouds: dict[int, Any] = {}
         self._shown: dict[str, tuple[Any, ...]] = {}
         self._closed = threading.Event()
+        self._looked: dict[int, tuple[Any, Any]] = {}
         self._begin()
         server.scene.on_click()(lambda event: self._clicked(event, shift=False))
         server.scene.on_click(modifier="shift")(lambda event: self._clicked(event, shift=True))
@@ -167,6 +168,7 @@ class Scene:
         """The two clouds that are looked at, the others hidden meanwhile; nothing where none are."""
         clouds = self._subject.clouds
         self._server.scene.add_frame("/clouds", show_axes=False, visible=pair is None)
+        self._turn_to(pair)
         if pair is None or clouds is None:
             for name in ("first", "second", "picks"):
                 self._remove(f"/pair/{name}")
@@ -191,6 +193,20 @@ class Scene:
                     "/pair/picks", picks, SELECTED, point_size=0.02 * self._size, point_shape="circle",
                     precision="float32",
                 )  # fmt: skip
+
+    def _turn_to(self, pair: Shown | None) -> None:
+        """Let every page look at the pair, and when it is left where it looked before."""
+        if self._same("eye", np.array([-1, -1, 0] if pair is None else [pair.i, pair.j, pair.wants_points])):
+            return
+        for number, client in self._server.get_clients().items():
+            if pair is not None:
+                self._looked.setdefault(number, (client.camera.position, client.camera.look_at))
+                back = pair.world_from_i[:3, 3] - pair.middle
+                way = back + 0.8 * np.linalg.norm(back) * self._up
+                client.camera.position = pair.middle + 2.2 * pair.size_m * way / max(float(np.linalg.norm(way)), 1e-9)
+                client.camera.look_at = pair.middle
+            elif number in self._looked:
+                client.camera.position, client.camera.look_at = self._looked.pop(number)
 
     def _same(self, name: str, *drawn: Any) -> bool:
         """Whether this was drawn with the same numbers before; else they are remembered."""

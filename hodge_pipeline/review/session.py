@@ -15,7 +15,7 @@ import numpy as np
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.pairs.edits import REGISTERED, Edit, pair_names
+from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, Edit, pair_names
 from hodge_pipeline.review.adding import Candidate, assessed, guess_from_poses, register_candidate
 from hodge_pipeline.review.decisions import Decisions, LockedError, Said
 from hodge_pipeline.review.jobs import Jobs
@@ -29,6 +29,7 @@ _EDITS: dict[str, Callable[[tuple[str, ...]], Edit]] = {
     "enable": lambda pairs: Edit(enable=pairs),
     "right": lambda pairs: Edit(right=pairs),
 }
+_SWITCHES = {"disable": DISABLED, "enable": ENABLED, "right": RIGHT}
 VERBS = tuple(_EDITS)
 MODES = ("all", "edge", "solution", "blink", "between", "apart")
 
@@ -74,7 +75,7 @@ class Session:
         self.table: Table = self._settler.table
         self.settled: Settled = self._settler.settled
         self.judged: Judged | None = None
-        self.first_error_m = self.settled.error_m
+        self.first = self.settled
         if self.decisions.history.switches:
             self.quick.put("solving", self._solve)
         self.slow.put("judging", self._judge)
@@ -113,6 +114,9 @@ class Session:
         if verb not in VERBS or not rows or not all(0 <= row < count for row in rows):
             raise GraphError(f"{verb}: expected {', '.join(VERBS)} and rows of edges from 0 to {count - 1}")
         pairs = tuple(dict.fromkeys(self.names(rows)))
+        switches = self.decisions.history.switches
+        if all(switches.get(pair) == _SWITCHES[verb] for pair in pairs):
+            raise GraphError(f"{', '.join(pairs)}: {_SWITCHES[verb]} already")
         self._change(lambda: self.decisions.add(revision, _EDITS[verb](pairs), self._said(rows, note)))
 
     def disable_wrong(self, revision: int, note: str = "") -> None:
@@ -186,14 +190,18 @@ class Session:
         for new in adding:
             assert new.found is not None
             settler.add(new.i, new.j, new.found)
-        settled = settler.solve(history, revision)
+        self._publish(settler, settler.solve(history, revision))
+        better = settler.checked(history, revision)
+        if better is not None:
+            self._publish(settler, better)
+        self.slow.put("judging", self._judge)
+
+    def _publish(self, settler: Settler, settled: Settled) -> None:
         with self.changed:
             if settler is self._settler:
                 self.settled = settled
-                verdicts = self.table.edges
-                self.table = settler.table = _with_verdicts(settler.table, verdicts)
+                self.table = settler.table = _with_verdicts(settler.table, self.table.edges)
             self.bump()
-        self.slow.put("judging", self._judge)
 
     def _judge(self) -> None:
         with self.changed:

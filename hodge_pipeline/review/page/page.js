@@ -95,7 +95,7 @@ async function list(always) {
     const found = await ask(`edges?${query}`);
     if (key !== listed) return;
     rows = found.edges; total = found.total;
-    $("table").tBodies[0].replaceChildren(...rows.map(tableRow));
+    fill($("table").tBodies[0]);
     $("place").textContent = `${total ? first + 1 : 0}–${first + rows.length} of ${total}`;
     $("before").disabled = first === 0; $("after").disabled = first + rows.length >= total;
     for (const head of $("table").tHead.rows[0].cells) head.classList.toggle("sorted", head.dataset.sort === sort);
@@ -104,15 +104,25 @@ async function list(always) {
   }
 }
 
-function tableRow(edge) {
-  const row = document.createElement("tr");
+// Rows are filled anew where they stand: one that is replaced between press and release of the mouse gets no click.
+function fill(body) {
+  while (body.rows.length > rows.length) body.deleteRow(-1);
+  while (body.rows.length < rows.length) {
+    const row = body.insertRow(-1);
+    for (let k = 0; k < 7; k++) row.insertCell(-1);
+    row.onclick = () => act("select", { row: Number(row.dataset.row) });
+  }
+  rows.forEach((edge, at) => fillRow(body.rows[at], edge));
+}
+
+function fillRow(row, edge) {
   row.dataset.row = edge.row; row.dataset.name = edge.name;
   row.className = [edge.row === state.look.selected ? "selected" : "", edge.counts ? "" : "off"].join(" ");
   const score = edge.score === null ? "" : ` ${edge.score.toFixed(2)}`;
   const said = edge.decision ? ` (${edge.decision})` : ["used", "disabled"].includes(edge.status) ? "" : ` (${edge.status})`;
-  row.append(element("td", edge.name), element("td", `${edge.verdict}${score}${said}`, edge.verdict), element("td", metres(edge.residual_m)), element("td", edge.residual_deg === null ? "–" : edge.residual_deg.toFixed(1)), element("td", edge.gap), element("td", `${edge.closing} of ${edge.cycles}`), element("td", edge.reason));
-  row.onclick = () => act("select", { row: edge.row });
-  return row;
+  const texts = [edge.name, `${edge.verdict}${score}${said}`, metres(edge.residual_m), edge.residual_deg === null ? "–" : edge.residual_deg.toFixed(1), edge.gap, edge.cycles === null ? "–" : `${edge.closing} of ${edge.cycles}`, edge.reason];
+  texts.forEach((text, at) => { row.cells[at].textContent = text; });
+  row.cells[1].className = edge.verdict;
 }
 
 async function describe() {
