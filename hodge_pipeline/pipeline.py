@@ -31,11 +31,13 @@ from hodge_pipeline.run_folder import Run, begin, check_layout, end, opening_of
 from hodge_pipeline.scene import Round, Scene
 from hodge_pipeline.sources.measured_edges import measured_edges
 from hodge_pipeline.sources.opening import open_source, remembered
+from hodge_pipeline.start.truth import with_truth
 from hodge_pipeline.store.log import logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.store.workspace import RECIPE_FILE, Workspace
 from hodge_pipeline.types import Floats, Source, ViewGraph
+from hodge_pipeline.types.notes import Note, notes_of
 
 
 def run(
@@ -124,17 +126,15 @@ class _Job:
         )
         if not source.frames:
             raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
-        for note in source.notes:
-            self.store.note(note)
+        self.store.note(*notes_of("reader", source.notes))
         if len(source.frames) == 1:
-            self.store.note(f"{path}: has a single frame: there is nothing to register, the model is that frame alone")
-        return remembered(source, reader, self.store)
+            self.store.note(Note("single frame", detail=str(path)))
+        return with_truth(remembered(source, reader, self.store), self.recipe.evaluation.truth, self.store)
 
     def measured(self, scene: Scene) -> ViewGraph:
         """The edges that come measured, over the key frames: they join every round's graph as they are."""
         graph, notes = measured_edges(scene.source, self.recipe.measured)
-        for note in notes:
-            self.store.note(note)
+        self.store.note(*notes_of("measured", notes))
         return graph
 
     def compute(self, work: Work, recording: Recording) -> tuple[list[Round], ScoreTable | None]:
@@ -163,15 +163,15 @@ class _Job:
             omega = one_form(graph, registered.start)
             found = energies(complex_, decompose(complex_, omega))
         except GraphError as error:  # the poses do not depend on it
-            self.store.note(f"{registered.name}: without its decomposition: {error}")
+            self.store.note(Note("no decomposition", detail=f"{registered.name}: without its decomposition: {error}"))
         return work.solve(registered, graph, found)
 
     def score(self, work: Work, rounds: list[Round]) -> ScoreTable | None:
         """The scores of every round, where they are wished for."""
         if not self.recipe.evaluation.tables:
             return None
-        if self.again:
-            self.store.note("the scores are not measured again after an edit: hodge run, as before, measures them")
+        if self.again and rounds[-1].edited:
+            self.store.note(Note("scores of before"))
             return None
         scale = float(self.recipe.scale)
         return score_rounds(work.scene.source, work.scene.clouds, rounds, scale, self.store, work.workers)

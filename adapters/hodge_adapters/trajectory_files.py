@@ -8,10 +8,11 @@ from pathlib import Path
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.poses_text import parse_tum, read_kitti
+from hodge_adapters.poses_text import COLUMNS, parse_tum, read_kitti
 from hodge_adapters.text_rows import to_floats
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source
+from hodge_pipeline.types.input_files import beginning
 
 SNIFFED_LINES = 40
 SNIFFED_BYTES = 1 << 14
@@ -23,7 +24,7 @@ class TumPosesReader:
 
     def sniff(self, path: Path) -> Sniff:
         """By the first lines that are no comment: eight numbers each."""
-        return _sniff_columns(Path(path), 8, "lines of eight numbers")
+        return _sniff_columns(Path(path), COLUMNS, "lines of eight numbers")
 
     def open(self, path: Path) -> Source:
         """The trajectory, ascending; lines that are no pose are left out and noted."""
@@ -41,7 +42,7 @@ class KittiPosesReader:
 
     def sniff(self, path: Path) -> Sniff:
         """By the first lines: twelve numbers each."""
-        return _sniff_columns(Path(path), 12, "lines of twelve numbers")
+        return _sniff_columns(Path(path), (12,), "lines of twelve numbers")
 
     def open(self, path: Path) -> Source:
         """The trajectory."""
@@ -52,19 +53,15 @@ class KittiPosesReader:
 
 
 def first_rows(path: Path) -> list[list[str]]:
-    """The fields of the first lines that are no comment, cut at blanks; raises `OSError` alone."""
-    with open(path, "rb") as file:
-        lines = file.read(SNIFFED_BYTES).decode("utf-8-sig", "replace").split("\n")[:-1] or [""]
+    """The fields of the first lines that are no comment, cut at blanks, none where it cannot be read."""
+    lines = beginning(path, SNIFFED_BYTES).decode("utf-8-sig", "replace").split("\n")[:-1] or [""]
     rows = (line.split("#", 1)[0].split() for line in lines)
     return list(islice((row for row in rows if row), SNIFFED_LINES))
 
 
-def _sniff_columns(path: Path, count: int, what: str) -> Sniff:
-    try:
-        rows = [to_floats(" ".join(row).replace(",", " ").split()) for row in first_rows(path)]
-    except OSError:
-        return Sniff(0.0, "not a file that can be read")
-    good = sum(row is not None and len(row) == count for row in rows)
+def _sniff_columns(path: Path, counts: tuple[int, ...], what: str) -> Sniff:
+    rows = [to_floats(" ".join(row).replace(",", " ").split()) for row in first_rows(path)]
+    good = sum(row is not None and len(row) in counts for row in rows)
     if not good or good < 0.8 * len(rows):
         return Sniff(0.0, f"no {what}")
     return Sniff(0.7, what)

@@ -134,6 +134,7 @@ class TumReader:
                     units_per_metre=scale,
                     no_depth=self.no_depth,
                     world_from_cam=poses[row],
+                    is_true=True,
                     lens=lens,
                 )
                 for row in rows

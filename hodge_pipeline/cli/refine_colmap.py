@@ -29,12 +29,13 @@ def refine(
 ) -> None:
     """Refine a model into a run folder. Raises `CheckError` (exit code 3) where the guard kept the input as worse."""
     options = load_model_refinement(recipe or RECIPE, overrides)
+    from hodge_pipeline.types.input_files import read_input_text
     from hodge_pipeline.uses.colmap import run_refinement
 
     with resumable(out), Terminal(quiet or as_json) as terminal:
         done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal, dask=dask)
     if as_json:
-        print((out / "report.json").read_text("utf-8"), end="")
+        print(read_input_text(out / "report.json"), end="")
     elif not quiet:
         for result in done.results:
             _print(result)
@@ -54,6 +55,11 @@ def _print(result: RefinedModel) -> None:
     rows = [(m.name, f"{m.before:.4g}", f"{m.after:.4g}", m.unit) for m in result.decision.measures]
     if rows:
         print_table(f"{result.start.quality.images} images", ("measure", "before", "after", "unit"), rows)
+    costs = [
+        (name, f"{cost.px:.4g}", f"{cost.median_px:.4g}", str(len(cost.images_off)), "kept" * (row == result.kept_row))
+        for row, (name, cost) in enumerate(result.candidates)
+    ]
+    print_table("candidates", ("candidate", "mean px", "median px", "images off", ""), costs)
     print(f"{'verdict':<8} {result.decision.outcome}: {result.decision.reason}")
     if result.decision.change is not None:
         print(f"{'change':<8} {result.decision.change}")

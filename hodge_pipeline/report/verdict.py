@@ -12,6 +12,7 @@ from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
 from hodge_pipeline.evaluation.difference import MEASURABLE, Change, floor_of, length
 from hodge_pipeline.report.contents import GraphSummary, Report, TrajectoryRow
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.notes import Note
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
 
@@ -21,13 +22,16 @@ UNMATCHED_SHARE = 0.01
 UNSETTLED_M, UNSETTLED_SHARE = 0.05, 0.01
 """By how much (root mean square), and by which share of the path, the last of several rounds may move the positions.
 Runs that end near the truth move by less than 1 cm, one whose edges slide along a bare floor by 30."""
+NOTHING_MOVED_M = 0.0005
+"""The least movement that is told in a room."""
+TRUTH = "truth"
 MOST_SIZES = 3
 """Pieces whose sizes a headline tells."""
-NO_MEASURE = "there were neither overlapping clouds nor true poses to compare the poses by."
+NO_MEASURE = "nothing was there to compare the poses by, before and after."
 
 
 REFINEMENTS: dict[str, Outcome] = {
-    "refined": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
+    "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",
 }  # fmt: skip
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
@@ -36,7 +40,7 @@ GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 @dataclass(frozen=True)
 class Verdict:
     """The outcome of all measures in one word; a headline, which begins with the pieces where there are several; the
-    details, and the changes they rest on.
+    details, and the changes they rest on. `reason` is why a refinement, or a solve, came out as it did.
     """
 
     outcome: Outcome
@@ -44,11 +48,19 @@ class Verdict:
     details: str
     changes: tuple[Change, ...]
     pieces: int = 1
+    reason: str = ""
 
     @property
     def sentence(self) -> str:
         """Headline and details in one."""
         return f"{self.headline}. {_capital(self.details)}"
+
+    @property
+    def points(self) -> tuple[str, ...]:
+        """What the headline rests on, a short line each."""
+        if not self.changes and not self.reason:
+            return (_capital(self.details),)
+        return (*filter(None, [_capital(self.reason)]), *(change.line for change in self.changes))
 
     @property
     def mark(self) -> Outcome:
@@ -63,10 +75,11 @@ def judge(report: Report) -> Verdict:
     """
     changes = (*_score_changes(report), *_trajectory_changes(report))
     outcome, headline, details = _judged(report, changes)
-    pieces = _pieces(report)
+    pieces, reason = _pieces(report), report.refinement.reason if report.refinement else ""
     if pieces:
-        headline = f"{pieces}: {headline[:1].lower()}{headline[1:]}"
-    return Verdict(outcome, headline, details, changes, max(len(_joined(report)), 1))
+        all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
+        headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
+    return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason)
 
 
 def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, str]:
@@ -80,7 +93,7 @@ def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, 
             return "mixed", f"{refinement.headline}, but {but}", f"{refinement.reason}."
         return outcome, refinement.headline, f"{refinement.reason}."
     if not changes:
-        return "not measured", "Not measured", NO_MEASURE
+        return "not measured", "Not measured", report.unmeasured or NO_MEASURE
     if better and worse:
         good = min(better, key=lambda change: change.share).briefly
         good += f" and {len(better) - 1} more better" if len(better) > 1 else ""
@@ -93,15 +106,9 @@ def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _joined(report: Report) -> list[int]:
-    """The frames of each piece that joins at least two, most first."""
-    parts = () if report.graph is None else report.graph.components
-    return sorted((part.count for part in parts if part.count > 1), reverse=True)
-
-
 def _pieces(report: Report) -> str:
     """What is in one piece and what is not, in words; empty where it goes without saying."""
-    graph, sizes = report.graph, _joined(report)
+    graph, sizes = report.graph, report.pieces
     if graph is None or graph.vertices < 2:
         return ""
     of_all = f"of {graph.vertices} {report.source.vertex_name}"
@@ -133,6 +140,9 @@ def _trajectory_changes(report: Report) -> Iterator[Change]:
     before, after = rows[report.before], rows[report.after]
     floor = floor_m(report)
     yield Change("the error of the trajectory (ATE)", "ATE", before.ate_rmse_m, after.ate_rmse_m, floor)
+    largest = Change("the largest error of a position", "largest error", before.ate_max_m, after.ate_max_m, floor)
+    if largest.sign < 0:
+        yield largest
     if not np.isfinite(before.rpe_translation_m):
         return
     step = "from frame to frame" if before.rpe_delta_frames == 1 else f"over {before.rpe_delta_frames} frames"
@@ -151,84 +161,100 @@ def floor_m(report: Report) -> float:
     return max(floor_of(*(path.positions for path in report.pictures.paths)), MEASURABLE * scale)
 
 
-def suspicions(report: Report) -> tuple[str, ...]:
-    """What a reader should distrust, one line each; the run's own notes come first."""
-    graph = () if report.graph is None else tuple(_graph_suspicions(report.graph))
-    return (
+def suspicions(report: Report) -> tuple[Note, ...]:
+    """What a reader should distrust and what else is to be known, by rank; the run's own notes come first in each."""
+    found = (
         *_unsettled(report),
         *report.notes,
-        *graph,
+        *(() if report.graph is None else _graph_suspicions(report.graph)),
+        *_wrong(report),
         *_edge_suspicions(report),
+        *_above_truth(report),
         *_unmatched(report),
-        *(line for row in report.trajectories for line in _trajectory_suspicions(row)),
+        *(note for row in report.trajectories for note in _trajectory_suspicions(row)),
     )
+    return tuple(sorted(found, key=lambda note: note.rank))
 
 
-def _unsettled(report: Report) -> Iterator[str]:
-    scale = report.scores.scale if report.scores else 1.0
+def _unsettled(report: Report) -> Iterator[Note]:
     path_m = max((_path_m(path.positions) for path in report.pictures.paths if path.name == report.after), default=0.0)
-    if report.last_shift_m is not None and report.last_shift_m > max(UNSETTLED_M * scale, UNSETTLED_SHARE * path_m):
-        yield (
-            "The result is not to be trusted: the last round still moved the cameras by "
-            f"{length(report.last_shift_m)}, so the registered pairs do not agree on one scene. Frames nearer to each "
-            "other, or more texture, would help."
-        )
+    if report.last_shift_m is not None and report.last_shift_m > max(
+        UNSETTLED_M * report.scale, UNSETTLED_SHARE * path_m
+    ):
+        yield Note("unsettled", detail=length(report.last_shift_m))
 
 
 def _path_m(positions: Floats) -> float:
     return float(np.nansum(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
 
 
-def _graph_suspicions(graph: GraphSummary) -> Iterator[str]:
+def _graph_suspicions(graph: GraphSummary) -> Iterator[Note]:
     if len(graph.components) > 1:
-        yield (
-            f"The viewing graph falls into {len(graph.components)} parts that nothing connects: "
-            "their poses relative to each other mean nothing."
-        )
+        yield Note("parts", len(graph.components))
     alone = sum(part.count == 1 for part in graph.components)
     if alone and graph.vertices > 1:
-        yield f"{alone} of {graph.vertices} frames have no edge at all: they keep the pose they started with."
+        yield Note("alone", alone, str(graph.vertices))
     if graph.edges_ignored:
-        yield f"The solver ignored {graph.edges_ignored} of {graph.edges} edges (weight 0)."
-    wrong, suspect = graph.verdicts_in_use.get("wrong", 0), graph.verdicts_in_use.get("suspect", 0)
-    if wrong or suspect:
-        yield (
-            f"Of the edges that the solver used {wrong} are judged wrong and {suspect} suspect: hodge diagnose "
-            "shows them."
-        )
+        yield Note("edges ignored", graph.edges_ignored, str(graph.edges))
+    if suspect := graph.verdicts_in_use.get("suspect", 0):
+        yield Note("suspect", suspect)
     if untestable := graph.verdicts.get("untestable", 0):
-        yield f"{untestable} of {graph.edges} edges are untestable: nothing in the graph says whether they are right."
+        yield Note("untestable", untestable, str(graph.edges))
 
 
-def _edge_suspicions(report: Report) -> Iterator[str]:
+def _wrong(report: Report) -> Iterator[Note]:
+    """The edges called wrong, weighed by what they do."""
+    wrong = report.wrong_edges
+    if wrong is None or not wrong.count:
+        return
+    moved = report.length(max(wrong.moved_m, NOTHING_MOVED_M * report.scale))
+    if not wrong.matters(report.scale):
+        yield Note("harmless", wrong.count, f"{wrong.frames}; without them no pose moves by more than {moved}")
+    elif wrong.pieces_more:
+        yield Note(
+            "wrong", wrong.count, f"{wrong.frames}; without them the scene falls into {wrong.pieces_more} more pieces"
+        )
+    else:
+        yield Note("wrong", wrong.count, f"{wrong.frames}; without them poses move by up to {moved}")
+
+
+def _above_truth(report: Report) -> Iterator[Note]:
+    """Why clouds can fit better than at the true poses."""
+    table = report.scores
+    if table is None or TRUTH not in table.names or report.after not in table.names:
+        return
+    truth, after = table.names.index(TRUTH), table.names.index(report.after)
+    if any(graph.mean_score[after] > graph.mean_score[truth] for graph in table.graphs):
+        yield Note("above truth")
+
+
+def _edge_suspicions(report: Report) -> Iterator[Note]:
     large = [
         edge
         for edge in report.worst_edges
         if edge.weight > 0 and (edge.residual_m > _large_m(report) or edge.residual_deg > LARGE_RESIDUAL_DEG)
     ]
     if large:
-        yield (
-            f"At least {len(large)} edges that the solver used are more than {length(_large_m(report))} or "
-            f"{LARGE_RESIDUAL_DEG:g}° off the result: see the worst edges."
-        )
+        yield Note("edges far off", len(large), f"{length(_large_m(report))} or {LARGE_RESIDUAL_DEG:g}°")
 
 
 def _large_m(report: Report) -> float:
-    return LARGE_RESIDUAL_M * (report.scores.scale if report.scores else 1.0)
+    return LARGE_RESIDUAL_M * report.scale
 
 
-def _unmatched(report: Report) -> Iterator[str]:
+def _unmatched(report: Report) -> Iterator[Note]:
     if report.scores is None:
         return
     for graph in report.scores.graphs:
         for name, unmatched, count in zip(report.scores.names, graph.unmatched, graph.counts, strict=True):
             if unmatched > UNMATCHED_SHARE * count:
                 pairs = f"{unmatched} of {count} {GRAPH_NAMES[graph.kind]}"
-                yield f"{name}: {pairs} have no point within {length(graph.scale * NO_NEIGHBOUR_M)} of each other."
+                far = length(graph.scale * NO_NEIGHBOUR_M)
+                yield Note("unmatched", int(unmatched), f"{name}: {pairs} have no point within {far}")
 
 
-def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[str]:
+def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[Note]:
     if row.left_out:
-        yield f"{row.name}: {row.left_out} frames without a true pose, or joined to no other, are not in its error."
+        yield Note("not in the error", row.left_out, f"{row.name}, {row.of}")
     if row.degenerate:
-        yield f"{row.name}: its positions lie on a line (or are fewer than three): its orientations aligned it."
+        yield Note("degenerate", detail=row.name)
