@@ -9,8 +9,8 @@ from threading import Lock
 import numpy as np
 
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.edge_pictures import edge_pictures
-from hodge_pipeline.report.plots import Plot
 from hodge_pipeline.review.session import Session
 
 KEPT = 8
@@ -22,10 +22,10 @@ class Pictures:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._made: OrderedDict[tuple[int, int, int], tuple[Plot, ...]] = OrderedDict()
+        self._made: OrderedDict[tuple[int, int, int], tuple[Picture, ...]] = OrderedDict()
         self._lock = Lock()
 
-    def of(self, row: int) -> tuple[Plot, ...]:
+    def of(self, row: int) -> tuple[Picture, ...]:
         """The pictures of an edge; none where nothing is judged yet. Raises `GraphError` for a row without an edge."""
         with self._session.changed:
             subject, table, settled, judged = (
@@ -47,5 +47,5 @@ class Pictures:
             return self._made[key]
 
 
-def _told(plot: Plot) -> Plot:
+def _told(plot: Picture) -> Picture:
     return replace(plot, title=plot.title.replace("robust poses say", "solution says"))

@@ -14,12 +14,14 @@ from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import pair_names
 from hodge_pipeline.pipeline import solve_again
+from hodge_pipeline.report.document import JPEG
 from hodge_pipeline.review.front import Answer, Route, Site
 from hodge_pipeline.review.keeping import save_graph
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.pictures import Pictures
 from hodge_pipeline.review.session import MODES, Session
 from hodge_pipeline.stages import Advance
+from hodge_pipeline.types.notes import Note
 
 FILES = {
     "": ("index.html", "text/html; charset=utf-8"),
@@ -69,7 +71,8 @@ def _shown(session: Session) -> Mapping[str, Route]:
         plots, number = pictures.of(_whole(asked, "row")), _whole(asked, "number")
         if not 0 <= number < len(plots):
             raise GraphError("there is no such picture")
-        return Answer(plots[number].png, "image/jpeg")
+        image = plots[number].image
+        return Answer(image, "image/jpeg" if image.startswith(JPEG) else "image/png")
 
     def log(_: Asked) -> Answer:
         body = session.subject.log.read_bytes() if session.subject.log.exists() else b""
@@ -136,7 +139,7 @@ class _Told:
         self._session.say(f"hodge solve: {title}")
         return nullcontext(lambda *_: None)
 
-    def say(self, message: str) -> None:
+    def note(self, note: Note) -> None:
         """Nothing: the run's log has it."""
 
 

@@ -142,8 +142,8 @@ def _of_graph(path: Path) -> Subject:
 def base_weights(subject: Subject) -> Floats:
     """The weight (E,) of each edge before any decision: 1, but 0 for those that are rejected or the solver left out.
 
-    A solver that weighs edges by how well they fit has found its weights beside the wrong edges: these have driven right
-    ones out, which count in full again here.
+    A solver that weighs edges by how well they fit has found its weights beside the wrong edges: these have driven
+    right ones out, which count in full again here.
     """
     return np.where(subject.edges.status == DISABLED, 1.0, (subject.solution.weights > 0).astype(float))
 

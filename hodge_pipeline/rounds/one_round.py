@@ -26,6 +26,8 @@ from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution,
 from hodge_pipeline.types.edges import HELD_OUT
 from hodge_pipeline.types.notes import notes_of
 
+LEFT_OUT = 1e-3
+"""A weight below which a robust solver has left an edge out, whether or not it keeps a rest."""
 EDITED = "edited"
 """The name of a round that a person's edits made."""
 
@@ -159,7 +161,7 @@ def solve_edges(
 
 def with_right(graph: ViewGraph, solution: Solution, right: Bools) -> Solution:
     """The solution with those of the edges that are right (E,) which a robust solver left out."""
-    left_out = np.flatnonzero(right & (solution.weights <= 0))
+    left_out = np.flatnonzero(right & (solution.weights < LEFT_OUT))
     if not len(left_out):
         return solution
     editor = GraphEditor(graph, solution)
