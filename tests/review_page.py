@@ -145,5 +145,12 @@ class Page:
 
     def picture(self, path: Path) -> None:
         """A screenshot, once the scene had time to be drawn."""
+        from selenium.common.exceptions import TimeoutException
+
         time.sleep(3.0)
-        self.browser.save_screenshot(str(path))
+        for attempt in range(6):
+            try:
+                self.browser.save_screenshot(str(path))
+                return
+            except TimeoutException:  # a frame without a GPU takes seconds
+                assert attempt < 5

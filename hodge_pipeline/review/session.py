@@ -15,7 +15,7 @@ import numpy as np
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, Edit, pair_names
+from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, Edit, pair_names, vertex_rows
 from hodge_pipeline.review.adding import Candidate, assessed, guess_from_poses, register_candidate
 from hodge_pipeline.review.decisions import Decisions, LockedError, Said
 from hodge_pipeline.review.jobs import Jobs
@@ -78,6 +78,7 @@ class Session:
         self.first = self.settled
         if self.decisions.history.switches:
             self.quick.put("solving", self._solve)
+        self.slow.put("registering", self._register_missing)
         self.slow.put("judging", self._judge)
 
     def close(self) -> None:
@@ -212,6 +213,19 @@ class Session:
                 self.judged = judged
                 self.table = replace(table, edges=judged.edges)
             self.bump()
+
+    def _register_missing(self) -> None:
+        """Register again what an earlier review added and no solve has had: its motion is known, not how well."""
+        recipe, clouds, guesses = self.subject.recipe, self.subject.clouds, self.decisions.history.guesses
+        pairs = [pair for pair in self.decisions.history.registered if pair in guesses and not self.rows_of(pair)]
+        if recipe is None or clouds is None or not pairs:
+            return
+        for pair, (i, j) in zip(pairs, vertex_rows(self.table.graph.vertex_ids, pairs).tolist(), strict=True):
+            wanted = Candidate(i, j, guesses[pair])
+            found = register_candidate(recipe, clouds, wanted)
+            with self.changed:
+                self._adding.append(replace(wanted, found=found))
+        self.quick.put("solving", self._solve)
 
     def show(self, **changes: Any) -> None:
         """Change what the scene shows."""
