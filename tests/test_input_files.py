@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from reading_targets import TARGETS
 
-from fuzz_targets import TARGETS
 from hodge_adapters.colmap_database import database_names
 from hodge_adapters.mcap_records import MAGIC
 from hodge_adapters.pcd_points import MAX_EXPANDED_BYTES, read_pcd

@@ -11,7 +11,7 @@ import typer
 
 from hodge_pipeline.cli import refine as refining
 from hodge_pipeline.cli.guard import guard_streams, shown
-from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet, Truth
+from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet, Strict, Truth
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -73,6 +73,7 @@ def run(
     overwrite: Overwrite = False,
     dask: Dask = None,
     live: Annotated[bool, typer.Option("--live", help="Show the run as it happens in a Rerun viewer.")] = False,
+    strict: Strict = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -80,7 +81,8 @@ def run(
     from hodge_pipeline.cli import run as running
 
     sets = [*(overrides or []), *running.named_truth(truth)]
-    running.run(recipe, source, out, sets, overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask)
+    shown = {"quiet": quiet, "as_json": json, "live": live}
+    running.run(recipe, source, out, sets, overwrite=overwrite, dask=dask, strict=strict, **shown)
 
 
 @app.command()
