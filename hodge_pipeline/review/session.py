@@ -76,7 +76,7 @@ class Session:
         self.settled: Settled = self._settler.settled
         self.judged: Judged | None = None
         self.first = self.settled
-        if self.decisions.history.switches:
+        if ((self.table.weights(self.decisions.history) > 0) != (self.settled.weights > 0)).any():
             self.quick.put("solving", self._solve)
         self.slow.put("registering", self._register_missing)
         self.slow.put("judging", self._judge)
