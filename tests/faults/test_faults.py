@@ -10,6 +10,7 @@ import pytest
 import reading
 import repeated
 import strangers
+
 from reading_targets import TARGETS
 
 INPUTS = 60
