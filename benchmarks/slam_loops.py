@@ -4,8 +4,9 @@
     python -m benchmarks.slam_loops FOLDER --json slam_loops.json
 
 Errors are of positions, metres RMS, after a rigid fit. A loop is right where its ends lie within 1.5 m (Bicocca, planar
-pose) or 5 m (RobotCar, distance of the places alone) of where the truth says; loops without truth are left out of the counts. AUC is of the probability that a loop is
-right. GTSAM's GNC is told that consecutive edges are right, and so is Open3D's line process. One set of defaults.
+pose) or 5 m (RobotCar, distance of the places alone) of where the truth says; loops without truth are not counted. AUC
+is of the probability that a loop is right. GTSAM's GNC is told that consecutive edges are right, and so is Open3D's
+line process. One set of defaults.
 """
 
 from __future__ import annotations

@@ -11,9 +11,9 @@ from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.resistance import effective_resistance
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WITNESSES, WRONG, Cycles, Diagnosis
-from hodge_pipeline.diagnosis.robust_poses import left_over
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors
 from hodge_pipeline.diagnosis.wording import distance
+from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -34,7 +34,7 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisO
     wrong = ~kept & (probability < options.wrong_below)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
     piece = connected_components(graph.edges[kept], graph.vertex_count)
-    angle, displacement_m = left_over(graph, backbone.world_from_cam)
+    displacement_m, angle = edge_residuals(graph, backbone.world_from_cam)
     apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
     residual_m = np.where(apart, np.nan, displacement_m)
     residual_deg = np.where(apart, np.nan, np.degrees(angle))
