@@ -265,9 +265,9 @@ def test_what_can_be_measured_goes_by_the_extent_of_the_scene() -> None:
     [
         ([0] * 12 + [1] * 8, False, "In 2 pieces (12, 8 of 20 frames): improved against odometry"),
         ([0] * 12 + [1] * 3 + [2] * 3 + [3] * 2, False, "In 4 pieces (12, 3, 3, … of 20 frames): improved against"),
-        ([0] * 19 + [1], False, "19 of 20 frames in one piece: improved against odometry"),
+        ([0] * 19 + [1], False, "19 of 20 frames joined: improved against odometry"),
         ([0] * 20, False, "Improved against odometry"),
-        ([0] * 20, True, "20 of 20 scans in one piece"),
+        ([0] * 20, True, "20 of 20 scans joined"),
         (list(range(20)), True, "No two of 20 scans joined: improved against odometry"),
     ],
 )

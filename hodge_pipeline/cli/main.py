@@ -11,7 +11,19 @@ import typer
 
 from hodge_pipeline.cli import refine as refining
 from hodge_pipeline.cli.guard import guard_streams, shown
-from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet, Truth, Verbose
+from hodge_pipeline.cli.options import (
+    Dask,
+    Json,
+    Out,
+    Overrides,
+    Overwrite,
+    Quiet,
+    Reader,
+    ReaderSet,
+    Strict,
+    Truth,
+    Verbose,
+)  # fmt: skip
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -79,6 +91,7 @@ def run(
     dask: Dask = None,
     live: Annotated[bool, typer.Option("--live", help="Show the run as it happens in a Rerun viewer.")] = False,
     stray: Annotated[list[str] | None, typer.Argument(hidden=True, metavar="--source PATH")] = None,
+    strict: Strict = False,
     verbose: Verbose = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -89,9 +102,8 @@ def run(
     from hodge_pipeline.cli import run as running
 
     sets = [*(overrides or []), *running.named_truth(truth)]
-    running.run(
-        recipe, source, out, sets, overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask, verbose=verbose
-    )
+    shown = {"quiet": quiet, "as_json": json, "live": live, "verbose": verbose}
+    running.run(recipe, source, out, sets, overwrite=overwrite, dask=dask, strict=strict, **shown)
 
 
 @app.command()

@@ -26,6 +26,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "recording": (Rank.FACT, "{detail}"),
     "refinement": (Rank.FACT, "{detail}"),
     # What a run does.
+    "input changed": (
+        Rank.DOUBT,
+        "{count} files of the input changed while the run read them ({detail}): run the same command again once they "
+        "stay as they are.",
+    ),
     "single frame": (
         Rank.LOOK,
         "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
@@ -44,6 +49,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "path broken": (
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
+    ),
+    "misfits": (
+        Rank.LOOK,
+        "{count} frames fit nothing that their key frame saw ({detail}): their poses follow from its own",
     ),
     "truth": (Rank.FACT, "{count} of {detail} frames have a true pose, by the truth that was named"),
     "no truth near": (Rank.LOOK, "{detail}: no pose has a true one near in time: its error is not measured"),
