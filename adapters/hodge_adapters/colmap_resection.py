@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from hodge_adapters.colmap_bodies import Bodies
 from hodge_adapters.colmap_cameras import colmap_camera
-from hodge_adapters.colmap_records import Model
+from hodge_adapters.colmap_points import points_of_rays
+from hodge_adapters.colmap_records import Model, Points
 from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -24,8 +26,11 @@ SEED = 0
 def resected(model: Model, bodies: Bodies, chosen: Bools | None = None) -> Floats:
     """Poses (B, 4, 4), those of the chosen bodies (B,) by RANSAC and refinement; all by default.
 
-    A body that too few points agree on keeps its pose.
+    Points are as they are, or where the bodies that were not chosen see them. A body that too few points agree on keeps
+    its pose.
     """
+    if chosen is not None:
+        model = _seen_by_others(model, bodies, chosen)
     out = bodies.world_from_body.copy()
     body = bodies.body_of_image[model.image_rows]
     order = np.argsort(body, kind="stable")
@@ -38,6 +43,20 @@ def resected(model: Model, bodies: Bodies, chosen: Bools | None = None) -> Float
         if pose is not None:
             out[number] = pose
     return out
+
+
+def _seen_by_others(model: Model, bodies: Bodies, chosen: Bools) -> Model:
+    """The model with its points where the other bodies see them, and none of which fewer than two do."""
+    points, owner = model.points, model.points.owners
+    other = ~chosen[bodies.body_of_image[model.image_rows]]
+    counts = np.bincount(owner[other], minlength=len(points.ids))
+    tracks = Points(points.ids, points.xyz, np.r_[0, np.cumsum(counts)], points.image_ids[other], points.columns[other])
+    poses = np.array([image.world_from_cam for image in model.images])
+    xyz = points_of_rays(replace(model, points=tracks), poses)
+    kept = (counts >= 2)[owner]
+    left = np.bincount(owner[kept], minlength=len(points.ids))
+    offsets = np.r_[0, np.cumsum(left)]
+    return replace(model, points=Points(points.ids, xyz, offsets, points.image_ids[kept], points.columns[kept]))
 
 
 def _placed(model: Model, bodies: Bodies, rows: Ints) -> Floats | None:
