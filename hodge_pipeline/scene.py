@@ -151,7 +151,8 @@ class Scene:
     """The whole source, its key frames as a source of their own, their clouds, and the first round: edges and poses.
 
     `drift`: None where the first poses are not odometry's; `given`: the file that they come from, where there is one;
-    `in_order`: whether frames that follow each other in the source do so in time.
+    `in_order`: whether frames that follow each other in the source do so in time; `sightings`: the folder of what
+    frames that are no key frames saw of these, where they were tracked.
     """
 
     whole: Source
@@ -163,6 +164,7 @@ class Scene:
     is_given: bool = False
     given: GivenFile | None = None
     in_order: bool = True
+    sightings: Path | None = None
 
 
 def key_source(whole: Source, rows: Ints) -> Source:

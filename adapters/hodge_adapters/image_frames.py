@@ -28,6 +28,7 @@ def image_frame(
     is_true: bool = False,
     sequence: str = "",
     lens: Lens | None = None,
+    colour_delay_s: float = 0.0,
 ) -> Frame:
     """A frame that reads its images when asked, and then refuses those of another size than the camera.
 
@@ -48,6 +49,7 @@ def image_frame(
         world_from_cam=pose,
         true_world_from_cam=pose if is_true else None,
         sequence=sequence,
+        colour_delay_s=colour_delay_s,
     )
     return frame if lens is None else _straight(frame, lens, units_per_metre)
 

@@ -11,7 +11,7 @@ import typer
 
 from hodge_pipeline.cli import refine as refining
 from hodge_pipeline.cli.guard import guard_streams, shown
-from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet, Truth
+from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet, Strict, Truth
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -32,6 +32,7 @@ Examples:
   hodge solve graph.g2o --out solved.g2o         any pose graph, or a run folder
   hodge solve graph.g2o --certificate --disable 12-87
   hodge diagnose runs/kitchen --out why          which edge is wrong?
+  hodge review runs/kitchen                      see the edges, decide by hand
   hodge edit runs/kitchen --disable 12-87        take an edge out of a run,
   hodge solve runs/kitchen                       and solve and fuse it again
   hodge refine trajectory poses.txt --frames DIR --out runs/better
@@ -72,6 +73,7 @@ def run(
     overwrite: Overwrite = False,
     dask: Dask = None,
     live: Annotated[bool, typer.Option("--live", help="Show the run as it happens in a Rerun viewer.")] = False,
+    strict: Strict = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -79,7 +81,8 @@ def run(
     from hodge_pipeline.cli import run as running
 
     sets = [*(overrides or []), *running.named_truth(truth)]
-    running.run(recipe, source, out, sets, overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask)
+    shown = {"quiet": quiet, "as_json": json, "live": live}
+    running.run(recipe, source, out, sets, overwrite=overwrite, dask=dask, strict=strict, **shown)
 
 
 @app.command()
@@ -172,6 +175,10 @@ def edit(
         list[str] | None,
         typer.Option(metavar="A-B", help="Switch them on: disabled ones again, rejected ones in spite of the reason."),
     ] = None,
+    right: Annotated[
+        list[str] | None,
+        typer.Option(metavar="A-B", help="Switch them on, and let no robust solver leave them out."),
+    ] = None,
     register: Annotated[
         list[str] | None,
         typer.Option(metavar="A-B", help="Register a pair that is no edge, as `hodge diagnose` suggests some."),
@@ -184,8 +191,20 @@ def edit(
     """Switch edges of a run off or on, or have more registered; `hodge solve RUN` then solves and fuses again."""
     from hodge_pipeline.cli import edit as editing
 
-    pairs = editing.Pairs(disable or [], enable or [], register or [])
+    pairs = editing.Pairs(disable or [], enable or [], register or [], right or [])
     editing.edit(run_folder, pairs, undo=undo, listing=listing, quiet=quiet, as_json=json)
+
+
+@app.command()
+def review(
+    path: Annotated[Path, typer.Argument(help="A run, or a pose graph (g2o, TORO, Open3D, pair .log).")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: a free one.")] = 0,
+    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+) -> None:
+    """See edges and their clouds on a page that only this machine can open, decide by hand, and watch the map mend."""
+    from hodge_pipeline.cli import review as reviewing
+
+    reviewing.review(path, port=port, browser=browser)
 
 
 @app.command()

@@ -27,6 +27,9 @@ Truth = Annotated[
         "--truth", metavar="FILE", help="True poses to compare with: a file of poses; `frames`: the source's own."
     ),
 ]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="Notice input that changes during the run by hashes of all its files.")
+]
 Dask = Annotated[
     str | None,
     typer.Option(

@@ -31,6 +31,7 @@ def run(
     as_json: bool,
     live: bool = False,
     dask: str | None = None,
+    strict: bool = False,
 ) -> None:
     """Run a recipe and print what came out."""
     loaded = load_recipe(recipe, overrides, source)
@@ -39,7 +40,9 @@ def run(
     from hodge_pipeline.pipeline import run as run_pipeline
 
     with resumable(out), Terminal(quiet or as_json) as terminal, _viewer(live, terminal) as address:
-        result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal, live=address, dask=dask)
+        result = run_pipeline(
+            loaded, out, overwrite=overwrite, watcher=terminal, live=address, dask=dask, strict=strict
+        )
     print_result(result, quiet=quiet, as_json=as_json)
     if result.refined is not None and result.refined.decision.exit_code:
         raise CheckError(result.refined.decision.reason)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -26,9 +29,9 @@ from hodge_pipeline.report.contents import (
     StageRow,
     TrajectoryRow,
 )
-from hodge_pipeline.report.refinement import summary
-from hodge_pipeline.report.sides import four_sides, worst_pairs
-from hodge_pipeline.report.summary import graph_summary, trajectory_rows, worst_edges
+from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
+from hodge_pipeline.report.refined import summary
+from hodge_pipeline.report.summary import graph_summary, trajectory_rows, weigh_wrong, worst_edges
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.scene import (
     START,
@@ -47,7 +50,10 @@ from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import Store, versions
 from hodge_pipeline.types import Floats, Ints, Solution, Source, Trajectory
-from hodge_pipeline.types.text import file_stems
+from hodge_pipeline.types.text import cell, file_stems
+
+KEY_OF_CACHE = r"-[0-9a-f]{12}$"
+"""What a cached folder's name ends with, which tells nobody anything."""
 
 
 def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
@@ -63,6 +69,16 @@ def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
         name = "poses" if len(sequences) == 1 else f"poses-{stem}"
         for writer in ("tum", "kitti"):
             registry.load("writers", writer)().write(folder / f"{name}.{writer}", part)
+
+
+def write_pose_table(folder: Path, source: Source, world_from_cam: Floats) -> None:
+    """`poses.csv`: every frame by its name, and the 4x4 matrix world from camera (or scan), row by row."""
+    table = io.StringIO(newline="")
+    rows = csv.writer(table, csv.unix_dialect, quoting=csv.QUOTE_MINIMAL)
+    rows.writerow(["name", *(f"m{row}{column}" for row in range(4) for column in range(4))])
+    for frame, numbers in zip(source.frames, (world_from_cam + 0.0).reshape(-1, 16).tolist(), strict=True):
+        rows.writerow([cell(str(frame.frame_id)), *map(repr, numbers)])
+    artifacts.write_text(folder / "poses.csv", table.getvalue())
 
 
 def write_graph(folder: Path, source: Source, last: Round) -> None:
@@ -91,10 +107,12 @@ def make_report(
     kept = refined is not None and refined.decision.keeps_input
     assert last.solution is not None
     component = last.solution.component
+    first = next(iter(sets))
+    shown = sets[first], sets["result"]
     worst = worst_edges(last.edges, last.vertex_ids)
     return Report(
-        title=f"{source.name}",
-        before=next(iter(sets)),
+        title=re.sub(KEY_OF_CACHE, "", source.name),
+        before=first,
         source=SourceSummary(
             name=source.name,
             path=str(source.path),
@@ -103,6 +121,7 @@ def make_report(
             key_frames=None if scene.key_frames.are_all else len(source.frames),
             sequences=tuple(name for name in sequences_of(source) if name),
             notes=source.notes,
+            format="" if recipe.source.reader is None else registry.name_of(recipe.source.reader),
             kind="scans" if all(frame.read_depth is None for frame in source.frames) else "frames",
             unordered=not scene.in_order,
         ),
@@ -117,13 +136,25 @@ def make_report(
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(recipe)),
         last_shift_m=_last_shift(rounds, component),
+        wrong_edges=store.step(weigh_wrong, last, recipe.solver, title="diagnosis"),
+        unmeasured=_unmeasured(recipe, scores, last),
         pictures=dataclasses.replace(
             _pictures(source, rounds, sets),
-            sides=four_sides(scene.clouds, next(iter(sets.values())), sets["result"], component),
+            changed_most=changed_most(scene.clouds, *shown, last.graph.edges, last.vertex_ids.tolist(), component),
+            sides=four_sides(scene.clouds, *shown, component),
             worst_pairs=worst_pairs(source, worst),
         ),
         refinement=None if refined is None else summary(refined.decision),
     )
+
+
+def _unmeasured(recipe: Recipe, scores: ScoreTable | None, last: Round) -> str:
+    """Why there are no scores, where there are none."""
+    if scores is not None:
+        return ""
+    if not recipe.evaluation.tables:
+        return "the recipe asks for no scores (evaluation.tables is false), and there are no true poses."
+    return "scores are not measured after an edit, and there are no true poses." if last.edited else ""
 
 
 def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
@@ -204,11 +235,14 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
     last = rounds[-1]
     assert last.solution is not None
     component = last.solution.component
-    shown = {name: sets[name] for name in (next(iter(sets)), "result")}
+    first = next(iter(sets))
+    shown = {name: sets[name] for name in (first, "result")}
     if has_truth(source):
         truth = true_poses(source)
         aligned = {name: absolute_error(poses, truth, component).aligned for name, poses in shown.items()}
         shown = {"truth": truth, **aligned}
+    else:
+        shown[first] = absolute_error(shown[first], shown["result"], component).aligned
     paths = [Path3D(name, poses[:, :3, 3]) for name, poses in shown.items()]
     finite = next(name for name, poses in sets.items() if np.isfinite(poses).all())
     residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in (finite, "result"))
@@ -217,7 +251,9 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
         for number, one in enumerate(rounds)
         if one.solution is not None
     }
-    return Pictures(tuple(paths), component, residuals, last.graph, convergence)
+    names = tuple(str(frame.frame_id) for frame in source.frames)
+    stamps = np.array([frame.stamp_s for frame in source.frames])
+    return Pictures(tuple(paths), component, residuals, last.graph, convergence, names, stamps)
 
 
 def write(
@@ -237,6 +273,7 @@ def write(
     """
     if refined is None or refined.decision.outcome != "nothing":
         write_poses(folder, scene.whole, world_from_cam)
+        write_pose_table(folder, scene.whole, world_from_cam)
         write_graph(folder, scene.source, rounds[-1])
         for name, path in models.items():
             artifacts.link_or_copy(path, folder / f"{name}.ply")

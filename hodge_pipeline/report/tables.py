@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
 from hodge_pipeline.report.contents import RefinementSummary, Report
+from hodge_pipeline.report.document import Table
 from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m, judge, suspicions
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows of text under a header; the first `names` columns are words, the rest numbers. The caption explains it."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    caption: str = ""
-    names: int = 1
 
 
 def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
@@ -35,11 +24,12 @@ def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
         lines.append(("graph", f"{graph.edges} edges{sources}, {len(graph.components)} connected part(s)"))
     if report.stages:
         wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
-        lines.append(("time", f"{wall:.1f} s, {cpu:.1f} CPU s, at most {_peak(report):.0f} MB"))
+        lines.append(("time", f"{wall:.1f} s, {cpu:.1f} CPU s, at most {peak_mb(report):.0f} MB"))
     return (*lines, *(("note", str(note)) for note in suspicions(report)))
 
 
-def _peak(report: Report) -> float:
+def peak_mb(report: Report) -> float:
+    """The most memory that a stage took."""
     return max(stage.peak_mb for stage in report.stages)
 
 
@@ -113,7 +103,13 @@ def _scores(report: Report) -> Table:
         f"d: mean point-to-plane distance; score: mean of exp(−d / {table.scale * SIGMA_M * 1000:g} mm), 1 is perfect. "
         "Compare rows with each other: a score has no meaning alone."
     )
-    return Table("Scores", ("poses", *(cell for column in columns for cell in column)), tuple(rows), caption)
+    return Table(
+        "Scores",
+        ("poses", *(cell for column in columns for cell in column)),
+        tuple(rows),
+        caption,
+        highlighted=report.after,
+    )
 
 
 def _score_cells(graph: GraphScores, row: int) -> tuple[str, str, str]:
@@ -144,7 +140,7 @@ def _trajectories(report: Report) -> Table:
         f"{of} from the true positions after the best rigid alignment (ATE, root mean square), and error of the "
         f"motion from each {noun} to the {step} (RPE). The truth of a benchmark has errors of its own."
     )
-    return Table("Trajectory", header, rows, caption)
+    return Table("Trajectory", header, rows, caption, highlighted=report.after)
 
 
 def _graph(report: Report) -> Table:
@@ -189,7 +185,8 @@ def source_table(report: Report) -> Table:
     """What was read."""
     source = report.source
     rows = [
-        ("format", source.name),
+        *((("format", source.format),) if source.format else ()),
+        ("name", source.name),
         ("path", source.path),
         ("frames", str(source.frames)),
         *((("key frames", str(source.key_frames)),) if source.key_frames is not None else ()),
@@ -209,7 +206,7 @@ def worst_edges_table(report: Report) -> Table:
             edge.source,
             number(edge.fitness, ".2f"),
             number(edge.weight, ".2g"),
-            number(edge.residual_m * 100, ".1f", " cm"),
+            report.length(edge.residual_m, report.worst_edges[0].residual_m),
             number(edge.residual_deg, ".2f", "°"),
             edge.verdict or "–",
         )
@@ -228,7 +225,7 @@ def stages_table(report: Report) -> Table:
     """What each stage cost, with the total."""
     rows = [(s.name, f"{s.wall_s:.1f} s", f"{s.cpu_s:.1f} s", f"{s.peak_mb:.0f} MB") for s in report.stages]
     wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
-    rows.append(("all", f"{wall:.1f} s", f"{cpu:.1f} s", f"{_peak(report):.0f} MB"))
+    rows.append(("all", f"{wall:.1f} s", f"{cpu:.1f} s", f"{peak_mb(report):.0f} MB"))
     caption = "CPU time and peak memory are summed over all processes; a stage that was resumed cost nothing."
     return Table("Time", ("stage", "wall", "CPU", "peak memory"), tuple(rows), caption)
 

@@ -22,7 +22,10 @@ from hodge_pipeline.types.edges import ViewGraph as ViewGraph
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: `u = fx x / z + cx`, `v = fy y / z + cy`, in pixels; `fy` is negative where y points up."""
+    """A pinhole camera: `u = fx x / z + cx`, `v = fy y / z + cy`, in pixels; `fy` is negative where y points up.
+
+    `readout_s` is how much later its last row is read than its first one, by a rolling shutter; 0: all at once.
+    """
 
     width: int
     height: int
@@ -30,6 +33,7 @@ class Camera:
     fy: float
     cx: float
     cy: float
+    readout_s: float = 0.0
 
     @property
     def matrix(self) -> Floats:
@@ -105,6 +109,7 @@ class Frame:
 
     - `read_depth()` gives (H, W) float32 metres, 0 where there is no measurement.
     - `read_colour()` gives (H, W, 3) uint8 RGB.
+    - `stamp_s` is the moment of the depth image; the colour image was taken `colour_delay_s` later.
     - `image` is the file behind the colour, which may be another camera's where that is undistorted; None without one.
     - `world_from_cam` is the pose that the source gives; None where it has none. The result is compared with it; the
       pipeline never starts from it unless a recipe says so.
@@ -123,6 +128,13 @@ class Frame:
     world_from_cam: Floats | None = None
     true_world_from_cam: Floats | None = None
     sequence: str = ""
+    colour_delay_s: float = 0.0
+
+
+def number_of(frame: Frame) -> int | str:
+    """The number of a frame: its id, or the whole number that is the stamp of a frame with a name; else the name."""
+    named = isinstance(frame.frame_id, str)
+    return int(frame.stamp_s) if named and float(frame.stamp_s).is_integer() else frame.frame_id
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "recording": (Rank.FACT, "{detail}"),
     "refinement": (Rank.FACT, "{detail}"),
     # What a run does.
+    "input changed": (
+        Rank.DOUBT,
+        "{count} files of the input changed while the run read them ({detail}): run the same command again once they "
+        "stay as they are.",
+    ),
     "single frame": (
         Rank.LOOK,
         "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
@@ -44,6 +49,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "path broken": (
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
+    ),
+    "misfits": (
+        Rank.LOOK,
+        "{count} frames fit nothing that their key frame saw ({detail}): their poses follow from its own",
     ),
     "truth": (Rank.FACT, "{count} of {detail} frames have a true pose, by the truth that was named"),
     "no truth near": (Rank.LOOK, "{detail}: no pose has a true one near in time: its error is not measured"),
@@ -86,13 +95,21 @@ WORDING: dict[str, tuple[Rank, str]] = {
     ),
     "alone": (Rank.LOOK, "{count} of {detail} frames have no edge at all: they keep the pose they started with."),
     "edges ignored": (Rank.FACT, "The solver ignored {count} of {detail} edges (weight 0)."),
-    "edges wrong": (Rank.LOOK, "Of the edges that the solver used {detail}: hodge diagnose shows them."),
+    "wrong": (Rank.LOOK, "{count} of the edges used are judged wrong, {detail}: hodge diagnose shows them."),
+    "harmless": (Rank.FACT, "{count} of the edges used are judged wrong, {detail}: nothing to do."),
+    "suspect": (Rank.FACT, "{count} of the edges used are suspect: hodge diagnose shows them."),
+    "above truth": (
+        Rank.FACT,
+        "The clouds lie closer together at the result than at the true poses: a score measures how well clouds fit, "
+        "and the noise of depth, or an error of the truth, moves the best fit away from it. Errors of the "
+        "trajectory do not depend on that.",
+    ),
     "untestable": (
         Rank.LOOK,
         "{count} of {detail} edges are untestable: nothing in the graph says whether they are right.",
     ),
     "edges far off": (
-        Rank.LOOK,
+        Rank.FACT,
         "At least {count} edges that the solver used are more than {detail} off the result: see the worst edges.",
     ),
     "unmatched": (Rank.LOOK, "{detail} of each other."),

@@ -21,8 +21,9 @@ from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.pairs.edits import joining, pair_names, read_history
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
-from hodge_pipeline.report.diagnosis_page import PageContents, render
+from hodge_pipeline.report.diagnosis_page import PageContents, document
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
+from hodge_pipeline.report.document import render
 from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.sources.inspect import guess_reader
@@ -207,7 +208,7 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) 
     residuals = {"residual_m": found.residual_m, "residual_rad": np.deg2rad(found.residual_deg)}
     write_edges(out / "edges.csv", replace(found.put_into(subject.edges), **residuals), subject.graph.vertex_ids)
     _write_poses(out / "poses.tum", subject, found)
-    artifacts.write_text(out / "diagnosis.html", render(_page(diagnosed)))
+    artifacts.write_text(out / "diagnosis.html", render(document(_page(diagnosed))))
     if recording:
         from hodge_pipeline.recording.diagnosis_file import write_diagnosis
 
