@@ -64,7 +64,7 @@ class OdometryStart(OdometryOptions):
         steps.remember(keys, steps.key([source, key_frames.rows]))
         part = connected_components(found.steps.pairs, len(found.world_from_cam))
         drift, first = (
-            Drift(found.world_from_cam, part, self.max_drift),
+            None if self.max_drift is None else Drift(found.world_from_cam, part, self.max_drift),
             Round(found.steps, vertex_ids(keys), found.world_from_cam),
         )
         several = int((np.bincount(part) > 1).sum()) > 1

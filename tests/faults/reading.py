@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reading_targets import TARGETS, Target
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_trajectory, check_view_graph
 from hodge_pipeline.types import PointCloud, Source
+from reading_targets import TARGETS, Target
 
 MAX_SECONDS = 5.0
 MAX_EXTRA_BYTES = 2 << 30
