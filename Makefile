@@ -8,7 +8,7 @@ BASELINE ?= ../hodge-baseline
 
 .PHONY: help setup demo paper test faults faults-full faults-mutants baseline compare-baseline docs lint format clean
 help:
-	@echo "make setup   system libraries, $(VENV) and everything in it"
+	@echo "make setup   system libraries, $(VENV) and everything in it: 3 GB"
 	@echo "make demo    make a room, reconstruct it: runs/demo"
 	@echo "make paper   the paper's tables for every sequence that is there: runs/paper"
 	@echo "make test    the tests"
@@ -22,7 +22,8 @@ help:
 $(STAMP): pyproject.toml constraints.txt tools/system-libraries.sh
 	sh tools/system-libraries.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "no venv: apt-get install python3-venv"; exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@echo "into $(VENV): about 3 GB with all libraries, of which 1 GB is downloaded; some minutes"
+	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
 setup: $(STAMP)

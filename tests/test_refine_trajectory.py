@@ -63,7 +63,7 @@ def refine(poses: Path, frames: Path, out: Path, *more: str) -> Result:
         *sets,
         *more,
         "--recipe",
-        "slam-refine",
+        "slam_refine",
     ]
     return CliRunner().invoke(app, arguments)
 
@@ -155,7 +155,7 @@ def test_a_worse_result_is_not_written_but_with_force(
              "--set", "registration.points_per_sample=0.01")  # fmt: skip
     arguments = [str(tmp_path / "slam.tum"), "--frames", str(sequence), "--out", str(tmp_path / "run"), *blind]
     sets = [argument for override in SMALL for argument in ("--set", override)]
-    monkeypatch.setattr("sys.argv", ["hodge", "refine", "trajectory", *arguments, *sets, "--recipe", "slam-refine"])
+    monkeypatch.setattr("sys.argv", ["hodge", "refine", "trajectory", *arguments, *sets, "--recipe", "slam_refine"])
     with pytest.raises(SystemExit) as stopped:
         main()
     assert stopped.value.code == 3 and outcome(tmp_path / "run") == "worse"

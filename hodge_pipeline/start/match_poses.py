@@ -19,8 +19,8 @@ SAME_STAMP_S = 1e-6
 LIKELY_SHARE = 0.5
 """Of the frames: fewer numbers in common may be a coincidence, since small numbers occur in every sequence."""
 
-RECIPE = "slam-refine"
-CALIBRATED = {"tum": "slam-refine-tum"}
+RECIPE = "slam_refine"
+CALIBRATED = {"tum": "slam_refine_tum"}
 """Recipes for the readers of formats whose depth and colour are calibrated to each other, where landmarks measure."""
 
 

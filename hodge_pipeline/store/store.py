@@ -30,7 +30,7 @@ from hodge_pipeline.types.notes import Note
 
 T = TypeVar("T")
 LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless", "pycolmap")
-LAYOUT = 2
+LAYOUT = 3
 """Raised when steps are written in another form: those of before are computed again."""
 RECORD, KEY, INDEX = "step.json", "key.txt", "index.json"
 """Of a finished step: its key, the hash of each file, notes, cost; of a begun one: its key; of a run: its steps."""
