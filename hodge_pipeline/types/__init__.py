@@ -345,6 +345,11 @@ class CloudSet(Sequence[PointCloud]):
         """Points of each cloud, (N,)."""
         return np.diff(self.offsets)
 
+    @property
+    def reach_m(self) -> float:
+        """How far the farthest point of any cloud is from its camera; 1 where there is none."""
+        return max((float(np.linalg.norm(c.points_in_cam, axis=1).max()) for c in self if len(c)), default=0.0) or 1.0
+
 
 def _offsets(sizes: Sequence[int]) -> Ints:
     return np.concatenate([[0], np.cumsum(np.array(sizes, np.int64))]).astype(np.int64)
