@@ -155,6 +155,7 @@ class Source:
     - `trajectory` is the whole trajectory that the frames' poses come from, on its own stamps, where there is one.
     - `notes` say what was skipped or repaired, with counts: one line each.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
+    - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
     """
 
     name: str
@@ -164,6 +165,7 @@ class Source:
     graph: ViewGraph | None = None
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
+    contents: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]
