@@ -80,8 +80,8 @@ def test_three_wrong_edges_taken_out_by_mouse_and_the_run_solved(
     session, before_m = review.session, error_of(run_folder)
     page = Page(browser, review)
     assert set(page.rows()) == PLANTED
-    page.click("th[data-sort=gap]")
-    page.click("th[data-sort=score]")
+    page.sort("gap")
+    page.sort("score")
     for name in sorted(PLANTED):
         page.choose(name)
         page.decided(lambda: page.click("#disable"))
