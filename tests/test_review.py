@@ -164,6 +164,15 @@ def test_the_table_is_filtered_and_sorted(session: Session) -> None:
     assert [edge["row"] for edge in some] == [edge["row"] for edge in everything["edges"][10:15]]
 
 
+def test_the_whole_scene_is_seen_from_above_when_it_is_asked_for_again(session: Session) -> None:
+    session.show(mode="edge")
+    session.show(mode="all")
+    session.select(3)
+    assert (session.look.home, session.look.mode, session.look.selected) == (0, "all", 3)
+    session.show(mode="all")
+    assert session.look.home == 1
+
+
 def test_a_graph_is_saved_beside_the_old_one_and_nothing_is_written_over(session: Session) -> None:
     before = session.subject.path.read_bytes()
     session.disable_wrong(revision(session))
