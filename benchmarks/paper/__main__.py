@@ -49,7 +49,7 @@ def paper(
     dask: Dask = None,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the paper-* recipes."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Change an option of the paper_* recipes."),
     ] = None,
     figure: Annotated[bool, typer.Option(help="Render GT, peer and ours side by side.")] = True,
 ) -> None:
