@@ -145,12 +145,14 @@ class Source:
 class Match:
     """Where cloud j lies in cloud i, found with no guess: `inliers` of the `matches` between them agree with it.
 
-    The identity with no inlier where nothing was found.
+    The identity with no inlier where nothing was found. `rivals` of the other matches agree with another motion; 0
+    where nobody has looked for one.
     """
 
     i_from_j: Floats
     inliers: int
     matches: int
+    rivals: int = 0
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     pairs = propose(scene, clouds, rows, scratch / DESCRIBED, options)
     matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
     views = Views.make(scene.frames, scratch / VIEWS, workers)
-    hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, not by_image, workers)
+    hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
     notes.append(_tried(len(rows), pairs, hypotheses))
     labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
     measured = labelled.select(labelled.counts).as_graph(scene.vertex_ids)
