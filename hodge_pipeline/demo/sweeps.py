@@ -1,0 +1,92 @@
+"""What a spinning scanner on a car measures of the street: points with their times, one file a revolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+
+from hodge_pipeline import se3
+from hodge_pipeline.demo.street import CAR, Road, build_street
+from hodge_pipeline.types import Floats, Floats32
+
+REVOLUTION_S = 0.1
+LOWEST_DEG, HIGHEST_DEG = -24.0, 6.0
+NEAREST_M, FARTHEST_M = 2.0, 80.0
+RANGE_NOISE_M, LOST_SHARE = 0.02, 0.03
+MOVING_CARS, ONCOMING_M_S, LANE_M = 5, 7.0, 3.0
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One revolution: `points (N, 3)` in the scanner's axes at the time of each, `times_s (N,)` after the first."""
+
+    points: Floats32
+    times_s: Floats32
+
+
+class SpinningScanner:
+    """A scanner of `beams` and `columns` on a car that drives the road."""
+
+    def __init__(self, road: Road, seed: int, beams: int, columns: int, noise: float) -> None:
+        self.road, self.seed, self.noise = road, seed, noise
+        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        vertices, triangles = build_street(seed)
+        self._scene.add_triangles(
+            o3d.core.Tensor.from_numpy(vertices.astype(np.float32)),
+            o3d.core.Tensor.from_numpy(triangles.astype(np.uint32)),
+        )
+        up = np.radians(np.linspace(LOWEST_DEG, HIGHEST_DEG, beams))
+        round_ = -2 * np.pi * np.arange(columns) / columns
+        self._directions = np.stack(
+            [
+                np.cos(up) * np.cos(round_)[:, None],
+                np.cos(up) * np.sin(round_)[:, None],
+                np.broadcast_to(np.sin(up), (columns, beams)),
+            ],
+            axis=2,
+        )
+        self._column_s = REVOLUTION_S * np.arange(columns) / columns
+
+    def sweep(self, number: int) -> Sweep:
+        """The revolution that begins at `number` tenths of a second."""
+        rng = np.random.default_rng([self.seed, 8, number])
+        begin_s = number * REVOLUTION_S
+        poses = self.road.world_from_car(begin_s + self._column_s)
+        towards = np.einsum("cij,cbj->cbi", poses[:, :3, :3], self._directions)
+        rays = np.concatenate([np.broadcast_to(poses[:, None, :3, 3], towards.shape), towards], axis=2)
+        hit = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays.astype(np.float32)), nthreads=1)
+        ranges = np.minimum(hit["t_hit"].numpy().astype(float), self._to_cars(rays, begin_s))
+        ranges += self.noise * RANGE_NOISE_M * rng.standard_normal(ranges.shape)
+        seen = (ranges > NEAREST_M) & (ranges < FARTHEST_M) & (rng.random(ranges.shape) >= LOST_SHARE * self.noise)
+        points = self._directions * np.where(seen, ranges, 0.0)[:, :, None]
+        times = np.broadcast_to(self._column_s[:, None], seen.shape)
+        return Sweep(points[seen].astype(np.float32), times[seen].astype(np.float32))
+
+    def _to_cars(self, rays: Floats, time_s: float) -> Floats:
+        """The range at which each ray meets a moving car, infinite where it meets none."""
+        nearest = np.full(rays.shape[:2], np.inf)
+        for number in range(MOVING_CARS):
+            way = 37.0 + self.road.length_m * number / MOVING_CARS - ONCOMING_M_S * time_s
+            x, y, heading = (float(value) for value in self.road.place(np.array(way)))
+            lane = se3.from_parts(se3.so3_exp(np.array([0, 0, heading])), np.array([x, y, 0.2]))
+            car_from_world = se3.inverse(lane @ se3.from_parts(np.eye(3), np.array([0.0, LANE_M, 0.0])))
+            nearest = np.minimum(nearest, _to_box(_in_frame(car_from_world, rays), np.array(CAR)))
+        return nearest
+
+
+def _in_frame(b_from_a: Floats, rays: Floats) -> Floats:
+    """Rays (…, 6) in frame b."""
+    return np.concatenate(
+        [rays[..., :3] @ b_from_a[:3, :3].T + b_from_a[:3, 3], rays[..., 3:] @ b_from_a[:3, :3].T], axis=-1
+    )
+
+
+def _to_box(rays: Floats, size: Floats) -> Floats:
+    """Where rays (…, 6) meet a box that stands on the origin: the slab test."""
+    low, high = np.array([-size[0] / 2, -size[1] / 2, 0.0]), np.array([size[0] / 2, size[1] / 2, size[2]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (low - rays[..., :3]) / rays[..., 3:], (high - rays[..., :3]) / rays[..., 3:]
+    enter, leave = np.fmin(a, b).max(axis=-1), np.fmax(a, b).min(axis=-1)
+    return np.where((enter <= leave) & (enter > 0), enter, np.inf)
