@@ -89,7 +89,8 @@ def run(case: Case, folder: Path) -> tuple[Result, Floats]:
     cpu_s = after.children_user + after.children_system - before.children_user - before.children_system
     report = json.loads((folder / "report.json").read_text()) if (folder / "report.json").is_file() else {}
     headline = str((report.get("verdict") or {}).get("sentence", "")) or done.stderr.strip()
-    return Result(done.returncode, cpu_s, headline, list(report.get("notes", [])), edges(folder)), poses(folder)
+    notes = [note["text"] for note in report.get("notes", [])]
+    return Result(done.returncode, cpu_s, headline, notes, edges(folder)), poses(folder)
 
 
 def poses(folder: Path) -> Floats:

@@ -36,6 +36,7 @@ from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.store.workspace import RECIPE_FILE, Workspace
 from hodge_pipeline.types import Floats, Source, ViewGraph
+from hodge_pipeline.types.notes import Note, notes_of
 
 
 def run(
@@ -124,17 +125,15 @@ class _Job:
         )
         if not source.frames:
             raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
-        for note in source.notes:
-            self.store.note(note)
+        self.store.note(*notes_of("reader", source.notes))
         if len(source.frames) == 1:
-            self.store.note(f"{path}: has a single frame: there is nothing to register, the model is that frame alone")
+            self.store.note(Note("single frame", detail=str(path)))
         return remembered(source, reader, self.store)
 
     def measured(self, scene: Scene) -> ViewGraph:
         """The edges that come measured, over the key frames: they join every round's graph as they are."""
         graph, notes = measured_edges(scene.source, self.recipe.measured)
-        for note in notes:
-            self.store.note(note)
+        self.store.note(*notes_of("measured", notes))
         return graph
 
     def compute(self, work: Work, recording: Recording) -> tuple[list[Round], ScoreTable | None]:
@@ -163,7 +162,7 @@ class _Job:
             omega = one_form(graph, registered.start)
             found = energies(complex_, decompose(complex_, omega))
         except GraphError as error:  # the poses do not depend on it
-            self.store.note(f"{registered.name}: without its decomposition: {error}")
+            self.store.note(Note("no decomposition", detail=f"{registered.name}: without its decomposition: {error}"))
         return work.solve(registered, graph, found)
 
     def score(self, work: Work, rounds: list[Round]) -> ScoreTable | None:
@@ -171,7 +170,7 @@ class _Job:
         if not self.recipe.evaluation.tables:
             return None
         if self.again:
-            self.store.note("the scores are not measured again after an edit: hodge run, as before, measures them")
+            self.store.note(Note("scores of before"))
             return None
         scale = float(self.recipe.scale)
         return score_rounds(work.scene.source, work.scene.clouds, rounds, scale, self.store, work.workers)

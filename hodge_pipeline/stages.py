@@ -30,6 +30,7 @@ from hodge_pipeline.types import (
     Trajectory,
     ViewGraph,
 )
+from hodge_pipeline.types.notes import Note
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -39,6 +40,14 @@ Advance = Callable[[int], None]
 
 def no_progress(done: int) -> None:
     """Where nobody watches."""
+
+
+class Tell(Protocol):
+    """Takes what there is to report."""
+
+    def __call__(self, *notes: Note) -> None:
+        """Nothing comes back."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -51,7 +60,7 @@ class Step:
 
     folder: Path
     advance: Advance
-    note: Callable[[str], None]
+    note: Tell
 
 
 class Steps(Protocol):
@@ -81,7 +90,7 @@ class Steps(Protocol):
         """The key of an input: of the step that made it, else of its contents."""
         ...
 
-    def note(self, message: str) -> None:
+    def note(self, *notes: Note) -> None:
         """Tell the user, the log and the report, once."""
         ...
 

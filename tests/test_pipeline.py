@@ -20,6 +20,7 @@ from hodge_adapters.poses_text import parse_tum
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError, WorkspaceError
 from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.types.notes import Note
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
@@ -50,8 +51,8 @@ class Log:
             raise KeyboardInterrupt
         yield lambda done: None
 
-    def say(self, message: str) -> None:
-        self.said.append(message)
+    def note(self, note: Note) -> None:
+        self.said.append(str(note))
 
 
 def test_a_run_leaves_what_a_person_can_open(run: Run) -> None:
@@ -200,7 +201,7 @@ def test_unreadable_and_empty_frames_are_kept_without_edges_and_reported(damaged
     cv2.imwrite(str(depths[16]), np.full((60, 80), 9000, np.uint16))
     result = quick(damaged, tmp_path / "run")
     bad = {5, 11, 15}  # the rows after the missing image move up by one
-    notes = "\n".join(result.report.notes)
+    notes = "\n".join(map(str, result.report.notes))
     assert f"1 depth images listed but not there left out: {depths[9].name}" in notes
     for row in bad:
         assert f"frame {result.source.frames[row].frame_id}" in notes
@@ -218,7 +219,7 @@ def test_a_sequence_in_two_pieces_is_a_warning_that_lists_them(damaged: Path, tm
     result = quick(damaged, tmp_path / "run")
     assert result.result.solution is not None
     assert result.result.solution.component.max() >= 1
-    assert any("piece" in note for note in result.report.notes)
+    assert any("piece" in str(note) for note in result.report.notes)
 
 
 def test_one_frame(damaged: Path, tmp_path: Path) -> None:
@@ -229,7 +230,7 @@ def test_one_frame(damaged: Path, tmp_path: Path) -> None:
     (damaged / "depth.txt").write_text("\n".join(lines) + "\n")
     result = quick(damaged, tmp_path / "run")
     assert len(result.result.world_from_cam) == 1
-    assert any("single frame" in note for note in result.report.notes)
+    assert any("single frame" in str(note) for note in result.report.notes)
 
 
 def test_no_frame_with_depth_is_one_line(damaged: Path, tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from hodge_pipeline.report.write import (
     write_report,
 )
 from hodge_pipeline.types import Edges, Floats, ViewGraph
+from hodge_pipeline.types.notes import Note
 
 VOID = {"meta", "img", "br"}
 
@@ -86,7 +87,7 @@ def report() -> Report:
         graph=graph_summary(Edges.joined([edges, rejected]), graph.vertex_ids, np.zeros(20, np.int64)),
         worst_edges=worst_edges(edges, graph.vertex_ids, 3),
         stages=(StageRow("read", 1.0, 0.5, 100.0), StageRow("solve", 2.0, 3.5, 300.0)),
-        notes=("2 pairs were tried twice",),
+        notes=(Note("solver", detail="2 pairs were tried twice"),),
         versions={"hodge-pipeline": "0.1.0"},
         recipe="reader: seven_scenes  # <ring>\n",
         pictures=Pictures(
@@ -295,7 +296,7 @@ def test_what_to_distrust_is_said(report: Report) -> None:
     assert report.pictures.graph is not None
     edges = Edges.measured(report.pictures.graph).put(slice(None), weight=np.array([0.0] * 2 + [1.0] * 18))
     summary = graph_summary(edges, report.pictures.graph.vertex_ids, component)
-    said = "\n".join(suspicions(replace(report, graph=summary, scores=scored(0.01, 0.1, 0.01))))
+    said = "\n".join(map(str, suspicions(replace(report, graph=summary, scores=scored(0.01, 0.1, 0.01)))))
     for expected in (
         "2 pairs were tried twice",
         "falls into 3 parts",
@@ -313,7 +314,7 @@ def test_what_to_distrust_is_said(report: Report) -> None:
 def test_a_result_that_has_not_settled_is_not_to_be_trusted(shift_m: float | None, spread: float, said: bool) -> None:
     path = Path3D("result", np.array([[0.0, 0, 0], [4, 0, 0], [4, 4, 0]]) * spread)
     report = Report("r", SourceSummary("tum", "x", 3), last_shift_m=shift_m, pictures=Pictures(paths=(path,)))
-    lines = suspicions(report)
+    lines = [str(note) for note in suspicions(report)]
     assert ("not to be trusted" in "".join(lines)) == said
     if said:
         assert "33 cm" in lines[0]
@@ -321,7 +322,7 @@ def test_a_result_that_has_not_settled_is_not_to_be_trusted(shift_m: float | Non
 
 def test_an_ignored_edge_is_not_called_used(report: Report) -> None:
     ignored = EdgeRow("1", "2", "overlap", 0.5, 0.0, 1.0, 20.0)
-    assert not any("that the solver used" in line for line in suspicions(replace(report, worst_edges=(ignored,))))
+    assert not any("that the solver used" in str(line) for line in suspicions(replace(report, worst_edges=(ignored,))))
 
 
 def test_parts_are_listed_largest_first_as_the_source_names_them(report: Report) -> None:
@@ -390,7 +391,7 @@ def test_what_is_a_large_residual_and_how_many_pairs_may_see_nothing_goes_by_the
         pairs = np.stack([np.arange(200), np.arange(1, 201)], axis=1)
         scores = ScoreTable(("result",), "result", (GraphScores("iou", pairs, distances_m, scale),))
         far = replace(report.worst_edges[0], residual_m=0.15, residual_deg=0.0, weight=1.0)
-        return "\n".join(suspicions(replace(report, scores=scores, worst_edges=(far,))))
+        return "\n".join(map(str, suspicions(replace(report, scores=scores, worst_edges=(far,)))))
 
     assert "1 edges that the solver used are more than 10 cm" in said(1.0, 0)
     assert "that the solver used are more than" not in said(10.0, 0)

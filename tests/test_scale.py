@@ -78,5 +78,5 @@ def test_a_scene_of_another_size_gives_the_same_poses_in_its_size(tmp_path: Path
     found = se3.inverse(run.result.world_from_cam[0]) @ run.result.world_from_cam[1]
     found[:3, 3] /= size
     assert np.abs(se3.log(se3.inverse(se3.inverse(POSES[0]) @ POSES[1]) @ found)).max() < 0.01
-    assert any("all lengths of the recipe are taken times" in note for note in run.report.notes)
+    assert any("all lengths of the recipe are taken times" in str(note) for note in run.report.notes)
     assert run.report.scores is not None and run.report.scores.scale == pytest.approx(size, rel=1.0)

@@ -28,6 +28,7 @@ from hodge_pipeline.stages import Step
 from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.testing.writers import whole_source
 from hodge_pipeline.types import Edges, Floats, PointCloud, Source
+from hodge_pipeline.types.notes import Note
 from test_readers_colmap import synthetic
 
 OFF = se3.exp(np.array([0.0, 0.0, 0.3, 0.5, 0.0, 0.0]))
@@ -315,8 +316,8 @@ class Forgetful:
     def key(self, value: Any) -> str:
         return str(self.inner.key(value))
 
-    def note(self, message: str) -> None:
-        self.inner.note(message)
+    def note(self, *notes: Note) -> None:
+        self.inner.note(*notes)
 
 
 def draw(*, step: Step) -> Floats:

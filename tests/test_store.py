@@ -21,6 +21,7 @@ from hodge_pipeline.store import artifacts, codec
 from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.store import Store, stored, stored_clouds
 from hodge_pipeline.types import CloudSet, Edges, Floats, PointCloud
+from hodge_pipeline.types.notes import Note
 
 CALLS: list[str] = []
 
@@ -51,7 +52,7 @@ class Made:
 def doubled(value: Floats, *, step: Step) -> Floats:
     """A step that is counted, and has something to say."""
     CALLS.append("doubled")
-    step.note(f"doubled {len(value)}")
+    step.note(Note("fuser", detail=f"doubled {len(value)}"))
     return 2 * value
 
 
@@ -102,7 +103,7 @@ def test_a_step_is_computed_once_and_its_notes_are_told_again(tmp_path: Path) ->
     for _ in range(2):
         store = Store(tmp_path)
         np.testing.assert_array_equal(store.step(doubled, ONE, title="a"), 2 * ONE)
-        assert store.notes == ["doubled 3"]
+        assert store.notes == [Note("fuser", detail="doubled 3")]
     assert CALLS == ["doubled"]
     assert not list(tmp_path.rglob("*.part")) and not list(tmp_path.rglob(".*"))
     np.testing.assert_array_equal(stored(tmp_path, doubled), [2 * ONE])
@@ -242,7 +243,7 @@ def test_a_damaged_file_of_a_step_is_said_refused_and_healed(tmp_path: Path, dam
         store = Store(tmp_path)
         made = store.step(made_files, 1, title="a")
         assert CALLS == ["made_files"]
-        assert len(store.notes) == 1 and file.name in store.notes[0] and "computed again" in store.notes[0]
+        assert len(store.notes) == 1 and file.name in str(store.notes[0]) and "computed again" in str(store.notes[0])
         assert made.file.read_text() == "model"
         np.testing.assert_array_equal(made.clouds.points, clouds(1).points)
     assert len(stored(tmp_path, made_files)) == len(stored_clouds(tmp_path)) == 1

@@ -35,6 +35,7 @@ from hodge_pipeline.start.unordered.join import _stays
 from hodge_pipeline.start.unordered.start import Start
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Source, ViewGraph
+from hodge_pipeline.types.notes import Note
 
 FRAMES = 64
 SMALL = (
@@ -66,8 +67,11 @@ def tracking_options(recipe: Recipe) -> TrackingOptions:
 def track(source: Source, folder: Path) -> tuple[Tracked, list[str]]:
     folder.mkdir()
     options, notes = tracking_options(small_recipe(source.path)), list[str]()
-    found = tracked.track(source, options, workers=InProcess(), step=Step(folder, no_progress, notes.append))
-    return found, notes
+
+    def tell(*told: Note) -> None:
+        notes.extend(map(str, told))
+
+    return tracked.track(source, options, workers=InProcess(), step=Step(folder, no_progress, tell)), notes
 
 
 def all_poses(source: Source, found: Tracked, world_from_key: Floats) -> Floats:
@@ -84,7 +88,7 @@ class Told:
         self.asked.append(function_and_inputs)
         return self.answer
 
-    def note(self, message: str) -> None:
+    def note(self, *notes: Note) -> None:
         pass
 
     def key(self, value: object) -> str:
@@ -109,7 +113,7 @@ def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeli
     assert 2 < len(run.result.world_from_cam) < FRAMES / 2
     poses = parse_tum(run.folder / "poses.tum").trajectory
     assert len(poses) == FRAMES
-    assert any("of 64 frames are key frames" in note for note in run.report.notes)
+    assert any("of 64 frames are key frames" in str(note) for note in run.report.notes)
     keys = len(run.result.world_from_cam)
     assert run.report.source.counted == f"64 frames, {keys} of them key frames"
     assert f"64 frames, {keys} of them key frames" in (run.folder / "report.html").read_text("utf-8")
@@ -136,9 +140,9 @@ def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(sequence: Path,
     i, j = before.result.graph.vertex_ids[before.result.graph.edges[0]]
     write_history(before.folder, History((Edit(disable=(f"{i}-{j}",)),)))
     edited = solve_again(before.folder)
-    assert any(f"the {keys} key frames alone" in note for note in edited.report.notes)
+    assert any(f"the {keys} key frames alone" in str(note) for note in edited.report.notes)
     again = hodge_pipeline.run(recipe, before.folder)
-    assert not any("key frames alone" in note for note in again.report.notes)
+    assert not any("key frames alone" in str(note) for note in again.report.notes)
     np.testing.assert_array_equal(again.result.world_from_cam, edited.result.world_from_cam)
 
 

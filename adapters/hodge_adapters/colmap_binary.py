@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ from hodge_adapters.colmap_records import (
 )
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Ints
+from hodge_pipeline.types.input_files import open_input
 
 MAX_NAME_BYTES = 4096
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
@@ -85,8 +87,8 @@ class Cursor:
 def opened(path: Path) -> Iterator[Cursor]:
     """A cursor on the file, mapped into memory. Raises `SourceError` where it cannot be read."""
     try:
-        with open(path, "rb") as file:
-            if not path.stat().st_size:
+        with open_input(path) as file:
+            if not os.fstat(file.fileno()).st_size:
                 yield Cursor(path, b"")
                 return
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:

@@ -11,6 +11,7 @@ from hodge_adapters.image_headers import MAX_PIXELS
 from hodge_adapters.text_rows import inside
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats32
+from hodge_pipeline.types.input_files import open_input
 
 MAP_ENDINGS = (".geometric.bin", ".photometric.bin")
 _HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&(\d{1,3})&")
@@ -30,9 +31,11 @@ def read_depth_map(path: Path, size: tuple[int, int]) -> Floats32:
             f"{path}: the depth map is {found[0]}x{found[1]}, the others {size[0]}x{size[1]}: make it again"
         )
     count = found[0] * found[1]
-    if path.stat().st_size != start + 4 * count:
-        raise SourceError(f"{path}: holds {path.stat().st_size - start} bytes for {count} pixels: copy it again")
-    depth = np.fromfile(path, "<f4", count, offset=start).reshape(found[1], found[0])
+    with open_input(path) as file:
+        contents = file.read(start + 4 * count + 1)
+    if len(contents) != start + 4 * count:
+        raise SourceError(f"{path}: holds not the bytes for {count} pixels: copy it again")
+    depth = np.frombuffer(contents, "<f4", count, offset=start).reshape(found[1], found[0])
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0)).astype(np.float32)
 
 
@@ -59,7 +62,7 @@ def sensor_depth(folder: Path, name: str, colour: Path | None) -> Path | None:
 
 def _parse_header(path: Path) -> tuple[tuple[int, int], int]:
     try:
-        with open(path, "rb") as file:
+        with open_input(path) as file:
             match = _HEADER.match(file.read(32))
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore it or its permissions") from error

@@ -14,6 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source, Trajectory
+from hodge_pipeline.types.input_files import beginning
 
 COLUMNS = 8
 NANO = 1_000_000_000
@@ -27,11 +28,7 @@ class EurocReader:
 
     def sniff(self, path: Path) -> Sniff:
         """By the first lines: whole nanoseconds, then numbers with commas between."""
-        try:
-            with open(file_of(Path(path)), "rb") as file:
-                lines = file.read(4096).decode("utf-8-sig", "replace").splitlines()[:2]
-        except OSError:
-            return Sniff(0.0, "not a file that can be read")
+        lines = beginning(file_of(Path(path)), 4096).decode("utf-8-sig", "replace").splitlines()[:2]
         if lines and "timestamp" in lines[0] and "q_RS_w" in lines[0]:
             return Sniff(0.95, "EuRoC's header")
         fields = lines[0].split(",") if lines else []

@@ -25,11 +25,13 @@ from hodge_adapters.tum import frame_ids
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source
+from hodge_pipeline.types.input_files import beginning
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
 REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
 TRUTH_PATTERN = "*.gt.freiburg*"
 MAX_GAP_FRAMES = 1.0
+SNIFFED_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -179,6 +181,6 @@ def _find_truth(folder: Path) -> Path | None:
 
 def _is_numbered(association: Path) -> bool:
     """Whether its first row has a frame number where TUM has a time."""
-    with association.open(encoding="utf-8", errors="replace") as lines:
-        row = next((line.split() for line in lines if line.strip() and not line.startswith("#")), [""])
+    lines = beginning(association, SNIFFED_BYTES).decode("utf-8-sig", "replace").splitlines()
+    row = next((line.split() for line in lines if line.strip() and not line.startswith("#")), [""])
     return row[0].isdigit()

@@ -14,6 +14,7 @@ from hodge_adapters.text_rows import listed, read_text, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Floats, Floats32, Frame
+from hodge_pipeline.types.input_files import read_input
 
 FARTHEST_M = 1000.0
 """A ray that hits nothing has a huge length: no measurement."""
@@ -75,9 +76,7 @@ def read_ray_lengths(path: Path, *, camera: Camera, units_per_metre: float) -> F
     """
     count = camera.width * camera.height
     try:
-        if path.stat().st_size > count * _BYTES_PER_NUMBER:
-            raise SourceError(f"{path}: too large for {camera.width}x{camera.height} numbers: is it of another camera?")
-        lengths = np.array(path.read_bytes().split(), np.float64) / units_per_metre
+        lengths = np.array(read_input(path, count * _BYTES_PER_NUMBER).split(), np.float64) / units_per_metre
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file") from error
     except ValueError as error:

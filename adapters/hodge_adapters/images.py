@@ -15,9 +15,12 @@ import numpy as np
 from hodge_adapters.image_headers import is_complete, parse_header
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, EncodedImage, Floats32
+from hodge_pipeline.types.input_files import open_input, read_input
 
 HEADER_BYTES = 1 << 16
 """Where an image's size is looked for: room for the thumbnail that may precede it."""
+MAX_IMAGE_BYTES = 1 << 29
+"""Twice what 64 megapixels of 16-bit depth and their rows' heads take uncompressed."""
 
 
 def read_depth(
@@ -84,7 +87,11 @@ def read_whole_image(path: Path, size: tuple[int, int] | None = None) -> bytes:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the header alone; raises `SourceError` where there is none."""
-    header = parse_header(_read_bytes(path, HEADER_BYTES), path)
+    try:
+        with open_input(path) as file:
+            header = parse_header(file.read(HEADER_BYTES), path)
+    except OSError as error:
+        raise _unreadable(path, error) from error
     return header.width, header.height
 
 
@@ -102,9 +109,12 @@ def common_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int]:
     return sizes.most_common(1)[0][0]
 
 
-def _read_bytes(path: Path, limit: int = -1) -> bytes:
+def _read_bytes(path: Path) -> bytes:
     try:
-        with open(path, "rb") as file:
-            return file.read(limit)
+        return read_input(path, MAX_IMAGE_BYTES)
     except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: OSError) -> SourceError:
+    return SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions")

@@ -13,6 +13,7 @@ from hodge_adapters.text_rows import read_text, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.input_files import beginning
 
 SNIFFED_BYTES = 4096
 
@@ -30,13 +31,9 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def beginning(path: Path) -> str:
+def first_text(path: Path) -> str:
     """The first characters of a file, empty where it cannot be read."""
-    try:
-        with open(path, "rb") as file:
-            return file.read(SNIFFED_BYTES).decode("utf-8-sig", "replace")
-    except OSError:
-        return ""
+    return beginning(path, SNIFFED_BYTES).decode("utf-8-sig", "replace")
 
 
 def objects(value: Any, where: str) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ from hodge_adapters.mcap_records import MAGIC
 from hodge_adapters.text_rows import inside, listed, read_text
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
+from hodge_pipeline.types.input_files import beginning
 
 METADATA = "metadata.yaml"
 SQLITE_REMEDY = "convert it with `ros2 bag convert` to storage mcap"
@@ -29,9 +30,7 @@ def sniff_recording(path: Path) -> Sniff:
     """How sure it is that a path is an MCAP file, or a folder of some."""
     try:
         if path.is_file():
-            with open(path, "rb") as file:
-                is_mcap = file.read(len(MAGIC)) == MAGIC
-            if is_mcap:
+            if beginning(path, len(MAGIC)) == MAGIC:
                 return Sniff(1.0, "starts as an MCAP file")
             return Sniff(0.0, "does not start as an MCAP file", _other_recording(path))
         if path.is_dir() and any(path.glob("*.mcap")):

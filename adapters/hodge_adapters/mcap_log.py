@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -31,9 +32,12 @@ from hodge_adapters.mcap_records import (
     summary_span,
 )
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types.input_files import open_input
 
 _MESSAGE = struct.Struct("<HIQQ")
 _MAX_SMALL_RECORD_BYTES = 1 << 24
+MAX_EXPANSION, ALWAYS_EXPANDED_BYTES = 200, 1 << 31
+"""Images and scans shrink to a half or a tenth: the chunks of a file together expand to no more, and 2 GiB."""
 
 
 class Logged(NamedTuple):
@@ -61,6 +65,7 @@ class LogFile:
     _is_wanted: dict[int, bool] = field(default_factory=dict)
     _chunk_offsets: list[int] = field(default_factory=list)
     _has_footer: bool = False
+    _expansion_left: int = 0
     _count: int = 0
     _first_ns: int = 0
     _last_ns: int = 0
@@ -68,16 +73,17 @@ class LogFile:
     def messages(self) -> Iterator[Logged]:
         """The wanted messages. Raises `SourceError` for a file that is no MCAP; all else is complained of."""
         try:
-            with open(self.path, "rb") as file:
+            with open_input(self.path) as file:
                 yield from self._messages(file)
         except OSError as error:
             remedy = "restore the file or its permissions"
             raise SourceError(f"{self.path}: cannot be read ({error.strerror}): {remedy}") from error
 
     def _messages(self, file: IO[bytes]) -> Iterator[Logged]:
-        read, size = read_at(file), self.path.stat().st_size
+        read, size = read_at(file), os.fstat(file.fileno()).st_size
         if read(0, len(MAGIC)) != MAGIC:
             raise SourceError(f"{self.path}: does not start as an MCAP file: record or copy it again")
+        self._expansion_left = ALWAYS_EXPANDED_BYTES + MAX_EXPANSION * size
         self._read_summary(read, size)
         at: int | None = len(MAGIC)
         while at is not None and at < size:
@@ -140,6 +146,9 @@ class LogFile:
 
     def _chunk(self, read: ReadAt, chunk: Chunk, complete: bool) -> Iterator[Logged]:
         if chunk.compression:
+            if chunk.uncompressed_bytes > self._expansion_left:
+                raise Malformed("a chunk past what a file of this size may expand to")
+            self._expansion_left -= chunk.uncompressed_bytes
             contents = expand(read, chunk, chunk.uncompressed_bytes)
             crc = zlib.crc32(contents) if chunk.crc else 0
             inner: ReadAt = lambda offset, length: contents[offset : offset + length]  # noqa: E731

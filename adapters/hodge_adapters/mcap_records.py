@@ -20,6 +20,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types.input_files import open_input
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_CHUNK_BYTES = 1 << 28
@@ -84,7 +85,7 @@ def read_at(file: IO[bytes]) -> ReadAt:
 def read_place(path: Path, place: Place) -> bytes:
     """The bytes at a place; raises `Malformed` where they are not all there, `SourceError` without the file."""
     try:
-        with open(path, "rb") as file:
+        with open_input(path) as file:
             if place.chunk is None:
                 contents = read_at(file)(place.offset, place.length)
             else:

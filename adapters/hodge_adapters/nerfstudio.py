@@ -11,7 +11,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters import images
-from hodge_adapters.json_files import beginning, motion, number, objects, read_json, whole, write_json
+from hodge_adapters.json_files import first_text, motion, number, objects, read_json, whole, write_json
 from hodge_adapters.posed import trajectory_of
 from hodge_adapters.text_rows import inside, listed
 from hodge_pipeline.errors import SourceError
@@ -35,9 +35,9 @@ class NerfstudioReader:
     every: int = Field(1, ge=1, description="take every n-th frame")
 
     def sniff(self, path: Path) -> Sniff:
-        """By the name, or by the keys near the beginning."""
+        """By the name, or by the keys near the first_text."""
         path = Path(path)
-        text = beginning(path / FILE if path.is_dir() else path)
+        text = first_text(path / FILE if path.is_dir() else path)
         if '"transform_matrix"' in text or '"frames"' in text:
             return Sniff(0.9, "frames with a transform_matrix")
         return Sniff(0.0, "no transforms.json")

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.json_files import beginning, motion, numbers, objects, read_json, whole, write_json
+from hodge_adapters.json_files import first_text, motion, numbers, objects, read_json, whole, write_json
 from hodge_adapters.posed import trajectory_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -32,8 +32,8 @@ class Open3dReader:
     """Opens a pose graph or a camera trajectory that Open3D wrote."""
 
     def sniff(self, path: Path) -> Sniff:
-        """By the class that the file names near its beginning, or the keys that such a class begins with."""
-        text = beginning(Path(path))
+        """By the class that the file names near its first_text, or the keys that such a class begins with."""
+        text = first_text(Path(path))
         for name in (GRAPH, TRAJECTORY):
             if f'"{name}' in text:
                 return Sniff(0.95, f"class_name {name}")

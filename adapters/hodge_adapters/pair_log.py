@@ -20,10 +20,12 @@ from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Ints, Source, ViewGraph
+from hodge_pipeline.types.input_files import beginning
 
 INFORMATION_ALONE = "the information of pairs alone: give the .log beside it"
 MAX_INFORMATION = 1e100
 """Sums of larger ones are no numbers any more."""
+SNIFFED_BYTES = 4096
 SPARSE = 10
 """A count of vertices beyond so many times those that edges name is no count of them: the named ones are taken."""
 
@@ -43,12 +45,10 @@ class PairLogReader:
         path = Path(path)
         if path.suffix != ".log" or not path.is_file():
             return Sniff(0.0, "not a .log file", INFORMATION_ALONE if path.suffix == ".info" else "")
-        try:
-            with path.open(encoding="ascii") as file:
-                head = next((line.split() for line in file if line.strip()), [])
-        except (OSError, UnicodeDecodeError):
-            return Sniff(0.0, "no text")
-        pair = len(head) == 3 and all(field.isdecimal() for field in head) and int(head[0]) != int(head[1])
+        lines = beginning(path, SNIFFED_BYTES).split(b"\n")
+        head = next((line.split() for line in lines if line.strip()), [])
+        numbers = [int(field) for field in head if field.isdigit() and len(field) < 19]
+        pair = len(head) == len(numbers) == 3 and numbers[0] != numbers[1]
         return Sniff(0.9, "a .log of pairs i ≠ j") if pair else Sniff(0.0, "its first block is no pair")
 
     def open(self, path: Path) -> Source:

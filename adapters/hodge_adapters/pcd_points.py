@@ -14,10 +14,13 @@ import numpy as np
 from hodge_adapters.point_columns import number_rows, parts_of, points_of_parts
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PointCloud
+from hodge_pipeline.types.input_files import read_input
 
 MAX_HEADER_BYTES = 1 << 14
 MAX_EXPANSION = 264
 """LZF writes at most so many bytes for one that it reads."""
+MAX_EXPANDED_BYTES = 1 << 30
+"""Compressed points are expanded whole: 1 GiB are 30 million points with normals and colours."""
 _CODES = {"F": "f", "I": "i", "U": "u"}
 _PACKED = ("rgb", "rgba")
 
@@ -43,7 +46,7 @@ def read_pcd(path: Path) -> PointCloud:
     Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
     """
     try:
-        contents = path.read_bytes()
+        contents = read_input(path)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
     header = _read_header(path, contents)
@@ -59,7 +62,7 @@ def _unpacked(columns: dict[str, Any]) -> dict[str, Any]:
     return columns
 
 
-def expand_lzf(compressed: bytes, size: int) -> bytes | None:
+def expand_lzf(compressed: bytes, size: int) -> bytearray | None:
     """What LZF compressed, if it is exactly `size` bytes; None where it is damaged."""
     out, at, end = bytearray(), 0, len(compressed)
     try:
@@ -84,7 +87,7 @@ def expand_lzf(compressed: bytes, size: int) -> bytes | None:
             out += (piece * (length // len(piece) + 2))[: length + 2]
     except IndexError:
         return None
-    return bytes(out) if len(out) == size and at == end else None
+    return out if len(out) == size and at == end else None
 
 
 def _read_header(path: Path, contents: bytes) -> PcdHeader:
@@ -153,13 +156,16 @@ def _read_binary(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dic
 
 
 def _read_compressed(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dict[str, Any]]:
-    _check_room(path, header, (len(contents) - header.start) * MAX_EXPANSION)
     size = header.count * header.dtype.itemsize
+    if size > MAX_EXPANDED_BYTES:
+        raise SourceError(
+            f"{path}: expands to {size} bytes, the limit is {MAX_EXPANDED_BYTES}: write it as DATA binary"
+        )
     if len(contents) < header.start + 8:
         raise SourceError(f"{path}: cut off after its header: copy it again")
     packed, unpacked = struct.unpack_from("<II", contents, header.start)
     expanded = None
-    if unpacked == size and packed <= len(contents) - header.start - 8:
+    if unpacked == size <= packed * MAX_EXPANSION and packed <= len(contents) - header.start - 8:
         expanded = expand_lzf(contents[header.start + 8 : header.start + 8 + packed], size)
     if expanded is None:
         raise SourceError(f"{path}: its compressed points are damaged or cut off: copy it again")

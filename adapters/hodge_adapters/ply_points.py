@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,6 +14,7 @@ from hodge_adapters.point_columns import ROWS_IN_PART, number_rows, points_of_pa
 from hodge_adapters.text_rows import write_bytes_atomically
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PointCloud
+from hodge_pipeline.types.input_files import open_input
 
 MAX_HEADER_BYTES = 1 << 16
 TYPES = {
@@ -58,7 +60,7 @@ def read_ply(path: Path) -> PointCloud:
     Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
     """
     try:
-        with open(path, "rb") as file:
+        with open_input(path) as file:
             header = _read_header(path, file)
             parts = _binary_parts if header.order else _ascii_parts
             return points_of_parts(path, parts(path, file, header))
@@ -137,8 +139,8 @@ def _binary_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dic
 
 def _ascii_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dict[str, Any]]:
     file.seek(header.start)
-    for _ in range(header.lines):
-        file.readline()
+    for _ in islice(file, header.lines):
+        pass
     names = [COLOURS.get(name, name) for name, _ in header.properties]
     for table in number_rows(path, file, header.count, len(names)):
         yield dict(zip(names, table.T, strict=True))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
 
@@ -13,10 +12,11 @@ import numpy as np
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types.input_files import beginning, read_input
 
 MAX_NUMBER = 1e100
 """Past it squares and products of numbers overflow."""
-SNIFFED_LINES = 20
+SNIFFED_LINES, SNIFFED_BYTES = 20, 1 << 16
 Columns = Mapping[str, tuple[int, ...] | None]
 """How many numbers may follow the keys of a tag; None: those that follow are more keys."""
 
@@ -49,9 +49,8 @@ LANDMARK_TAGS = frozenset(
 def count_tags(path: Path) -> Counter[str]:
     """How often each first word occurs in the first lines; empty where the path is no readable text."""
     try:
-        with Path(path).open("rb") as file:
-            lines = _text(b"".join(islice(file, SNIFFED_LINES))).split("\n")
-    except (OSError, ValueError):
+        lines = _text(beginning(Path(path), SNIFFED_BYTES)).split("\n")[:SNIFFED_LINES]
+    except ValueError:
         return Counter()
     return Counter(line.split(None, 1)[0] for line in lines if line.strip() and not line.startswith("#"))
 
@@ -64,7 +63,7 @@ def read_records(
     A tag that is among the `other_names` is read as the one it stands for.
     """
     try:
-        lines = _text(Path(path).read_bytes()).split("\n")
+        lines = _text(read_input(Path(path))).split("\n")
     except (OSError, ValueError) as error:
         raise SourceError(f"{path}: cannot be read as text ({error}): expected a pose-graph file") from error
     numbers: dict[str, list[int]] = {tag: [] for tag in keys}

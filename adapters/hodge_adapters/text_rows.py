@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from hodge_pipeline.errors import SourceError, not_written
+from hodge_pipeline.types.input_files import read_input_text
 
 SHOWN = 5
 """How many records a note names before it only counts them."""
@@ -25,7 +26,7 @@ class Row:
 def read_text(path: Path) -> str:
     """The text of a file, whatever its bytes; raises `SourceError` where it cannot be read."""
     try:
-        return path.read_text(encoding="utf-8-sig", errors="replace")
+        return read_input_text(path, errors="replace")
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
 

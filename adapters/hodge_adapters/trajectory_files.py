@@ -12,6 +12,7 @@ from hodge_adapters.poses_text import parse_tum, read_kitti
 from hodge_adapters.text_rows import to_floats
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source
+from hodge_pipeline.types.input_files import beginning
 
 SNIFFED_LINES = 40
 SNIFFED_BYTES = 1 << 14
@@ -52,18 +53,14 @@ class KittiPosesReader:
 
 
 def first_rows(path: Path) -> list[list[str]]:
-    """The fields of the first lines that are no comment, cut at blanks; raises `OSError` alone."""
-    with open(path, "rb") as file:
-        lines = file.read(SNIFFED_BYTES).decode("utf-8-sig", "replace").split("\n")[:-1] or [""]
+    """The fields of the first lines that are no comment, cut at blanks, none where it cannot be read."""
+    lines = beginning(path, SNIFFED_BYTES).decode("utf-8-sig", "replace").split("\n")[:-1] or [""]
     rows = (line.split("#", 1)[0].split() for line in lines)
     return list(islice((row for row in rows if row), SNIFFED_LINES))
 
 
 def _sniff_columns(path: Path, count: int, what: str) -> Sniff:
-    try:
-        rows = [to_floats(" ".join(row).replace(",", " ").split()) for row in first_rows(path)]
-    except OSError:
-        return Sniff(0.0, "not a file that can be read")
+    rows = [to_floats(" ".join(row).replace(",", " ").split()) for row in first_rows(path)]
     good = sum(row is not None and len(row) == count for row in rows)
     if not good or good < 0.8 * len(rows):
         return Sniff(0.0, f"no {what}")

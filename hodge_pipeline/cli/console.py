@@ -23,6 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hodge_pipeline.stages import Advance, no_progress
+from hodge_pipeline.types.notes import Note
 
 
 class Terminal:
@@ -75,6 +76,10 @@ class Terminal:
         self._progress.update(task, total=self._totals[title])
         yield lambda done: self._progress.advance(task, done)
         self._progress.update(task, completed=before + total)
+
+    def note(self, note: Note) -> None:
+        """Its sentence."""
+        self.say(str(note))
 
     def say(self, message: str) -> None:
         """One line above the bars."""

@@ -275,6 +275,9 @@ def main() -> None:
             raise
         print(f"error: {error.filename or 'a file'}: {error.strerror}", file=sys.stderr)
         sys.exit(1)
+    except MemoryError:
+        print("error: this needs more memory than there is: give less data, or free some", file=sys.stderr)
+        sys.exit(1)
     except Exception as error:
         from hodge_pipeline.errors import HodgeError
 

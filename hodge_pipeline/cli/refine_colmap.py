@@ -29,12 +29,13 @@ def refine(
 ) -> None:
     """Refine a model into a run folder. Raises `CheckError` (exit code 3) where the guard kept the input as worse."""
     options = load_model_refinement(recipe or RECIPE, overrides)
+    from hodge_pipeline.types.input_files import read_input_text
     from hodge_pipeline.uses.colmap import run_refinement
 
     with resumable(out), Terminal(quiet or as_json) as terminal:
         done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal, dask=dask)
     if as_json:
-        print((out / "report.json").read_text("utf-8"), end="")
+        print(read_input_text(out / "report.json"), end="")
     elif not quiet:
         for result in done.results:
             _print(result)

@@ -26,6 +26,7 @@ from hodge_pipeline.demo.room import build_room
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Bytes, Camera, Floats
+from hodge_pipeline.types.input_files import read_input_text
 
 VERSION = 2
 """Raised whenever the same options give other files, so that nobody goes on with old ones."""
@@ -144,7 +145,7 @@ def _stamp(options: DemoOptions) -> str:
 
 def _is_made(folder: Path, options: DemoOptions) -> bool:
     stamp = folder / STAMP_FILE
-    return stamp.is_file() and stamp.read_text() == _stamp(options)
+    return stamp.is_file() and read_input_text(stamp, errors="replace") == _stamp(options)
 
 
 def _publish(draft: Path, folder: Path, options: DemoOptions) -> None:

@@ -11,6 +11,7 @@ from hodge_pipeline.fusion.ply import write_ply
 from hodge_pipeline.scene import KeyFrames, Scene
 from hodge_pipeline.stages import Fuser, Step, Steps
 from hodge_pipeline.types import Bools, Floats, Source
+from hodge_pipeline.types.notes import Note, notes_of
 
 
 def fuse_all(
@@ -23,9 +24,7 @@ def fuse_all(
     if keys_only and not scene.key_frames.are_all:
         rows = scene.key_frames.rows
         source, poses, placed = scene.source, world_from_cam[rows], scene.clouds.sizes > 0
-        steps.note(
-            f"fused after an edit: the {len(source.frames)} key frames alone; hodge run, as before, fuses all frames"
-        )
+        steps.note(Note("fused key frames", len(source.frames)))
     else:
         source, poses = scene.whole, world_from_cam
         placed = _placed(scene.key_frames, scene.clouds.sizes > 0)
@@ -42,8 +41,7 @@ def fuse(fuser: Fuser, source: Source, world_from_cam: Floats, *, step: Step) ->
     model = fuser.fuse(source.frames, world_from_cam, step.advance)
     path = step.folder / f"{model.name}.ply"
     write_ply(path, model)
-    for note in model.notes:
-        step.note(note)
+    step.note(*notes_of("fuser", model.notes))
     return path
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.store.artifacts import write_atomically
 from hodge_pipeline.types import Model
+from hodge_pipeline.types.input_files import open_input
 
 POINTS, NORMALS, COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", (3,))])
@@ -43,7 +44,7 @@ def write_ply(path: Path, model: Model) -> None:
 
 def read_ply(path: Path) -> Model:
     """The model that `write_ply` wrote. `SourceError` for a file of another layout, or one cut short."""
-    with path.open("rb") as file:
+    with open_input(path) as file:
         header = _read_header(file, path)
         vertices = _read(file, header.vertex_type, header.counts.get("vertex", 0), path)
         faces = _read(file, FACE, header.counts["face"], path) if "face" in header.counts else None

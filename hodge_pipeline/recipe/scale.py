@@ -12,6 +12,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.types import Floats, Frame, Source
+from hodge_pipeline.types.notes import Note
 
 T = TypeVar("T")
 SECTIONS = (
@@ -47,7 +48,7 @@ def scale_of_scans(source: Source, voxel_m: float, *, step: Step) -> float:
     """Step: the factor on lengths that suits the scans of a source."""
     factor = measured_scale(source.frames, voxel_m)
     if factor != 1.0:
-        step.note(_said(factor, voxel_m))
+        step.note(Note("scale", detail=_said(factor, voxel_m)))
     return factor
 
 

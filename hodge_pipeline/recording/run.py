@@ -28,6 +28,8 @@ from hodge_pipeline.store.log import log
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.store.workspace import RUN, identity_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
+from hodge_pipeline.types.input_files import read_input_text
+from hodge_pipeline.types.notes import notes_of
 
 FILE = "recording.rrd"
 RECORDING = "recording"
@@ -161,7 +163,7 @@ class Recording:
         """Truth, recipe and log, which belong to the run as a whole, then all parts as one file."""
         recorder = self._recorder(folder)
         notes = _record_truth(recorder, self._source, self._rounds)
-        lines = (self._folder / "log.txt").read_text("utf-8").splitlines()
+        lines = read_input_text(self._folder / "log.txt", errors="replace").splitlines()
         recorder.text(yaml_file.dump(binding.unbind(self._recipe)), lines)
         parts = [*self._parts, *find_parts(folder)]
         if self._live is not None:
@@ -178,8 +180,7 @@ def record_part(
     step: Step,
 ) -> tuple[Path, ...]:
     """Step: the files of one part of the recording, which `inputs` and `options` decide and `write` writes."""
-    for note in write(recorder(step.folder)):
-        step.note(note)
+    step.note(*notes_of("recording", write(recorder(step.folder))))
     return tuple(find_parts(step.folder))
 
 
@@ -187,8 +188,7 @@ def merge_recording(
     parts: list[Path], options: RecordingOptions, *, merge: Callable[[Path, Path], Notes], step: Step
 ) -> Path:
     """Step: all parts as one file."""
-    for note in merge(step.folder, step.folder / FILE):
-        step.note(note)
+    step.note(*notes_of("recording", merge(step.folder, step.folder / FILE)))
     return step.folder / FILE
 
 

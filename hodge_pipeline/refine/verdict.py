@@ -21,6 +21,7 @@ from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.stages import Step, Workers
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source, Trajectory
+from hodge_pipeline.types.notes import Note
 
 CHI2_TOLERANCE = 0.02
 """Of the start's: the solver minimises a robust cost, not this one."""
@@ -51,7 +52,7 @@ def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
     """
     last, key_frames = rounds[-1], work.scene.key_frames
     decision = _decision(work, rounds, key_frames.world_from_key)
-    work.steps.note(decision.reason)
+    work.steps.note(Note("guard", detail=decision.reason))
     poses = key_frames.first if decision.keeps_input else key_frames.expand(last.world_from_cam)
     file = None if decision.outcome == "nothing" else _write(work, folder, decision, last)
     return Refined(decision, poses, "" if file is None else file.name)
@@ -86,7 +87,7 @@ def _held_out(work: Work, rounds: Sequence[Round], before: Floats) -> list[Measu
     """The score of the pairs kept out of every round; its tolerance is its own standard error."""
     pairs, after = held_out_pairs(rounds), rounds[-1].world_from_cam
     if not len(pairs):
-        work.steps.note("no overlapping pair was left to judge the result by: only the edges' own chi2 does")
+        work.steps.note(Note("nothing held out", 0))
         return []
     distances = work.steps.step(
         held_out_distances, work.scene.clouds, pairs, np.stack([before, after]), title="guard", workers=work.workers
@@ -96,7 +97,7 @@ def _held_out(work: Work, rounds: Sequence[Round], before: Floats) -> list[Measu
     tolerance = max(SIGMAS * error, LEAST_TOLERANCE)
     mean_m, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_m[0]:.3g} mm apart before, {mean_m[1]:.3g} mm after"
-    work.steps.note(f"{len(pairs)} overlapping pairs were kept out of the solve: clouds there {apart}")
+    work.steps.note(Note("held out", len(pairs), apart))
     return [Measure("score of held-out edges", float(mean[0]), float(mean[1]), "higher", tolerance)]
 
 
@@ -134,6 +135,6 @@ def _write(work: Work, folder: Path, decision: Decision, last: Round) -> Path | 
     refined = Trajectory(given.trajectory.stamps_s, moved)
     if rewriter is not None:
         return Path(rewriter.rewrite(folder, original, refined))
-    work.steps.note(f"poses are not written back into {original.suffix or 'a folder'}: refined.tum holds them")
+    work.steps.note(Note("other format", detail=original.suffix or "a folder"))
     registry.load("writers", "tum")().write(folder / "refined.tum", Source("refined", original, trajectory=refined))
     return folder / "refined.tum"

@@ -14,6 +14,7 @@ import numpy as np
 
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers, no_progress
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, Match
+from hodge_pipeline.types.input_files import open_input
 
 CLOUDS_IN_BLOCK = 8
 PAIRS_IN_BLOCK = 24
@@ -103,5 +104,5 @@ def _match_block(described: Path, registrar: GlobalRegistrar, pairs: Ints) -> Ma
 
 @lru_cache(maxsize=DESCRIPTIONS_KEPT)
 def _load(path: Path) -> Any:
-    with path.open("rb") as file:
+    with open_input(path) as file:
         return pickle.load(file)

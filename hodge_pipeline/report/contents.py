@@ -10,6 +10,7 @@ import numpy as np
 
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types.notes import Note
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,7 @@ class Report:
     graph: GraphSummary | None = None
     worst_edges: tuple[EdgeRow, ...] = ()
     stages: tuple[StageRow, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
     recipe: str = ""
     last_shift_m: float | None = None

@@ -156,7 +156,7 @@ def _notes(report: Report) -> str:
     lines = suspicions(report)
     if not lines:
         return "<section><h2>What to look at</h2><p>Nothing suspicious was found.</p></section>"
-    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    items = "".join(f"<li>{escape(str(line))}</li>" for line in lines)
     return f'<section><h2>What to look at</h2><ul class="notes">{items}</ul></section>'
 
 

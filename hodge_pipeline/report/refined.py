@@ -23,8 +23,7 @@ from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.store import yaml_file
 from hodge_pipeline.store.cost import Cost
 from hodge_pipeline.store.store import versions
-
-NO_METRES = "There is no depth that tells the scale: lengths are in the model's own unit, called metres here."
+from hodge_pipeline.types.notes import Note, notes_of
 
 
 def _scales(result: RefinedModel) -> str:
@@ -40,7 +39,7 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
         f"model {number} ({result.start.quality.images} images): {result.decision.outcome}, {result.decision.reason}"
         for number, result in enumerate(results[1:], start=1)
     ]
-    metric = () if first.final_scale.is_observable else (NO_METRES,)
+    metric = () if first.final_scale.is_observable else (Note("no metres"),)
     solved = first.solved
     sets = {"start": first.start.world_from_body, "result": first.model.world_from_body}
     quality = first.start.quality
@@ -63,7 +62,7 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
         graph=graph,
         worst_edges=worst,
         stages=(StageRow("refine", cost.wall_s, cost.cpu_s, cost.peak_mb),),
-        notes=(*metric, *others, *first.notes),
+        notes=(*metric, *notes_of("refinement", (*others, *first.notes))),
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(options)),
         pictures=pictures,

@@ -15,6 +15,7 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import versions
 from hodge_pipeline.types import Edges, Floats
+from hodge_pipeline.types.notes import notes_of
 
 SOLVED = "solved.json"
 
@@ -54,7 +55,7 @@ def _report(solved: SolvedFile) -> Report:
         graph=graph_summary(_edges(solved), graph.vertex_ids, solution.component),
         worst_edges=worst_edges(_edges(solved), graph.vertex_ids),
         stages=(StageRow("solve", solved.wall_s, solved.cpu_s, float("nan")),),
-        notes=solution.notes,
+        notes=notes_of("solver", solution.notes),
         versions=versions(),
         pictures=Pictures(
             paths=tuple(Path3D(name, poses[:, :3, 3]) for name, poses in sets.items()),

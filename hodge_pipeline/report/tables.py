@@ -36,7 +36,7 @@ def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
     if report.stages:
         wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
         lines.append(("time", f"{wall:.1f} s, {cpu:.1f} CPU s, at most {_peak(report):.0f} MB"))
-    return (*lines, *(("note", line) for line in suspicions(report)))
+    return (*lines, *(("note", str(note)) for note in suspicions(report)))
 
 
 def _peak(report: Report) -> float:

@@ -12,6 +12,7 @@ from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
 from hodge_pipeline.evaluation.difference import MEASURABLE, Change, floor_of, length
 from hodge_pipeline.report.contents import GraphSummary, Report, TrajectoryRow
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.notes import Note
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
 
@@ -151,84 +152,72 @@ def floor_m(report: Report) -> float:
     return max(floor_of(*(path.positions for path in report.pictures.paths)), MEASURABLE * scale)
 
 
-def suspicions(report: Report) -> tuple[str, ...]:
-    """What a reader should distrust, one line each; the run's own notes come first."""
-    graph = () if report.graph is None else tuple(_graph_suspicions(report.graph))
-    return (
+def suspicions(report: Report) -> tuple[Note, ...]:
+    """What a reader should distrust and what else is to be known, by rank; the run's own notes come first in each."""
+    found = (
         *_unsettled(report),
         *report.notes,
-        *graph,
+        *(() if report.graph is None else _graph_suspicions(report.graph)),
         *_edge_suspicions(report),
         *_unmatched(report),
-        *(line for row in report.trajectories for line in _trajectory_suspicions(row)),
+        *(note for row in report.trajectories for note in _trajectory_suspicions(row)),
     )
+    return tuple(sorted(found, key=lambda note: note.rank))
 
 
-def _unsettled(report: Report) -> Iterator[str]:
+def _unsettled(report: Report) -> Iterator[Note]:
     scale = report.scores.scale if report.scores else 1.0
     path_m = max((_path_m(path.positions) for path in report.pictures.paths if path.name == report.after), default=0.0)
     if report.last_shift_m is not None and report.last_shift_m > max(UNSETTLED_M * scale, UNSETTLED_SHARE * path_m):
-        yield (
-            "The result is not to be trusted: the last round still moved the cameras by "
-            f"{length(report.last_shift_m)}, so the registered pairs do not agree on one scene. Frames nearer to each "
-            "other, or more texture, would help."
-        )
+        yield Note("unsettled", detail=length(report.last_shift_m))
 
 
 def _path_m(positions: Floats) -> float:
     return float(np.nansum(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
 
 
-def _graph_suspicions(graph: GraphSummary) -> Iterator[str]:
+def _graph_suspicions(graph: GraphSummary) -> Iterator[Note]:
     if len(graph.components) > 1:
-        yield (
-            f"The viewing graph falls into {len(graph.components)} parts that nothing connects: "
-            "their poses relative to each other mean nothing."
-        )
+        yield Note("parts", len(graph.components))
     alone = sum(part.count == 1 for part in graph.components)
     if alone and graph.vertices > 1:
-        yield f"{alone} of {graph.vertices} frames have no edge at all: they keep the pose they started with."
+        yield Note("alone", alone, str(graph.vertices))
     if graph.edges_ignored:
-        yield f"The solver ignored {graph.edges_ignored} of {graph.edges} edges (weight 0)."
+        yield Note("edges ignored", graph.edges_ignored, str(graph.edges))
     wrong, suspect = graph.verdicts_in_use.get("wrong", 0), graph.verdicts_in_use.get("suspect", 0)
     if wrong or suspect:
-        yield (
-            f"Of the edges that the solver used {wrong} are judged wrong and {suspect} suspect: hodge diagnose "
-            "shows them."
-        )
+        yield Note("edges wrong", wrong + suspect, f"{wrong} are judged wrong and {suspect} suspect")
     if untestable := graph.verdicts.get("untestable", 0):
-        yield f"{untestable} of {graph.edges} edges are untestable: nothing in the graph says whether they are right."
+        yield Note("untestable", untestable, str(graph.edges))
 
 
-def _edge_suspicions(report: Report) -> Iterator[str]:
+def _edge_suspicions(report: Report) -> Iterator[Note]:
     large = [
         edge
         for edge in report.worst_edges
         if edge.weight > 0 and (edge.residual_m > _large_m(report) or edge.residual_deg > LARGE_RESIDUAL_DEG)
     ]
     if large:
-        yield (
-            f"At least {len(large)} edges that the solver used are more than {length(_large_m(report))} or "
-            f"{LARGE_RESIDUAL_DEG:g}° off the result: see the worst edges."
-        )
+        yield Note("edges far off", len(large), f"{length(_large_m(report))} or {LARGE_RESIDUAL_DEG:g}°")
 
 
 def _large_m(report: Report) -> float:
     return LARGE_RESIDUAL_M * (report.scores.scale if report.scores else 1.0)
 
 
-def _unmatched(report: Report) -> Iterator[str]:
+def _unmatched(report: Report) -> Iterator[Note]:
     if report.scores is None:
         return
     for graph in report.scores.graphs:
         for name, unmatched, count in zip(report.scores.names, graph.unmatched, graph.counts, strict=True):
             if unmatched > UNMATCHED_SHARE * count:
                 pairs = f"{unmatched} of {count} {GRAPH_NAMES[graph.kind]}"
-                yield f"{name}: {pairs} have no point within {length(graph.scale * NO_NEIGHBOUR_M)} of each other."
+                far = length(graph.scale * NO_NEIGHBOUR_M)
+                yield Note("unmatched", int(unmatched), f"{name}: {pairs} have no point within {far}")
 
 
-def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[str]:
+def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[Note]:
     if row.left_out:
-        yield f"{row.name}: {row.left_out} frames without a true pose, or joined to no other, are not in its error."
+        yield Note("not in the error", row.left_out, row.name)
     if row.degenerate:
-        yield f"{row.name}: its positions lie on a line (or are fewer than three): its orientations aligned it."
+        yield Note("degenerate", detail=row.name)

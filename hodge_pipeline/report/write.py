@@ -41,7 +41,7 @@ __all__ = [
     "write_report",
 ]
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Raised when a key of `report.json` is renamed, moved or removed."""
 
 
@@ -77,7 +77,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "worst_edges": [asdict(row) for row in report.worst_edges],
         "convergence": {name: list(series) for name, series in report.pictures.convergence.items()},
         "stages": [asdict(row) for row in report.stages],
-        "notes": list(suspicions(report)),
+        "notes": [{"kind": note.kind, "count": note.count, "text": str(note)} for note in suspicions(report)],
         "versions": dict(report.versions),
         "recipe": report.recipe,
     }

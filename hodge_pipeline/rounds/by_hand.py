@@ -18,6 +18,7 @@ from hodge_pipeline.scene import Round
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.types import Bools, Edges, Floats, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, HELD_OUT, REJECTED, USED
+from hodge_pipeline.types.notes import Note
 
 ARM_M = 1.0
 """A residual rotation counts as its arc at this distance."""
@@ -87,13 +88,12 @@ def _any_joining(edges: Edges, vertex_ids: NDArray[np.generic], pairs: tuple[str
 def _tell(work: Work, edges: Edges, vertex_ids: NDArray[np.generic], history: History) -> None:
     for word in (DISABLED, ENABLED, REGISTERED):
         if pairs := [pair for pair, switch in history.switches.items() if switch == word]:
-            work.steps.note(f"edited by hand: {word} {', '.join(pairs)} ({NEXT})")
+            work.steps.note(Note("edited", len(pairs), f"{word} {', '.join(pairs)} ({NEXT})"))
     found = {pair: joining(vertex_ids, edges.pairs, pair) for pair in history.switches}
     if lost := [pair for pair, rows in found.items() if not rows.any()]:
-        work.steps.note(f"edits without effect, since the last round has no such edge: {', '.join(lost)}")
+        work.steps.note(Note("edit lost", len(lost), ", ".join(lost)))
     for pair in history.registered:
         rows = edges.select(found[pair])
         if len(rows) and not rows.in_graph.any():
-            work.steps.note(
-                f"{pair} was registered and rejected, {rows.why[-1]}: --enable {pair} lets it in all the same"
-            )
+            told = f"{pair} was registered and rejected, {rows.why[-1]}: --enable {pair} lets it in all the same"
+            work.steps.note(Note("edit rejected", detail=told))

@@ -18,6 +18,7 @@ from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.start import uses_images
 from hodge_pipeline.start.unordered.views import Views
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
+from hodge_pipeline.types.notes import Note
 
 
 @dataclass(frozen=True)
@@ -96,5 +97,5 @@ def _without_guess(
     shutil.rmtree(scratch, ignore_errors=True)
     if not found.counts.all():
         refused = ", ".join(f"{count} {reason}" for reason, count in found.rejected_counts.items())
-        step.note(f"{len(pairs)} pairs between pieces matched, {int(found.counts.sum())} may be edges ({refused})")
+        step.note(Note("matched", len(pairs), f"{int(found.counts.sum())} may be edges ({refused})"))
     return found.select(found.counts)

@@ -23,6 +23,7 @@ from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Step, Steps, W
 from hodge_pipeline.start.unordered.tour import propose_along_tour
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import HELD_OUT
+from hodge_pipeline.types.notes import notes_of
 
 EDITED = "edited"
 """The name of a round that a person's edits made."""
@@ -145,8 +146,7 @@ def solve_edges(
     weights = np.zeros(len(edges))
     weights[edges.counts] = solution.weights
     solution = replace(solution, weights=weights[edges.in_graph])
-    for note in solution.notes:
-        step.note(f"{registered.name}: {note}")
+    step.note(*notes_of("solver", (f"{registered.name}: {note}" for note in solution.notes)))
     return Round(
         with_residuals(edges, solution.world_from_cam, solution.weights), graph.vertex_ids, solution.world_from_cam,
         solution, registered.fresh, registered.before, found, edited=registered.name == EDITED,

@@ -20,6 +20,7 @@ from hodge_pipeline.stages import Step
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
+from hodge_pipeline.types.notes import Note
 
 SUGGESTED = "suggested"
 
@@ -53,10 +54,9 @@ def suggested_rounds(work: Work, rounds: Sequence[Round]) -> Iterator[Registered
         rows = np.arange(len(edges) - len(new), len(edges))
         edges, start = _judged(work, last, edges, rows, found)
         new = edges.select(rows)
-        work.steps.note(
-            f"round {number}: of {len(found.pairs)} suggested pairs {int(new.counts.sum())} became edges; before it "
-            f"{found.untestable} of {last.graph.edge_count} edges could not be tested"
-        )
+        untested = f"before it {found.untestable} of {last.graph.edge_count} edges could not be tested"
+        told = f"round {number}: of {len(found.pairs)} suggested pairs {int(new.counts.sum())} became edges; {untested}"
+        work.steps.note(Note("suggested", len(found.pairs), told))
         yield Registered(f"round {number}", work.with_measured(edges), rows, found.placed.world_from_cam, start)
 
 

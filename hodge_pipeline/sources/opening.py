@@ -41,7 +41,7 @@ def open_with_reader(
     """
     chosen = reader or guess_reader(path)
     try:
-        source = chosen.open(path)
+        source = _opened(chosen, path)
     except SourceError as error:
         likelier = _likelier(path, chosen)
         if likelier is None:
@@ -54,6 +54,13 @@ def open_with_reader(
         read_as = f"read as {registry.name_of(chosen)}, but it looks like {_described(likelier)}"
         source = replace(source, notes=(*source.notes, f"{read_as}: {_remedy(likelier.name, path, recipes)}"))
     return source, chosen
+
+
+def _opened(reader: FrameReader, path: Path) -> Source:
+    try:
+        return reader.open(path)
+    except MemoryError as error:
+        raise SourceError(f"{path}: needs more memory than there is: give a part of it, or free some") from error
 
 
 def _likelier(path: Path, chosen: FrameReader) -> Guess | None:

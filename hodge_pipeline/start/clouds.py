@@ -8,6 +8,7 @@ from hodge_pipeline.registration.clouds import CloudOptions, prepare_clouds
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.types import CloudSet, Source
+from hodge_pipeline.types.notes import notes_of
 
 
 def make_clouds(source: Source, options: CloudOptions, steps: Steps, workers: Workers) -> CloudSet:
@@ -18,8 +19,7 @@ def make_clouds(source: Source, options: CloudOptions, steps: Steps, workers: Wo
 def clouds(source: Source, options: CloudOptions, *, workers: Workers, step: Step) -> CloudSet:
     """Step: the cloud of each frame by `registration.clouds`."""
     made, notes = prepare_clouds(source.frames, options, workers, step.advance)
-    for note in notes:
-        step.note(note)
+    step.note(*notes_of("clouds", notes))
     return made
 
 

@@ -32,6 +32,7 @@ from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_poses
 from hodge_pipeline.start.odometry import OPTIONS, chain
 from hodge_pipeline.types import Edges, Floats, Source, Trajectory
+from hodge_pipeline.types.notes import Note, notes_of
 
 SAME_M = 1e-6
 """Metres: poses of a file that are this near the frames' own are the frames' own."""
@@ -75,17 +76,15 @@ class GivenStart:
         """
         matched, file = self._matched(source, steps)
         known = np.isfinite(matched.world_from_cam).all(axis=(1, 2))
-        steps.note(
-            f"{int(known.sum())} of {len(source.frames)} frames have a given pose, by {matched.how}; "
-            f"{len(matched.pose_times)} poses given"
-        )
+        told = f"{len(source.frames)} frames have a given pose, by {matched.how}; {len(matched.pose_times)}"
+        steps.note(Note("given poses", int(known.sum()), told))
         poses = matched.world_from_cam
         if not known.all():
             poses = self._bridged(source, matched, clouds, steps, workers)
         rows = choose_key_frames(
             poses, list(sequences_of(source).values()), self.distance_m, self.angle_deg, self.every
         )
-        steps.note(f"{len(rows)} of {len(source.frames)} frames are key frames")
+        steps.note(Note("key frames", len(rows), str(len(source.frames))))
         whole = without_truth(source, poses, rows, own=self.poses == "frames")
         count = len(poses)
         key_frames = KeyFrames(
@@ -128,9 +127,7 @@ class GivenStart:
         """
         known = np.flatnonzero(np.isfinite(matched.world_from_cam).all(axis=(1, 2)))
         times = np.arange(len(source.frames), dtype=float)
-        steps.note(
-            f"{len(times) - len(known)} frames without a given pose are carried from the nearest ones by odometry"
-        )
+        steps.note(Note("carried", len(times) - len(known)))
         every = make_clouds(source, clouds, steps, workers)
         sequences, stamps = tuple(sequences_of(source).values()), np.array([f.stamp_s for f in source.frames])
         title = "poses between the given ones"
@@ -157,8 +154,7 @@ def _trajectory(path: Path, steps: Steps) -> Trajectory:
     opened = guess_reader(path).open(path)
     if opened.graph is not None and opened.graph.edge_count:
         raise SourceError(f"{path}: a graph of measured edges, which needs no frames: give it to hodge solve")
-    for note in opened.notes:
-        steps.note(f"{path.name}: {note}")
+    steps.note(*notes_of("given file", (f"{path.name}: {note}" for note in opened.notes)))
     if opened.trajectory is not None:
         return opened.trajectory
     posed = [(frame.stamp_s, frame.world_from_cam) for frame in opened.frames if frame.world_from_cam is not None]

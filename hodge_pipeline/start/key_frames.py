@@ -21,6 +21,7 @@ from hodge_pipeline.scene import KeyFrames, Scene, sequence_numbers, sequences_o
 from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
+from hodge_pipeline.types.notes import Note, notes_of
 
 NOTES_SHOWN = 5
 
@@ -127,8 +128,7 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     )
     tracked = _without_lonely(tracked)
     blocks.remove()
-    for note in _notes(source, tracked, parts):
-        step.note(note)
+    step.note(*_notes(source, tracked, parts))
     return tracked
 
 
@@ -169,20 +169,17 @@ def _without_lonely(tracked: Tracked) -> Tracked:
     return tracked if lonely.all() else replace(tracked, found=tracked.found & ~lonely[tracked.anchors])
 
 
-def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[str, ...]:
-    frames, keys = len(tracked.anchors), len(tracked.key_rows)
-    notes = [f"{keys} of {frames} frames are key frames: these are registered, the others move as those around them"]
+def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[Note, ...]:
+    notes = [Note("key frames", len(tracked.key_rows), str(len(tracked.anchors)))]
     lost = np.flatnonzero(~tracked.found)
     ids = vertex_ids(source)
     if len(lost):
-        notes.append(
-            f"tracking was lost at {len(lost)} frames ({in_runs(lost, ids)}): their poses lie between their neighbours'"
-        )
+        notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
     sizes = np.bincount(tracked.piece)
     pieces = int((sizes > 1).sum())
     if pieces > len(sequences_of(source)):
-        notes.append(f"tracking was lost for good in {pieces - 1} places: {pieces} pieces of the path begin anew")
-    return (*notes, *_few(list(dict.fromkeys(note for part in parts for note in part.notes))))
+        notes.append(Note("path broken", pieces - 1, str(pieces)))
+    return (*notes, *notes_of("clouds", _few(list(dict.fromkeys(note for part in parts for note in part.notes)))))
 
 
 def _few(notes: list[str]) -> list[str]:

@@ -20,6 +20,7 @@ from hodge_pipeline.start.clouds import landmarks_for, make_clouds
 from hodge_pipeline.start.unordered.join import join_parts
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
+from hodge_pipeline.types.notes import notes_of
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
@@ -84,8 +85,7 @@ def chain(
     """Step: poses of all frames by `registration.odometry`."""
     assert clouds.folder is not None
     found = tracking.odometry(clouds.folder, sequences, stamps_s, options, workers, step.advance)
-    for note in found.notes:
-        step.note(note)
+    step.note(*notes_of("start", found.notes))
     return found
 
 

@@ -15,6 +15,8 @@ from typing import IO, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.types.input_files import open_input, read_input_text
+
 T = TypeVar("T")
 
 
@@ -77,7 +79,7 @@ def _finite(value: Any) -> Any:
 
 def read_json(path: Path) -> Any:
     """The value of a JSON file."""
-    return json.loads(path.read_text("utf-8"))
+    return json.loads(read_input_text(path))
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -87,7 +89,7 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of an `.npz`; nothing in it is executed."""
-    with np.load(path, allow_pickle=False) as file:
+    with open_input(path) as stream, np.load(stream, allow_pickle=False) as file:
         return {name: file[name] for name in file.files}
 
 

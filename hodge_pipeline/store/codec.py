@@ -40,7 +40,7 @@ def load(folder: Path, kind: Any) -> Any:
     """
     arrays = artifacts.load_arrays(folder / ARRAYS) if (folder / ARRAYS).is_file() else {}
     try:
-        return _typed(folder, json.loads((folder / TEXT).read_text("utf-8")), kind, arrays)
+        return _typed(folder, artifacts.read_json(folder / TEXT), kind, arrays)
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{folder / TEXT}: does not hold what was expected ({error})") from error
 

@@ -7,8 +7,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import psutil
+
+from hodge_pipeline.types.input_files import open_input
 
 SAMPLE_SECONDS = 0.25
 
@@ -76,8 +79,8 @@ class Monitor:
 
 def _memory_bytes(process: psutil.Process) -> int:
     try:
-        with open(f"/proc/{process.pid}/smaps_rollup") as rollup:
+        with open_input(Path(f"/proc/{process.pid}/smaps_rollup")) as rollup:
             lines = (line.split() for line in rollup)
-            return next(int(words[1]) * 1024 for words in lines if words[0] == "Pss:")
+            return next(int(words[1]) * 1024 for words in lines if words[0] == b"Pss:")
     except (OSError, StopIteration):
         return int(process.memory_info().rss)

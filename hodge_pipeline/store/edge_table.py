@@ -16,6 +16,7 @@ from hodge_pipeline.errors import WorkspaceError, not_written
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Edges
 from hodge_pipeline.types.edges import Words
+from hodge_pipeline.types.input_files import read_input_text
 
 COLUMNS = {
     "source": "proposed_by",
@@ -66,9 +67,11 @@ def read_edges(path: Path) -> tuple[Edges, Words]:
 
     Raises `WorkspaceError` for a table without the ends, source and status of its rows.
     """
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-        header = ("i", "j", *COLUMNS) if not rows else tuple(rows[0])
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_input_text(path))))
+    except (OSError, ValueError, csv.Error) as error:
+        raise WorkspaceError(f"{path}: is no table of edges ({error}): run the same recipe again") from error
+    header = ("i", "j", *COLUMNS) if not rows else tuple(rows[0])
     if missing := [name for name in LEAST if name not in header]:
         raise WorkspaceError(f"{path}: has no column {missing[0]!r}: run the same recipe again")
     names, ends = np.unique(np.array([(row["i"], row["j"]) for row in rows], np.str_), return_inverse=True)

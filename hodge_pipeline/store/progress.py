@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Protocol
 
 from hodge_pipeline.stages import Advance, no_progress
+from hodge_pipeline.types.notes import Note
 
 
 class Watcher(Protocol):
@@ -15,8 +16,8 @@ class Watcher(Protocol):
         """A context whose value is called with the units just finished, of `total` in all."""
         ...
 
-    def say(self, message: str) -> None:
-        """One line for the user: a note or a warning."""
+    def note(self, note: Note) -> None:
+        """A fact, as soon as it is known."""
         ...
 
 
@@ -27,5 +28,5 @@ class Nobody:
         """A context that shows nothing."""
         return nullcontext(no_progress)
 
-    def say(self, message: str) -> None:
+    def note(self, note: Note) -> None:
         """Nothing."""

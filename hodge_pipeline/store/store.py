@@ -25,9 +25,13 @@ from hodge_pipeline.store.log import log
 from hodge_pipeline.store.progress import Nobody, Watcher
 from hodge_pipeline.store.workspace import disk_errors
 from hodge_pipeline.types import CloudSet
+from hodge_pipeline.types.input_files import open_input, read_input_text
+from hodge_pipeline.types.notes import Note
 
 T = TypeVar("T")
 LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless", "pycolmap")
+LAYOUT = 2
+"""Raised when steps are written in another form: those of before are computed again."""
 RECORD, KEY, INDEX = "step.json", "key.txt", "index.json"
 """Of a finished step: its key, the hash of each file, notes, cost; of a begun one: its key; of a run: its steps."""
 HASHED_AT_ONCE = 1 << 22
@@ -55,7 +59,7 @@ class Store:
     """
 
     def __init__(self, folder: Path, watcher: Watcher | None = None) -> None:
-        self.folder, self.notes = folder, list[str]()
+        self.folder, self.notes = folder, list[Note]()
         self.watcher = watcher or Nobody()
         self._monitor, self._counts = Monitor(), Counter[str]()
         self._keys: dict[int, tuple[object, str]] = {}
@@ -66,14 +70,13 @@ class Store:
     ) -> T:
         """What the function returns, computed or read back: see `stages.Steps`, and `codec` for what can be stored."""
         name = self._numbered(name or function.__name__)
-        key = self.key([name, versions(), inputs])
+        key = self.key([name, LAYOUT, versions(), inputs])
         path, kind = self.folder / name, get_type_hints(function)["return"]
         if self._is_whole(path, key):
             log.info("%s: already done", title)
         else:
             self._compute(path, key, title, total, partial(function, *inputs, **resources))
-        for message in _unsealed(path / RECORD)["notes"]:
-            self.note(message)
+        self.note(*(Note(**note) for note in _unsealed(path / RECORD)["notes"]))
         value: T = codec.load(path, kind)
         self.remember(value, key)
         self._listed(name, function.__name__, title)
@@ -89,12 +92,13 @@ class Store:
         if value is not None and not isinstance(value, (bool, int, float, str)):
             self._keys[id(value)] = (value, key)
 
-    def note(self, message: str) -> None:
+    def note(self, *notes: Note) -> None:
         """Tell the user, the log and the report, once; a finished step tells its notes again in every later run."""
-        if message not in self.notes:
-            self.notes.append(message)
-            self.watcher.say(message)
-            log.warning(message)
+        for note in notes:
+            if note not in self.notes:
+                self.notes.append(note)
+                self.watcher.note(note)
+                log.warning(note)
 
     def costs(self) -> list[dict[str, Any]]:
         """Title, wall_s, cpu_s and peak_mb of each step so far, whenever it was computed; those of one title added."""
@@ -140,24 +144,24 @@ class Store:
                 return False
             _check_files(path, record["files"])
         except (OSError, ValueError) as error:
-            self.note(f"{path.name}: {error}: the step is computed again")
+            self.note(Note("damaged step", detail=f"{path.name}: {error}"))
             return False
         return True
 
     def _compute(self, path: Path, key: str, title: str, total: int, function: Callable[..., Any]) -> None:
         part = path.with_name(f"{path.name}.part")
-        notes: list[str] = []
+        notes: dict[Note, None] = {}
         log.info("%s: begins", title)
         with self._monitor.measure() as cost, disk_errors(part), self.watcher.stage(title, total) as advance:
             if _text(part / KEY) != key:
                 shutil.rmtree(part, ignore_errors=True)
                 part.mkdir(parents=True)
                 artifacts.write_text(part / KEY, key)
-            codec.save(part, function(step=Step(part, advance, notes.append)))
+            codec.save(part, function(step=Step(part, advance, lambda *told: notes.update(dict.fromkeys(told)))))
         with disk_errors(part):
             (part / KEY).unlink()
             files = {str(file.relative_to(part)): _facts(file) for file in sorted(part.rglob("*")) if file.is_file()}
-            facts = {"key": key, "title": title, "files": files, "notes": list(dict.fromkeys(notes))}
+            facts = {"key": key, "title": title, "files": files, "notes": [vars(note) for note in notes]}
             _seal(part / RECORD, {**facts, "versions": versions(), "cost": vars(cost)})
             _commit(part, path)
         log.info("%s: %.1f s wall, %.1f s CPU, %.0f MB", title, cost.wall_s, cost.cpu_s, cost.peak_mb)
@@ -247,7 +251,7 @@ def _unsealed(path: Path) -> dict[str, Any]:
 def _facts(path: Path) -> list[Any]:
     """Size and SHA-256 of a file."""
     total, size = hashlib.sha256(), 0
-    with path.open("rb") as stream:
+    with open_input(path) as stream:
         while block := stream.read(HASHED_AT_ONCE):
             total.update(block)
             size += len(block)
@@ -273,7 +277,7 @@ def _commit(part: Path, path: Path) -> None:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text("utf-8")
+        return read_input_text(path)
     except (OSError, UnicodeDecodeError):
         return ""
 

@@ -13,6 +13,7 @@ from typing import IO, Any
 
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.store import artifacts, yaml_file
+from hodge_pipeline.types.input_files import read_input
 
 RECIPE_FILE = "recipe.yaml"
 OLD_KEY_FILE = "key.json"
@@ -25,7 +26,7 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, N
 
 def identity_of(folder: Path) -> str:
     """A name of the run in a folder that stays the same when it is resumed."""
-    return hashlib.sha256((folder / RECIPE_FILE).read_bytes()).hexdigest()[:32]
+    return hashlib.sha256(read_input(folder / RECIPE_FILE)).hexdigest()[:32]
 
 
 def is_run_folder(path: Path) -> bool:
@@ -152,7 +153,7 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal
     path = folder / RECIPE_FILE
     text = yaml_file.dump(recipe)
     if path.exists():
-        if path.read_text("utf-8") == text:
+        if _is_text(path, text):
             return
         if not overwrite and _has_stages(folder / kind):
             change = _first_change(yaml_file.read(path).data, recipe)
@@ -163,6 +164,13 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal
         raise WorkspaceError(f"{folder}: is not empty and not a run folder: give another --out")
     with disk_errors(path):
         artifacts.write_text(path, text)
+
+
+def _is_text(path: Path, text: str) -> bool:
+    try:
+        return read_input(path) == text.encode()
+    except OSError as error:
+        raise WorkspaceError(f"{path}: cannot be read ({error.strerror}): remove it, or give another --out") from error
 
 
 def _has_stages(stages: Path) -> bool:

@@ -12,6 +12,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq, TaggedScalar
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.types.input_files import read_input_text
 
 MAX_BYTES = 100_000
 """A recipe with every default written out has about 3 kB; what is this long takes up to 4 s to parse."""
@@ -37,12 +38,11 @@ class Document:
 def read(path: Path) -> Document:
     """The mapping in a YAML file. Raises `RecipeError` with file and line."""
     try:
-        size = path.stat().st_size
-        text = path.read_text("utf-8") if size <= MAX_BYTES else ""
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_input_text(path, MAX_BYTES)
+    except OSError as error:
+        raise RecipeError(f"{path}: no recipe that can be read ({error.strerror}): give another file") from error
+    except UnicodeDecodeError as error:
         raise RecipeError(f"{path}: cannot be read: {error}") from error
-    if size > MAX_BYTES:
-        raise RecipeError(f"{path}: {size} bytes is no recipe; the limit is {MAX_BYTES}")
     return parse(text, str(path))
 
 

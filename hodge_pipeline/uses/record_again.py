@@ -19,6 +19,7 @@ from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.store.workspace import Workspace
 from hodge_pipeline.types import Source
+from hodge_pipeline.types.notes import Note
 
 PARTS = "recording"
 """The folder of the parts, which depend on the level and are not those that the run made."""
@@ -56,9 +57,9 @@ def _with_images(run: Run, recipe: Recipe, store: Store) -> Source:
             if [frame.frame_id for frame in opened.frames] == [frame.frame_id for frame in source.frames]:
                 source = remembered(opened, reader, store)
             else:
-                store.note(f"{opened.path}: holds other frames by now: recorded without images")
+                store.note(Note("without images", detail=f"{opened.path}: holds other frames by now"))
         except (HodgeError, OSError) as error:
-            store.note(f"recorded without images: {error}")
+            store.note(Note("without images", detail=str(error)))
     keys = key_source(source, run.key_frames.rows)
     store.remember(keys, store.key([source, run.key_frames.rows]))
     return keys

@@ -18,6 +18,7 @@ from hodge_pipeline.start.clouds import landmarks_for, make_clouds
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.start import Frames, Start, find_start
 from hodge_pipeline.types import CloudSet, Edges, Source
+from hodge_pipeline.types.notes import Note, notes_of
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
@@ -67,10 +68,9 @@ def start_without_guess(
     scratch = step.folder / "scratch"
     found = find_start(frames, options, scratch, workers, step.advance)
     shutil.rmtree(scratch, ignore_errors=True)
-    for note in found.notes:
-        step.note(note)
+    step.note(*notes_of("start", found.notes))
     if edges is not None and world_from_cam is not None and _stays(source, edges, found):
-        step.note("nothing joins what tracking left apart: it starts where the guessed motion puts it")
+        step.note(Note("left apart"))
         return replace(found, edges=edges, world_from_cam=world_from_cam)
     return found
 

@@ -1,0 +1,70 @@
+"""The one way to open an input file, which is not trusted: a regular one, opened without waiting, read to a limit."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from io import BytesIO, TextIOWrapper
+from pathlib import Path
+from typing import BinaryIO
+
+MAX_WHOLE_BYTES = 1 << 31
+"""What is read whole is no longer: 2 GiB of text are 20 million edges, or a model of 10,000 images with its tracks."""
+_KINDS = {
+    stat.S_IFDIR: (errno.EISDIR, "a folder"),
+    stat.S_IFIFO: (errno.EINVAL, "a pipe"),
+    stat.S_IFSOCK: (errno.EINVAL, "a socket"),
+    stat.S_IFCHR: (errno.EINVAL, "a device"),
+    stat.S_IFBLK: (errno.EINVAL, "a device"),
+}
+
+
+def open_input(path: Path) -> BinaryIO:
+    """The file, for reading bytes. Raises `OSError` for what is missing and at once for what is no regular file.
+
+    A pipe would wait for a writer, a device never end: both are looked at before they are opened, and after.
+    """
+    try:
+        _check_regular(path, os.stat(path).st_mode)
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0))
+    except ValueError as error:  # a zero byte in the name
+        raise OSError(errno.EINVAL, "no name of a file", str(path)) from error
+    try:
+        _check_regular(path, os.fstat(handle).st_mode)
+        return os.fdopen(handle, "rb")
+    except BaseException:
+        os.close(handle)
+        raise
+
+
+def read_input(path: Path, limit: int = MAX_WHOLE_BYTES) -> bytes:
+    """All bytes of the file. Raises `OSError` as `open_input` does, and for more bytes than the limit."""
+    with open_input(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise OSError(errno.EFBIG, f"holds {size} bytes, the limit is {limit}", str(path))
+        return file.read(size)
+
+
+def read_input_text(path: Path, limit: int = MAX_WHOLE_BYTES, *, errors: str = "strict") -> str:
+    """The text of a UTF-8 file, with or without a byte-order mark, its line ends as one newline each.
+
+    Raises `OSError` as `read_input` does, `UnicodeDecodeError` unless `errors` is another way to treat wrong bytes.
+    """
+    return TextIOWrapper(BytesIO(read_input(path, limit)), encoding="utf-8-sig", errors=errors).read()
+
+
+def beginning(path: Path, size: int) -> bytes:
+    """The first bytes of the file, by which a reader knows its format; none where it cannot be read."""
+    try:
+        with open_input(path) as file:
+            return file.read(size)
+    except OSError:
+        return b""
+
+
+def _check_regular(path: Path, mode: int) -> None:
+    if not stat.S_ISREG(mode):
+        number, kind = _KINDS.get(stat.S_IFMT(mode), (errno.EINVAL, "something else"))
+        raise OSError(number, f"is {kind}, no file", str(path))

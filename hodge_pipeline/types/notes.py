@@ -1,0 +1,138 @@
+"""Facts that a run reports: they travel as values, and become sentences where a person reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Rank(IntEnum):
+    """How much a reader should heed a note: it puts the result in doubt, needs a look, or only informs."""
+
+    DOUBT = 0
+    LOOK = 1
+    FACT = 2
+
+
+WORDING: dict[str, tuple[Rank, str]] = {
+    # What stages report in their own words.
+    "reader": (Rank.FACT, "{detail}"),
+    "clouds": (Rank.FACT, "{detail}"),
+    "start": (Rank.FACT, "{detail}"),
+    "measured": (Rank.FACT, "{detail}"),
+    "solver": (Rank.FACT, "{detail}"),
+    "fuser": (Rank.FACT, "{detail}"),
+    "recording": (Rank.FACT, "{detail}"),
+    "refinement": (Rank.FACT, "{detail}"),
+    # What a run does.
+    "single frame": (
+        Rank.LOOK,
+        "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
+    ),
+    "scale": (Rank.LOOK, "{detail}"),
+    "given poses": (Rank.FACT, "{count} of {detail} poses given"),
+    "given file": (Rank.FACT, "{detail}"),
+    "key frames": (
+        Rank.FACT,
+        "{count} of {detail} frames are key frames: these are registered, the others move as those around them",
+    ),
+    "tracking lost": (
+        Rank.LOOK,
+        "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
+    ),
+    "path broken": (
+        Rank.LOOK,
+        "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
+    ),
+    "carried": (Rank.LOOK, "{count} frames without a given pose are carried from the nearest ones by odometry"),
+    "left apart": (Rank.LOOK, "nothing joins what tracking left apart: it starts where the guessed motion puts it"),
+    "matched": (Rank.FACT, "{count} pairs between pieces matched, {detail}"),
+    "suggested": (Rank.FACT, "{detail}"),
+    "no decomposition": (Rank.LOOK, "{detail}"),
+    "scores of before": (
+        Rank.FACT,
+        "the scores are not measured again after an edit: hodge run, as before, measures them",
+    ),
+    "fused key frames": (
+        Rank.FACT,
+        "fused after an edit: the {count} key frames alone; hodge run, as before, fuses all frames",
+    ),
+    "damaged step": (Rank.LOOK, "{detail}: the step is computed again"),
+    "without images": (Rank.LOOK, "recorded without images: {detail}"),
+    # Edits and refinements.
+    "edited": (Rank.FACT, "edited by hand: {detail}"),
+    "edit lost": (Rank.LOOK, "edits without effect, since the last round has no such edge: {detail}"),
+    "edit rejected": (Rank.LOOK, "{detail}"),
+    "guard": (Rank.FACT, "{detail}"),
+    "held out": (Rank.FACT, "{count} overlapping pairs were kept out of the solve: clouds there {detail}"),
+    "nothing held out": (
+        Rank.LOOK,
+        "no overlapping pair was left to judge the result by: only the edges' own chi2 does",
+    ),
+    "other format": (Rank.LOOK, "poses are not written back into {detail}: refined.tum holds them"),
+    # What a report finds.
+    "unsettled": (
+        Rank.DOUBT,
+        "The result is not to be trusted: the last round still moved the cameras by {detail}, so the registered pairs "
+        "do not agree on one scene. Frames nearer to each other, or more texture, would help.",
+    ),
+    "parts": (
+        Rank.DOUBT,
+        "The viewing graph falls into {count} parts that nothing connects: their poses relative to each other mean "
+        "nothing.",
+    ),
+    "alone": (Rank.LOOK, "{count} of {detail} frames have no edge at all: they keep the pose they started with."),
+    "edges ignored": (Rank.FACT, "The solver ignored {count} of {detail} edges (weight 0)."),
+    "edges wrong": (Rank.LOOK, "Of the edges that the solver used {detail}: hodge diagnose shows them."),
+    "untestable": (
+        Rank.LOOK,
+        "{count} of {detail} edges are untestable: nothing in the graph says whether they are right.",
+    ),
+    "edges far off": (
+        Rank.LOOK,
+        "At least {count} edges that the solver used are more than {detail} off the result: see the worst edges.",
+    ),
+    "unmatched": (Rank.LOOK, "{detail} of each other."),
+    "not in the error": (
+        Rank.FACT,
+        "{detail}: {count} frames without a true pose, or joined to no other, are not in its error.",
+    ),
+    "degenerate": (
+        Rank.FACT,
+        "{detail}: its positions lie on a line (or are fewer than three): its orientations aligned it.",
+    ),
+    "no metres": (
+        Rank.LOOK,
+        "There is no depth that tells the scale: lengths are in the model's own unit, called metres here.",
+    ),
+}
+"""Each kind's rank, and its sentence: `{count}` and `{detail}` are the note's."""
+
+
+@dataclass(frozen=True)
+class Note:
+    """A fact of a run: its kind (see `WORDING`), how many it concerns, and what in particular; `str` gives the
+    sentence.
+    """
+
+    kind: str
+    count: int = 1
+    detail: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in WORDING:
+            raise ValueError(f"'{self.kind}' is no kind of note: use {', '.join(WORDING)}")
+
+    def __str__(self) -> str:
+        return WORDING[self.kind][1].format(count=self.count, detail=self.detail)
+
+    @property
+    def rank(self) -> Rank:
+        """How much a reader should heed it."""
+        return WORDING[self.kind][0]
+
+
+def notes_of(kind: str, details: Iterable[str]) -> tuple[Note, ...]:
+    """A note of one kind for each of these details, which are sentences of a stage."""
+    return tuple(Note(kind, detail=detail) for detail in details)

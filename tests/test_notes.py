@@ -1,0 +1,25 @@
+"""Notes: facts that travel as values and become sentences at the end."""
+
+import string
+
+import pytest
+
+from hodge_pipeline.types.notes import WORDING, Note, Rank
+
+
+@pytest.mark.parametrize("kind", WORDING)
+def test_each_kind_tells_all_that_it_is_given(kind: str) -> None:
+    asked = {name for _, name, _, _ in string.Formatter().parse(WORDING[kind][1]) if name}
+    sentence = str(Note(kind, 17, "seq-01 {x}"))
+    assert ("17" in sentence) == ("count" in asked) and ("seq-01 {x}" in sentence) == ("detail" in asked)
+    assert asked <= {"count", "detail"}
+
+
+def test_an_unknown_kind_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="'frobnicated' is no kind of note"):
+        Note("frobnicated")
+
+
+def test_doubt_comes_before_what_only_informs() -> None:
+    notes = [Note("solver", detail="a"), Note("parts", 2), Note("untestable", 3, "9")]
+    assert [note.rank for note in sorted(notes, key=lambda note: note.rank)] == [Rank.DOUBT, Rank.LOOK, Rank.FACT]
