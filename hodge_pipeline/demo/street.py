@@ -105,7 +105,7 @@ def _side(rng: np.random.Generator, half_length_m: float, away_m: float) -> Iter
             yield from _house(rng, x + width / 2, line - facing * setback, facing, width, height)
             x += width + (rng.uniform(1.5, 5) if rng.random() < 0.4 else 0.0)
         kerb = -away_m - facing * KERB_M
-        for x in np.arange(-half_length_m + 8, half_length_m - 8, 6.0) + rng.uniform(-2, 2, 1):
+        for x in np.arange(CORNER_M - half_length_m, half_length_m - CORNER_M, 6.0):
             yield from _on_pavement(rng, float(x) + float(rng.uniform(-1.5, 1.5)), kerb, facing)
 
 

@@ -69,13 +69,15 @@ class Landmarks:
 class PointCloud:
     """Points of one frame, in its camera's axes: `points_in_cam (N, 3)` metres, unit normals, 8-bit RGB.
 
-    `landmarks` are other points, of the frame's image; None where nobody asked for them.
+    `landmarks` are other points, of the frame's image; None where nobody asked for them. `times_s (N,)` is when each
+    point was measured, seconds after the first, by a scanner that turns while it moves; None where nobody says.
     """
 
     points_in_cam: Floats32
     normals_in_cam: Floats32 | None = None
     colours: Bytes | None = None
     landmarks: Landmarks | None = None
+    times_s: Floats32 | None = None
 
     def __len__(self) -> int:
         return len(self.points_in_cam)

@@ -45,6 +45,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
     ),
+    "sweeps untimed": (
+        Rank.FACT,
+        "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an instant",
+    ),
     "carried": (Rank.LOOK, "{count} frames without a given pose are carried from the nearest ones by odometry"),
     "left apart": (Rank.LOOK, "nothing joins what tracking left apart: it starts where the guessed motion puts it"),
     "matched": (Rank.FACT, "{count} pairs between pieces matched, {detail}"),
