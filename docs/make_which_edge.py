@@ -21,7 +21,7 @@ from hodge_pipeline.diagnosis.result import WRONG
 from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.report import splat
+from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_plots import draw
 from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.run_folder import Run
@@ -51,13 +51,13 @@ def write_loops(path: Path, source: Path) -> None:
     write_g2o(path, ViewGraph.from_edges(np.arange(len(frames.frames)), pairs, measured, information, source="loop"))
 
 
-def from_above(path: Path, folder: Path, world_from_cam: Floats, stand: splat.Stand | None) -> splat.Stand:
+def from_above(path: Path, folder: Path, world_from_cam: Floats, view: raster.View | None) -> raster.View:
     """A picture of all clouds laid together by these poses, and where it was taken from."""
     clouds = Run.load(folder).clouds
-    scene = splat.merged(clouds, world_from_cam, np.arange(len(clouds)))
-    stand = stand or splat.stands(scene, world_from_cam)["front"]
-    path.write_bytes(splat.jpeg(splat.picture(scene, stand)))
-    return stand
+    scene = raster.merged(clouds, world_from_cam, np.arange(len(clouds)))
+    view = view or raster.around(scene, world_from_cam)["front"]
+    path.write_bytes(raster.jpeg(raster.picture(scene, view)))
+    return view
 
 
 def stacked(path: Path, jpegs: list[bytes]) -> None:
@@ -89,10 +89,10 @@ def main(folder: Path) -> None:
     print("\n".join(found.commands))
     rows = np.array([row for row in found.rows if found.subject.graph.source[row] != "sequential"][:1])
     (edge,) = edge_pictures(found.subject.graph, found.diagnosis, rows, found.subject.frames, found.subject.clouds)
-    stacked(PICTURES / "which-edge-wrong.jpg", [plot.png for plot in edge.plots])
+    stacked(PICTURES / "which-edge-wrong.jpg", [plot.image for plot in edge.plots])
     matrix, above, *_ = draw(found.subject.graph, found.diagnosis, ())
-    (PICTURES / "which-edge-matrix.png").write_bytes(matrix.png)
-    (PICTURES / "which-edge-above.png").write_bytes(above.png)
+    (PICTURES / "which-edge-matrix.png").write_bytes(matrix.image)
+    (PICTURES / "which-edge-above.png").write_bytes(above.image)
 
     names, graph = found.subject.graph.vertex_ids, found.subject.graph
     wrong = [names[graph.edges[row]] for row in found.rows if found.diagnosis.verdict[row] == WRONG]

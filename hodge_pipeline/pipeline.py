@@ -24,6 +24,7 @@ from hodge_pipeline.refine import verdict
 from hodge_pipeline.refine.poses import refine_poses
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report import run_files
+from hodge_pipeline.rounds.all_frames import pose_all_frames
 from hodge_pipeline.rounds.by_hand import edited_rounds
 from hodge_pipeline.rounds.one_round import Registered, Work
 from hodge_pipeline.rounds.suggested import suggested_rounds
@@ -31,6 +32,7 @@ from hodge_pipeline.run_folder import Run, begin, check_layout, end, opening_of
 from hodge_pipeline.scene import Round, Scene
 from hodge_pipeline.sources.measured_edges import measured_edges
 from hodge_pipeline.sources.opening import open_with_reader, remembered
+from hodge_pipeline.start.truth import with_truth
 from hodge_pipeline.store.log import logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
@@ -108,8 +110,8 @@ class _Job:
                 work = Work(job.recipe, job.store, scene, job.measured(scene), workers)
                 rounds, scores = job.compute(work, recording)
                 refined = verdict.finish(work, job.workspace.folder, rounds) if scene.is_given else None
+                poses = job.refine(work, rounds[-1], refined)
                 pool.close()  # fusing needs their memory
-                poses = job.refine(scene, rounds[-1], refined)
                 keys_only = job.again and rounds[-1].edited
                 models = fuse_all(job.recipe.fusion, scene, poses, job.store, keys_only=keys_only)
                 recording.models(models)
@@ -128,7 +130,7 @@ class _Job:
         self.store.note(*notes_of("reader", source.notes))
         if len(source.frames) == 1:
             self.store.note(Note("single frame", detail=str(path)))
-        return remembered(source, reader, self.store)
+        return with_truth(remembered(source, reader, self.store), self.recipe.evaluation.truth, self.store)
 
     def measured(self, scene: Scene) -> ViewGraph:
         """The edges that come measured, over the key frames: they join every round's graph as they are."""
@@ -141,7 +143,7 @@ class _Job:
         rounds = [work.scene.first]
         for number in range(1, self.recipe.outer_iterations + 1):
             proposed = work.propose(number, rounds[-1])
-            registered = work.register(number, proposed, rounds[-1].world_from_cam)
+            registered = work.register(number, proposed, rounds[-1])
             rounds.append(self.consistent(work, registered))
             recording.round(number, rounds[-1])
         for more in chain(suggested_rounds(work, rounds), edited_rounds(work, self.workspace.folder, rounds)):
@@ -169,17 +171,22 @@ class _Job:
         """The scores of every round, where they are wished for."""
         if not self.recipe.evaluation.tables:
             return None
-        if self.again:
+        if self.again and rounds[-1].edited:
             self.store.note(Note("scores of before"))
             return None
         scale = float(self.recipe.scale)
         return score_rounds(work.scene.source, work.scene.clouds, rounds, scale, self.store, work.workers)
 
-    def refine(self, scene: Scene, last: Round, refined: Refined | None) -> Floats:
+    def refine(self, work: Work, last: Round, refined: Refined | None) -> Floats:
         """The final poses (N, 4, 4) of all frames: those that follow from the last round, or that its guard kept,
         refined where the recipe says how.
         """
-        poses = scene.key_frames.expand(last.world_from_cam) if refined is None else refined.world_from_cam
+        scene = work.scene
+        poses = (
+            pose_all_frames(scene, last.world_from_cam, self.store, work.workers)
+            if refined is None
+            else refined.world_from_cam
+        )
         if self.recipe.refiner is None:
             return poses
         title, total = "refine", len(poses)

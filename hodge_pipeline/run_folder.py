@@ -16,17 +16,18 @@ from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.rounds.one_round import judge_edges, solve_edges
-from hodge_pipeline.scene import KeyFrames, Round, Scene
+from hodge_pipeline.scene import KeyFrames, Round, Scene, given_poses, true_poses
 from hodge_pipeline.stages import Step
 from hodge_pipeline.store.store import stored, stored_clouds
 from hodge_pipeline.store.workspace import OLD_KEY_FILE, RECIPE_FILE, RUN, is_run_folder
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, Source
+from hodge_pipeline.types.text import command
 
 
 @dataclass(frozen=True)
 class FrameTable:
     """The frames of a source in columns: `frame_ids`, `stamps_s`, `sequences (N,)`, `cameras (N, 6)` (width, height,
-    fx, fy, cx, cy) and poses `world_from_cam (N, 4, 4)` of the source's own, NaN where it has none.
+    fx, fy, cx, cy), poses `world_from_cam (N, 4, 4)` of the source's own and true ones, NaN where it has none.
     """
 
     name: str
@@ -37,6 +38,7 @@ class FrameTable:
     sequences: np.ndarray
     cameras: Floats
     world_from_cam: Floats
+    true_world_from_cam: Floats
 
     @classmethod
     def of(cls, source: Source) -> FrameTable:
@@ -50,19 +52,23 @@ class FrameTable:
             stamps_s=np.array([frame.stamp_s for frame in frames], float),
             sequences=np.array([frame.sequence for frame in frames], np.str_),
             cameras=np.array([_numbers(frame.camera) for frame in frames]).reshape(-1, 6),
-            world_from_cam=np.array([_pose(frame) for frame in frames]).reshape(-1, 4, 4),
+            world_from_cam=given_poses(source),
+            true_world_from_cam=true_poses(source),
         )
 
     def source(self) -> Source:
         """A source of these frames, without images."""
         rows = zip(
             self.frame_ids.tolist(), self.stamps_s.tolist(), self.sequences.tolist(), self.cameras,
-            self.world_from_cam, strict=True,
+            self.world_from_cam, self.true_world_from_cam, strict=True,
         )  # fmt: skip
         frames = tuple(
-            Frame(name, stamp, _camera(camera), world_from_cam=_known(pose), sequence=sequence)
-            for name, stamp, sequence, camera, pose in rows
-        )
+            Frame(
+                name, stamp, _camera(camera), world_from_cam=_known(pose), true_world_from_cam=_known(true),
+                sequence=sequence,
+            )
+            for name, stamp, sequence, camera, pose, true in rows
+        )  # fmt: skip
         return Source(self.name, Path(self.path), frames, notes=self.notes)
 
 
@@ -188,7 +194,7 @@ def check_layout(folder: Path) -> None:
     if not is_run_folder(folder):
         raise WorkspaceError(f"{folder}: is no run folder: there is no {RECIPE_FILE} with steps in it")
     if any((folder / RUN).glob(f"*/{OLD_KEY_FILE}")):
-        again = f"hodge run {folder / RECIPE_FILE} --out {folder} --overwrite"
+        again = command("hodge", "run", folder / RECIPE_FILE, "--out", folder, "--overwrite")
         raise WorkspaceError(f"{folder}: was made in the layout of an earlier version: '{again}' makes it again")
 
 
@@ -202,10 +208,6 @@ def _camera(numbers: Floats) -> Camera | None:
     if np.isnan(numbers).any():
         return None
     return Camera(int(numbers[0]), int(numbers[1]), *map(float, numbers[2:]))
-
-
-def _pose(frame: Frame) -> Floats:
-    return np.full((4, 4), np.nan) if frame.world_from_cam is None else frame.world_from_cam
 
 
 def _known(pose: Floats) -> Floats | None:

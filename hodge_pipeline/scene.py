@@ -17,7 +17,9 @@ from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution,
 from hodge_pipeline.types.edges import REJECTED
 
 START = "start"
-"""The name of first poses that are not odometry's."""
+"""The name of given poses, and of first poses that are not odometry's."""
+FIRST = "first poses"
+"""Their name where they are not the given ones."""
 
 
 @dataclass(frozen=True)
@@ -128,11 +130,20 @@ class Drift:
 
 @dataclass(frozen=True)
 class GivenFile:
-    """A file of given poses, what it holds, and the moments (P,) of its poses on the clock of `KeyFrames.times`."""
+    """A file of given poses, what it holds, and the moments (P,) of its poses on the clock of `KeyFrames.times`.
+
+    `true_world_from_cam (P, 4, 4)` is the truth nearest to each pose, NaN where there is none.
+    """
 
     path: Path
     trajectory: Trajectory
     pose_times: Floats
+    true_world_from_cam: Floats
+
+    def expand(self, key_frames: KeyFrames, world_from_key: Floats) -> Floats:
+        """The poses (P, 4, 4) of the file, corrected as the key frames (K, 4, 4) were."""
+        times, poses = key_frames.times[key_frames.rows], self.trajectory.world_from_cam
+        return spread_correction(self.pose_times, poses, times, key_frames.world_from_key, world_from_key)
 
 
 @dataclass(frozen=True)
@@ -140,7 +151,8 @@ class Scene:
     """The whole source, its key frames as a source of their own, their clouds, and the first round: edges and poses.
 
     `drift`: None where the first poses are not odometry's; `given`: the file that they come from, where there is one;
-    `in_order`: whether frames that follow each other in the source do so in time.
+    `in_order`: whether frames that follow each other in the source do so in time; `sightings`: the folder of what
+    frames that are no key frames saw of these, where they were tracked.
     """
 
     whole: Source
@@ -152,6 +164,7 @@ class Scene:
     is_given: bool = False
     given: GivenFile | None = None
     in_order: bool = True
+    sightings: Path | None = None
 
 
 def key_source(whole: Source, rows: Ints) -> Source:
@@ -196,24 +209,43 @@ def _filled(poses: Floats, found: Bools, times: Floats) -> Floats:
     return np.asarray(out)
 
 
-def pose_sets(rounds: Sequence[Round]) -> dict[str, Floats]:
-    """The poses by name: odometry (or start), round 1, …, result."""
-    names = [rounds[0].name, *(f"round {number}" for number in range(1, len(rounds) - 1)), "result"]
-    return {name: one.world_from_cam for name, one in zip(names, rounds, strict=True)}
+def pose_sets(rounds: Sequence[Round], source: Source) -> dict[str, Floats]:
+    """The poses by name: start, odometry, round 1, …, result.
+
+    `start` are poses that the run started from, or that the source gives and that are not called true.
+    """
+    first = rounds[0].name
+    sets: dict[str, Floats] = {}
+    if has_given(source):
+        sets[START], first = given_poses(source), FIRST if first == START else first
+    names = [first, *(f"round {number}" for number in range(1, len(rounds) - 1)), "result"]
+    return sets | {name: one.world_from_cam for name, one in zip(names, rounds, strict=True)}
+
+
+def given_poses(source: Source) -> Floats:
+    """The poses (N, 4, 4) that the source gives, NaN where a frame has none."""
+    return _matrices([frame.world_from_cam for frame in source.frames])
 
 
 def true_poses(source: Source) -> Floats:
-    """The source's own poses (N, 4, 4), NaN where a frame has none."""
-    poses = np.full((len(source.frames), 4, 4), np.nan)
-    for row, frame in enumerate(source.frames):
-        if frame.world_from_cam is not None:
-            poses[row] = frame.world_from_cam
-    return poses
+    """The true poses (N, 4, 4), NaN where a frame has none."""
+    return _matrices([frame.true_world_from_cam for frame in source.frames])
+
+
+def _matrices(poses: Sequence[Floats | None]) -> Floats:
+    return np.array([np.full((4, 4), np.nan) if pose is None else pose for pose in poses]).reshape(-1, 4, 4)
+
+
+def has_given(source: Source) -> bool:
+    """Whether the source gives poses to at least half of its frames, and these are not the true ones."""
+    given, true = given_poses(source), true_poses(source)
+    known = np.isfinite(given).all(axis=(1, 2)) & (given != true).any(axis=(1, 2))
+    return bool(known.sum() > 1 and 2 * known.sum() >= len(known))
 
 
 def has_truth(source: Source) -> bool:
-    """Whether there are at least two poses of the source's own to compare with."""
-    return sum(frame.world_from_cam is not None for frame in source.frames) > 1
+    """Whether there are at least two true poses to compare with."""
+    return sum(frame.true_world_from_cam is not None for frame in source.frames) > 1
 
 
 def sequences_of(source: Source) -> dict[str, Ints]:

@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from hodge_pipeline.scene import Scene
 from hodge_pipeline.types import (
+    Bools,
     CloudSet,
     Edges,
     Floats,
@@ -222,10 +223,11 @@ class Fuser(Protocol):
 class Writer(Protocol):
     """Writes what another program reads."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> Sequence[str] | None:
         """One file or folder, written atomically, of what it can hold: a trajectory, a graph.
 
-        `SourceError` where the source has nothing of that kind.
+        Gives what was written, counted, and what the format cannot hold, a line each, or None. `SourceError` where the
+        source has nothing of that kind.
         """
         ...
 
@@ -306,15 +308,34 @@ class TrackedModel(Protocol):
         """The model in another unit of length."""
         ...
 
-    def moved(self, world_from_body: Floats) -> TrackedModel:
-        """The bodies at these poses (B, 4, 4), the points where their rays then meet; points that are one are merged
-        where measurements say so.
-        """
+    @property
+    def held_apart(self) -> int:
+        """How many pairs of images are well matched while they hardly share a point."""
         ...
 
-    def adjusted(self, priors: PositionPriors | None = None) -> tuple[TrackedModel, Floats]:
-        """Bundle adjustment of poses and points, cameras held; and the standard errors (B, 2) of each body's rotation
-        and position, radians and units.
+    def resected(self, bodies: Bools | None = None) -> Floats:
+        """Poses (B, 4, 4): of the chosen bodies (B,), all by default, those that the points as they are give them."""
+        ...
+
+    def moved(self, world_from_body: Floats) -> TrackedModel:
+        """The bodies at these poses (B, 4, 4), each point where that fits its observations best."""
+        ...
+
+    def merged(self) -> TrackedModel:
+        """Points that a match calls one merged where one position fits; this very model where there are none."""
+        ...
+
+    def adjusted(self, priors: PositionPriors | None = None) -> TrackedModel:
+        """Bundle adjustment of poses and points, cameras held. Raises `SourceError` where it fails."""
+        ...
+
+    def standard_errors(self) -> Floats:
+        """Standard errors (B, 2) of each body's rotation and position, radians and units."""
+        ...
+
+    def held_out_errors(self, entries: Bools, *, move_bodies: bool) -> Floats:
+        """Errors (H,) in pixels of the observations chosen from the N of `quality`, after an adjustment of the points,
+        and of the bodies where those move, without them; those that their points cannot spare are left out.
         """
         ...
 

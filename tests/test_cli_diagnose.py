@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +24,11 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.energy import energy_rows
 from hodge_pipeline.errors import GraphError, HodgeError
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.report import raster
+from hodge_pipeline.report.diagnosis_page import frames_table
 from hodge_pipeline.report.diagnosis_plots import side_by_side as pieces_apart
+from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views
 from hodge_pipeline.report.matches import side_by_side
-from hodge_pipeline.report.two_clouds import FIRST, SECOND, picture, views
 from hodge_pipeline.types import PointCloud, ViewGraph
 from hodge_pipeline.uses.diagnosed import open_subject
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
@@ -92,7 +95,7 @@ def test_the_files_say_the_same(wrong_edge: tuple[Path, str, ViewGraph]) -> None
 def test_the_page_needs_nothing_but_itself(wrong_edge: tuple[Path, str, ViewGraph]) -> None:
     folder, _, graph = wrong_edge
     page = (folder / "why/diagnosis.html").read_text()
-    assert not re.search(r"(src|href)=[\"'](?!data:)", page)
+    assert not re.search(r"(src|href)=[\"'](?!data:|#)", page)
     assert "1 of 36 edges is wrong" in page
     assert page.count("<img ") == 3
     i, j = graph.vertex_ids[graph.edges[17]]
@@ -113,6 +116,17 @@ def test_the_recording_holds_verdicts_triangles_and_loops(wrong_edge: tuple[Path
     assert lines["/world/verdicts/consistent"] == 35
     assert lines["/world/curl/triangles"] == flag_complex(graph.edges, graph.vertex_count).counts[2]
     assert lines["/world/curl/loops"] == 1
+
+
+def test_frames_that_several_bad_edges_share_are_named() -> None:
+    graph, _ = ring(reach=3)
+    found = diagnose(graph)
+    bad = np.flatnonzero((graph.edges == 4).any(axis=1))[:3]
+    verdict = np.array(found.verdict, dtype="<U12")
+    verdict[bad] = "wrong"
+    table = frames_table(graph, replace(found, verdict=verdict))
+    assert table.rows[0][:3] == ("104", "3", "6") and len(table.rows) == 1
+    assert frames_table(graph, found).rows == ()
 
 
 def test_json_has_every_edge(tmp_path: Path) -> None:
@@ -215,15 +229,20 @@ def test_two_clouds_are_drawn_where_they_are() -> None:
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)), axis=-1).reshape(-1, 2)
     left = PointCloud(np.column_stack([grid, np.full(len(grid), 2.0)]).astype(np.float32))
     i_from_j = se3.from_parts(np.eye(3), np.array([3.0, 0, 0]))
-    both = np.concatenate([left.points_in_cam, left.points_in_cam + [3, 0, 0]])
-    ahead, above = views(both, np.array([0.0, -1.0, 0.0]))
-    image = picture(left, left, i_from_j, ahead).astype(int)
+    ahead, above = _views(left, left, [i_from_j], np.array([0.0, -1.0, 0.0]))
+    both = raster.two(left, left, i_from_j, (BLUE, ORANGE))
+    image = raster.picture(both, ahead).astype(int)
     blue, orange = (
-        np.abs(image / image.sum(2, keepdims=True) - tint / tint.sum()).sum(2) < 0.05 for tint in (FIRST, SECOND)
+        np.abs(image / image.sum(2, keepdims=True) - np.divide(tint, sum(tint))).sum(2) < 0.05
+        for tint in (BLUE, ORANGE)
     )
     assert blue.sum() > 500 and orange.sum() > 500
     assert np.flatnonzero(blue.any(0)).max() < np.flatnonzero(orange.any(0)).min()
-    assert (picture(left, left, i_from_j, above) < 255).any(2).sum() < blue.sum()
+    assert (raster.picture(both, above) < 255).any(2).sum() < blue.sum()
+
+
+def test_a_small_offset_is_enlarged_until_it_is_seen() -> None:
+    assert [_exaggeration(size, 2.0) for size in (0.0, 0.3, 0.07, 0.02, 0.001, 1e-9)] == [1, 1, 1, 5, 100, 100]
 
 
 def test_an_image_matches_itself_and_nothing_else() -> None:

@@ -107,6 +107,7 @@ def test_an_edge_is_taken_out_the_run_resumes_with_it_and_undo_gives_the_old_pos
     np.testing.assert_array_equal(again.result.world_from_cam, before)
     assert "disabled" not in statuses(folder).values()
     assert not any("edited" in str(note) for note in again.report.notes)
+    assert again.report.scores is not None, "without an edit the report has its scores again"
 
 
 def test_a_rejected_pair_is_let_in(run: Run) -> None:

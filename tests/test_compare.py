@@ -63,7 +63,7 @@ def test_page_and_recording(tmp_path: Path) -> None:
     page, recording = write_comparison(tmp_path / "out", found)
     text, addresses = read_page(page)
     assert "a and b" in text and "laid onto A by the 12 frames" in text
-    assert len(addresses) == 5 and all(address.startswith("data:image/") for address in addresses)
+    assert len(addresses) == 7 and all(address.startswith("data:image/") for address in addresses)
     for side in "ab":
         poses = np.squeeze(rows(recording, f"{layout.WORLD}/{side}/poses", "Transform3D:translation"))
         np.testing.assert_allclose(np.float32(poses), np.float32(circle()[:, :3, 3]), atol=2e-6)

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.paper.sequences import associate
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.evaluation.trajectory import absolute_error, align, relative_error
+from hodge_pipeline.evaluation.trajectory import absolute_error, align, associate, relative_error
 from hodge_pipeline.types import Floats
 
 EVO = "trajectories/evo"
@@ -174,7 +173,7 @@ def test_unequal_lengths_are_refused() -> None:
         relative_error(random_poses(3), random_poses(3), 0)
 
 
-def test_association_is_mutual_and_within_the_limit() -> None:
+def test_the_shorter_list_takes_the_nearest_within_the_limit() -> None:
     stamps_a = np.array([0.0, 1.0, 1.004, 2.0, 9.0])
     stamps_b = np.array([-0.5, 0.005, 1.003, 2.02])
     rows_a, rows_b = associate(stamps_a, stamps_b, 0.01)
@@ -182,3 +181,5 @@ def test_association_is_mutual_and_within_the_limit() -> None:
     assert associate(stamps_a, stamps_b, 0.03)[0].tolist() == [0, 2, 3]
     assert [len(rows) for rows in associate(stamps_a, np.zeros(0))] == [0, 0]
     assert [rows.tolist() for rows in associate(np.array([1.0]), np.array([1.0]))] == [[0], [0]]
+    rows_a, rows_b = associate(np.array([0.004, 1.0, 2.02]), np.array([0.0, 0.006, 0.992, 2.0]))
+    assert (rows_a.tolist(), rows_b.tolist()) == ([0, 1], [1, 2]), "the longer list has the nearest of each"

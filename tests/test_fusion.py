@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -163,6 +164,17 @@ def test_only_every_second_frame() -> None:
     model = TsdfFuser(voxel_m=0.04, every=2).fuse(frames, poses, done.append)
     assert sum(done) == 8
     assert_same(model, TsdfFuser(voxel_m=0.04).fuse(frames[::2], poses[::2]))
+
+
+def test_frames_that_hardly_moved_are_not_read() -> None:
+    frames, poses = box_frames(4)
+    still = [replace(frame, read_depth=partial(fail, AssertionError("read"))) for frame in frames]
+    twice = [one for pair in zip(frames, still, strict=True) for one in pair]
+    done: list[int] = []
+    model = TsdfFuser(voxel_m=0.04, min_motion_m=0.05).fuse(twice, np.repeat(poses, 2, axis=0), done.append)
+    assert sum(done) == 8
+    assert_same(model, TsdfFuser(voxel_m=0.04).fuse(frames, poses))
+    assert model.notes == ("4 of 8 frames fused: one each min_motion_m = 0.05 of the path",)
 
 
 def test_the_mesh_is_coarser_where_memory_is_short() -> None:

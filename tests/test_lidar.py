@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import permutations
 from pathlib import Path
 
@@ -105,7 +106,7 @@ def test_a_scan_of_few_beams_wants_several_points_a_voxel() -> None:
 def kitti(data_dir: Path) -> tuple[list[Floats], list[Floats]]:
     """Points (N, 3) and poses of five scans over 28 m of road."""
     folder = data_dir / "scans" / "kitti_07_5scans"
-    points = [np.fromfile(file, "<f4").reshape(-1, 3) for file in sorted(folder.glob("*.bin"))]
+    points = [np.fromfile(file, "<f4").reshape(-1, 3).astype(np.float32) for file in sorted(folder.glob("*.bin"))]
     rows = [line.split() for line in (folder / "graph.txt").read_text().splitlines() if line.startswith("v")]
     values = np.array([row[1:8] for row in rows], float)
     return points, list(se3.from_quat_xyzw(values[:, :3], values[:, 3:]))
@@ -117,8 +118,7 @@ def test_five_scans_of_a_street_in_any_order(
 ) -> None:
     points, poses = kitti
     frames = tuple(
-        Frame(name, float(name), read_points=lambda row=row: PointCloud(points[row].astype(np.float32)))
-        for name, row in enumerate(order)
+        Frame(name, float(name), read_points=partial(PointCloud, points[row])) for name, row in enumerate(order)
     )
     recipe = "scans"
     found = run(recipe, tmp_path / "run", source=Source("street", tmp_path, frames)).poses

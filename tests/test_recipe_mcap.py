@@ -10,13 +10,16 @@ import pytest
 
 import hodge_pipeline
 from hodge_adapters.mcap import McapReader
+from hodge_adapters.poses_text import write_tum
 from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_adapters.tum import TumReader
+from hodge_pipeline import se3
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
+from hodge_pipeline.types import Trajectory
 from mcap_data import COMPRESSED, RAW, compressed_depth, compressed_inverse_depth, png, raw_image
 from mcap_encoding import CDR, ENCODINGS
-from mcap_scene import write_clouds, write_rgbd
+from mcap_scene import stamp_s, write_clouds, write_rgbd
 from readers_data import points_in_cam
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
@@ -72,10 +75,9 @@ def test_a_recording_gives_the_poses_of_its_folder(tiny_sequence: Path, tmp_path
         recipe = load_recipe(name, [*LIGHT, "fusion=[{stage: tsdf, voxel_m: 0.1, min_weight: 1}]", reader], source)
         runs.append(hodge_pipeline.run(recipe, tmp_path / name))
     folder, recording = runs
+    assert recording.report.before == "start" and not recording.report.trajectories, "/tf is no truth"
     np.testing.assert_allclose(recording.result.world_from_cam, folder.result.world_from_cam, atol=1e-6)
-    assert recording.report.trajectories[-1].ate_rmse_m == pytest.approx(
-        folder.report.trajectories[-1].ate_rmse_m, abs=1e-5
-    )
+    assert folder.report.before == "odometry" and folder.report.trajectories
     assert (tmp_path / "mcap/mesh.ply").stat().st_size > 10000
 
 
@@ -83,6 +85,28 @@ def test_a_recording_of_clouds(tiny_sequence: Path, tmp_path: Path) -> None:  # 
     frames = TumReader(every=2).open(tiny_sequence).frames
     clouds = [points_in_cam(frame.read_depth(), frame.camera, 1) for frame in frames if frame.read_depth]
     log = write_clouds(tmp_path / "log.mcap", frames, clouds)
-    run = hodge_pipeline.run(load_recipe("mcap_clouds", LIGHT, log), tmp_path / "run")
-    rows = {row.name: row.ate_rmse_m for row in run.report.trajectories}
-    assert rows["result"] < 0.05 and (tmp_path / "run/cloud.ply").is_file()
+    sets = (*LIGHT, "evaluation.tables=true")
+    run = hodge_pipeline.run(load_recipe("mcap_clouds", sets, log), tmp_path / "run")
+    assert run.scores is not None and run.scores.names[:2] == ("start", "odometry") and run.scores.reference == "result"
+    page = (tmp_path / "run/report.html").read_text()
+    assert "against start" in page and "(ATE" not in page and "no true poses" in page
+    assert (tmp_path / "run/cloud.ply").is_file()
+
+
+def test_a_truth_that_is_named_is_one(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    frames = TumReader(every=4).open(tiny_sequence).frames
+    clouds = [points_in_cam(frame.read_depth(), frame.camera, 1) for frame in frames if frame.read_depth]
+    log = write_clouds(tmp_path / "log.mcap", frames, clouds)
+    rows = {}
+    elsewhere = se3.exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
+    poses = elsewhere @ np.array([frame.world_from_cam for frame in frames])
+    write_tum(tmp_path / "true.txt", Trajectory(np.array([stamp_s(frame) for frame in frames]), poses))
+    for truth in ("frames", str(tmp_path / "true.txt")):
+        sets = (*LIGHT, "fusion=[]", f"evaluation.truth={truth}")
+        run = hodge_pipeline.run(load_recipe("mcap_clouds", sets, log), tmp_path / "run", overwrite=True)
+        rows[truth] = {row.name: row.ate_rmse_m for row in run.report.trajectories}
+        again = hodge_pipeline.Run.load(tmp_path / "run").source
+        assert all(frame.true_world_from_cam is not None for frame in again.frames)
+    own, file = rows.values()
+    assert file["result"] == pytest.approx(own["result"], rel=1e-6)
+    assert file["start"] < 1e-6 and "start" not in own, "poses that are the truth are not compared with it"

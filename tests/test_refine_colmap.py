@@ -13,7 +13,7 @@ from hodge_adapters.colmap_refining import ColmapModels
 from hodge_adapters.colmap_tracked import ColmapModel
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.errors import CheckError, SourceError, WorkspaceError
+from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.pairs.edits import listed_edges
 from hodge_pipeline.refine.scale import metric_scale
 from test_readers_colmap import synthetic
@@ -92,7 +92,7 @@ def test_an_optimal_model_is_given_back_byte_for_byte(tmp_path: Path) -> None:
     model = noisy(tmp_path)
     done = hodge_pipeline.refine_colmap(model, out=tmp_path / "out", overrides=FREE)
     decision = done.results[0].decision
-    assert decision.outcome == "optimal" and not decision.change.is_significant
+    assert decision.outcome == "optimal"
     names = sorted(path.name for path in model.iterdir())
     assert names == sorted(path.name for path in (tmp_path / "out/sparse/0").iterdir())
     for name in names:
@@ -107,32 +107,35 @@ def test_a_reconstruction_goes_in_and_comes_out(tmp_path: Path) -> None:
     assert refined.compute_mean_reprojection_error() <= 1.001 * error_px(model)
 
 
-def test_a_result_that_is_worse_is_kept_out_unless_forced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hodge_adapters.colmap_tracked import ColmapModel
-
-    model = noisy(tmp_path)
-    start = disturbed(model, tmp_path / "start")
+def spoil(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every bundle adjustment from now on leaves the bodies anywhere."""
     honest = ColmapModel.adjusted
 
-    def made(self: ColmapModel, priors: object = None) -> object:
-        keep = ("name", "all_frames", "depth", "edges", "text", "notes")
-        model, errors = honest(self, priors)
-        copy = model._copy()
+    def adjusted(self: ColmapModel, priors: object = None) -> ColmapModel:
+        model = honest(self, None)
         rng = np.random.default_rng(0)
         for frame_id, pose in zip(model.bodies.frame_ids, model.world_from_body, strict=True):
             moved = se3.inverse(pose @ se3.exp(rng.normal(scale=0.3, size=6)))
-            copy.frames[frame_id].rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(moved[:3]))
-        return ColmapModel(reconstruction=copy, **{name: getattr(model, name) for name in keep}), errors
+            model.reconstruction.frames[frame_id].rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(moved[:3]))
+        return model
 
-    monkeypatch.setattr(ColmapModel, "adjusted", made)
-    command = ["refine", "colmap", str(start), "--out", str(tmp_path / "out"), "--set", FREE[0], "--quiet"]
-    result = CliRunner().invoke(app, command)
-    assert isinstance(result.exception, CheckError) and result.exception.exit_code == 3
-    assert (tmp_path / "out/sparse/0/images.txt").read_bytes() == (start / "images.txt").read_bytes()
-    report = json.loads((tmp_path / "out/report.json").read_text())
-    assert report["refinement"]["outcome"] == "worse" and report["verdict"]["outcome"] == "worse"
+    monkeypatch.setattr(ColmapModel, "adjusted", adjusted)
+
+
+def test_a_candidate_that_is_worse_is_kept_out_unless_forced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = noisy(tmp_path)
+    spoil(monkeypatch)
+    out = tmp_path / "out"
+    command = ["refine", "colmap", str(model), "--out", str(out), "--set", FREE[0], "--quiet"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert (out / "sparse/0/images.bin").read_bytes() == (model / "images.bin").read_bytes()
+    report = json.loads((out / "report.json").read_text())
+    assert report["refinement"]["outcome"] == "optimal"
+    given, adjusted = report["refinement"]["candidates"][:2]
+    assert (given["name"], given["is_kept"], adjusted["is_kept"]) == ("as given", True, False)
+    assert adjusted["mean_px"] > 2 * given["mean_px"]
     assert CliRunner().invoke(app, [*command, "--force"]).exit_code == 0
-    assert (tmp_path / "out/sparse/0/images.txt").read_bytes() != (start / "images.txt").read_bytes()
+    assert (out / "sparse/0/images.bin").read_bytes() != (model / "images.bin").read_bytes()
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
@@ -149,14 +152,23 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         hodge_pipeline.refine_colmap(model, out=model)
 
 
-def test_without_one_edge_nothing_is_written_but_the_report(tmp_path: Path) -> None:
+def test_a_model_without_an_observation_is_refused_and_nothing_written(tmp_path: Path) -> None:
+    empty = pycolmap.Reconstruction(noisy(tmp_path))
+    for key in list(empty.points3D):
+        empty.delete_point3D(key)
+    (tmp_path / "empty").mkdir()
+    empty.write(tmp_path / "empty")
+    with pytest.raises(SourceError, match="no point that two images saw"):
+        hodge_pipeline.refine_colmap(tmp_path / "empty", out=tmp_path / "out", overrides=FREE)
+    assert not (tmp_path / "out/sparse").exists()
+
+
+def test_without_one_edge_there_are_still_candidates(tmp_path: Path) -> None:
     model = noisy(tmp_path)
-    out = tmp_path / "out"
-    command = ["refine", "colmap", str(model), "--out", str(out), "--set", "model.min_shared=100000", "--set", FREE[0]]
-    result = CliRunner().invoke(app, command)
-    assert isinstance(result.exception, CheckError) and "nothing was written" in str(result.exception)
-    written = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
-    assert written == ["recipe.yaml", "refinement", "report.html", "report.json"]
+    start = disturbed(model, tmp_path / "start")
+    done = hodge_pipeline.refine_colmap(start, out=tmp_path / "out", overrides=[*FREE, "model.min_shared=100000"])
+    assert done.results[0].decision.outcome == "refined"
+    assert error_px(tmp_path / "out/sparse/0") <= 1.001 * error_px(model)
 
 
 def refuse(*_: object) -> None:
@@ -165,6 +177,18 @@ def refuse(*_: object) -> None:
 
 def stop(*_: object) -> None:
     raise KeyboardInterrupt
+
+
+def counted(patch: pytest.MonkeyPatch, method: str) -> list[object]:
+    """One entry for each call of a method of models from now on."""
+    calls, honest = list[object](), getattr(ColmapModel, method)
+
+    def call(self: ColmapModel, *arguments: object) -> object:
+        calls.append(self)
+        return honest(self, *arguments)
+
+    patch.setattr(ColmapModel, method, call)
+    return calls
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -179,16 +203,18 @@ def test_a_refinement_that_was_stopped_goes_on_and_ends_the_same(
     whole, out = tmp_path / "whole", tmp_path / "stopped"
     hodge_pipeline.refine_colmap(start, overrides=FREE, out=whole)
     with monkeypatch.context() as patch:
-        patch.setattr(ColmapModel, "adjusted", stop)
+        patch.setattr(ColmapModel, "resected", stop)
         with pytest.raises(KeyboardInterrupt):
             hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
-    monkeypatch.setattr(ColmapModel, "measured", refuse)
-    hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
+    with monkeypatch.context() as patch:
+        calls = counted(patch, "adjusted")
+        hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
+        assert len(calls) == 1, "that of the model as given was done before"
     monkeypatch.setattr(ColmapModel, "adjusted", refuse)
     again = hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
     assert again.results[0].decision.outcome == "refined"
     ending = "txt" if text else "bin"
-    for name in ("poses.tum", "edges.csv", f"sparse/0/images.{ending}", f"sparse/0/points3D.{ending}"):
+    for name in ("poses.tum", f"sparse/0/images.{ending}", f"sparse/0/points3D.{ending}"):
         assert (out / name).read_bytes() == (whole / name).read_bytes()
 
 
@@ -201,7 +227,7 @@ def test_a_model_that_changed_is_computed_anew_and_another_option_replaces_only_
     with pytest.raises(WorkspaceError, match="another refined model .model.min_shared was 30, is 20.: --overwrite"):
         hodge_pipeline.refine_colmap(start, overrides=other, out=out)
     pycolmap.Reconstruction(start).write_text(start)
-    monkeypatch.setattr(ColmapModel, "measured", refuse)
+    monkeypatch.setattr(ColmapModel, "adjusted", refuse)
     with pytest.raises(AssertionError, match="done before"):
         hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
     with pytest.raises(AssertionError, match="done before"):

@@ -12,6 +12,8 @@ from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app, main
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.evaluation.trajectory import absolute_error, relative_error
+from hodge_pipeline.start.match_poses import poses_at
 from hodge_pipeline.types import Floats, Trajectory
 
 SMALL = (
@@ -95,6 +97,36 @@ def test_the_report_shows_what_the_guard_measured(refined: Path) -> None:
     assert "Better than the poses given" in (refined / "report.html").read_text()
 
 
+def test_errors_are_of_the_poses_in_the_file_as_evo_has_them(
+    sequence: Path, drifted: Trajectory, truth: Trajectory, tmp_path: Path
+) -> None:
+    """A pose between the frames too, at stamps 4 ms from those of the truth, and one far from any true pose."""
+    middle = (drifted.stamps_s[:-1] + drifted.stamps_s[1:]) / 2
+    between = poses_at(drifted, middle, 10.0)
+    stamps = np.concatenate([drifted.stamps_s, middle, [drifted.stamps_s[-1] + 1]])
+    poses = np.concatenate([drifted.world_from_cam, between, drifted.world_from_cam[-1:]])
+    order = np.argsort(stamps)
+    write_tum(tmp_path / "slam.txt", Trajectory(stamps[order], poses[order]))
+    true = Trajectory(
+        np.sort(np.r_[truth.stamps_s, middle]) + 0.004, poses_at(truth, np.sort(np.r_[truth.stamps_s, middle]), 10.0)
+    )
+    write_tum(tmp_path / "true.txt", true)
+    found = refine(tmp_path / "slam.txt", sequence, tmp_path / "run", "--truth", str(tmp_path / "true.txt"))
+    assert found.exit_code == 0, found.output
+    report = json.loads((tmp_path / "run/report.json").read_text())
+    rows = {row["name"]: row for row in report["trajectories"]}
+    for name, file in (("start", tmp_path / "slam.txt"), ("result", tmp_path / "run/refined.txt")):
+        written = parse_tum(file).trajectory.world_from_cam[:-1]
+        assert rows[name]["frames"] == len(true) and rows[name]["left_out"] == 1
+        assert rows[name]["of"] == "poses of slam.txt"
+        error = absolute_error(written, true.world_from_cam)
+        assert rows[name]["ate_rmse_m"] == pytest.approx(error.rmse_m, rel=1e-6)
+        assert rows[name]["ate_max_m"] == pytest.approx(error.max_m, rel=1e-6)
+        step = relative_error(written, true.world_from_cam)
+        assert rows[name]["rpe_translation_m"] == pytest.approx(step.translation_rmse_m, rel=1e-6)
+    assert rows["result"]["ate_rmse_m"] < rows["start"]["ate_rmse_m"]
+
+
 def test_optimal_poses_come_back_byte_for_byte(refined: Path, sequence: Path, tmp_path: Path) -> None:
     text = "# my own comment\n" + (refined / "refined.txt").read_text()
     (tmp_path / "slam.txt").write_text(text)
@@ -123,6 +155,7 @@ def test_a_worse_result_is_not_written_but_with_force(
     assert (tmp_path / "run" / "refined.tum").read_bytes() == (tmp_path / "slam.tum").read_bytes()
     poses = parse_tum(tmp_path / "run" / "poses.tum").trajectory
     np.testing.assert_allclose(poses.world_from_cam, truth.world_from_cam, atol=1e-9)
+    assert not json.loads((tmp_path / "run/report.json").read_text())["trajectories"], "compared with itself"
     forced = refine(tmp_path / "slam.tum", sequence, tmp_path / "forced", *blind, "--force")
     assert forced.exit_code == 0 and outcome(tmp_path / "forced") == "forced"
     assert (tmp_path / "forced" / "refined.tum").read_bytes() != (tmp_path / "slam.tum").read_bytes()

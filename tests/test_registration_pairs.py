@@ -2,20 +2,22 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.executors.local import LocalExecutor
+from hodge_pipeline.executors.local import InProcess, LocalExecutor
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
 from hodge_pipeline.registration.gaps import has_gap, over_gap
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.registration.pairs import Acceptance, register_pairs
-from hodge_pipeline.stages import Workers
+from hodge_pipeline.registration.register import register_edges
+from hodge_pipeline.stages import Step, Workers
 from hodge_pipeline.types import CloudSet, Edges, Floats, PointCloud
 from test_executors import dask_workers
 from test_registration import corner
@@ -103,6 +105,30 @@ def test_finished_blocks_are_not_registered_again(folder: Path) -> None:
         )
     assert sorted(again) == [1, 2, 5]
     assert same_bits(whole, resumed)
+
+
+def test_a_pair_is_registered_again_only_where_the_poses_moved_it(folder: Path, tmp_path: Path) -> None:
+    poses, pairs = path_of(FRAMES), Edges.of(PAIRS, "sequential")
+    asked: list[int] = []
+
+    def registered(where: Floats, earlier: Edges | None) -> Edges:
+        asked.clear()
+        step = Step(tmp_path, asked.append, lambda *notes: None)
+        return register_edges(pairs, CloudSet.open(folder), Gicp(), where, earlier, workers=InProcess(), step=step)
+
+    first = registered(poses, None)
+    marked = replace(first, fitness=first.fitness + 1.0)
+    settled = replace(marked, i_from_j=se3.inverse(poses[PAIRS[:, 0]]) @ poses[PAIRS[:, 1]])
+    moved = poses.copy()
+    moved[-1, :3, 3] += 0.03
+    again = registered(moved, settled)
+    fresh = (PAIRS == FRAMES - 1).any(axis=1)
+    assert fresh.any() and not fresh.all()
+    np.testing.assert_array_equal(again.pairs, PAIRS)
+    np.testing.assert_array_equal(again.fitness > 1.0, ~fresh)
+    assert sum(asked) == len(PAIRS)
+    rejected = replace(settled, status=np.full(len(PAIRS), "rejected"))
+    assert same_bits(registered(poses, rejected), first)
 
 
 def test_no_pairs_are_no_edges(folder: Path) -> None:

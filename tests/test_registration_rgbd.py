@@ -87,12 +87,6 @@ def test_landmarks_lie_at_the_measured_depth_and_never_on_its_edges():
     assert len(find_landmarks(torn, 100, 0.2, 6.0)) == 0
 
 
-def test_a_smaller_image_shows_landmarks_at_the_same_places():
-    whole, half = (find_landmarks(textured_frame(), 4000, 0.2, 6.0, scale=scale).points_in_cam for scale in (1, 2))
-    apart = np.linalg.norm(half[:, None, :2] - whole[None, :, :2], axis=2).min(axis=1)
-    assert len(half) > 20 and np.median(apart) < 2.0 / 525.0  # half a pixel of the whole image, at 2 m
-
-
 def test_a_faint_texture_gives_landmarks():
     frame = textured_frame()
     faint = (120 + frame.read_colour() // 12).astype(np.uint8)

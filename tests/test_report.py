@@ -16,8 +16,9 @@ from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
 from hodge_pipeline.evaluation.difference import MEASURABLE, length, percent, sign_of
 from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.evaluation.scores import GraphScores, ScoreTable
-from hodge_pipeline.report.contents import RefinementSummary
-from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows, worst_edges
+from hodge_pipeline.report.contents import RefinementSummary, WrongEdges
+from hodge_pipeline.report.run_page import document
+from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows, weigh_wrong, worst_edges
 from hodge_pipeline.report.tables import score_tables, summary_lines
 from hodge_pipeline.report.verdict import judge, suspicions
 from hodge_pipeline.report.write import (
@@ -33,8 +34,11 @@ from hodge_pipeline.report.write import (
     as_json,
     write_report,
 )
+from hodge_pipeline.scene import Round
+from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver
+from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.types import Edges, Floats, ViewGraph
-from hodge_pipeline.types.notes import Note
+from hodge_pipeline.types.notes import Note, Rank
 
 VOID = {"meta", "img", "br"}
 
@@ -108,9 +112,11 @@ class WellFormed(HTMLParser):
         self.open: list[str] = []
         self.text: list[str] = []
         self.addresses: list[str] = []
+        self.links: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        self.addresses += [value or "" for name, value in attrs if name == "src"]
+        self.links += [value or "" for name, value in attrs if name == "href"]
         if tag not in VOID:
             self.open.append(tag)
 
@@ -124,7 +130,7 @@ class WellFormed(HTMLParser):
 def read_page(path: Path) -> tuple[str, list[str]]:
     page = WellFormed()
     page.feed(path.read_text("utf-8"))
-    assert not page.open
+    assert not page.open and all(link.startswith("#") for link in page.links)
     return "".join(page.text), page.addresses
 
 
@@ -132,7 +138,7 @@ def test_the_page_is_small_well_formed_and_asks_for_nothing(report: Report, tmp_
     page, _ = write_report(tmp_path, report)
     text, addresses = read_page(page)
     assert page.stat().st_size < 3_000_000
-    assert len(addresses) == 5
+    assert len(addresses) == 7
     assert all(address.startswith("data:image/png;base64,") for address in addresses)
     assert not re.search(r"https?://|@import|url\(", page.read_text("utf-8"))
     for expected in ("A <ring> & its loop", "Improved against odometry", "107", "2 pairs were tried twice", "# <ring>"):
@@ -153,12 +159,8 @@ def test_json_reads_back_with_the_numbers(report: Report, tmp_path: Path) -> Non
 
 
 def test_the_same_report_gives_the_same_bytes(report: Report, tmp_path: Path) -> None:
-    first, second = tmp_path / "a", tmp_path / "b"
-    for folder in (first, second):
-        folder.mkdir()
-        write_report(folder, report)
-    for name in ("report.html", "report.json"):
-        assert (first / name).read_bytes() == (second / name).read_bytes()
+    first, second = ([path.read_bytes() for path in write_report(tmp_path, report)] for _ in range(2))
+    assert first == second
 
 
 def test_an_empty_report_still_says_what_it_is(tmp_path: Path) -> None:
@@ -226,6 +228,17 @@ def test_a_measure_that_got_worse_is_named_in_the_headline() -> None:
     assert "the error of the motion from frame to frame (RPE) rose from 17 mm to 20 mm (+18 %)" in verdict.details
 
 
+def test_a_largest_error_that_got_worse_is_named_too() -> None:
+    report = told((0.5, 0.020), (0.4, 0.017))
+    start, result = report.trajectories
+    rows = (start, replace(result, ate_max_m=0.7))
+    verdict = judge(replace(report, trajectories=rows))
+    assert verdict.headline.endswith(", but largest error 50 cm → 70 cm") and verdict.outcome == "mixed"
+    refined = RefinementSummary("refined", "Better than the poses given", "clouds lie nearer")
+    verdict = judge(replace(report, trajectories=rows, refinement=refined))
+    assert verdict.headline == "Better than the poses given, but largest error 50 cm → 70 cm"
+
+
 def test_a_difference_below_what_was_measured_is_none(tmp_path: Path) -> None:
     report = told((1e-17, 3e-18), (3e-17, 1e-17))
     verdict = judge(report)
@@ -253,7 +266,7 @@ def test_what_can_be_measured_goes_by_the_extent_of_the_scene() -> None:
         ([0] * 12 + [1] * 3 + [2] * 3 + [3] * 2, False, "In 4 pieces (12, 3, 3, … of 20 frames): improved against"),
         ([0] * 19 + [1], False, "19 of 20 frames in one piece: improved against odometry"),
         ([0] * 20, False, "Improved against odometry"),
-        ([0] * 20, True, "20 of 20 scans in one piece: improved against odometry"),
+        ([0] * 20, True, "20 of 20 scans in one piece"),
         (list(range(20)), True, "No two of 20 scans joined: improved against odometry"),
     ],
 )
@@ -279,7 +292,7 @@ def test_a_refinement_whose_error_against_the_truth_rose_is_mixed() -> None:
     refinement = RefinementSummary("refined", "Better than the poses given", "edge chi2 2 -> 1")
     verdict = judge(replace(told((0.5, 0.017), (0.6, 0.017)), refinement=refinement))
     assert verdict.outcome == "mixed"
-    assert verdict.headline == "Better than the poses given, but ATE 50 cm → 60 cm"
+    assert verdict.headline == "Better than the poses given, but ATE 50 cm → 60 cm, largest error 50 cm → 60 cm"
 
 
 def test_the_worst_edge_is_the_wrong_one(report: Report) -> None:
@@ -318,6 +331,73 @@ def test_a_result_that_has_not_settled_is_not_to_be_trusted(shift_m: float | Non
     assert ("not to be trusted" in "".join(lines)) == said
     if said:
         assert "33 cm" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (WrongEdges(0), []),
+        (WrongEdges(11, "5 at frame 12", 0.0018), ["11 of the edges used are judged wrong, 5 at frame 12; without them "
+          "no pose moves by more than 1.8 mm: nothing to do."]),
+        (WrongEdges(2, "3–9", 0.12), ["2 of the edges used are judged wrong, 3–9; without them poses move by up to "
+          "12 cm: hodge diagnose shows them."]),
+        (WrongEdges(2, "3–9", 0.0, 1), ["2 of the edges used are judged wrong, 3–9; without them the scene falls into "
+          "1 more pieces: hodge diagnose shows them."]),
+    ],
+)  # fmt: skip
+def test_wrong_edges_are_weighed_by_what_they_do(report: Report, wrong: WrongEdges, said: list[str]) -> None:
+    notes = [note for note in suspicions(replace(report, wrong_edges=wrong)) if note.kind in ("wrong", "harmless")]
+    assert [str(note) for note in notes] == said
+    assert all((note.rank == Rank.LOOK) == (note.kind == "wrong") for note in notes)
+
+
+def test_what_wrong_edges_do_is_solved_for(tmp_path: Path) -> None:
+    """A ring with one edge half a metre off that counts fully: without it the poses are exact again."""
+    truth = circle()
+    graph = ring(truth)
+    solver = MaximumLikelihoodSolver()
+    solution = solver.solve(graph, truth)
+    edges = with_residuals(Edges.measured(graph), solution.world_from_cam, solution.weights)
+    verdicts = np.full(20, "consistent", dtype="<U12")
+    last = Round(edges.put(slice(None), verdict=verdicts), graph.vertex_ids, solution.world_from_cam, solution)
+    step = Step(tmp_path, no_progress, lambda *notes: None)
+    assert weigh_wrong(last, solver, step=step) == WrongEdges(0)
+    verdicts[7] = "wrong"
+    last = replace(last, edges=edges.put(slice(None), verdict=verdicts))
+    found = weigh_wrong(last, solver, step=step)
+    assert (found.count, found.frames, found.pieces_more) == (1, "107–108", 0)
+    assert found.moved_m > 0.05, "as far as the edge had bent the ring"
+    verdicts[12] = "wrong"
+    found = weigh_wrong(replace(last, edges=edges.put(slice(None), verdict=verdicts)), solver, step=step)
+    assert (found.count, found.pieces_more) == (2, 1)
+
+
+def test_clouds_that_fit_better_than_at_the_truth_are_explained(report: Report) -> None:
+    better = replace(report, scores=scored(0.010, 0.020, 0.009))
+    assert [note.kind for note in suspicions(better)].count("above truth") == 1
+    assert "above truth" not in [note.kind for note in suspicions(report)]
+
+
+def test_the_first_lines_say_where_it_is_worst_and_what_to_type(report: Report) -> None:
+    names = tuple(str(100 + row) for row in range(20))
+    truth, before, after = report.pictures.paths
+    off = after.positions.copy()
+    off[13] += [0.0, 0.3, 0.0]
+    pictures = replace(report.pictures, paths=(truth, before, Path3D("result", off)), names=names)
+    assert report.graph is not None
+    suspect = replace(report.graph, verdicts_in_use={"suspect": 1})
+    page = document(replace(report, pictures=pictures, graph=suspect), "runs/a")
+    worst, now = page.first
+    assert worst.lines[0] == "Frame 113 lies 30.2 cm off the truth, more than any other."
+    assert worst.lines[1].startswith("Of the edges that count, 107–108 fits least: it is 5")
+    assert "hodge view runs/a --web" in now.text and "hodge diagnose runs/a" in now.text
+    assert "hodge edit" not in now.text, "nothing is known to be wrong"
+    assert "hodge diagnose" not in document(report, "runs/a").first[1].text
+
+
+def test_a_length_has_no_unit_where_none_is_known(report: Report) -> None:
+    page = document(replace(report, has_metres=False), "runs/a")
+    assert page.first[0].lines[0].endswith("it is 0.5 and 0.2° off the result.") or "0.50" in page.first[0].lines[0]
 
 
 def test_an_ignored_edge_is_not_called_used(report: Report) -> None:

@@ -9,51 +9,46 @@ import numpy as np
 from PIL import Image
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.report import splat
+from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow
-from hodge_pipeline.report.sides import four_sides, worst_pairs
+from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud, Source
 
 RED, BLUE = (200, 0, 0), (0, 0, 200)
-AHEAD = splat.Stand(np.eye(3), np.array([0.0, 0.0, 1.5]), 0.01)
+AHEAD = raster.View(np.eye(3), np.array([0.0, 0.0, 1.5]), 0.01)
 """Looks along +z with x to the right and y down; a pixel is 1 cm."""
 
 
-def wall(z: float, towards: float, colour: tuple[int, int, int], reach: float = 0.5) -> splat.Scene:
+def wall(z: float, towards: float, colour: tuple[int, int, int], reach: float = 0.5) -> raster.Points:
     """A square wall at depth z, dense enough to have no gaps, whose normal is (0, 0, towards)."""
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.arange(-reach, reach, 0.008)] * 2))
     points = np.stack([x, y, np.full_like(x, z)], axis=1).astype(np.float32)
     normals = np.tile(np.float32([0, 0, towards]), (len(points), 1))
-    return splat.Scene(points, normals, np.tile(np.uint8(colour), (len(points), 1)))
+    return raster.Points(points, normals, np.tile(np.uint8(colour), (len(points), 1)))
 
 
-def both(a: splat.Scene, b: splat.Scene) -> splat.Scene:
-    joined = (np.concatenate([getattr(a, n), getattr(b, n)]) for n in ("points", "normals", "colours"))
-    return splat.Scene(*joined)
-
-
-def centre(scene: splat.Scene) -> np.ndarray:
-    image = splat.picture(scene, AHEAD)
-    assert image.shape == (splat.HEIGHT, splat.WIDTH, 3) and (image[0, 0] == splat.PAPER).all()
-    return image[splat.HEIGHT // 2, splat.WIDTH // 2]
+def centre(scene: raster.Points) -> np.ndarray:
+    image = raster.picture(scene, AHEAD)
+    assert image.shape == (raster.HEIGHT, raster.WIDTH, 3) and (image[0, 0] == raster.PAPER).all()
+    return image[raster.HEIGHT // 2, raster.WIDTH // 2]
 
 
 def test_the_nearer_wall_hides_the_other_in_any_order() -> None:
     near, far = wall(1, -1, RED), wall(2, -1, BLUE)
-    for scene in (both(near, far), both(far, near)):
+    for scene in (raster.Points.joined([near, far]), raster.Points.joined([far, near])):
         assert centre(scene)[0] > 150 > centre(scene)[2]
 
 
 def test_a_wall_that_faces_away_is_looked_through() -> None:
-    assert centre(both(wall(1, 1, RED), wall(2, -1, BLUE)))[2] > 150
+    assert centre(raster.Points.joined([wall(1, 1, RED), wall(2, -1, BLUE)]))[2] > 150
 
 
 def test_it_is_where_it_should_be() -> None:
     """A wall of 1 m in pixels of 1 cm: 100 of them wide, and the gaps closed reach two further on each side."""
-    image = splat.picture(wall(1, -1, RED), AHEAD)
-    drawn = np.flatnonzero((image[splat.HEIGHT // 2] != splat.PAPER).any(axis=1))
-    assert abs(len(drawn) - 100) <= 2 * splat.FILL_PASSES + 1
-    assert abs(drawn.mean() - splat.WIDTH / 2) < 2
+    image = raster.picture(wall(1, -1, RED), AHEAD)
+    drawn = np.flatnonzero((image[raster.HEIGHT // 2] != raster.PAPER).any(axis=1))
+    assert abs(len(drawn) - 100) <= 2 * raster.FILL_PX + 1
+    assert abs(drawn.mean() - raster.WIDTH / 2) < 2
 
 
 def room(count: int = 6) -> tuple[CloudSet, Floats]:
@@ -71,9 +66,9 @@ def test_four_sides_are_jpegs_of_both_sets_of_poses() -> None:
     before[3, 2, 3] = -1.0  # one frame's wall stands apart
     sides = four_sides(clouds, before, poses, np.zeros(6, int))
     assert [side.title for side in sides] == ["From the front", "From the right", "From the back", "From the left"]
-    image = np.asarray(Image.open(io.BytesIO(sides[0].jpeg)), int)
-    assert image.shape == (splat.HEIGHT, 2 * splat.WIDTH + 8, 3)
-    left, right = image[:, : splat.WIDTH], image[:, -splat.WIDTH :]
+    image = np.asarray(Image.open(io.BytesIO(sides[0].image)), int)
+    assert image.shape == (raster.HEIGHT, 2 * raster.WIDTH + 8, 3)
+    left, right = image[:, : raster.WIDTH], image[:, -raster.WIDTH :]
     assert ((left.min(axis=2) < 200).sum(), (right.min(axis=2) < 200).sum()) > (0, 0)
     assert np.abs(left - right).max() > 100
 
@@ -101,4 +96,31 @@ def test_worst_pairs_show_colour_or_depth_and_leave_out_what_cannot_be_read() ->
     edges = [EdgeRow(i, j, "overlap", 0.5, 1.0, 0.1, 2.0) for i, j in (("0", "1"), ("0", "2"), ("1", "3"), ("0", "9"))]
     (pair,) = worst_pairs(Source("s", Path("s"), frames), edges)
     assert pair.title == "0 – 1" and "10 cm" in pair.caption
-    assert Image.open(io.BytesIO(pair.jpeg)).size == (606, 225)
+    assert Image.open(io.BytesIO(pair.image)).size == (608, 225)
+
+
+def test_two_points_of_one_surface_are_averaged_and_one_behind_it_is_not() -> None:
+    near, same, far = wall(1, -1, (200, 0, 0)), wall(1.005, -1, (0, 0, 200)), wall(1.2, -1, (0, 200, 0))
+    mean = centre(raster.Points.joined([near, same, far])).astype(int)
+    assert abs(mean[0] - mean[2]) < 20 and mean[1] < 20
+
+
+def test_in_perspective_what_is_twice_as_far_is_half_as_large() -> None:
+    """The eye 1 m before the centre, where a pixel is 1 cm: a wall of 1 m at 1 m and at 2 m from the eye."""
+    view = raster.View(np.eye(3), np.array([0, 0, 1.0]), 0.01, eye_m=1.0, fill_px=1)
+    sizes = [(raster.picture(wall(z, -1, RED), view)[raster.HEIGHT // 2] < 255).any(axis=1).sum() for z in (1, 2)]
+    assert abs(sizes[0] - 100) <= 4 and abs(sizes[1] - 50) <= 4
+    assert (raster.picture(wall(-1, -1, RED), view) == raster.PAPER).all(), "behind the eye"
+
+
+def test_the_place_that_changed_most_is_shown_before_and_after() -> None:
+    clouds, poses = room()
+    before = poses.copy()
+    before[3, 0, 3] += 0.3
+    pairs = np.array([[0, 1], [2, 3], [4, 5]])
+    (picture,) = changed_most(clouds, before, poses, pairs, list("abcdef"), np.zeros(6, int))
+    assert "what frame c sees" in picture.caption and "Frame d moved by 30 cm" in picture.caption
+    image = np.asarray(Image.open(io.BytesIO(picture.image)), int)
+    assert image.shape == (540, 2 * 720 + raster.GAP, 3)
+    nowhere = np.full((6, 4, 4), np.nan)
+    assert changed_most(clouds, nowhere, poses, pairs, list("abcdef"), np.zeros(6, int)) == ()

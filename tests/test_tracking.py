@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,9 +22,10 @@ from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
-from hodge_pipeline.registration.tracking import FRAMES_IN_BLOCK, TrackingOptions, frame_blocks, track_block
+from hodge_pipeline.registration.tracking import TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source
 from hodge_pipeline.sources.opening import remembered
 from hodge_pipeline.stages import Step, no_progress
@@ -37,11 +39,19 @@ from hodge_pipeline.store.store import Store
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Source, ViewGraph
 from hodge_pipeline.types.notes import Note
 
-FRAMES = 64
+FRAMES, BLOCK = 64, 48
 SMALL = (
     "clouds.voxel_m=0.06", "fusion=[]", "executor.workers=0", "recording.level=off", "evaluation.tables=false",
     "outer_iterations=1", "edges.max_edges_per_frame=4", "start.whole_up_to=20",
 )  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_blocks() -> Iterator[None]:
+    """Two blocks of these sequences."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracking, "FRAMES_IN_BLOCK", BLOCK)
+        yield
 
 
 def small_recipe(source: Path, *overrides: str) -> Recipe:
@@ -167,7 +177,7 @@ def test_frames_follow_their_key_frames(sequence: Path, tmp_path: Path) -> None:
 
 
 def test_blocks_share_their_border_and_nothing_else() -> None:
-    rows = np.arange(10, 10 + 2 * FRAMES_IN_BLOCK + 5)
+    rows = np.arange(10, 10 + 2 * BLOCK + 5)
     blocks = frame_blocks(rows, tuple(range(200)), np.arange(200.0))  # type: ignore[arg-type]
     own = [block.rows[int(block.warm_up) :] for block in blocks]
     assert [int(part[0]) for part in own[1:]] == [int(part[-1]) for part in own[:-1]]

@@ -30,7 +30,7 @@ def test_plain_values_and_their_lines() -> None:
         ("a: \0", "bad.yaml: not YAML: unacceptable character"),
         ('x: 1\na: "b\\0c"', "bad.yaml:2: 'b\\x00c' holds a character that no file can have"),
         ('a: "\\ud800"', "bad.yaml:1: '\\ud800' holds a character"),
-        ("a: " + "[" * 3000 + "]" * 3000, "bad.yaml: not YAML: maximum recursion depth"),
+        ("a: " + "[" * 3000 + "]" * 3000, "bad.yaml:1: more than 50 levels"),
     ],
 )
 def test_what_is_not_plain_data_is_refused(text: str, expected: str) -> None:
@@ -50,6 +50,26 @@ def test_a_merge_key_is_read_and_cannot_multiply() -> None:
     document = yaml_file.parse("a: &a {x: 1}\nb: {<<: *a}\nc:\n  <<: *a\n  y: 2\n", "x.yaml")
     assert document.data == {"a": {"x": 1}, "b": {"x": 1}, "c": {"x": 1, "y": 2}}
     assert (document.origins["b", "x"], document.origins["c", "y"]) == ("x.yaml:2", "x.yaml:5")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a: " + "[" * 5000 + "]" * 5000, "more than 50 levels"),
+        ("a: " + "{a: " * 5000 + "1" + "}" * 5000, "more than 50 levels"),
+        ("a:\n  " + "- " * 5000 + "1", "more than 50 levels"),
+        ("&a {b: *a}", "50 levels"),
+        ("a: &a {<<: *a}", "merged into itself"),
+        ("a: 0x" + "f" * 90_000, "a whole number of 360000 bits"),
+        ("a: 9223372036854775808", "a whole number of 64 bits"),
+        ("a: " + "9" * 90_000, "digits"),
+    ],
+)
+def test_what_would_fill_the_stack_or_a_line_is_refused(text: str, expected: str) -> None:
+    with pytest.raises(RecipeError, match=expected) as refused:
+        yaml_file.parse(text, "file")
+    assert len(str(refused.value)) < 200
+    assert "\n" not in str(refused.value)
 
 
 def test_a_huge_file_is_not_read(tmp_path: Path) -> None:

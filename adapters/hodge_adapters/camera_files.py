@@ -21,7 +21,8 @@ _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` 
 class Intrinsics:
     """Intrinsics in pixels; `size` (width, height) and `units_per_metre` of depth where the file says so.
 
-    `distortion`: the lens's `k1 k2 p1 p2 k3` where they are known; `distorted`: that there is some.
+    `distortion`: the lens's `k1 k2 p1 p2 k3` where they are known; `distorted`: that there is some; `readout_s`
+    of the rolling shutter.
     """
 
     fx: float
@@ -32,11 +33,12 @@ class Intrinsics:
     units_per_metre: float | None = None
     distorted: bool = False
     distortion: tuple[float, float, float, float, float] | None = None
+    readout_s: float = 0.0
 
     def camera(self, size: tuple[int, int]) -> Camera:
         """The camera, of the file's own size if it gives one, else of this one."""
         width, height = self.size or size
-        return Camera(width, height, self.fx, self.fy, self.cx, self.cy)
+        return Camera(width, height, self.fx, self.fy, self.cx, self.cy, self.readout_s)
 
 
 def read_intrinsics(path: Path) -> Intrinsics:

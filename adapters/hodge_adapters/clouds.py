@@ -18,7 +18,7 @@ from hodge_adapters.colmap_files import natural
 from hodge_adapters.log_text import read_log_file
 from hodge_adapters.pcd_points import read_pcd
 from hodge_adapters.ply_points import read_ply, write_ply
-from hodge_adapters.posed import posed_frames
+from hodge_adapters.posed import posed_frames, written
 from hodge_adapters.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
 from hodge_adapters.text_rows import listed
 from hodge_pipeline import se3
@@ -114,7 +114,7 @@ class CloudFolderReader:
 class PlyWriter:
     """Writes the points of all frames as one PLY in the world frame."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically. Frames need points; those without a pose are refused where there are several."""
         frames = [frame for frame in source.frames if frame.read_points is not None]
         if not frames:
@@ -133,6 +133,8 @@ class PlyWriter:
             np.concatenate([cloud.colours for cloud, _ in clouds if cloud.colours is not None]) if coloured else None
         )
         write_ply(path, PointCloud(np.concatenate(points).astype(np.float32), None, colours))
+        count = sum(map(len, points))
+        return written(f"{count} points of {len(frames)} clouds as one", source, {"point clouds"})
 
 
 @plain_dataclass(frozen=True)

@@ -36,7 +36,7 @@ from hodge_adapters.colmap_scale import metres_per_unit, scaled_graph, scaled_po
 from hodge_adapters.text_rows import inside, listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import EncodedImage, Floats, Frame, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import EncodedImage, Floats, Frame, ImageFile, Source, Trajectory, ViewGraph
 
 IMAGE_FOLDERS = ("images", "image", "rgb", "color")
 STEREO_FOLDERS = ("stereo/depth_maps", "dense/stereo/depth_maps", "dense/0/stereo/depth_maps")
@@ -187,6 +187,7 @@ class ColmapReader:
             read_colour=colour_reader(colour, record, size) if colour else None,
             encoded_depth=_encoded_depth(depth, self.depth_scale) if plain else None,
             encoded_colour=partial(images.encoded_colour, whole_colour) if whole_colour else None,
+            image=ImageFile(colour, record.width, record.height, record.model, record.params) if colour else None,
             world_from_cam=pose,
             sequence=parent_of(image.name),
         )

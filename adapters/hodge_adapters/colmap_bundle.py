@@ -10,60 +10,43 @@ from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PositionPriors
 
-ESCAPE_ROUNDS = 3
-ESCAPED_PX = 1e4
-"""No observation is off by so much: its point lies behind the camera."""
-MAX_ITERATIONS = 100
-FUNCTION_TOLERANCE = 1e-7
 
+def adjust(
+    reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors | None, *, move_bodies: bool = True
+) -> None:
+    """Adjust it in place with COLMAP's own options, cameras held; the points alone where bodies are not to move.
 
-def adjust(reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors | None) -> None:
-    """Adjust it in place. Without priors the gauge is that of two images; with them the model keeps to theirs.
-
-    A point that escapes through a camera, where COLMAP's cost has no slope, is held where it was. Raises `SourceError`
-    where the adjustment fails.
+    Without priors the gauge is that of two images; with them the model keeps to theirs. Raises `SourceError` where the
+    adjustment fails.
     """
     alone = [key for key, point in reconstruction.points3D.items() if point.track.length() < 2]
+    part = reconstruction
     if alone:  # they tell nothing; real models have such, and COLMAP refuses to adjust a model with them
         part = pycolmap.Reconstruction(reconstruction)
         for key in alone:
             part.delete_point3D(key)
-        _adjust(part, bodies, priors)
+    if not part.num_points3D():
+        raise SourceError("no point was seen by two images: nothing ties the poses: triangulate points first")
+    _solve(_adjuster(part, bodies, priors, move_bodies))
+    if alone:
         for frame_id in bodies.frame_ids:
             reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
         for key, point in part.points3D.items():
             reconstruction.points3D[key].xyz = point.xyz
-    else:
-        _adjust(reconstruction, bodies, priors)
     update_errors(reconstruction)
 
 
-def _adjust(reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors | None) -> None:
-    config = pycolmap.BundleAdjustmentConfig()
+def _adjuster(
+    reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors | None, move_bodies: bool
+) -> pycolmap.BundleAdjuster:
+    options, config = _options(), pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
         config.add_image(image_id)
-    if priors is None:
+    if not move_bodies:
+        for frame_id in bodies.frame_ids:
+            config.set_constant_rig_from_world_pose(frame_id)
+    elif priors is None:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    before = {key: point.xyz.copy() for key, point in reconstruction.points3D.items()}
-    for _ in range(ESCAPE_ROUNDS):
-        _solve(_adjuster(reconstruction, config, bodies, priors))
-        reconstruction.update_point_3d_errors()
-        escaped = [key for key, point in reconstruction.points3D.items() if not point.error < ESCAPED_PX]
-        if not escaped:
-            return
-        for key in escaped:
-            reconstruction.points3D[key].xyz = before[key]
-            if not config.has_constant_point(key):
-                config.add_constant_point(key)
-
-
-def _adjuster(
-    reconstruction: pycolmap.Reconstruction,
-    config: pycolmap.BundleAdjustmentConfig,
-    bodies: Bodies,
-    priors: PositionPriors | None,
-) -> pycolmap.BundleAdjuster:
-    options = _options()
     if priors is None:
         return pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
     # what tracks and priors make of each other must not hang on a few bad tracks
@@ -77,8 +60,6 @@ def _options() -> pycolmap.BundleAdjustmentOptions:
     options.print_summary = False
     options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.refine_sensor_from_rig = False
-    solver = options.ceres.solver_options
-    solver.max_num_iterations, solver.function_tolerance = MAX_ITERATIONS, FUNCTION_TOLERANCE
     return options
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,11 @@ class Points:
     image_ids: Ints
     columns: Ints
 
+    @cached_property
+    def owners(self) -> Ints:
+        """The row (T,) of the point that each entry of a track belongs to."""
+        return np.repeat(np.arange(len(self.ids)), np.diff(self.offsets))
+
 
 @dataclass(frozen=True)
 class Model:
@@ -81,6 +87,13 @@ class Model:
     points: Points
     files: tuple[Path, ...]
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def image_rows(self) -> Ints:
+        """The row (T,) of the image that each entry of a track names."""
+        ids = np.array([image.image_id for image in self.images], np.int64)
+        order = np.argsort(ids)
+        return np.asarray(order[np.searchsorted(ids[order], self.points.image_ids)], np.int64)
 
 
 def no_points() -> Points:

@@ -176,4 +176,5 @@ def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
         depth=depth,
         files=(),
         notes=(*whole.notes, *(line for line in other.notes if line not in whole.notes), note),
-    )
+        tracks=None,
+    ).merged()

@@ -33,9 +33,7 @@ def reprojection_errors(model: Model) -> tuple[Ints, Floats]:
     Infinite where the point lies behind the camera, so that the camera cannot project it.
     """
     points = model.points
-    row_of = {image.image_id: row for row, image in enumerate(model.images)}
-    row = np.array([row_of[image_id] for image_id in points.image_ids.tolist()], np.int64)
-    owner = np.repeat(np.arange(len(points.ids)), np.diff(points.offsets))
+    row, owner = model.image_rows, points.owners
     errors_px = np.full(len(row), np.inf)
     for number, image in enumerate(model.images):
         here = np.flatnonzero(row == number)

@@ -21,6 +21,8 @@ NEAR_SHARE = 0.03
 LEAST_PARALLAX = 1e-4
 LEAST_TIES = 12
 LEAST_TIE_SHARE = 0.15
+REFITS = 5
+"""Each to the better half, as least trimmed squares concentrate."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,14 @@ def merge_matched_points(reconstruction: pycolmap.Reconstruction, database: Path
     return count
 
 
+def held_apart(reconstruction: pycolmap.Reconstruction, database: Path, min_shared: int) -> int:
+    """How many pairs of images the database matches well while the model holds them apart."""
+    of_name = point_ids_by_name(reconstruction)
+    names = list(of_name)
+    pairs = database_matches(database, {name: row for row, name in enumerate(names)})
+    return sum(_is_apart(of_name[names[i]], of_name[names[j]], len(matches), min_shared) for i, j, matches in pairs)
+
+
 def tie_points(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, database: Path | None) -> Ties:
     """Points of two models that a match, or an image in both, calls one."""
     of_first, of_second = point_ids_by_name(first), point_ids_by_name(second)
@@ -91,7 +101,22 @@ def similarity(
     found: Any = pycolmap.estimate_sim3d_robust(there, here, options)
     if found is None or found["num_inliers"] < max(LEAST_TIES, LEAST_TIE_SHARE * len(ties.ids)):
         return None
-    return found["tgt_from_src"], int(found["num_inliers"])
+    return _refitted(found["tgt_from_src"], there, here, found["inlier_mask"]), int(found["num_inliers"])
+
+
+def _refitted(motion: pycolmap.Sim3d, there: Floats, here: Floats, mask: Any) -> pycolmap.Sim3d:
+    """Fitted again to the ties that agree best: those of a keypoint in both models are far better than matched ones."""
+    kept = np.asarray(mask, bool)
+    for _ in range(REFITS):
+        away: Floats = np.linalg.norm(here - np.array([motion * point for point in there]), axis=1)
+        near = kept & (away <= np.median(away[kept]))
+        if near.sum() < LEAST_TIES:
+            break
+        again = pycolmap.estimate_sim3d(there[near], here[near])
+        if again is None:
+            break
+        motion = again
+    return motion
 
 
 def _matched_points(
@@ -104,9 +129,7 @@ def _matched_points(
     names = list(dict.fromkeys([*of_first, *of_second]))
     seen = set()
     for i, j, matches in database_matches(database, {name: row for row, name in enumerate(names)}):
-        if min_shared and (
-            len(matches) < min_shared or 2 * _shared(of_first[names[i]], of_first[names[j]]) >= min_shared
-        ):
+        if min_shared and not _is_apart(of_first[names[i]], of_first[names[j]], len(matches), min_shared):
             continue
         for one, other, columns in ((names[i], names[j], matches), (names[j], names[i], matches[:, ::-1])):
             a, b = of_first.get(one), of_second.get(other)
@@ -121,6 +144,10 @@ def _matched_points(
                 if pair not in seen:
                     seen.add(pair)
                     yield pair
+
+
+def _is_apart(a: Ints, b: Ints, matches: int, min_shared: int) -> bool:
+    return matches >= min_shared and 2 * _shared(a, b) < min_shared
 
 
 def _shared(a: Ints, b: Ints) -> int:

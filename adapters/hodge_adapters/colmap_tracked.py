@@ -6,7 +6,6 @@ frames: all cameras of a rig at one moment, or a single image.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,19 +15,23 @@ import numpy as np
 
 from hodge_adapters.colmap_bodies import Bodies, bodies_of, body_graph
 from hodge_adapters.colmap_bundle import adjust
+from hodge_adapters.colmap_content import content_of, refreshed
 from hodge_adapters.colmap_database import database_pairs
 from hodge_adapters.colmap_edges import covisible_pairs, measured_graph
-from hodge_adapters.colmap_files import load_model
-from hodge_adapters.colmap_points import points_of_rays
+from hodge_adapters.colmap_points import parallaxes, points_of_rays
 from hodge_adapters.colmap_records import Model
-from hodge_adapters.colmap_reprojection import error_cap, reprojection_errors, update_errors
+from hodge_adapters.colmap_reprojection import reprojection_errors, update_errors
+from hodge_adapters.colmap_resection import resected
 from hodge_adapters.colmap_scale import depth_ratios
-from hodge_adapters.colmap_ties import merge_matched_points
+from hodge_adapters.colmap_ties import held_apart, merge_matched_points
 from hodge_adapters.colmap_uncertainty import standard_errors
 from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, Frame, Ints, ModelQuality, PositionPriors, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Frame, Ints, ModelQuality, PositionPriors, ViewGraph
+
+LEAST_LEFT = 3
+"""Entries of a track: two would meet in a point wherever the images are."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,8 @@ class ColmapModel:
     text: bool = False
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
+    tracks: Model | None = None
+    """The content of a model with the same tracks, from which this one differs by poses and positions alone."""
 
     @property
     def native(self) -> pycolmap.Reconstruction:
@@ -78,9 +83,7 @@ class ColmapModel:
     @cached_property
     def records(self) -> Model:
         """The model as plain arrays, images in natural order of their names."""
-        with tempfile.TemporaryDirectory() as folder:
-            self.reconstruction.write_binary(folder)
-            return replace(load_model(Path(folder), True), files=())
+        return content_of(self.reconstruction) if self.tracks is None else refreshed(self.tracks, self.reconstruction)
 
     @cached_property
     def bodies(self) -> Bodies:
@@ -117,15 +120,18 @@ class ColmapModel:
     @cached_property
     def quality(self) -> ModelQuality:
         """Errors are computed anew: what a file says of them may be older than its poses."""
-        keypoints, errors_px = reprojection_errors(self.records)
+        records = self.records
+        keypoints, errors_px = reprojection_errors(records)
+        owners = records.points.owners
         return ModelQuality(
             images=self.reconstruction.num_reg_images(),
             points=self.reconstruction.num_points3D(),
             mean_track_length=float(self.reconstruction.compute_mean_track_length()),
-            image_names=tuple(image.name for image in self.records.images),
+            image_names=tuple(image.name for image in records.images),
             keypoints=keypoints,
             errors_px=errors_px,
-            cap_px=error_cap(errors_px),
+            parallaxes_deg=parallaxes(records)[owners],
+            track_lengths=np.diff(records.points.offsets)[owners],
         )
 
     def depth_ratios(self) -> Sequence[Floats]:
@@ -147,11 +153,21 @@ class ColmapModel:
         graph = measured_graph(records, pairs, options.min_shared // 2, options.seed, notes)
         return body_graph(graph, self.bodies), tuple(notes)
 
+    @cached_property
+    def held_apart(self) -> int:
+        """Pairs of images that the database matches well and that share hardly a point."""
+        database = self.edges.database
+        return 0 if database is None else held_apart(self.reconstruction, database, self.edges.min_shared)
+
+    def resected(self, bodies: Bools | None = None) -> Floats:
+        """Poses (B, 4, 4): those of these bodies (B,), all by default, by the points; see `colmap_resection`."""
+        return resected(self.records, self.bodies, bodies)
+
     def scaled(self, factor: float) -> ColmapModel:
         """Positions times the factor."""
         copy = self._copy()
         copy.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
-        return replace(self, reconstruction=copy, files=())
+        return replace(self, reconstruction=copy, files=(), tracks=self.records)
 
     def moved(self, world_from_body: Floats) -> ColmapModel:
         """Bodies at these poses, points where their rays meet; what the database matched is merged where it fits."""
@@ -161,19 +177,48 @@ class ColmapModel:
         poses = world_from_body[self.bodies.body_of_image] @ self.bodies.body_from_cam
         for point_id, xyz in zip(before.points.ids.tolist(), points_of_rays(before, poses), strict=True):
             copy.points3D[point_id].xyz = xyz
-        notes = self.notes
-        if self.edges.database is not None:
-            merged = merge_matched_points(copy, self.edges.database, self.edges.min_shared)
-            notes = (*notes, f"{merged} pairs of points that a match calls one were merged") if merged else notes
         update_errors(copy)
-        return replace(self, reconstruction=copy, files=(), notes=notes)
+        return replace(self, reconstruction=copy, files=(), tracks=before)
 
-    def adjusted(self, priors: PositionPriors | None = None) -> tuple[ColmapModel, Floats]:
-        """Bundle adjustment with cameras and rigs held; see `colmap_bundle` and `colmap_uncertainty`."""
+    def merged(self) -> ColmapModel:
+        """What the database matched is one point where one position fits; this very model where nothing is merged."""
+        if not self.held_apart:
+            return self
+        assert self.edges.database is not None
+        copy = self._copy()
+        count = merge_matched_points(copy, self.edges.database, self.edges.min_shared)
+        if not count:
+            return self
+        update_errors(copy)
+        notes = (*self.notes, f"{count} pairs of points that a match calls one were merged")
+        return replace(self, reconstruction=copy, files=(), notes=notes, tracks=None)
+
+    def adjusted(self, priors: PositionPriors | None = None) -> ColmapModel:
+        """Bundle adjustment with cameras and rigs held; see `colmap_bundle`."""
         copy = self._copy()
         adjust(copy, self.bodies, priors)
-        adjusted = replace(self, reconstruction=copy, files=())
-        return adjusted, standard_errors(adjusted.records, adjusted.bodies)
+        return replace(self, reconstruction=copy, files=(), tracks=self.records)
+
+    def standard_errors(self) -> Floats:
+        """Of each body's rotation and position (B, 2), radians and units; see `colmap_uncertainty`."""
+        return standard_errors(self.records, self.bodies)
+
+    def held_out_errors(self, entries: Bools, *, move_bodies: bool) -> Floats:
+        """Errors (H,) of these entries of tracks (T,) after an adjustment without them, of the points or of all.
+
+        An entry whose point too few others would place is left in, and out of the answer.
+        """
+        copy, records = self._copy(), self.records
+        left, held = np.diff(records.points.offsets), []
+        for at in np.flatnonzero(entries):
+            owner = records.points.owners[at]
+            if left[owner] > LEAST_LEFT:
+                left[owner] -= 1
+                held.append(at)
+                image = records.images[records.image_rows[at]]
+                copy.delete_observation(image.image_id, int(records.points.columns[at]))
+        adjust(copy, self.bodies, None, move_bodies=move_bodies)
+        return reprojection_errors(refreshed(records, copy))[1][held]
 
     def write(self, folder: Path) -> None:
         """Five files, binary or text as the model was."""
@@ -181,7 +226,7 @@ class ColmapModel:
 
     def read_back(self, folder: Path, notes: tuple[str, ...]) -> ColmapModel:
         """The model of that folder with the frames, depth and database of this one."""
-        return replace(self, reconstruction=read_reconstruction(folder), files=(), notes=notes)
+        return replace(self, reconstruction=read_reconstruction(folder), files=(), notes=notes, tracks=None)
 
     def _copy(self) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(self.reconstruction)

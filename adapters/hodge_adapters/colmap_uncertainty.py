@@ -87,9 +87,7 @@ def _inverse_without_gauge(matrix: Floats) -> Floats:
 
 def _rows(model: Model, bodies: Bodies) -> _Rows:
     points = model.points
-    row_of = {image.image_id: row for row, image in enumerate(model.images)}
-    image_row = np.array([row_of[image_id] for image_id in points.image_ids.tolist()], np.int64)
-    owner = np.repeat(np.arange(len(points.ids)), np.diff(points.offsets))
+    image_row, owner = model.image_rows, points.owners
     parts = []
     for number, image in enumerate(model.images):
         here = np.flatnonzero(image_row == number)

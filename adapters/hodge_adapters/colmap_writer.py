@@ -1,8 +1,11 @@
-"""Writes posed frames as a COLMAP model without points, with rigs of one camera each, as COLMAP makes them itself."""
+"""Writes posed frames as a COLMAP model, with rigs of one camera each, as COLMAP makes them itself; a model that was
+read from COLMAP's files stays whole, points and rigs included.
+"""
 
 from __future__ import annotations
 
 import struct
+import tempfile
 from pathlib import Path
 from typing import Literal
 
@@ -11,11 +14,19 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.colmap_cameras import HALF_PIXEL
+from hodge_adapters.colmap_files import find_model, load_model
 from hodge_adapters.colmap_records import CAMERA_MODELS, to_colmap
 from hodge_adapters.colmap_rigs import CAMERA
-from hodge_adapters.text_rows import write_bytes_atomically
+from hodge_adapters.posed import written
+from hodge_adapters.pycolmap_import import pycolmap
+from hodge_adapters.text_rows import listed, write_bytes_atomically
 from hodge_pipeline.errors import SourceError, not_written
-from hodge_pipeline.types import Camera, Floats, Frame, Source
+from hodge_pipeline.types import Frame, Source
+
+SAME = 1e-6
+"""Of the positions' spread, and of a rotation's entries: poses that differ by less are the same."""
+Lens = tuple[str, int, int, tuple[float, ...]]
+"""A camera model by name, width, height, parameters."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -24,52 +35,115 @@ class ColmapWriter:
 
     form: Literal["bin", "txt"] = Field("bin", description="binary, or text with the digits that restore every number")
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """A folder with cameras, rigs, frames, images and points3D; each file is replaced in one step.
 
-        An image's name is the frame's id, with `.png` where that is a number. Raises `SourceError` where no frame has
-        a camera and a pose, or where y points up, which no camera of COLMAP's does.
+        A camera is that of the frame's image file, distortion included, else the frame's own; an image's name is the
+        frame's id, or its file's where that is a number. A model that was read from COLMAP's files keeps its points.
+        Raises `SourceError` where no frame has a camera and a pose, or where y points up, which no camera of COLMAP's
+        does.
         """
         frames = [frame for frame in source.frames if frame.camera is not None and frame.world_from_cam is not None]
         if not frames:
             raise SourceError(f"{source.path}: no frame with a camera and a pose: COLMAP needs both")
-        cameras = list(dict.fromkeys(frame.camera for frame in frames if frame.camera))
-        if any(camera.fy < 0 for camera in cameras):
+        lenses = [_lens(frame) for frame in frames]
+        if any(frame.camera.fy < 0 for frame in frames if frame.camera):
             raise SourceError(
                 f"{source.path}: fy is negative (y points up), which COLMAP has not: turn the images over"
             )
+        whole = _whole_model(source, frames)
+        if whole is not None:
+            _write_folder(Path(path), _files_of(whole, self.form))
+            count = f"{whole.num_reg_images()} images, {whole.num_cameras()} cameras, {whole.num_points3D()} points"
+            return written(count, source, {"cameras", "names", "images"})
+        cameras = list(dict.fromkeys(lenses))
+        names = _names(frames)
+        blank = [name for name in names if len(name.split()) != 1]
+        if blank and self.form == "txt":
+            raise SourceError(
+                f"{source.path}: COLMAP's text cannot hold names with blanks ({listed(blank)}): write form=bin"
+            )
         write = _binary_files if self.form == "bin" else _text_files
-        _write_folder(Path(path), write(cameras, frames))
+        numbers = [cameras.index(lens) + 1 for lens in lenses]
+        _write_folder(Path(path), write(cameras, numbers, names, _poses(frames)))
+        return written(
+            f"{len(frames)} images, {len(cameras)} cameras, no points", source, {"cameras", "names", "images"}
+        )
 
 
-def image_name(frame: Frame) -> str:
-    """The name that a frame's image gets in the model."""
-    name = f"{frame.frame_id:06d}.png" if isinstance(frame.frame_id, int) else frame.frame_id
-    return "_".join(name.split())
+def _whole_model(source: Source, frames: list[Frame]) -> pycolmap.Reconstruction | None:
+    """The model that the frames were read from, in their unit of length; None where they are no such model's, or not
+    all of it, or have other poses.
+    """
+    folder = find_model(source.path) if source.path.is_dir() else None
+    if folder is None:
+        return None
+    try:
+        load_model(folder, tracks=True)  # which checks what pycolmap would crash on
+        model = pycolmap.Reconstruction(str(folder))
+    except (SourceError, ValueError, RuntimeError):
+        return None
+    images = {
+        image.name: image.cam_from_world().inverse().matrix() for image in model.images.values() if image.has_pose
+    }
+    if set(images) != {frame.frame_id for frame in frames}:
+        return None
+    before = np.array([images[frame.frame_id] for frame in frames])
+    after = np.array([frame.world_from_cam for frame in frames])[:, :3]
+    spread = [float(np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0))) for poses in (before, after)]
+    scale = spread[1] / spread[0] if spread[0] > 0 else 1.0
+    turned = np.abs(after[:, :, :3] - before[:, :, :3]).max()
+    moved = np.abs(after[:, :, 3] - scale * before[:, :, 3]).max()
+    if turned > SAME or moved > SAME * max(spread[1], 1e-300):
+        return None
+    if abs(scale - 1) > SAME:
+        model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
+    return model
 
 
-def _params(camera: Camera) -> tuple[float, ...]:
-    return camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL
+def _files_of(model: pycolmap.Reconstruction, form: str) -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory(prefix="hodge-colmap-") as scratch:
+        (model.write_binary if form == "bin" else model.write_text)(scratch)
+        return {file.name: file.read_bytes() for file in sorted(Path(scratch).iterdir())}
 
 
-def _poses(frames: list[Frame]) -> Floats:
-    return np.hstack(to_colmap(np.array([frame.world_from_cam for frame in frames])))
+def _lens(frame: Frame) -> Lens:
+    if frame.image is not None:
+        return frame.image.lens, frame.image.width, frame.image.height, frame.image.params
+    camera = frame.camera
+    assert camera is not None
+    return (
+        "PINHOLE",
+        camera.width,
+        camera.height,
+        (camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL),
+    )
 
 
-def _camera_ids(cameras: list[Camera], frames: list[Frame]) -> list[int]:
-    """The number of each frame's camera, from 1; it is the number of its rig as well."""
-    numbers = {camera: number for number, camera in enumerate(cameras, 1)}
-    return [numbers[frame.camera] for frame in frames if frame.camera is not None]
+def _names(frames: list[Frame]) -> list[str]:
+    """The name of each frame's image in the model: its id, or its file's name where that is but a number."""
+    files = [frame.image.path.name if frame.image else f"{frame.frame_id}.png" for frame in frames]
+    numbered = [f"{frame.frame_id:06d}.png" if isinstance(frame.frame_id, int) else frame.frame_id for frame in frames]
+    if len(set(files)) < len(files) or not all(isinstance(frame.frame_id, int) and frame.image for frame in frames):
+        return numbered
+    return files
 
 
-def _text_files(cameras: list[Camera], frames: list[Frame]) -> dict[str, bytes]:
+def _poses(frames: list[Frame]) -> list[list[float]]:
+    poses = np.hstack(to_colmap(np.array([frame.world_from_cam for frame in frames])))
+    return [list(map(float, pose)) for pose in poses]
+
+
+def _text_files(
+    cameras: list[Lens], numbers: list[int], names: list[str], poses: list[list[float]]
+) -> dict[str, bytes]:
     lines = [
-        f"{number} PINHOLE {camera.width} {camera.height} {' '.join(map(repr, _params(camera)))}\n"
-        for number, camera in enumerate(cameras, 1)
+        f"{number} {lens} {width} {height} {' '.join(map(repr, params))}\n"
+        for number, (lens, width, height, params) in enumerate(cameras, 1)
     ]
-    poses = [" ".join(map(repr, pose)) for pose in _poses(frames).tolist()]
-    numbered = list(enumerate(zip(poses, _camera_ids(cameras, frames), frames, strict=True), 1))
-    rows = [f"{number} {pose} {camera} {image_name(frame)}\n\n" for number, (pose, camera, frame) in numbered]
+    words = [" ".join(map(repr, pose)) for pose in poses]
+    numbered = list(enumerate(zip(words, numbers, names, strict=True), 1))
+    rows = [f"{number} {pose} {camera} {name}\n\n" for number, (pose, camera, name) in numbered]
     rig_frames = [f"{number} {camera} {pose} 1 CAMERA {camera} {number}\n" for number, (pose, camera, _) in numbered]
     return {
         "cameras.txt": ("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n" + "".join(lines)).encode(),
@@ -83,16 +157,17 @@ def _text_files(cameras: list[Camera], frames: list[Frame]) -> dict[str, bytes]:
     }
 
 
-def _binary_files(cameras: list[Camera], frames: list[Frame]) -> dict[str, bytes]:
-    number_of_pinhole = CAMERA_MODELS["PINHOLE"][0]
+def _binary_files(
+    cameras: list[Lens], numbers: list[int], names: list[str], poses: list[list[float]]
+) -> dict[str, bytes]:
     records = [
-        struct.pack("<IiQQ4d", number, number_of_pinhole, camera.width, camera.height, *_params(camera))
-        for number, camera in enumerate(cameras, 1)
+        struct.pack(f"<IiQQ{len(params)}d", number, CAMERA_MODELS[lens][0], width, height, *params)
+        for number, (lens, width, height, params) in enumerate(cameras, 1)
     ]
-    numbered = list(enumerate(zip(_poses(frames).tolist(), _camera_ids(cameras, frames), frames, strict=True), 1))
+    numbered = list(enumerate(zip(poses, numbers, names, strict=True), 1))
     rows = [
-        struct.pack("<I7dI", number, *pose, camera) + image_name(frame).encode() + struct.pack("<xQ", 0)
-        for number, (pose, camera, frame) in numbered
+        struct.pack("<I7dI", number, *pose, camera) + name.encode() + struct.pack("<xQ", 0)
+        for number, (pose, camera, name) in numbered
     ]
     rigs = [struct.pack("<IIiI", number, 1, CAMERA, number) for number in range(1, len(cameras) + 1)]
     rig_frames = [

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.posed import length_notes, trajectory_of
+from hodge_adapters.posed import length_notes, trajectory_of, written
 from hodge_adapters.text_rows import Row, listed, read_text, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -71,7 +71,7 @@ class EurocReader:
 class EurocWriter:
     """Writes a trajectory in EuRoC's form; a double holds seconds since 1970 to 0.2 microseconds, no better."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically. Raises `SourceError` for stamps before zero, or two in one nanosecond."""
         trajectory = trajectory_of(source)
         stamps = [round(stamp * NANO) for stamp in trajectory.stamps_s.tolist()]
@@ -81,6 +81,7 @@ class EurocWriter:
         table = np.column_stack([poses[:, :3, 3], se3.to_quat_xyzw(poses)[:, [3, 0, 1, 2]]]) + 0.0
         lines = [f"{stamp},{','.join(map(repr, row))}\n" for stamp, row in zip(stamps, table.tolist(), strict=True)]
         write_text_atomically(Path(path), HEADER + "".join(lines))
+        return written(f"{len(trajectory)} poses", source, {"stamps"})
 
 
 def file_of(path: Path) -> Path:

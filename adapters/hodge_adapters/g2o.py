@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass as stage
 
 from hodge_adapters import g2o_priors
 from hodge_adapters.pose_graph_text import LANDMARK_TAGS, Records, count_tags, read_records, write_lines
-from hodge_adapters.posed import length_notes
+from hodge_adapters.posed import length_notes, written
 from hodge_adapters.text_rows import write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -278,13 +278,15 @@ def write_g2o(path: Path | str, graph: ViewGraph, world_from_vertex: Floats | No
 class G2oWriter:
     """Writes a measured graph as g2o, 2-D or 3-D as it is, and the trajectory where it has a pose for each vertex."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically; see `write_g2o`."""
         if source.graph is None:
             raise SourceError(f"{source.path}: has no graph to write: convert one that has edges")
         poses = None if source.trajectory is None else source.trajectory.world_from_cam
         complete = poses is not None and len(poses) == source.graph.vertex_count
         write_g2o(path, source.graph, poses if complete else None)
+        graph = source.graph
+        return written(f"{graph.vertex_count} vertices, {graph.edge_count} edges", source, {"edges"})
 
 
 def _pose_columns(motions: Floats, dimension: int) -> Floats:

@@ -108,7 +108,8 @@ class IclNuimReader:
         """The TUM-like layout without its list: images are paired by the numbers in their names."""
         notes = ["no associations.txt: images are paired by the numbers in their names"]
         found = list_images(path, notes)
-        listing = StampedImages(np.array(found.numbers, float), found.depth, found.colour, ())
+        delays_s = np.zeros(len(found.numbers))
+        listing = StampedImages(np.array(found.numbers, float), found.depth, found.colour, delays_s, ())
         return self._numbered(path, listing, notes)
 
     def _numbered(self, path: Path, listing: StampedImages, notes: list[str]) -> Source:
@@ -133,6 +134,7 @@ class IclNuimReader:
                 listing.colour[row],
                 units_per_metre=self.units_per_metre or 5000.0,
                 world_from_cam=poses[row],
+                is_true=True,
             )
             for row in range(0, len(ids), self.every)
         )

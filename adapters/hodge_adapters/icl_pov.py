@@ -57,6 +57,7 @@ def pov_frames(
                 read_colour=partial(images.read_colour, colour, size=size) if has_colour else None,
                 encoded_colour=partial(images.encoded_colour, colour) if has_colour else None,
                 world_from_cam=pose,
+                true_world_from_cam=pose,
             )
         )
     if without:

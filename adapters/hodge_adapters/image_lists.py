@@ -15,17 +15,22 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
 
 ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
+LONGEST_DELAY_S = 0.1
+"""Between the images of one frame: stamps further apart are not of one clock."""
 _STAMP_NAME = re.compile(r"\d+\.\d+\.(png|jpg|jpeg)", re.IGNORECASE)
 _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class StampedImages:
-    """Depth images in order of their stamps, each with its colour image where there is one."""
+    """Depth images in order of their stamps, each with its colour image where there is one, and how many seconds later
+    that was taken.
+    """
 
     stamps_s: Floats
     depth: list[Path]
     colour: list[Path | None]
+    colour_delays_s: Floats
     files: tuple[Path, ...]
 
 
@@ -65,7 +70,11 @@ def read_pairs(folder: Path, max_difference_s: float, notes: list[str]) -> Stamp
         notes.append(f"{len(lost)} colour images listed but not there: {listed(lost)}")
     rows = np.flatnonzero(there).tolist()
     return StampedImages(
-        found.stamps_s[rows], [found.depth[row] for row in rows], [colour[row] for row in rows], found.files
+        found.stamps_s[rows],
+        [found.depth[row] for row in rows],
+        [colour[row] for row in rows],
+        found.colour_delays_s[rows],
+        found.files,
     )
 
 
@@ -83,13 +92,14 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
     colour_stamps_s, colour = _listed_or_named(colour_list, folder / "rgb", notes)
     if not colour and not colour_list.is_file():
         notes.append("no rgb.txt: frames have no colour")
-        return StampedImages(depth_stamps_s, depth, [None] * len(depth), lists)
+        return StampedImages(depth_stamps_s, depth, [None] * len(depth), np.zeros(len(depth)), lists)
     columns = nearest_pairs(depth_stamps_s, colour_stamps_s, max_difference_s)
     alone = int((columns < 0).sum())
     if alone:
         notes.append(f"{alone} depth images have no colour image within {max_difference_s:g} s")
     paired = [colour[column] if column >= 0 else None for column in columns.tolist()]
-    return StampedImages(depth_stamps_s, depth, paired, lists)
+    delays_s = np.where(columns >= 0, np.append(colour_stamps_s, 0.0)[columns] - depth_stamps_s, 0.0)
+    return StampedImages(depth_stamps_s, depth, paired, delays_s, lists)
 
 
 def stamped_images(folder: Path) -> list[tuple[float, Path]]:
@@ -134,7 +144,7 @@ def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path]]:
 
 def _from_association(path: Path, notes: list[str]) -> StampedImages:
     """Lines `stamp depth stamp rgb` or `stamp rgb stamp depth`: the order is seen from the names."""
-    found: list[tuple[float, Path, Path]] = []
+    found: list[tuple[float, Path, Path, float]] = []
     unreadable: list[int] = []
     outside: list[int] = []
     rows = read_rows(path)
@@ -143,19 +153,23 @@ def _from_association(path: Path, notes: list[str]) -> StampedImages:
         if len(row.fields) != 4 or _stamp(row, 0) is None or _stamp(row, 2) is None:
             unreadable.append(row.line)
             continue
-        stamp_s = _stamp(row, depth_at - 1)
+        stamp_s, colour_stamp_s = _stamp(row, depth_at - 1), _stamp(row, 3 - depth_at)
         depth, colour = (inside(path.parent, row.fields[column]) for column in (depth_at, 4 - depth_at))
-        if stamp_s is None or depth is None or colour is None:
+        if stamp_s is None or colour_stamp_s is None or depth is None or colour is None:
             outside.append(row.line)
         else:
-            found.append((stamp_s, depth, colour))
+            delay_s = colour_stamp_s - stamp_s
+            found.append((stamp_s, depth, colour, delay_s if abs(delay_s) <= LONGEST_DELAY_S else 0.0))
     collected = Notes(notes)
     collected.leave_out(path.name, "that are not `stamp file stamp file`", unreadable)
     collected.leave_out(path.name, "that point out of the folder", outside)
     if not found:
         raise SourceError(f"{path}: no line `stamp file stamp file` that can be used in it: mend or remove the file")
-    stamps_s, order = _in_order(np.array([stamp for stamp, _, _ in found]), path.name, notes)
-    return StampedImages(stamps_s, [found[row][1] for row in order], [found[row][2] for row in order], (path,))
+    stamps_s, order = _in_order(np.array([stamp for stamp, *_ in found]), path.name, notes)
+    delays_s = np.array([found[row][3] for row in order])
+    return StampedImages(
+        stamps_s, [found[row][1] for row in order], [found[row][2] for row in order], delays_s, (path,)
+    )
 
 
 def _depth_column(rows: list[Row], path: Path) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
+from hodge_adapters.posed import written
 from hodge_adapters.text_rows import read_rows, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -104,18 +105,19 @@ class LogReader:
 class LogWriter:
     """Writes a Redwood `.log`: the trajectory where there is one, else the graph's edges."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically. Whole stamps are the numbers of the poses, else the rows; edges need integer ids."""
         if source.trajectory is not None:
             stamps = source.trajectory.stamps_s
             whole = np.equal(np.mod(stamps, 1), 0).all() and (stamps >= 0).all()
             numbers = stamps.astype(np.int64) if whole else np.arange(len(stamps))
             write_text_atomically(path, _blocks(np.column_stack([numbers, numbers]), source.trajectory.world_from_cam))
-        elif source.graph is not None and source.graph.vertex_ids.dtype.kind in "iu":
+            return written(f"{len(stamps)} poses", source, {"stamps"} if whole else ())
+        if source.graph is not None and source.graph.vertex_ids.dtype.kind in "iu":
             pairs = source.graph.vertex_ids[source.graph.edges].astype(np.int64)
             write_text_atomically(path, _blocks(pairs, source.graph.i_from_j, source.graph.vertex_count))
-        else:
-            raise SourceError(f"{source.path}: no trajectory, and no graph with numbered vertices, to write as .log")
+            return written(f"{len(pairs)} edges", source, {"edges"})
+        raise SourceError(f"{source.path}: no trajectory, and no graph with numbered vertices, to write as .log")
 
 
 def _blocks(keys: Ints, motions: Floats, count: int | None = None) -> str:

@@ -9,12 +9,14 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from hodge_adapters.mcap_records import MAGIC
-from hodge_adapters.text_rows import inside, listed, read_text
+from hodge_adapters.text_rows import inside, listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types.input_files import beginning
+from hodge_pipeline.types.input_files import beginning, read_input_text
 
 METADATA = "metadata.yaml"
+MAX_METADATA_BYTES = 1 << 18
+"""Of a bag of a thousand files; it takes ten seconds to parse."""
 SQLITE_REMEDY = "convert it with `ros2 bag convert` to storage mcap"
 
 
@@ -70,10 +72,10 @@ def find_files(path: Path, notes: list[str]) -> Listing:
 def _listed(metadata: Path, notes: list[str]) -> list[Path]:
     """The files that a bag's metadata lists, none where it cannot be read."""
     try:
-        content = YAML(typ="safe", pure=True).load(read_text(metadata))
+        content = YAML(typ="safe", pure=True).load(read_input_text(metadata, MAX_METADATA_BYTES, errors="replace"))
         names = content["rosbag2_bagfile_information"]["relative_file_paths"]
         paths = [inside(metadata.parent, str(name)) for name in names]
-    except (YAMLError, KeyError, TypeError, ValueError, RecursionError):
+    except (OSError, YAMLError, KeyError, TypeError, ValueError, AttributeError, RecursionError):
         notes.append(f"{METADATA} cannot be read: every .mcap file of the folder is taken, by name")
         return []
     if None in paths:

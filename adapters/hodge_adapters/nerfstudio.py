@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+import cv2
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters import images
 from hodge_adapters.json_files import first_text, motion, number, objects, read_json, whole, write_json
-from hodge_adapters.posed import trajectory_of
-from hodge_adapters.text_rows import inside, listed
-from hodge_pipeline.errors import SourceError
+from hodge_adapters.lens_models import FISHEYE, PERSPECTIVE, named
+from hodge_adapters.posed import trajectory_of, written
+from hodge_adapters.text_rows import inside, listed, write_bytes_atomically
+from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Camera, Frame, Source, Trajectory
+from hodge_pipeline.types import Camera, Frame, ImageFile, Source, Trajectory
+from hodge_pipeline.types.input_files import read_input
 
 FILE = "transforms.json"
+IMAGES = "images"
+ENDINGS = (".png", ".jpg", ".jpeg")
 OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 HALF_PIXEL = 0.5
 """nerfstudio puts 0, 0 at the outer corner of the first pixel."""
@@ -86,31 +93,94 @@ class NerfstudioReader:
             read_colour=partial(images.read_colour, colour, size=size) if colour else None,
             encoded_depth=partial(images.encoded_depth, depth, units_per_metre=1 / unit) if depth and camera else None,
             encoded_colour=partial(images.encoded_colour, colour) if colour else None,
+            image=_image_file(colour, camera, {**content, **entry}) if colour and camera else None,
             world_from_cam=pose,
         )
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class NerfstudioWriter:
-    """Writes posed frames as a `transforms.json`."""
+    """Writes posed frames as a `transforms.json`, with images that its cameras fit."""
 
-    def write(self, path: Path, source: Source) -> None:
-        """One file, atomically. A frame's `file_path` is its id; stamps are lost."""
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
+        """The file, atomically, after the images: each stays where it is below the file's folder, else a copy goes to
+        `images/` beside it. Lens distortion passes through where nerfstudio knows the lens (k1 to k4, p1, p2, for all
+        images alike); else undistorted images are written there. Without an image `file_path` is the frame's id.
+        """
+        path = Path(path)
         posed = [frame for frame in source.frames if frame.world_from_cam is not None]
-        if posed:
-            entries = [_entry(str(frame.frame_id), frame.world_from_cam, frame.camera) for frame in posed]
-        else:
+        if not posed:
             poses = trajectory_of(source).world_from_cam
-            entries = [_entry(f"{row:06d}", pose, None) for row, pose in enumerate(poses)]
-        write_json(Path(path), {"camera_model": "OPENCV", "orientation_override": "none", "frames": entries})
+            bare = [_entry(f"{row:06d}", pose, None) for row, pose in enumerate(poses)]
+            write_json(path, {"camera_model": PERSPECTIVE, "orientation_override": "none", "frames": bare})
+            return written(f"{len(bare)} poses without images", source)
+        lenses = [None if frame.image is None else named(frame.image) for frame in posed]
+        models = {lens[0] for lens in lenses if lens}
+        model = models.pop() if len(models) == 1 else None
+        entries, done = [], Counter[str]()
+        for frame, lens in zip(posed, lenses, strict=True):
+            if lens is not None and model is not None and frame.image is not None:
+                name, how = _placed(path.parent, frame.image.path, frame.frame_id)
+                entries.append(_entry(name, frame.world_from_cam, lens[1]))
+            else:
+                name, how = _undistorted(path.parent, frame)
+                entries.append(_entry(name, frame.world_from_cam, _pinhole(frame.camera)))
+            done[how] += 1
+        write_json(path, {"camera_model": model or PERSPECTIVE, "orientation_override": "none", "frames": entries})
+        how = ", ".join(f"{count} {what}" for what, count in done.items())
+        return written(f"{len(entries)} frames: {how}", source, {"cameras", "names", "images"})
 
 
-def _entry(name: str, world_from_cam: Any, camera: Camera | None) -> dict[str, Any]:
-    entry: dict[str, Any] = {"file_path": name}
-    if camera is not None:
-        entry |= {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
-        entry |= {"cx": camera.cx + HALF_PIXEL, "cy": camera.cy + HALF_PIXEL}
-    return entry | {"transform_matrix": (world_from_cam @ OPENGL_FROM_CAM + 0.0).tolist()}
+def _entry(name: str, world_from_cam: Any, camera: Mapping[str, float] | None) -> dict[str, Any]:
+    return {"file_path": name, **(camera or {}), "transform_matrix": (world_from_cam @ OPENGL_FROM_CAM + 0.0).tolist()}
+
+
+def _pinhole(camera: Camera | None) -> dict[str, float]:
+    if camera is None:
+        return {}
+    size = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
+    return size | {"cx": camera.cx + HALF_PIXEL, "cy": camera.cy + HALF_PIXEL}
+
+
+def _placed(folder: Path, image: Path, frame_id: int | str) -> tuple[str, str]:
+    """The `file_path` of an image below the folder, where a copy is put if it lies elsewhere: named as the frame, or
+    as the file where the frame has but a number.
+    """
+    base = folder.resolve()
+    if image.resolve().is_relative_to(base):
+        return image.resolve().relative_to(base).as_posix(), "images where they are"
+    target = _target(folder, image.name if isinstance(frame_id, int) else _bare(frame_id) + image.suffix)
+    write_bytes_atomically(target, read_input(image))
+    return target.relative_to(folder).as_posix(), "images copied"
+
+
+def _undistorted(folder: Path, frame: Frame) -> tuple[str, str]:
+    """The `file_path` of the image that a frame's pinhole camera sees, written as PNG."""
+    if frame.read_colour is None:
+        return str(frame.frame_id), "without an image"
+    target = _target(folder, _bare(str(frame.frame_id)) + ".png")
+    done, contents = cv2.imencode(".png", cv2.cvtColor(frame.read_colour(), cv2.COLOR_RGB2BGR))
+    assert done
+    write_bytes_atomically(target, bytes(contents))
+    return target.relative_to(folder).as_posix(), "images written undistorted"
+
+
+def _bare(name: str) -> str:
+    """The name without the ending of an image."""
+    pure = PurePosixPath(name)
+    return str(pure.with_suffix("")) if pure.suffix.lower() in ENDINGS else name
+
+
+def _target(folder: Path, name: str) -> Path:
+    """The path of this image in the folder of images, which is made."""
+    target = inside(folder / IMAGES, name)
+    if target is None:
+        raise SourceError(f"{name!r}: the name of an image leaves its folder: rename it")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise not_written(target, error) from error
+    return target
 
 
 def _camera(values: dict[str, Any], where: str) -> Camera | None:
@@ -125,12 +195,26 @@ def _camera(values: dict[str, Any], where: str) -> Camera | None:
     return Camera(width, height, fx, fy, cx - HALF_PIXEL, cy - HALF_PIXEL)
 
 
+def _image_file(path: Path, camera: Camera, values: dict[str, Any]) -> ImageFile:
+    """The image with the lens that the file says."""
+    k1, k2, k3, k4, p1, p2 = (number(values.get(name)) or 0.0 for name in DISTORTION)
+    pinhole = (camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL)
+    if values.get("camera_model") == FISHEYE:
+        return ImageFile(path, camera.width, camera.height, FISHEYE, (*pinhole, k1, k2, k3, k4))
+    if k3:
+        return ImageFile(
+            path, camera.width, camera.height, "FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+        )
+    lens, more = (PERSPECTIVE, (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
+    return ImageFile(path, camera.width, camera.height, lens, (*pinhole, *more))
+
+
 def _existing(folder: Path, name: Any) -> Path | None:
     """The image of a frame inside the folder; older files leave out the ending."""
     if not isinstance(name, str) or "\0" in name:
         return None
     for ending in ("", ".png", ".jpg"):
         path = inside(folder, name + ending)
-        if path and path.suffix.lower() in (".png", ".jpg", ".jpeg") and path.is_file():
+        if path and path.suffix.lower() in ENDINGS and path.is_file():
             return path
     return None

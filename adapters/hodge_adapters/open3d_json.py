@@ -15,7 +15,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.json_files import first_text, motion, numbers, objects, read_json, whole, write_json
-from hodge_adapters.posed import trajectory_of
+from hodge_adapters.posed import trajectory_of, written
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -58,7 +58,7 @@ class Open3dReader:
 class Open3dPoseGraphWriter:
     """Writes a measured graph as Open3D's pose graph, with the trajectory's poses where it has one for each vertex."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically. Edges of neighbouring vertices are certain, others uncertain, unless they came so."""
         graph = source.graph
         if graph is None:
@@ -73,13 +73,14 @@ class Open3dPoseGraphWriter:
             **VERSION,
         }
         write_json(Path(path), content)
+        return written(f"{graph.vertex_count} vertices, {graph.edge_count} edges", source, {"edges"})
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Open3dTrajectoryWriter:
     """Writes posed frames as Open3D's PinholeCameraTrajectory."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically. Stamps are lost; a source without cameras gets intrinsics of size 0, which Open3D
         takes for unknown.
         """
@@ -100,6 +101,7 @@ class Open3dTrajectoryWriter:
             **VERSION,
         }
         write_json(Path(path), content)
+        return written(f"{len(poses)} poses", source, {"cameras"})
 
 
 def information_of_open3d(j_from_i: Floats, information: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -31,6 +31,33 @@ def trajectory_of(source: Source) -> Trajectory:
     if found is None:
         raise SourceError(f"{source.path}: has no poses to write: convert one that has a trajectory")
     return found
+
+
+def written(what: str, source: Source, keeps: Collection[str] = ()) -> tuple[str, ...]:
+    """`what` was written, and what a source has that a format lost: all but what it `keeps`, a line each."""
+    frames = source.frames
+    stamps = np.array([frame.stamp_s for frame in frames]) if frames else _stamps(source.trajectory)
+    counts = {
+        "stamps": 0 if np.array_equal(stamps, np.arange(len(stamps))) else len(stamps),
+        "names": sum(isinstance(frame.frame_id, str) for frame in frames),
+        "cameras": len({frame.camera for frame in frames if frame.camera}),
+        "images": sum(frame.read_colour is not None for frame in frames),
+        "depth images": sum(frame.read_depth is not None for frame in frames),
+        "point clouds": sum(frame.read_points is not None for frame in frames),
+        "edges": 0 if source.graph is None else source.graph.edge_count,
+    }
+    words = {name: name.removesuffix("s") if count == 1 else name for name, count in counts.items()}
+    lost = [f"{count} {words[name]}" for name, count in counts.items() if count and name not in keeps]
+    without = sum(frame.world_from_cam is None for frame in frames)
+    return (
+        what,
+        *([f"{without} of {len(frames)} frames have no pose"] if without else []),
+        *([f"not in this format, so lost: {', '.join(lost)}"] if lost else []),
+    )
+
+
+def _stamps(trajectory: Trajectory | None) -> Floats:
+    return np.zeros(0) if trajectory is None else trajectory.stamps_s
 
 
 def posed_frames(frames: Sequence[Frame]) -> Trajectory | None:

@@ -11,11 +11,14 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.posed import length_notes, trajectory_of
+from hodge_adapters.posed import length_notes, trajectory_of, written
 from hodge_adapters.text_rows import Row, listed, read_rows, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Source, Trajectory
+
+COLUMNS = (8, 9)
+"""Of a line of TUM's: RTAB-Map adds the number of the node."""
 
 
 @plain_dataclass(frozen=True)
@@ -77,18 +80,22 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
 class TumWriter:
     """Writes a trajectory as TUM text."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically; see `write_tum`."""
-        write_tum(path, trajectory_of(source))
+        trajectory = trajectory_of(source)
+        write_tum(path, trajectory)
+        return written(f"{len(trajectory)} poses", source, {"stamps"})
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class KittiWriter:
     """Writes a trajectory as KITTI text."""
 
-    def write(self, path: Path, source: Source) -> None:
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically; see `write_kitti`."""
-        write_kitti(path, trajectory_of(source))
+        trajectory = trajectory_of(source)
+        write_kitti(path, trajectory)
+        return written(f"{len(trajectory)} poses", source)
 
 
 def _lines(table: Floats) -> str:
@@ -102,8 +109,8 @@ def _tum_table(rows: Sequence[Row]) -> tuple[Floats, list[Row]]:
     bad: list[Row] = []
     for row in rows:
         values = to_floats(row.fields)
-        if values and len(values) == 8 and all(map(math.isfinite, values)) and _is_quat(values[4:]):
-            good.append(values)
+        if values and len(values) in COLUMNS and all(map(math.isfinite, values)) and _is_quat(values[4:8]):
+            good.append(values[:8])
         else:
             bad.append(row)
     return np.array(good, np.float64).reshape(-1, 8), bad

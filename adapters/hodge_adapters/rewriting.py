@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters.euroc import NANO
 from hodge_adapters.euroc import file_of as euroc_file
 from hodge_adapters.open3d_json import Open3dReader, Open3dTrajectoryWriter
+from hodge_adapters.poses_text import COLUMNS
 from hodge_adapters.seven_scenes_files import FRAME_FILE, sequence_folders
 from hodge_adapters.text_rows import read_text, to_floats, write_text_atomically
 from hodge_pipeline import se3
@@ -55,7 +56,7 @@ class TumRewriter(_OneFile):
 
         def numbers(fields: list[str]) -> list[float] | None:
             values = to_floats(fields)
-            pose = poses.at(values[0]) if values and len(values) == 8 else None
+            pose = poses.at(values[0]) if values and len(values) in COLUMNS else None
             return None if pose is None else [*pose[:3, 3], *se3.to_quat_xyzw(pose)]
 
         return _rewritten(folder, original, numbers, first=1)

@@ -165,6 +165,7 @@ class SevenScenesReader:
             units_per_metre=UNITS_PER_METRE,
             no_depth=self.no_depth,
             world_from_cam=pose,
+            is_true=True,
             sequence=files.sequence,
         )
         colour = self._colour(camera)
@@ -179,7 +180,7 @@ class SevenScenesReader:
             units_per_metre=UNITS_PER_METRE,
             no_depth=self.no_depth,
         )
-        return replace(frame, read_colour=read, encoded_colour=None)
+        return replace(frame, read_colour=read, encoded_colour=None, image=None)
 
     def _colour(self, camera: Camera) -> ColourCamera | None:
         """The colour camera, None where it is taken to be the depth camera."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.poses_text import parse_tum, read_kitti
+from hodge_adapters.poses_text import COLUMNS, parse_tum, read_kitti
 from hodge_adapters.text_rows import to_floats
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source
@@ -24,7 +24,7 @@ class TumPosesReader:
 
     def sniff(self, path: Path) -> Sniff:
         """By the first lines that are no comment: eight numbers each."""
-        return _sniff_columns(Path(path), 8, "lines of eight numbers")
+        return _sniff_columns(Path(path), COLUMNS, "lines of eight numbers")
 
     def open(self, path: Path) -> Source:
         """The trajectory, ascending; lines that are no pose are left out and noted."""
@@ -42,7 +42,7 @@ class KittiPosesReader:
 
     def sniff(self, path: Path) -> Sniff:
         """By the first lines: twelve numbers each."""
-        return _sniff_columns(Path(path), 12, "lines of twelve numbers")
+        return _sniff_columns(Path(path), (12,), "lines of twelve numbers")
 
     def open(self, path: Path) -> Source:
         """The trajectory."""
@@ -59,9 +59,9 @@ def first_rows(path: Path) -> list[list[str]]:
     return list(islice((row for row in rows if row), SNIFFED_LINES))
 
 
-def _sniff_columns(path: Path, count: int, what: str) -> Sniff:
+def _sniff_columns(path: Path, counts: tuple[int, ...], what: str) -> Sniff:
     rows = [to_floats(" ".join(row).replace(",", " ").split()) for row in first_rows(path)]
-    good = sum(row is not None and len(row) == count for row in rows)
+    good = sum(row is not None and len(row) in counts for row in rows)
     if not good or good < 0.8 * len(rows):
         return Sniff(0.0, f"no {what}")
     return Sniff(0.7, what)

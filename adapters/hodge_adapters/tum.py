@@ -25,8 +25,18 @@ from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Source, Trajectory
 
 UNITS_PER_METRE = 5000.0
+READOUT_S = 0.0225
+"""Of the first Kinect's rolling shutter: where landmarks of fr1/xyz and fr1/rpy fit best, 22.2 and 23.1 ms."""
 CAMERAS = {
-    "fr1": Intrinsics(517.3, 516.5, 318.6, 255.3, (640, 480), distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "fr1": Intrinsics(
+        517.3,
+        516.5,
+        318.6,
+        255.3,
+        (640, 480),
+        distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+        readout_s=READOUT_S,
+    ),  # fmt: skip
     "fr2": Intrinsics(520.9, 521.0, 325.1, 249.7, (640, 480), distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "fr3": Intrinsics(535.4, 539.2, 320.1, 247.6, (640, 480)),
     "default": Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480)),
@@ -134,7 +144,9 @@ class TumReader:
                     units_per_metre=scale,
                     no_depth=self.no_depth,
                     world_from_cam=poses[row],
+                    is_true=True,
                     lens=lens,
+                    colour_delay_s=float(listing.colour_delays_s[row]),
                 )
                 for row in rows
             ),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
@@ -15,35 +14,18 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
+from hodge_pipeline.report import raster
 from hodge_pipeline.store.artifacts import write_atomically
-from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Ints
+from hodge_pipeline.types import Camera, Floats, Frame
 
 STRIDE = 3  # pixels: 34 000 points of a VGA frame, which fill nearly all pixels of the pictures
 MAX_RANGE_M = 5.0
 SURFACE_M = 0.04  # points this far behind the front one belong to the same surface: their colours are averaged
 STEP_BACK_M = 1.2
+SHARP_M = 1.0  # where a pixel is as wide as the focal length says
 DETAILS = 4
 PICTURE = (360, 270)
 WHOLE_FOCAL, DETAIL_FOCAL = 0.55, 1.1  # of the picture's width
-
-
-@dataclass(frozen=True)
-class _Points:
-    """The points of all frames in their cameras' axes, with colours; `offsets (N + 1,)` cut them into frames."""
-
-    offsets: Ints
-    in_cam: Floats32
-    colours: Bytes
-
-    def in_world(self, world_from_cam: Floats) -> tuple[Floats32, Bytes]:
-        """Points of the frames that have a pose, (M, 3), and their colours."""
-        parts, kept = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
-        for row in np.flatnonzero(np.isfinite(world_from_cam).all(axis=(1, 2))):
-            cut = slice(self.offsets[row], self.offsets[row + 1])
-            pose = world_from_cam[row].astype(np.float32)
-            parts.append(self.in_cam[cut] @ pose[:3, :3].T + pose[:3, 3])
-            kept.append(self.colours[cut])
-        return np.concatenate(parts), np.concatenate(kept)
 
 
 def draw_comparison(path: Path, frames: Sequence[Frame], pose_sets: Mapping[str, Floats]) -> None:
@@ -52,17 +34,18 @@ def draw_comparison(path: Path, frames: Sequence[Frame], pose_sets: Mapping[str,
     The first set decides the places; the others are aligned to it. A pixel shows the mean colour of all points on its
     front surface, so what does not fit together is blurred or doubled.
     """
-    points = _read_points(frames)
+    points = [_frame_points(frame) for frame in frames]
     names = list(pose_sets)
     reference = pose_sets[names[0]]
     views = _views(reference)
     figure, axes = plt.subplots(len(names), len(views), figsize=(3.2 * len(views), 2.55 * len(names)), squeeze=False)
     for row, name in enumerate(names):
         aligned = pose_sets[name] if row == 0 else _aligned(pose_sets[name], reference)
-        in_world, colours = points.in_world(aligned)
+        known = np.flatnonzero(np.isfinite(aligned).all(axis=(1, 2)))
+        scene = raster.Points.joined([points[one].moved(aligned[one]) for one in known])
         for column, (title, world_from_eye, focal) in enumerate(views):
             axis = axes[row, column]
-            axis.imshow(_render(in_world, colours, world_from_eye, focal))
+            axis.imshow(raster.picture(scene, _view(world_from_eye, focal)))
             axis.set(xticks=[], yticks=[], ylabel=name if column == 0 else "", title=title if row == 0 else "")
     figure.tight_layout(pad=0.4)
     try:
@@ -92,20 +75,10 @@ def _views(reference: Floats) -> list[tuple[str, Floats, float]]:
     return [("whole", whole, WHOLE_FOCAL), *details]
 
 
-def _read_points(frames: Sequence[Frame]) -> _Points:
-    parts, colours, sizes = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)], [0]
-    for frame in frames:
-        in_cam, colour = _frame_points(frame)
-        parts.append(in_cam)
-        colours.append(colour)
-        sizes.append(len(in_cam))
-    return _Points(np.cumsum(sizes), np.concatenate(parts), np.concatenate(colours))
-
-
-def _frame_points(frame: Frame) -> tuple[Floats32, Bytes]:
+def _frame_points(frame: Frame) -> raster.Points:
     """A frame without depth, or whose images cannot be read, has none: the run has said so already."""
     camera: Camera | None = frame.camera
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    nothing = raster.Points.of(np.zeros((0, 3), np.float32))
     if camera is None or frame.read_depth is None or frame.read_colour is None:
         return nothing
     try:
@@ -118,26 +91,12 @@ def _frame_points(frame: Frame) -> tuple[Floats32, Bytes]:
     v, u = v * STRIDE, u * STRIDE
     x, y = (u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z
     colour = image[v * image.shape[0] // depth.shape[0], u * image.shape[1] // depth.shape[1]]
-    return np.stack([x, y, z], axis=1).astype(np.float32), colour
+    return raster.Points.of(np.stack([x, y, z], axis=1).astype(np.float32), colours=colour)
 
 
-def _render(in_world: Floats32, colours: Bytes, world_from_eye: Floats, focal: float) -> Bytes:
-    """The picture (H, W, 3) of the points from a camera; white where there is none."""
-    width, height = PICTURE
-    eye_from_world = se3.inverse(world_from_eye).astype(np.float32)
-    in_eye = in_world @ eye_from_world[:3, :3].T + eye_from_world[:3, 3]
-    front = in_eye[:, 2] > 0.1
-    in_eye, colours = in_eye[front], colours[front]
-    u = np.floor(in_eye[:, 0] / in_eye[:, 2] * focal * width + width / 2).astype(np.int64)
-    v = np.floor(in_eye[:, 1] / in_eye[:, 2] * focal * width + height / 2).astype(np.int64)
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    pixel, depth, colours = (v * width + u)[inside], in_eye[inside, 2], colours[inside]
-    nearest = np.full(width * height, np.inf, np.float32)
-    np.minimum.at(nearest, pixel, depth)
-    shown = depth <= nearest[pixel] + SURFACE_M
-    pixel, colours = pixel[shown], colours[shown]
-    count = np.bincount(pixel, minlength=width * height)
-    sums = [np.bincount(pixel, colours[:, channel], minlength=width * height) for channel in range(3)]
-    mean = np.stack(sums, axis=1) / np.maximum(count, 1)[:, None]
-    picture = np.where(count[:, None] > 0, mean, 255.0).astype(np.uint8)
-    return np.asarray(picture.reshape(height, width, 3))
+def _view(world_from_eye: Floats, focal: float) -> raster.View:
+    """What a camera sees whose focal length is this share of the picture's width."""
+    axes = world_from_eye[:3, :3].T
+    centre = world_from_eye[:3, 3] + SHARP_M * axes[2]
+    pixel_m = SHARP_M / (focal * PICTURE[0])
+    return raster.View(axes, centre, pixel_m, PICTURE, eye_m=SHARP_M, culled=False, fill_px=0, surface_m=SURFACE_M)

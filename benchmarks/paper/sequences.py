@@ -13,7 +13,8 @@ import numpy as np
 from benchmarks.paper.tables import SEQUENCES
 from hodge_pipeline import registry, se3
 from hodge_pipeline.errors import HodgeError, SourceError
-from hodge_pipeline.types import Floats, Frame, Ints
+from hodge_pipeline.evaluation.trajectory import associate
+from hodge_pipeline.types import Floats, Frame
 
 SCENES = ("chess", "fire", "redkitchen", "stairs")
 COLLECTIONS = ("", "seven_scenes", "7scenes", "7-scenes", "icl_nuim", "icl-nuim")
@@ -139,24 +140,3 @@ def _checked(poses: Floats, place: Path) -> tuple[Floats, str]:
     if not known:
         raise SourceError(f"{place}: no pose in it belongs to a frame of the sequence: check frame numbers and stamps")
     return poses, f"peer: {known} of {len(poses)} poses"
-
-
-def associate(stamps_a: Floats, stamps_b: Floats, max_difference_s: float = 0.01) -> tuple[Ints, Ints]:
-    """Rows (M,) of each list of ascending stamps that belong together: each is the other's nearest, within the limit.
-
-    Mutual nearness keeps the match one to one; what has no partner is in neither list.
-    """
-    if not len(stamps_a) or not len(stamps_b):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    nearest_b, nearest_a = _nearest(stamps_a, stamps_b), _nearest(stamps_b, stamps_a)
-    rows_a = np.arange(len(stamps_a))
-    mutual = nearest_a[nearest_b] == rows_a
-    near = np.abs(stamps_a - stamps_b[nearest_b]) <= max_difference_s
-    return rows_a[mutual & near], nearest_b[mutual & near]
-
-
-def _nearest(stamps: Floats, among: Floats) -> Ints:
-    after = np.clip(np.searchsorted(among, stamps), 1, max(len(among) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(among) - 1)
-    return np.asarray(np.where(stamps - among[before] <= among[after] - stamps, before, after), np.int64)

@@ -7,11 +7,9 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
 
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, SIGMA_M, GraphKind
-from hodge_pipeline.report.page import STYLE
-from hodge_pipeline.report.tables import Table
+from hodge_pipeline.report.document import Document, Linked, Section, Table, markdown, render
 
 NAN = float("nan")
 COLUMNS = ("GT", "BF", "Hodge 1st", "Hodge 3rd")
@@ -177,13 +175,7 @@ def _run_table(results: Results) -> Table:
 
 def as_markdown(shown: Sequence[Table], heading: str) -> str:
     """The tables as one Markdown document."""
-    parts = [f"# {heading}\n"]
-    for table in shown:
-        align = ["---" if column < table.names else "---:" for column in range(len(table.header))]
-        rows = [table.header, tuple(align), *table.rows]
-        lines = [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in rows]
-        parts.append(f"## {table.title}\n\n" + "\n".join(lines) + f"\n\n{table.caption}\n")
-    return "\n".join(parts)
+    return f"# {heading}\n\n{markdown(shown)}"
 
 
 def as_csv(shown: Sequence[Table]) -> str:
@@ -201,27 +193,6 @@ def as_csv(shown: Sequence[Table]) -> str:
 
 def as_html(shown: Sequence[Table], heading: str, figures: Mapping[str, str] | None = None) -> str:
     """The tables as one page; `figures` are paths of pictures, relative to the page, by their caption."""
-    pictures = "".join(
-        f'<figure><img src="{escape(path)}" alt="{escape(caption)}"><figcaption>{escape(caption)}</figcaption></figure>'
-        for caption, path in (figures or {}).items()
-    )
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(heading)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<h1>{escape(heading)}</h1>\n"
-        + "\n".join(_html_table(table) for table in shown)
-        + f"\n{pictures}\n</body>\n</html>\n"
-    )
-
-
-def _html_table(table: Table) -> str:
-    def line(cells: Sequence[str], tag: str) -> str:
-        kinds = [' class="word"' if column < table.names else "" for column in range(len(cells))]
-        return "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
-
-    body = "\n".join(f"<tr>{line(row, 'td')}</tr>" for row in table.rows)
-    return (
-        f'<section><h2>{escape(table.title)}</h2>\n<div class="scroll"><table>\n<thead><tr>{line(table.header, "th")}'
-        f"</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>\n"
-        f'<p class="caption">{escape(table.caption)}</p></section>'
-    )
+    pictures = tuple(Linked("", caption, path) for caption, path in (figures or {}).items())
+    sections = (*(Section.of(table) for table in shown), Section("Pictures", pictures=pictures, is_large=True))
+    return render(Document(heading, sections=sections))

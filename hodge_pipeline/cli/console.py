@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -22,15 +23,17 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from hodge_pipeline.cli.guard import unguarded
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types.notes import Note
+from hodge_pipeline.types.text import visible
 
 
 class Terminal:
     """A watcher that draws one bar for each stage on stderr; where that is not a terminal, one plain line for each."""
 
     def __init__(self, quiet: bool) -> None:
-        self._console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
+        self._console = Console(file=unguarded(sys.stderr), quiet=quiet, highlight=False, soft_wrap=True)
         self._tasks: dict[str, TaskID] = {}
         self._totals: dict[str, int] = {}
         self._draws = self._console.is_terminal and not quiet
@@ -83,7 +86,7 @@ class Terminal:
 
     def say(self, message: str) -> None:
         """One line above the bars."""
-        self._console.print(message, markup=False)
+        self._console.print(visible(message), markup=False)
 
 
 class RateColumn(ProgressColumn):
@@ -97,9 +100,9 @@ class RateColumn(ProgressColumn):
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """A table on stdout, numbers to the right."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title=Text(visible(title)), title_justify="left", box=box.SIMPLE_HEAD)
     for row, name in enumerate(header):
         table.add_column(name, justify="left" if row == 0 else "right")
     for cells in rows:
-        table.add_row(*cells)
-    Console(highlight=False).print(table)
+        table.add_row(*(Text(visible(cell)) for cell in cells))
+    Console(highlight=False, file=unguarded(sys.stdout)).print(table)

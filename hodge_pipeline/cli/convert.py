@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.cli.paths import keep_source
 from hodge_pipeline.cli.reader_choice import choose_reader
-from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.errors import RecipeError, SourceError, not_written
 from hodge_pipeline.stages import Writer
 from hodge_pipeline.types import Source, Trajectory
 
@@ -30,20 +30,33 @@ BY_SUFFIX = {
 
 
 def convert(
-    source: Path, out: Path, *, to: str | None = None, reader: str | None = None, settings: Sequence[str] = ()
+    source: Path,
+    out: Path,
+    *,
+    to: str | None = None,
+    reader: str | None = None,
+    settings: Sequence[str] = (),
+    overwrite: bool = False,
 ) -> None:
     """Read a path with the surest reader, or the one named, and write it, in the format of its name or of `to`.
 
-    Prints what was written and every note of the reader. Raises `RecipeError` where no writer is meant by the name.
+    Prints what was written, what the format lost, and every note of the reader. Raises `RecipeError` where no writer is
+    meant by the name, or there is something at `out` that is not to be replaced.
     """
     keep_source(source, out)
+    if not overwrite and out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise RecipeError(f"{out}: is there already: give another name, or --overwrite to replace it")
     opened = with_trajectory(choose_reader(source, reader, settings).open(source))
     name = to or writer_name(out, opened)
     writer: Writer = registry.load("writers", name)()
-    writer.write(out, opened)
-    for note in opened.notes:
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise not_written(out, error) from error
+    what, *lost = writer.write(out, opened) or ("",)
+    for note in (*opened.notes, *lost):
         print(f"note: {note}")
-    print(f"{out}: written as {name}")
+    print(f"{out}: written as {name}{what and ': '}{what}")
 
 
 def writer_name(out: Path, source: Source) -> str:

@@ -83,14 +83,18 @@ def _cells(found: Diagnosed, row: int) -> tuple[str, ...]:
 def _print_rich(rows: list[tuple[str, ...]]) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
+
+    from hodge_pipeline.cli.guard import unguarded
+    from hodge_pipeline.types.text import visible
 
     styles = {"wrong": "bold magenta", "suspect": "yellow", "untestable": "dim", "consistent": "blue"}
     table = Table(title="Edges, the worst first", title_justify="left")
     for name in HEADER:
         table.add_column(name, justify="right" if name == "right" else "left", overflow="fold")
     for cells in rows:
-        table.add_row(*cells, style=styles.get(cells[1], ""))
-    Console(highlight=False).print(table)
+        table.add_row(*(Text(visible(cell)) for cell in cells), style=styles.get(cells[1], ""))
+    Console(highlight=False, file=unguarded(sys.stdout)).print(table)
 
 
 def _energy(row: EnergyRow) -> dict[str, Any]:

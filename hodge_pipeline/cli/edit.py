@@ -91,6 +91,8 @@ def _words(pairs: Sequence[str]) -> list[str]:
 
 
 def _print(folder: Path, history: History, listed: Listed, *, changed: bool, listing: bool) -> None:
+    from hodge_pipeline.types.text import command
+
     if listing:
         for number, one in enumerate(history.edits, start=1):
             print(f"{number:>3}  {one}")
@@ -101,7 +103,7 @@ def _print(folder: Path, history: History, listed: Listed, *, changed: bool, lis
         print(f"{switch:<10} {pair}{_facts(listed.edges, by_name.get(pair), switch)}")
     if changed:
         registers = "registers, " if history.registered else ""
-        print(f"next       hodge solve {folder}     ({registers}solves and fuses again)")
+        print(f"next       {command('hodge', 'solve', folder)}     ({registers}solves and fuses again)")
 
 
 def _facts(edges: Edges, row: int | None, switch: str) -> str:

@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 
 from hodge_pipeline.cli import refine as refining
-from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet
+from hodge_pipeline.cli.guard import guard_streams, shown
+from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet, Truth
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -66,6 +67,7 @@ def run(
     recipe: Annotated[str, typer.Argument(help="A recipe by name (see `hodge recipes`) or a .yaml file.")],
     out: Out,
     source: Annotated[Path | None, typer.Option(help="What to read; overrides source.path.")] = None,
+    truth: Truth = None,
     overrides: Overrides = None,
     overwrite: Overwrite = False,
     dask: Dask = None,
@@ -76,9 +78,8 @@ def run(
     """Run a recipe on a source: poses, fused model, report and recording in --out."""
     from hodge_pipeline.cli import run as running
 
-    running.run(
-        recipe, source, out, overrides or [], overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask
-    )
+    sets = [*(overrides or []), *running.named_truth(truth)]
+    running.run(recipe, source, out, sets, overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask)
 
 
 @app.command()
@@ -202,11 +203,12 @@ def convert(
     to: Annotated[str | None, typer.Option("--to", help="The writer by name (see `hodge stages writers`).")] = None,
     reader: Reader = None,
     overrides: ReaderSet = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is at OUT.")] = False,
 ) -> None:
     """Write what a path holds in another format."""
     from hodge_pipeline.cli import convert as converting
 
-    converting.convert(source, out, to=to, reader=reader, settings=overrides or [])
+    converting.convert(source, out, to=to, reader=reader, settings=overrides or [], overwrite=overwrite)
 
 
 @app.command()
@@ -268,12 +270,13 @@ def compare(
 
 def main() -> None:
     """Run the command; what a user can mend is one line and exit code 1 (3: a result that failed its checks)."""
+    guard_streams()
     try:
         app(standalone_mode=True)  # which ends with 130 on Ctrl-C
     except OSError as error:
         if error.filename is None and error.errno is None:
             raise
-        print(f"error: {error.filename or 'a file'}: {error.strerror}", file=sys.stderr)
+        print(f"error: {shown(str(error.filename or 'a file'))}: {error.strerror}", file=sys.stderr)
         sys.exit(1)
     except MemoryError:
         print("error: this needs more memory than there is: give less data, or free some", file=sys.stderr)
@@ -283,7 +286,7 @@ def main() -> None:
 
         if not isinstance(error, HodgeError):
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shown(str(error))}", file=sys.stderr)
         sys.exit(error.exit_code)
 
 

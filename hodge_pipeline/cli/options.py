@@ -21,6 +21,12 @@ Overwrite = Annotated[bool, typer.Option(help="Replace the run of another recipe
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")]
+Truth = Annotated[
+    str | None,
+    typer.Option(
+        "--truth", metavar="FILE", help="True poses to compare with: a file of poses; `frames`: the source's own."
+    ),
+]
 Dask = Annotated[
     str | None,
     typer.Option(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hodge_pipeline.cli.options import Dask, Force, Json, Overrides, Overwrite, Quiet
+from hodge_pipeline.cli.options import Dask, Force, Json, Overrides, Overwrite, Quiet, Truth
 
 HELP = """Make the poses of COLMAP or SLAM better, in their own format.
 
@@ -38,6 +38,7 @@ def trajectory(
     match: Annotated[
         str, typer.Option(help="How a pose finds its frame: stamp, number, row (n-th pose, n-th frame), or auto.")
     ] = "auto",
+    truth: Truth = None,
     force: Force = False,
     recipe: Annotated[
         str, typer.Option("--recipe", help="A recipe like slam-refine, which is the default; for TUM slam-refine-tum.")
@@ -50,6 +51,7 @@ def trajectory(
 ) -> None:
     """Refine SLAM poses with the frames they belong to: loops, registration, a robust solve."""
     from hodge_pipeline.cli import refine_trajectory as refining_trajectory
+    from hodge_pipeline.cli.run import named_truth
 
     refining_trajectory.refine(
         poses,
@@ -57,7 +59,7 @@ def trajectory(
         out,
         match,
         recipe,
-        overrides or [],
+        [*named_truth(truth), *(overrides or [])],
         force=force,
         overwrite=overwrite,
         quiet=quiet,

@@ -55,6 +55,11 @@ def _print(result: RefinedModel) -> None:
     rows = [(m.name, f"{m.before:.4g}", f"{m.after:.4g}", m.unit) for m in result.decision.measures]
     if rows:
         print_table(f"{result.start.quality.images} images", ("measure", "before", "after", "unit"), rows)
+    costs = [
+        (name, f"{cost.px:.4g}", f"{cost.median_px:.4g}", str(len(cost.images_off)), "kept" * (row == result.kept_row))
+        for row, (name, cost) in enumerate(result.candidates)
+    ]
+    print_table("candidates", ("candidate", "mean px", "median px", "images off", ""), costs)
     print(f"{'verdict':<8} {result.decision.outcome}: {result.decision.reason}")
     if result.decision.change is not None:
         print(f"{'change':<8} {result.decision.change}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -42,6 +43,11 @@ def run(
     print_result(result, quiet=quiet, as_json=as_json)
     if result.refined is not None and result.refined.decision.exit_code:
         raise CheckError(result.refined.decision.reason)
+
+
+def named_truth(truth: str | None) -> list[str]:
+    """The option that `--truth` stands for."""
+    return [] if truth is None else [f"evaluation.truth={json.dumps(truth)}"]
 
 
 def print_result(result: Run, *, quiet: bool, as_json: bool) -> None:

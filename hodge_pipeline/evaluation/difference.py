@@ -76,6 +76,12 @@ class Change:
         return f"{self.short} {' → '.join(self.values)}"
 
     @property
+    def line(self) -> str:
+        """`ATE 5 cm → 3 cm (−40 %, better)`."""
+        word = {1: "better", 0: "unchanged", -1: "worse"}[self.sign]
+        return f"{self.briefly}{f' ({percent(self.share)}, {word})' if self._in_percent else f' ({word})'}"
+
+    @property
     def values(self) -> tuple[str, str]:
         """Before and after in the same unit."""
         if self.unit == "°":

@@ -15,7 +15,7 @@ def score_rounds(
     source: Source, clouds: CloudSet, rounds: Sequence[Round], scale: float, steps: Steps, workers: Workers
 ) -> ScoreTable:
     """The score tables of the true poses (where there are any) and of every round; lengths are in units of `scale`."""
-    sets = pose_sets(rounds)
+    sets = pose_sets(rounds, source)
     sets = {"truth": true_poses(source), **sets} if has_truth(source) else sets
     reference = "truth" if has_truth(source) else "result"
     return steps.step(evaluate, clouds, sets, reference, scale, title="evaluation", workers=workers)

@@ -30,8 +30,8 @@ SIGMA_M = 0.069
 CENTROID_DISTANCE_M = 0.2
 IOU = 0.5
 IOU_VOXEL_M = 0.1
-MOST_PAIRS = 5000
-"""Pairs of a graph that are scored: the mean of so many is known to a tenth of a millimetre."""
+MOST_PAIRS = 1500
+"""Pairs of a graph that are scored: the mean of so many is known to a fifth of a millimetre (red kitchen)."""
 PAIRS_PER_BLOCK = 96
 """About half a second of work: long against the cost of sending a block, short against a whole run."""
 
@@ -187,7 +187,7 @@ def score_table(
 ) -> ScoreTable:
     """Every set of poses (N, 4, 4), scored on the graphs of the one that `reference` names.
 
-    Of a graph with more than 5000 pairs so many are taken, evenly. Pairs that both graphs share are measured
+    Of a graph with more than 1500 pairs so many are taken, evenly. Pairs that both graphs share are measured
     once. Give the ground truth as the reference where there is one, else the result.
     """
     if reference not in pose_sets:

@@ -20,6 +20,9 @@ COLLINEAR = 1e-6
 ORIENTATION_SHARE = 1e-6
 """Weight of the orientations where positions leave a rotation open: small, so that positions decide where they can."""
 
+ASSOCIATED_S = 0.01
+"""Seconds between a pose and the truth that it is compared with: evo's own."""
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -103,6 +106,27 @@ def absolute_error(
         aligned=aligned,
         alignments=tuple(alignments),
     )
+
+
+def associate(stamps_a: Floats, stamps_b: Floats, most_s: float = ASSOCIATED_S) -> tuple[Ints, Ints]:
+    """Rows (M,) of two lists of ascending stamps that belong together, as evo has it: each stamp of the shorter list
+    with the nearest of the longer one, at most `most_s` away.
+    """
+    if not len(stamps_a) or not len(stamps_b):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    rows_a, rows_b = np.arange(len(stamps_a)), np.arange(len(stamps_b))
+    if len(rows_b) < len(rows_a):
+        rows_a = _nearest(stamps_b, stamps_a)
+    else:
+        rows_b = _nearest(stamps_a, stamps_b)
+    near = np.abs(stamps_a[rows_a] - stamps_b[rows_b]) <= most_s
+    return rows_a[near], rows_b[near]
+
+
+def _nearest(moments: Floats, among: Floats) -> Ints:
+    after = np.clip(np.searchsorted(among, moments), 0, len(among) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(among[before] - moments) <= np.abs(among[after] - moments), before, after)
 
 
 def _usable(estimate: Floats, reference: Floats) -> Bools:

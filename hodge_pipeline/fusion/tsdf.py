@@ -32,6 +32,12 @@ class TsdfFuser:
         "more are fused, all of them must have seen it",
     )
     every: int = Field(1, ge=1, description="frames: only each such frame is fused; a long sequence needs fewer")
+    min_motion_m: float = Field(
+        0.0,
+        ge=0,
+        description="metres, and radians at one metre: a frame that moved less since the last one fused is left out "
+        "and not read; at frame rate 0.05 leaves out two of three, which show the same from the same side",
+    )
     colour: bool = Field(True, description="colour the mesh; without it fusion is a third faster")
     memory_limit_mb: float = Field(
         2000.0,
@@ -52,7 +58,7 @@ class TsdfFuser:
         voxel_m, reported, grid = self.voxel_m, 0, None
         while grid is None:
             skipped = Skipped()
-            views = posed(frames, world_from_cam, self.every, skipped)
+            views = posed(frames, world_from_cam, self.every, skipped, self.min_motion_m)
             grid, reported = self._integrated(views, voxel_m, skipped, reported, advance)
             voxel_m *= 2 if grid is None else 1
         advance(len(frames) - len(views))
@@ -64,7 +70,11 @@ class TsdfFuser:
             normals_in_world=normals,
             colours=colours if grid.coloured else None,
             triangles=triangles,
-            notes=(*skipped.notes(), *self._notes(voxel_m, len(triangles), min_weight)),
+            notes=(
+                *skipped.notes(),
+                *self._notes(voxel_m, len(triangles), min_weight),
+                *self._thinned(len(views), len(frames)),
+            ),
         )
 
     def _integrated(
@@ -93,6 +103,11 @@ class TsdfFuser:
             colour = skipped.colour(frame) if grid.colour else None
             if not grid.integrate(depth_m, colour, frame.camera, world_from_cam):
                 skipped.add(f"no depth within max_depth_m = {self.max_depth_m:g}", frame)
+
+    def _thinned(self, fused: int, frames: int) -> list[str]:
+        if self.min_motion_m == 0 or fused == frames:
+            return []
+        return [f"{fused} of {frames} frames fused: one each min_motion_m = {self.min_motion_m:g} of the path"]
 
     def _notes(self, voxel_m: float, triangles: int, min_weight: float) -> list[str]:
         notes = []

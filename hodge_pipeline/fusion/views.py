@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.errors import HodgeError
 from hodge_pipeline.types import Bytes, Floats, Frame
 
@@ -46,12 +47,22 @@ class Skipped:
         )
 
 
-def posed(frames: Sequence[Frame], world_from_cam: Floats, every: int, skipped: Skipped) -> list[tuple[Frame, Floats]]:
-    """Each `every`-th frame with its pose (4, 4); one whose pose is not finite is counted in `skipped` instead."""
-    taken = []
+def posed(
+    frames: Sequence[Frame], world_from_cam: Floats, every: int, skipped: Skipped, min_motion_m: float = 0.0
+) -> list[tuple[Frame, Floats]]:
+    """Each `every`-th frame with its pose (4, 4), without those that moved less than `min_motion_m` since the last one.
+
+    A turn counts as what it moves a point at one metre. A frame whose pose is not finite is counted in `skipped`.
+    """
+    taken: list[tuple[Frame, Floats]] = []
     for frame, pose in zip(frames[::every], world_from_cam[::every], strict=True):
-        if np.isfinite(pose).all():
-            taken.append((frame, pose))
-        else:
+        if not np.isfinite(pose).all():
             skipped.add("nothing says where it is", frame)
+        elif not taken or min_motion_m == 0 or _moved_m(taken[-1][1], pose) >= min_motion_m:
+            taken.append((frame, pose))
     return taken
+
+
+def _moved_m(before: Floats, after: Floats) -> float:
+    twist = se3.log(se3.inverse(before) @ after)
+    return float(np.linalg.norm(twist[:3]) + np.linalg.norm(twist[3:]))

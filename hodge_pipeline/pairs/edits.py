@@ -16,6 +16,7 @@ from hodge_pipeline.store.edge_table import read_edges
 from hodge_pipeline.store.workspace import REFINEMENT
 from hodge_pipeline.types import Bools, Edges, Ints
 from hodge_pipeline.types.edges import DISABLED, HELD_OUT, Words
+from hodge_pipeline.types.text import command
 
 FILE = "edits.json"
 EDGES = "edges.csv"
@@ -145,8 +146,8 @@ def listed_edges(folder: Path) -> Listed:
     path = folder / EDGES
     if (folder / REFINEMENT).is_dir():
         raise WorkspaceError(
-            f"{folder}: holds a refined model, of which no edge is switched: hodge diagnose {folder} judges its edges, "
-            "hodge refine colmap takes other options"
+            f"{folder}: holds a refined model, of which no edge is switched: '{command('hodge', 'diagnose', folder)}' "
+            "judges its edges, hodge refine colmap takes other options"
         )
     if not path.is_file():
         raise WorkspaceError(f"{folder}: holds no finished run ({EDGES} is missing): run the recipe to its end first")

@@ -50,6 +50,11 @@ class EvaluationOptions:
     """What is measured at the end."""
 
     tables: bool = Field(default=True, description="the two score tables, about 40 CPU seconds for 250 frames")
+    truth: Path | None = Field(
+        default=None,
+        description="a file of true poses of the frames; `frames`: the source's own poses are true; none: those of a "
+        "benchmark are, no others",
+    )
     rpe_delta_frames: int = Field(
         default=1,
         ge=1,

@@ -10,7 +10,7 @@ from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.eye import Eye
 
 BACKGROUND = (24, 26, 32)
-COLOUR_NAMES = {"truth": "green", "odometry": "orange", "start": "orange"}
+COLOUR_NAMES = {"truth": "green", "odometry": "orange", "start": "violet"}
 PAIR_EYE = Eye((0.6, -1.6, -2.2), (0.0, 0.0, 1.8), (0.0, -1.0, 0.0))
 """In the axes of a camera: behind it, above, to the right."""
 

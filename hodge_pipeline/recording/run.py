@@ -20,7 +20,7 @@ from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge_parts
 from hodge_pipeline.recording.recorder import APPLICATION, Recorder
-from hodge_pipeline.scene import Round, has_truth, pose_sets, true_poses
+from hodge_pipeline.scene import FIRST, START, Round, given_poses, has_given, has_truth, pose_sets, true_poses
 from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.start.clouds import clouds as clouds_step
 from hodge_pipeline.store import artifacts, yaml_file
@@ -73,6 +73,7 @@ class Recording:
         self._seen(source, clouds)
         self._rounds, frames = [first], source.frames
         name, poses = first.name, first.world_from_cam
+        name = FIRST if name == START and has_given(source) else name
         self._part("first_poses", (self._source, name, poses), lambda to: to.poses(name, poses, frames))
 
     def _seen(self, source: Source, clouds: CloudSet | None) -> None:
@@ -160,9 +161,9 @@ class Recording:
             log.warning("the recording could not be merged: %s", error)
 
     def _merge(self, folder: Path, out: Path) -> Notes:
-        """Truth, recipe and log, which belong to the run as a whole, then all parts as one file."""
+        """True and given poses, recipe and log, which belong to the run as a whole, then all parts as one file."""
         recorder = self._recorder(folder)
-        notes = _record_truth(recorder, self._source, self._rounds)
+        notes = _record_reference(recorder, self._source, self._rounds)
         lines = read_input_text(self._folder / "log.txt", errors="replace").splitlines()
         recorder.text(yaml_file.dump(binding.unbind(self._recipe)), lines)
         parts = [*self._parts, *find_parts(folder)]
@@ -192,13 +193,17 @@ def merge_recording(
     return step.folder / FILE
 
 
-def _record_truth(recorder: Recorder, source: Source, rounds: Sequence[Round]) -> Notes:
-    """The truth, laid onto the last poses, so that the two are seen to differ and nothing else."""
-    if not rounds or not has_truth(source):
+def _record_reference(recorder: Recorder, source: Source, rounds: Sequence[Round]) -> Notes:
+    """True and given poses, laid onto the last ones, so that they are seen to differ and nothing else."""
+    if not rounds:
         return ()
-    truth = true_poses(source)
-    laid = absolute_error(truth, np.where(np.isfinite(truth), rounds[-1].world_from_cam, np.nan)).aligned
-    return recorder.poses("truth", laid, source.frames)
+    named = {"truth": true_poses(source)} if has_truth(source) else {}
+    named |= {START: given_poses(source)} if has_given(source) else {}
+    notes: Notes = ()
+    for name, poses in named.items():
+        laid = absolute_error(poses, np.where(np.isfinite(poses), rounds[-1].world_from_cam, np.nan)).aligned
+        notes += recorder.poses(name, laid, source.frames)
+    return notes
 
 
 def _record_round(recorder: Recorder, source: Source, rounds: Sequence[Round], number: int) -> Notes:
@@ -214,7 +219,7 @@ def _record_evaluation(recorder: Recorder, source: Source, rounds: Sequence[Roun
     truth = true_poses(source)
     per_frame: dict[str, Floats] = {}
     if has_truth(source):
-        for name, poses in pose_sets(rounds).items():
+        for name, poses in pose_sets(rounds, source).items():
             per_frame[f"error_m/{name}"] = absolute_error(poses, truth).per_frame_m
     bars, tables = {}, {}
     if scores is not None:

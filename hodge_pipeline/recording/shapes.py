@@ -16,8 +16,8 @@ RESIDUAL_COLOURS = np.array([[60, 115, 225], [130, 145, 170], [190, 180, 120], [
 IGNORED_COLOUR = (230, 60, 160)
 REJECTED_COLOUR = (110, 110, 110)
 RESULT_COLOUR = (255, 255, 255)
-TRAJECTORY_COLOURS = {"truth": (0, 200, 140), "odometry": (230, 130, 0), "start": (230, 130, 0)}
-"""Bluish green and orange of Okabe and Ito's colour-blind safe set, brightened for the dark background."""
+TRAJECTORY_COLOURS = {"truth": (0, 200, 140), "odometry": (230, 130, 0), "start": (185, 130, 235)}
+"""Bluish green, orange and purple of Okabe and Ito's colour-blind safe set, brightened for the dark background."""
 
 FRUSTUM_DEPTH_M = 0.06
 _CORNERS = np.array([[-0.8, -0.6, 1.0], [0.8, -0.6, 1.0], [0.8, 0.6, 1.0], [-0.8, 0.6, 1.0]]) * FRUSTUM_DEPTH_M

@@ -17,21 +17,23 @@ from hodge_pipeline.types import Floats, Solution, ViewGraph
 def record_graph(
     folder: Path,
     name: str,
-    graph: ViewGraph,
+    graph: ViewGraph | None,
     start: Floats,
-    solution: Solution,
+    solution: Solution | None,
     sets: Mapping[str, Floats],
     notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Write `recording.rrd`: the graph as it was, the film of the solve, the edges under its result, further poses.
 
-    What was left out of it, in words.
+    The sets of poses alone where nothing was solved. What was left out of it, in words.
     """
-    identity = hashlib.sha256(np.ascontiguousarray(solution.world_from_cam).tobytes()).hexdigest()[:32]
+    result = start if solution is None else solution.world_from_cam
+    identity = hashlib.sha256(np.ascontiguousarray(result).tobytes()).hexdigest()[:32]
     with tempfile.TemporaryDirectory(dir=folder) as parts:
         recorder = Recorder(Path(parts), identity)
         left_out = [*recorder.frames(name, (), tuple(notes))]
         left_out += [note for label, poses in sets.items() for note in recorder.poses(label, poses)]
-        left_out += [*recorder.edges(1, graph, start), *recorder.solution(1, graph, start, solution)]
+        if graph is not None and solution is not None:
+            left_out += [*recorder.edges(1, graph, start), *recorder.solution(1, graph, start, solution)]
         merged = recorder.finish(folder / FILE)
     return (*left_out, *(merged.notes if merged else ()))

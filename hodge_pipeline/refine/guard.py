@@ -31,6 +31,11 @@ class Measure:
         """Whether it got worse by more than the tolerance; a measure that is lost (NaN) is worse."""
         return sign_of(self.before, self.after, self.tolerance, self.better) < 0
 
+    @property
+    def is_better(self) -> bool:
+        """Whether it got better by more than the tolerance."""
+        return sign_of(self.before, self.after, self.tolerance, self.better) > 0
+
     def __str__(self) -> str:
         return f"{self.name} {self.before:.4g} -> {self.after:.4g}{self.unit and ' '}{self.unit}"
 
@@ -43,6 +48,8 @@ class Change:
     rotation_deg: float
     translation_uncertainty_m: float
     rotation_uncertainty_deg: float
+    is_metric: bool = True
+    """False where no scale is known: lengths are in the model's own unit, whatever the names say."""
 
     @property
     def is_significant(self) -> bool:
@@ -52,9 +59,13 @@ class Change:
         )
 
     def __str__(self) -> str:
+        moved, known = (
+            f"{length * 1000:.3g} mm" if self.is_metric else f"{length:.3g} units"
+            for length in (self.translation_m, self.translation_uncertainty_m)
+        )
         return (
-            f"poses moved by {self.translation_m * 1000:.3g} mm and {self.rotation_deg:.2g}° (RMS), "
-            f"known to {self.translation_uncertainty_m * 1000:.3g} mm and {self.rotation_uncertainty_deg:.2g}°"
+            f"poses moved by {moved} and {self.rotation_deg:.2g}° (RMS), "
+            f"known to {known} and {self.rotation_uncertainty_deg:.2g}°"
         )
 
 

@@ -16,8 +16,7 @@ from hodge_pipeline.pairs.held_out import held_out_pairs
 from hodge_pipeline.refine.guard import Decision, Measure, decide
 from hodge_pipeline.refine.uncertainty import change, mean_chi2
 from hodge_pipeline.rounds.one_round import Work
-from hodge_pipeline.scene import GivenFile, Round
-from hodge_pipeline.se3 import spread_correction
+from hodge_pipeline.scene import Round
 from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.stages import Step, Workers
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source, Trajectory
@@ -107,13 +106,6 @@ def held_out_distances(clouds: CloudSet, pairs: Ints, pose_sets: Floats, *, work
     return edge_distances(clouds.folder, pairs, pose_sets, workers)
 
 
-def _spread(work: Work, given: GivenFile, key_after: Floats) -> Floats:
-    """The poses (P, 4, 4) of the file, corrected as the key frames were."""
-    keys = work.scene.key_frames
-    times, poses = keys.times[keys.rows], given.trajectory.world_from_cam
-    return spread_correction(given.pose_times, poses, times, keys.world_from_key, key_after)
-
-
 def _write(work: Work, folder: Path, decision: Decision, last: Round) -> Path | None:
     """`refined.<suffix>`: the input's own bytes where it is kept, else its form with the refined poses."""
     given = work.scene.given
@@ -131,7 +123,7 @@ def _write(work: Work, folder: Path, decision: Decision, last: Round) -> Path | 
         out = folder / f"refined{original.suffix}"
         shutil.copyfile(original, out)
         return out
-    moved = _spread(work, given, last.world_from_cam)
+    moved = given.expand(work.scene.key_frames, last.world_from_cam)
     refined = Trajectory(given.trajectory.stamps_s, moved)
     if rewriter is not None:
         return Path(rewriter.rewrite(folder, original, refined))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -49,12 +48,6 @@ class CloudOptions:
         ge=0,
         description="SIFT landmarks of a frame, at most, the strongest; `rgbd` needs them, 800 serve it. About 60 ms a "
         "frame; 0: none",
-    )
-    landmark_scale: int = Field(
-        default=1,
-        ge=1,
-        description="landmarks are found in an image this many times smaller; 2 takes a third of the time, and serves "
-        "to follow a camera",
     )
 
     @model_validator(mode="after")
@@ -120,9 +113,7 @@ def _landmarks(frame: Frame, options: CloudOptions) -> Landmarks:
     from hodge_pipeline.registration.landmarks import find_landmarks
 
     try:
-        return find_landmarks(
-            frame, options.landmarks, options.min_range_m, options.max_range_m, scale=options.landmark_scale
-        )
+        return find_landmarks(frame, options.landmarks, options.min_range_m, options.max_range_m)
     except (SourceError, OSError):  # said where the colours are read
         return Landmarks.none()
 
@@ -168,11 +159,6 @@ def cloud_or_note(frame: Frame, options: CloudOptions) -> tuple[PointCloud, str]
     """The cloud of a frame and a note, empty where all is well; an empty cloud where it cannot be read."""
     cloud, counts = _make_or_report(frame, options)
     return cloud, "" if counts.odd is None else str(counts.odd)
-
-
-def with_landmarks(cloud: PointCloud, frame: Frame, options: CloudOptions) -> PointCloud:
-    """The frame's cloud with the landmarks of these options in place of its own."""
-    return replace(cloud, landmarks=_landmarks(frame, options))
 
 
 def _make_or_report(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:

@@ -17,25 +17,21 @@ CONTRAST, FAINT_CONTRAST = 0.04, 0.005
 without them an image of a bare cabinet has next to none."""
 
 
-def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: float, *, scale: int = 1) -> Landmarks:
+def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: float) -> Landmarks:
     """At most `count` landmarks, the strongest first; none for a frame without image, depth image or camera.
 
-    A colour image of another size than the depth image is taken to show the same view. They are found in an image
-    `scale` times smaller.
+    A colour image of another size than the depth image is taken to show the same view.
     """
     if frame.read_colour is None or frame.read_depth is None or frame.camera is None:
         return Landmarks.none()
     grey: Bytes = np.asarray(cv2.cvtColor(frame.read_colour(), cv2.COLOR_RGB2GRAY), np.uint8)
     depth = frame.read_depth()
-    if scale > 1:
-        size = (grey.shape[1] // scale, grey.shape[0] // scale)
-        grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
     marks = Landmarks.none()
     for contrast in (CONTRAST, FAINT_CONTRAST):
         pixels, descriptors = _features(grey, depth.shape, count, contrast)
         if not len(pixels):
             continue
-        z, sound = _depth_at(depth, np.round(pixels).astype(np.int64), min_range_m, max_range_m)
+        z, sound = sound_depth(depth, np.round(pixels).astype(np.int64), min_range_m, max_range_m)
         points = back_projected(pixels[sound].astype(np.float32), z[sound], frame.camera)
         marks = Landmarks(points, descriptors[sound])
         if len(marks) >= min(FEW, count):
@@ -61,7 +57,7 @@ def back_projected(pixels: Floats32, depth_m: Floats32, camera: Camera) -> Float
     return np.column_stack([slopes * depth_m[:, None], depth_m]).astype(np.float32)
 
 
-def _depth_at(depth: Floats32, pixels: Ints, min_range_m: float, max_range_m: float) -> tuple[Floats32, Bools]:
+def sound_depth(depth: Floats32, pixels: Ints, min_range_m: float, max_range_m: float) -> tuple[Floats32, Bools]:
     """The median depth (n,) of the 3x3 pixels around each, and where it is in range and not on an edge."""
     height, width = depth.shape
     steps = np.array([(dv, du) for dv in (-1, 0, 1) for du in (-1, 0, 1)])

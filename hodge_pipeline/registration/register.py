@@ -2,27 +2,71 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from hodge_pipeline import se3
 from hodge_pipeline.registration.block_store import BlockStore
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.stages import Registrar, Step, Workers
-from hodge_pipeline.types import CloudSet, Edges, Floats
-from hodge_pipeline.types.edges import HELD_OUT
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
+from hodge_pipeline.types.edges import HELD_OUT, MEASURED, USED
+
+STANDING_M = 0.01
+"""Between a registration and where the poses now put its pair: nearer than any registrar's start must be."""
+ARM_M = 1.0
+"""A rotation counts as the displacement that it causes at this distance."""
 
 
 def register_edges(
-    edges: Edges, clouds: CloudSet, registrar: Registrar, world_from_cam: Floats, *, workers: Workers, step: Step
+    edges: Edges,
+    clouds: CloudSet,
+    registrar: Registrar,
+    world_from_cam: Floats,
+    earlier: Edges | None = None,
+    scale: float = 1.0,
+    *,
+    workers: Workers,
+    step: Step,
 ) -> Edges:
-    """Step: the table with its candidates registered from these poses; a killed run goes on at its last block."""
+    """Step: the table with its candidates registered from these poses; a killed run goes on at its last block.
+
+    A pair that was registered `earlier`, to where the poses put it still, keeps that registration; lengths are
+    multiplied by `scale`.
+    """
     assert clouds.folder is not None
     held_out = edges.status == HELD_OUT
     candidates = edges.select(~held_out)
     i, j = candidates.pairs.T
     guesses = se3.inverse(world_from_cam[i]) @ world_from_cam[j]
+    rows, known = _standing(candidates, guesses, earlier, scale)
+    missing = np.setdiff1d(np.arange(len(candidates)), rows)
+    step.advance(len(rows))
     blocks = BlockStore(step.folder / "blocks")
     found = register_pairs(
-        clouds.folder, registrar, candidates, guesses, workers, step.advance,
+        clouds.folder, registrar, candidates.select(missing), guesses[missing], workers, step.advance,
         finished=blocks.read(), on_block=blocks.write,
     )  # fmt: skip
     blocks.remove()
-    return Edges.joined([found, edges.select(held_out)])
+    kept = candidates.select(rows)
+    if earlier is not None and len(rows):
+        columns = {name: getattr(earlier, name)[known] for name in (*MEASURED, "iterations", "converged")}
+        kept = replace(kept, status=np.full(len(rows), USED), **columns)
+    order = np.argsort(np.concatenate([missing, rows]))
+    return Edges.joined([Edges.joined([found, kept]).select(order), edges.select(held_out)])
+
+
+def _standing(candidates: Edges, guesses: Floats, earlier: Edges | None, scale: float) -> tuple[Ints, Ints]:
+    """Rows of the candidates whose earlier registration stands, and its rows in that table."""
+    if earlier is None:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    by_pair = {
+        (int(a), int(b)): row for row, (a, b) in enumerate(earlier.pairs) if earlier.status[row] == USED
+    }  # of parallel ones the last
+    both = [(row, by_pair[a, b]) for row, (a, b) in enumerate(candidates.pairs.tolist()) if (a, b) in by_pair]
+    rows, known = np.array(both, np.int64).reshape(-1, 2).T
+    apart = se3.log(se3.inverse(earlier.i_from_j[known]) @ guesses[rows])
+    moved = np.linalg.norm(apart[:, 3:], axis=1) + ARM_M * scale * np.linalg.norm(apart[:, :3], axis=1)
+    near = moved < STANDING_M * scale
+    return rows[near], known[near]

@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registration.tracking import TrackedBlock
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 
-STEP, CLOUD = "step_", "cloud_"
+STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
 
 
 @dataclass(frozen=True)
 class BlockRows:
-    """A `TrackedBlock` without its clouds."""
+    """A `TrackedBlock` without its clouds and sightings."""
 
     keys: Ints
     steps: Edges
@@ -48,6 +49,7 @@ class TrackedBlocks:
         arrays = {name: getattr(block, name) for name in ("keys", "rows", "anchors", "key_from_row", "fitness")}
         arrays["notes"] = np.array(block.notes, dtype=np.str_)
         arrays |= {STEP + field.name: getattr(block.steps, field.name) for field in fields(Edges)}
+        arrays |= {SIGHTING + field.name: getattr(block.sightings, field.name) for field in fields(Sightings)}
         arrays |= {CLOUD + name: getattr(clouds, name) for name in CloudSet.FILES}
         artifacts.save_arrays(self._path(number), arrays)
 
@@ -57,6 +59,13 @@ class TrackedBlocks:
             steps = Edges(*(stored[STEP + field.name] for field in fields(Edges)))
             columns = {name: stored[name] for name in ("keys", "rows", "anchors", "key_from_row", "fitness")}
             return BlockRows(steps=steps, notes=tuple(stored["notes"].tolist()), **columns)
+
+    def keep_sightings(self, folder: Path) -> None:
+        """Write what the frames of each block saw of their key frames' corners into a folder, a file for each block."""
+        for path in sorted(self._folder.glob("[0-9]*.npz")):
+            with np.load(path) as stored:
+                arrays = {field.name: stored[SIGHTING + field.name] for field in fields(Sightings)}
+            artifacts.save_arrays(folder / path.name, arrays)
 
     def remove(self) -> None:
         """Forget the blocks: what they held is written."""

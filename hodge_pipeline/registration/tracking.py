@@ -1,36 +1,45 @@
-"""Long sequences: each frame is registered to the last key frame, and key frames alone are kept.
+"""Long sequences: each frame is followed from the last key frame by optical flow, and key frames alone are kept.
 
 A frame becomes a key frame where the camera has moved far enough from the last one, or sees too little of what that
-saw. The sequence is cut into blocks that are tracked side by side, so nothing depends on how many workers there are,
-and memory holds one block a worker, never the sequence.
+saw. Where flow finds no motion, as without texture, the frame's cloud is registered to the key frame's instead. The
+sequence is cut into blocks that are tracked side by side, so nothing depends on how many workers there are, and memory
+holds one block a worker, never the sequence.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, with_landmarks
+from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note
+from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
 from hodge_pipeline.registration.odometry import OdometryOptions
+from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.types import Edges, Floats, Frame, Ints, PointCloud, Registration
 
-FRAMES_IN_BLOCK = 48
-"""About three seconds of work; the first and the last frame of a block are key frames, however little they moved."""
+FRAMES_IN_BLOCK = 96
+"""Three seconds at frame rate; the first and the last frame of a block are key frames, however little they moved."""
 LONGEST_GUESS = 4.0
 """Frame steps over which a motion is taken to go on as it was."""
+FEWEST_FOLLOWED = 25
+"""Corners that must agree on a motion for it to be believed; below it clouds are registered."""
+FEW_FOLLOWED, SMALL_SHARE = 60, 0.35
+"""Corners, and share of the key frame's, below which the next frame is followed from this one."""
+CORNERS_A_SAMPLE = 75.0
+"""Corners that count as one independent measurement, as matches of landmarks do."""
 
 
 @dataclass(frozen=True)
 class TrackingOptions:
-    """How frames are followed: `clouds` of key frames, `followed` of all others; a frame that has moved `distance_m` or
-    `angle_rad` from the last key frame, or shares less than `kept_fitness` with it, becomes one.
+    """How frames are followed: `clouds` of key frames; a frame that has moved `distance_m` or `angle_rad` from the last
+    key frame becomes one, and so does, where clouds are registered, one that shares less than `kept_fitness` with it.
     """
 
     clouds: CloudOptions
-    followed: CloudOptions
     odometry: OdometryOptions
     distance_m: float
     angle_rad: float
@@ -52,7 +61,7 @@ class FrameBlock:
 @dataclass(frozen=True)
 class TrackedBlock:
     """What became of a block: its key frames (rows, clouds), the steps from each to the next, and for every row the row
-    of the key frame that it was registered to, the motion, and its fitness: NaN where the motion is a guess.
+    of the key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess.
 
     A step of fitness 0 is a guess too. The block's last row is the first of the next one.
     """
@@ -65,6 +74,7 @@ class TrackedBlock:
     key_from_row: Floats
     fitness: Floats
     notes: tuple[str, ...]
+    sightings: Sightings
 
 
 def frame_blocks(rows: Ints, frames: tuple[Frame, ...], times: Floats) -> list[FrameBlock]:
@@ -82,13 +92,37 @@ def track_block(options: TrackingOptions, block: FrameBlock) -> TrackedBlock:
     return _Tracker(options, block).run()
 
 
-@dataclass(frozen=True)
 class _View:
-    """A frame as the registrar wants it: its place in the block, its cloud, and what was prepared of it."""
+    """A frame at its place in the block: its image, corners and cloud, each made when it is first needed."""
 
-    place: int
-    cloud: PointCloud
-    prepared: Any
+    def __init__(self, options: TrackingOptions, frame: Frame, place: int) -> None:
+        self._options, self._frame, self.place = options, frame, place
+
+    @cached_property
+    def image(self) -> FlowImage | None:
+        """None of a frame that flow cannot follow."""
+        clouds = self._options.clouds
+        return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m))
+
+    @cached_property
+    def corners(self) -> Corners | None:
+        """What flow follows from this frame."""
+        return None if self.image is None else find_corners(self.image)
+
+    @cached_property
+    def cloud_and_note(self) -> tuple[PointCloud, str]:
+        """The frame's cloud, and a note where something is odd about it."""
+        return cloud_or_note(self._frame, self._options.clouds)
+
+    @property
+    def cloud(self) -> PointCloud:
+        """The frame's cloud."""
+        return self.cloud_and_note[0]
+
+    @cached_property
+    def prepared(self) -> Any:
+        """What the registrar made of the cloud."""
+        return self._options.odometry.registration.prepare(self.cloud)
 
 
 class _Tracker:
@@ -100,10 +134,12 @@ class _Tracker:
     def __init__(self, options: TrackingOptions, block: FrameBlock) -> None:
         self._options, self._block = options, block
         self._registrar, self._limits = options.odometry.registration, options.odometry
-        self._notes: dict[int, str] = {}
         self._rows: dict[int, tuple[int, Floats, float]] = {}
         self._keys: list[_View] = []
+        self._clouds: dict[int, tuple[PointCloud, str]] = {}
         self._steps: list[tuple[int, int, Registration]] = []
+        self._corner_points: dict[int, Floats] = {}
+        self._sightings: dict[tuple[int, int], Followed] = {}
         self._velocity: Floats = np.zeros(6)
         self._usual_step = float(np.median(np.diff(block.times))) if len(block.times) > 1 else 1.0
 
@@ -115,50 +151,56 @@ class _Tracker:
         self._begin(start)
         for place in range(first + 1, count):
             self._follow(self._view(place), is_last=place == count - 1)
+        self._keep_cloud(self._keys[-1])
         rows = self._block.rows
         anchors, motions, fitness = zip(*(self._rows[place] for place in range(first, count)), strict=True)
         pairs = np.array([(rows[i], rows[j]) for i, j, _ in self._steps], np.int64).reshape(-1, 2)
         return TrackedBlock(
-            keys=rows[[key.place for key in self._keys]],
-            clouds=tuple(key.cloud for key in self._keys),
+            keys=rows[list(self._clouds)],
+            clouds=tuple(cloud for cloud, _ in self._clouds.values()),
             steps=Edges.of(pairs, "sequential").with_registrations([step for _, _, step in self._steps]),
             rows=rows[first:],
             anchors=rows[list(anchors)],
             key_from_row=np.array(motions),
             fitness=np.array(fitness),
-            notes=tuple(note for place, note in self._notes.items() if note and place >= first),
+            notes=tuple(note for _, note in self._clouds.values() if note),
+            sightings=self._kept_sightings(first),
         )
 
     def _view(self, place: int) -> _View:
-        cloud, self._notes[place] = cloud_or_note(self._block.frames[place], self._options.followed)
-        return _View(place, cloud, self._registrar.prepare(cloud))
+        return _View(self._options, self._block.frames[place], place)
 
     def _warm_up(self, start: _View) -> None:
-        step = self._registrar.register(self._view(0).prepared, start.prepared, np.eye(4))
+        before = self._view(0)
+        found = self._flowed(start, before, np.eye(4))
+        step = found or self._registrar.register(start.prepared, before.prepared, np.eye(4))
         if self._good(step):
-            self._velocity = se3.log(step.i_from_j) / self._duration(0, start.place)
+            self._velocity = -se3.log(step.i_from_j) / self._duration(0, start.place)
 
     def _begin(self, view: _View) -> None:
         """From here on this view is the key frame, and the last frame tracked."""
-        options = self._options
-        if options.clouds != options.followed and len(view.cloud):
-            cloud = with_landmarks(view.cloud, self._block.frames[view.place], options.clouds)
-            view = replace(view, cloud=cloud, prepared=self._registrar.prepare(cloud))
+        if self._keys:
+            self._keep_cloud(self._keys.pop())
         self._keys.append(view)
         self._rows[view.place] = (view.place, np.eye(4), 1.0)
         self._last, self._key_from_last = view, np.eye(4)
         self._missed: _View | None = None
+
+    def _keep_cloud(self, key: _View) -> None:
+        """All that is kept of a key frame that nothing follows any more."""
+        self._clouds[key.place] = key.cloud_and_note
 
     def _promote(self, view: _View, step: Registration) -> None:
         self._steps.append((self._keys[-1].place, view.place, step))
         self._begin(view)
 
     def _follow(self, view: _View, is_last: bool) -> None:
-        found = self._registered(self._keys[-1], view, self._key_from_last)
-        if found.fitness < self._options.kept_fitness and self._last.place != self._keys[-1].place:
-            found = self._from_last(view, found)
-        if not self._good(found) and self._missed is not None:
-            found = self._from_missed(view, self._missed, found)
+        key = self._keys[-1]
+        found = self._flowed(key, view, self._key_from_last @ self._ahead(view))
+        if found is None and self._last is not key and self._last.corners is not None:
+            found = self._flowed_from_last(view)
+        if found is None:
+            found = self._registered_by_clouds(view)
         if not self._good(found):
             self._lose(view, is_last)
             return
@@ -166,17 +208,50 @@ class _Tracker:
         self._velocity = se3.log(se3.inverse(self._key_from_last) @ found.i_from_j) / seconds
         self._rows[view.place] = (self._keys[-1].place, found.i_from_j, found.fitness)
         self._last, self._key_from_last, self._missed = view, found.i_from_j, None
-        if is_last or self._has_moved(found.i_from_j):
+        if is_last or self._has_moved(found.i_from_j) or self._sees_little(view):
             self._promote(view, found)
+
+    def _flowed(self, key: _View, view: _View, guess: Floats) -> Registration | None:
+        """The motion by optical flow, None where it finds none; what the view saw is kept."""
+        if key.corners is None or view.image is None:
+            return None
+        found = follow(key.corners, view.image, guess)
+        if found is None or len(found.rows) < FEWEST_FOLLOWED or found.share < self._limits.min_fitness:
+            return None
+        self._corner_points[key.place] = key.corners.points
+        self._sightings[key.place, view.place] = found
+        information = found.information / CORNERS_A_SAMPLE
+        return Registration(found.key_from_view, information, found.share, found.rmse_m, len(found.rows), 0, True)
+
+    def _flowed_from_last(self, view: _View) -> Registration | None:
+        """The motion from the last frame tracked, which becomes a key frame, where flow finds this one."""
+        found = self._flowed(self._last, view, self._ahead(view))
+        if found is not None:
+            self._promote(self._last, self._step_to_last())
+        return found
+
+    def _step_to_last(self) -> Registration:
+        """The step from the key frame to the last frame tracked."""
+        key, last = self._keys[-1], self._last
+        _, key_from_last, _ = self._rows[last.place]
+        step = self._flowed(key, last, key_from_last)
+        return step or self._registrar.register(key.prepared, last.prepared, key_from_last)
+
+    def _registered_by_clouds(self, view: _View) -> Registration:
+        """The motion by the registrar of odometry."""
+        found = self._registered(self._keys[-1], view, self._key_from_last)
+        if found.fitness < self._options.kept_fitness and self._last.place != self._keys[-1].place:
+            found = self._from_last(view, found)
+        if not self._good(found) and self._missed is not None:
+            found = self._from_missed(view, self._missed, found)
+        return found
 
     def _from_last(self, view: _View, to_key: Registration) -> Registration:
         """The view seen from the last frame tracked, which becomes a key frame, where these two share more."""
         found = self._registered(self._last, view, np.eye(4))
         if found.fitness <= to_key.fitness or not self._good(found):
             return to_key
-        _, key_from_last, _ = self._rows[self._last.place]
-        step = self._registrar.register(self._keys[-1].prepared, self._last.prepared, key_from_last)
-        self._promote(self._last, step)
+        self._promote(self._last, self._step_to_last())
         return found
 
     def _from_missed(self, view: _View, missed: _View, to_key: Registration) -> Registration:
@@ -223,3 +298,17 @@ class _Tracker:
         moved = float(np.linalg.norm(key_from_view[:3, 3]))
         turned = float(np.linalg.norm(se3.so3_log(key_from_view[:3, :3])))
         return moved >= self._options.distance_m or turned >= self._options.angle_rad
+
+    def _sees_little(self, view: _View) -> bool:
+        """Whether flow lost most corners of the key frame; what the registrar found is judged by its fitness."""
+        key = self._keys[-1]
+        found = self._sightings.get((key.place, view.place))
+        if found is None or key.corners is None:
+            return False
+        corners = len(key.corners)
+        return len(found.rows) < max(SMALL_SHARE * corners, min(FEW_FOLLOWED, 2 * SMALL_SHARE * corners))
+
+    def _kept_sightings(self, first: int) -> Sightings:
+        """The sightings from the first key frame on."""
+        kept = {pair: found for pair, found in self._sightings.items() if pair[1] > first}
+        return Sightings.of(kept, self._corner_points, self._block.rows)

@@ -15,10 +15,14 @@ from hodge_pipeline.types import Bools, Floats
 
 TRIPLES = 300
 FEWEST_MATCHES = 8
-PIXEL_SIGMA_RAD = 1.5 / 525.0
-"""A pixel and a half of a camera of 60°: the feature's own error, and that of depth and colour taken at two moments."""
+PIXEL_SIGMA_RAD = 0.75 / 525.0
+"""Three quarters of a pixel of a camera of 60°: a feature's own error, once the shutter's is taken out."""
+DEPTH_SIGMAS = 2.0
+"""What `depth_sigma`, the noise of one pixel on a plane, is taken times: features lie where depth is worst."""
 GATE = 3.0
 """Standard deviations, in each of three axes, at which a match stops to count."""
+GATE_PIXEL_SIGMA_RAD = 1.5 / 525.0
+"""A pixel and a half: what a match may err by and still be right, blur and a camera that turns fast included."""
 STEPS = 8
 
 
@@ -37,11 +41,11 @@ def depth_sigma(z_m: Floats) -> Floats:
     return np.asarray(0.0012 + 0.0019 * (z_m - 0.4) ** 2)
 
 
-def covariances(points: Floats) -> Floats:
+def covariances(points: Floats, pixel_sigma_rad: float, depth_sigmas: float) -> Floats:
     """Covariances (n, 3, 3) of landmarks (n, 3) in their camera's axes: depth along the ray, the pixel across."""
     z = points[:, 2]
     ray = points / z[:, None]
-    across, along = (PIXEL_SIGMA_RAD * z) ** 2, depth_sigma(z) ** 2
+    across, along = (pixel_sigma_rad * z) ** 2, (depth_sigmas * depth_sigma(z)) ** 2
     return np.asarray(
         across[:, None, None] * np.diag([1.0, 1.0, 0.0]) + along[:, None, None] * ray[:, :, None] * ray[:, None, :]
     )
@@ -52,10 +56,11 @@ def visual_motion(points_i: Floats, points_j: Floats, seed: int) -> VisualMotion
     count = len(points_i)
     if count < FEWEST_MATCHES:
         return None
-    errors_i, errors_j = covariances(points_i), covariances(points_j)
+    errors_i, errors_j = (covariances(points, PIXEL_SIGMA_RAD, DEPTH_SIGMAS) for points in (points_i, points_j))
+    gate_i, gate_j = (covariances(points, GATE_PIXEL_SIGMA_RAD, 1.0) for points in (points_i, points_j))
     rows = np.random.default_rng(seed).integers(0, count, (TRIPLES, 3))
     guesses = rigid_motions(points_i[rows], points_j[rows])
-    spread = np.sqrt((np.trace(errors_i, axis1=1, axis2=2) + np.trace(errors_j, axis1=1, axis2=2)) / 3)
+    spread = np.sqrt((np.trace(gate_i, axis1=1, axis2=2) + np.trace(gate_j, axis1=1, axis2=2)) / 3)
     apart = np.linalg.norm(se3.transform(guesses, points_j[None]) - points_i, axis=2) / spread
     scores = np.maximum(1 - (apart / (2 * GATE)) ** 2, 0).sum(axis=1)
     motion = guesses[int(np.argmax(scores))]
@@ -65,7 +70,7 @@ def visual_motion(points_i: Floats, points_j: Floats, seed: int) -> VisualMotion
             return None
         step, information = _step(points_i[inlier], points_j[inlier], errors_i[inlier], errors_j[inlier], motion)
         motion = motion @ se3.exp(step)
-        before, inlier = inlier, _agrees(points_i, points_j, errors_i, errors_j, motion)
+        before, inlier = inlier, _agrees(points_i, points_j, gate_i, gate_j, motion)
         if np.linalg.norm(step) < 1e-5 and (before == inlier).all():
             break
     if inlier.sum() < FEWEST_MATCHES:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +10,14 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.recording.comparison import record_comparison
-from hodge_pipeline.report import page, splat
+from hodge_pipeline.report import raster
 from hodge_pipeline.report.comparison import Comparison, RunFacts, tables
-from hodge_pipeline.report.contents import Path3D, Photograph, Pictures, Report, SourceSummary
+from hodge_pipeline.report.contents import Path3D, Pictures, Report, SourceSummary
+from hodge_pipeline.report.document import Banner, Document, Picture, Section, markdown, render
+from hodge_pipeline.report.photographs import sides
 from hodge_pipeline.report.plots import draw
 from hodge_pipeline.store.artifacts import write_text
 from hodge_pipeline.types import Floats, Model
-
-GAP = 8
 
 
 def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
@@ -28,12 +26,12 @@ def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
     models = _model(comparison.a, np.eye(4)), _model(comparison.b, comparison.a_from_b)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(html, _page(comparison, models))
+        write_text(html, render(_page(comparison, models)))
     except OSError as error:
         raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
     names = comparison.a.name, comparison.b.name
     poses = comparison.a_poses, comparison.b_poses
-    record_comparison(recording, names, poses, models, comparison.apart_m, _markdown(comparison))
+    record_comparison(recording, names, poses, models, comparison.apart_m, markdown(tables(comparison)))
     return html, recording
 
 
@@ -51,30 +49,21 @@ def _model(run: RunFacts, world_from_run: Floats) -> Model | None:
     return Model(model.name, points, normals, model.colours, model.triangles, model.notes)
 
 
-def _page(comparison: Comparison, models: tuple[Model | None, Model | None]) -> str:
+def _page(comparison: Comparison, models: tuple[Model | None, Model | None]) -> Document:
     a, b = comparison.a, comparison.b
     shared = len(comparison.apart_m)
     laid = f"B is laid onto A by the {shared} frames that both have." if shared else "The runs share too few frames."
-    head = (
-        f"<header><h1>{escape(a.name)} and {escape(b.name)}</h1>"
-        f'<p class="soft">A: {escape(str(a.folder))}. B: {escape(str(b.folder))}. {laid}</p></header>'
-    )
-    verdicts = "".join(
-        f'<div class="verdict unchanged"><b>{escape(run.name)}</b><br>{escape(run.report["verdict"]["sentence"])}</div>'
-        for run in (a, b)
-    )
-    sides = page.photographs(
-        "The models from four sides", f"Left: {a.name}. Right: {b.name}.", _sides(comparison, models)
-    )
-    return page.document(
+    return Document(
         f"{a.name} and {b.name}",
-        [
-            head,
-            verdicts,
-            *(page.table(each, "") for each in tables(comparison)),
-            sides,
-            page.plots(draw(_paths(comparison))),
-        ],
+        f"A: {a.folder}. B: {b.folder}. {laid}",
+        tuple(Banner("", run.name, (run.report["verdict"]["sentence"],)) for run in (a, b)),
+        sections=(
+            *(Section.of(each) for each in tables(comparison)),
+            Section(
+                "The models from four sides", f"Left: {a.name}. Right: {b.name}.", pictures=_sides(comparison, models)
+            ),
+            Section("Trajectories", pictures=draw(_paths(comparison))),
+        ),
     )
 
 
@@ -92,29 +81,10 @@ def _paths(comparison: Comparison) -> Report:
     return Report("", SourceSummary("", "", 0), before=a.name, after=b.name, pictures=pictures)
 
 
-def _sides(comparison: Comparison, models: tuple[Model | None, Model | None]) -> Iterator[Photograph]:
+def _sides(comparison: Comparison, models: tuple[Model | None, Model | None]) -> tuple[Picture, ...]:
     first, second = models
     if first is None or second is None or not len(comparison.a_poses) or not len(first.points_in_world):
-        return
-    scenes = [_scene(model) for model in (first, second)]
-    gap = np.full((splat.HEIGHT, GAP, 3), splat.PAPER, np.uint8)
-    for name, stand in splat.stands(scenes[0], comparison.a_poses).items():
-        image = np.hstack([splat.picture(scenes[0], stand), gap, splat.picture(scenes[1], stand)])
-        yield Photograph(f"From the {name}", f"{comparison.a.name} | {comparison.b.name}", splat.jpeg(image))
-
-
-def _scene(model: Model) -> splat.Scene:
-    zeros = np.zeros_like(model.points_in_world)
-    return splat.Scene(
-        model.points_in_world,
-        zeros if model.normals_in_world is None else model.normals_in_world,
-        zeros.astype(np.uint8) if model.colours is None else model.colours,
-    )
-
-
-def _markdown(comparison: Comparison) -> str:
-    lines = []
-    for table in tables(comparison):
-        lines += [f"## {table.title}", "", f"| {' | '.join(table.header)} |", "|---" * len(table.header) + "|"]
-        lines += [f"| {' | '.join(row)} |" for row in table.rows] + [""]
-    return "\n".join(lines)
+        return ()
+    scenes = [raster.Points.of(one.points_in_world, one.normals_in_world, one.colours) for one in (first, second)]
+    views = raster.around(scenes[0], comparison.a_poses)
+    return sides(scenes, views, f"{comparison.a.name} | {comparison.b.name}")

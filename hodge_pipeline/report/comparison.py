@@ -13,7 +13,7 @@ from hodge_pipeline import registry, se3
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.difference import floor_of, length, percent, sign_of
 from hodge_pipeline.evaluation.trajectory import absolute_error
-from hodge_pipeline.report.tables import Table
+from hodge_pipeline.report.document import Table
 from hodge_pipeline.report.verdict import GRAPH_NAMES
 from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.store.workspace import RECIPE_FILE, is_run_folder

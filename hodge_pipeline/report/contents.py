@@ -8,17 +8,22 @@ from typing import Literal
 
 import numpy as np
 
+from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.notes import Note
+
+NOTHING_TO_DO_M = 0.005
+"""A change of poses in a room that nobody need act on: a quarter of the voxel that clouds are thinned to."""
 
 
 @dataclass(frozen=True)
 class SourceSummary:
     """What was read: how many frames, how many of them with a true pose, and what the reader remarked.
 
-    `key_frames` is None where every frame is a vertex of the graph. `kind` says what a frame is, `unordered` that all
-    were joined from nothing.
+    `key_frames` is None where every frame is a vertex of the graph. `format` is the reader's name, `kind`
+    says what a frame is, `unordered` that all were joined from nothing.
     """
 
     name: str
@@ -28,7 +33,8 @@ class SourceSummary:
     sequences: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     key_frames: int | None = None
-    kind: Literal["frames", "scans"] = "frames"
+    format: str = ""
+    kind: Literal["frames", "scans", "images", "poses"] = "frames"
     unordered: bool = False
 
     @property
@@ -45,7 +51,10 @@ class SourceSummary:
 
 @dataclass(frozen=True)
 class TrajectoryRow:
-    """Absolute (ATE) and relative (RPE, over `rpe_delta_frames`) error of one set of poses against the truth."""
+    """Absolute (ATE) and relative (RPE, over `rpe_delta_frames`) error of one set of poses against the truth.
+
+    `of` says what is counted in `frames` and `left_out`: the frames of the source, or the poses of a file.
+    """
 
     name: str
     frames: int
@@ -57,6 +66,7 @@ class TrajectoryRow:
     rpe_rotation_deg: float
     degenerate: bool = False
     rpe_delta_frames: int = 1
+    of: str = "frames"
 
 
 @dataclass(frozen=True)
@@ -111,6 +121,22 @@ class ComponentRow:
 
 
 @dataclass(frozen=True)
+class WrongEdges:
+    """The edges judged wrong that the solver used: how many, at which frames most, and what they do: without them
+    poses move by up to `moved_m`, aligned, and the scene has `pieces_more`.
+    """
+
+    count: int
+    frames: str = ""
+    moved_m: float = 0.0
+    pieces_more: int = 0
+
+    def matters(self, scale: float) -> bool:
+        """Whether anything changes without them: by more than `NOTHING_TO_DO_M` times the recipe's scale."""
+        return self.pieces_more > 0 or self.moved_m > NOTHING_TO_DO_M * scale
+
+
+@dataclass(frozen=True)
 class GraphSummary:
     """The viewing graph in numbers: what it joins, where its edges come from, what was rejected and why, and how many
     edges the diagnosis judged how.
@@ -149,6 +175,21 @@ class MeasureRow:
 
 
 @dataclass(frozen=True)
+class CandidateRow:
+    """What one candidate for a refined model costs: see `refine.judge.Cost`; `images_off` counts them."""
+
+    name: str
+    mean_px: float
+    median_px: float
+    observations: int
+    behind: int
+    distant: int
+    beyond: float
+    images_off: int
+    is_kept: bool
+
+
+@dataclass(frozen=True)
 class RefinementSummary:
     """What became of a refinement: `outcome` is refined, optimal, worse or forced; why; and what it rests on."""
 
@@ -158,6 +199,7 @@ class RefinementSummary:
     measures: tuple[MeasureRow, ...] = ()
     change: str = ""
     scale: str = ""
+    candidates: tuple[CandidateRow, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -178,21 +220,12 @@ class Residuals:
 
 
 @dataclass(frozen=True)
-class Photograph:
-    """A JPEG with its title and what it shows, in a sentence."""
-
-    title: str
-    caption: str
-    jpeg: bytes
-
-
-@dataclass(frozen=True)
 class Pictures:
     """What the plots are drawn from; a plot without its data is left out.
 
-    `component (N,)` breaks the paths between parts and sequences. `convergence` holds the objective after each
-    iteration, one series for each solve. `sides` shows the scene before and after, `worst_pairs` the frames of the
-    worst edges.
+    `component (N,)` breaks the paths between parts and sequences; `names (N,)` and `stamps_s (N,)` are those of their
+    frames. `convergence` holds the objective after each iteration, one series for each solve. `changed_most` shows the
+    place that changed most before and after, `sides` the whole scene, `worst_pairs` the frames of the worst edges.
     """
 
     paths: tuple[Path3D, ...] = ()
@@ -200,8 +233,11 @@ class Pictures:
     residuals: tuple[Residuals, ...] = ()
     graph: ViewGraph | None = None
     convergence: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    sides: tuple[Photograph, ...] = ()
-    worst_pairs: tuple[Photograph, ...] = ()
+    names: tuple[str, ...] = ()
+    stamps_s: Floats = field(default_factory=lambda: np.zeros(0))
+    changed_most: tuple[Picture, ...] = ()
+    sides: tuple[Picture, ...] = ()
+    worst_pairs: tuple[Picture, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -210,6 +246,8 @@ class Report:
 
     `before` and `after` name the sets of poses that the verdict compares, as in `scores` and `trajectories`.
     `last_shift_m` is how far the last round moved the positions (root mean square), None where it had none before it.
+    `wrong_edges` is None where nobody judged; `unmeasured` says why no measure was taken; without `has_metres` lengths
+    are in the source's own unit.
     """
 
     title: str
@@ -228,4 +266,28 @@ class Report:
     versions: Mapping[str, str] = field(default_factory=dict)
     recipe: str = ""
     last_shift_m: float | None = None
+    wrong_edges: WrongEdges | None = None
+    unmeasured: str = ""
+    has_metres: bool = True
     pictures: Pictures = field(default_factory=Pictures)
+
+    @property
+    def scale(self) -> float:
+        """The unit that recipes are written in, in metres: 1 in a room."""
+        return self.scores.scale if self.scores else 1.0
+
+    @property
+    def pieces(self) -> tuple[int, ...]:
+        """The frames of each piece that joins at least two, most first."""
+        parts = () if self.graph is None else self.graph.components
+        return tuple(sorted((part.count for part in parts if part.count > 1), reverse=True))
+
+    @property
+    def verdicts_of_concern(self) -> int:
+        """Edges that the solver used, and that the diagnosis judged wrong or suspect."""
+        used = {} if self.graph is None else self.graph.verdicts_in_use
+        return used.get("wrong", 0) + used.get("suspect", 0)
+
+    def length(self, value: float, *others: float) -> str:
+        """A length in a unit that suits its size; without a unit where none is known."""
+        return length(value, *others) if self.has_metres else f"{value:.3g}"

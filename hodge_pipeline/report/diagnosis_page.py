@@ -1,11 +1,9 @@
-"""A diagnosis as one HTML page that needs nothing but itself."""
+"""A diagnosis as a page."""
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 
@@ -15,18 +13,13 @@ from hodge_pipeline.diagnosis.energy import CAVEAT, PARTS, SHARE_CAVEAT, EnergyR
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.suggestions import Suggestions
 from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle
-from hodge_pipeline.report.page import STYLE
-from hodge_pipeline.report.plots import Plot
-from hodge_pipeline.report.tables import Table, number
+from hodge_pipeline.report.document import Banner, Document, Mark, Picture, Section, Table
+from hodge_pipeline.report.tables import number
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 LISTED = 20
 CYCLES_EACH = 2
-OUTCOMES = {WRONG: "worse", SUSPECT: "mixed", UNTESTABLE: "unchanged", CONSISTENT: "improved"}
-EXTRA_STYLE = (
-    ".wrong { color: #b0207a; font-weight: 600; } .suspect { color: #8a5a00; font-weight: 600; } "
-    ".cycles { min-width: 17em; } "
-)
+MARKS: dict[str, Mark] = {WRONG: "worse", SUSPECT: "mixed", UNTESTABLE: "mixed", CONSISTENT: "better"}
 
 
 @dataclass(frozen=True)
@@ -34,7 +27,7 @@ class EdgePictures:
     """Pictures of one edge, by its row: its clouds and its images, each with what it shows."""
 
     row: int
-    plots: tuple[Plot, ...]
+    plots: tuple[Picture, ...]
 
 
 @dataclass(frozen=True)
@@ -47,37 +40,36 @@ class PageContents:
     diagnosis: Diagnosis
     advice: tuple[str, ...]
     energy: tuple[EnergyRow, ...]
-    plots: tuple[Plot, ...]
+    plots: tuple[Picture, ...]
     edges: tuple[EdgePictures, ...] = ()
     suggestions: Suggestions | None = None
     commands: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
 
-def render(contents: PageContents) -> str:
-    """The page, as HTML5 text."""
-    head = (
-        f"<header><h1>Which edge is wrong: {escape(contents.title)}</h1>"
-        f'<p class="soft">{escape(contents.path)}: {contents.graph.vertex_count} frames, {contents.graph.edge_count} '
-        "edges. Each edge is a measured motion between two frames; the cycles that it lies in test it.</p></header>"
-    )
-    body = [
-        head,
-        _verdict(contents),
-        _next(contents.commands),
-        *(_edge_pictures(contents, edge) for edge in contents.edges),
-        _table(edge_table(contents)),
-        _figures("The graph", contents.plots),
-        _suggestions(contents),
-        *([_table(energy_table(contents.energy))] if contents.energy else []),
-        _table(pieces_table(contents.graph, contents.diagnosis)),
-        _notes(contents.notes),
-    ]
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>Which edge is wrong: {escape(contents.title)}</title>\n<style>{STYLE}{EXTRA_STYLE}</style>\n</head>\n"
-        "<body>\n" + "\n".join(part for part in body if part) + "\n</body>\n</html>\n"
+def document(contents: PageContents) -> Document:
+    """The page."""
+    verdict = contents.diagnosis.verdict
+    worst = next((name for name in (WRONG, SUSPECT, UNTESTABLE) if (verdict == name).any()), CONSISTENT)
+    pieces = int(contents.diagnosis.piece.max(initial=-1)) + 1
+    rest = (f"What is kept holds the scene in {pieces} pieces.",) if pieces > 1 else ()
+    frames = frames_table(contents.graph, contents.diagnosis)
+    return Document(
+        f"Which edge is wrong: {contents.title}",
+        f"{contents.graph.vertex_count} frames, {contents.graph.edge_count} edges. Each edge is a measured motion "
+        "between two frames; the cycles that it lies in test it.",
+        (Banner(MARKS[worst], sentence(contents.graph, contents.diagnosis), rest),),
+        first=(Section("What to do", text="\n".join(contents.commands)),),
+        sections=(
+            *([Section.of(frames)] if frames.rows else []),
+            *(_edge_pictures(contents, edge) for edge in contents.edges),
+            Section.of(edge_table(contents)),
+            Section("The graph", pictures=contents.plots),
+            *_suggestions(contents),
+            *([Section.of(energy_table(contents.energy))] if contents.energy else []),
+            Section.of(pieces_table(contents.graph, contents.diagnosis)),
+            Section("Notes", lines=contents.notes, is_folded=True),
+        ),
     )
 
 
@@ -131,24 +123,21 @@ def _are(count: int) -> str:
     return "is" if count == 1 else "are"
 
 
-def _verdict(contents: PageContents) -> str:
-    verdict = contents.diagnosis.verdict
-    worst = next((name for name in (WRONG, SUSPECT, UNTESTABLE) if (verdict == name).any()), CONSISTENT)
-    pieces = int(contents.diagnosis.piece.max(initial=-1)) + 1
-    rest = f" What is kept holds the scene in {pieces} pieces." if pieces > 1 else ""
-    text = escape(sentence(contents.graph, contents.diagnosis) + rest)
-    return f'<div class="verdict {OUTCOMES[worst]}"><b>{text}</b></div>'
+def frames_table(graph: ViewGraph, diagnosis: Diagnosis) -> Table:
+    """The frames that several wrong or suspect edges share, most first: one bad frame spoils all its edges."""
+    bad = np.flatnonzero(np.isin(diagnosis.verdict, (WRONG, SUSPECT)))
+    counts = np.bincount(graph.edges[bad].ravel(), minlength=graph.vertex_count)
+    order = np.argsort(-counts, kind="stable")
+    rows = tuple(_frame_row(graph, diagnosis, bad, int(frame)) for frame in order[:LISTED] if counts[frame] > 1)
+    caption = "Where many of a frame's edges are bad look at the frame: its depth, blur, or a place that looks alike."
+    return Table("Frames that bad edges share", ("frame", "bad edges", "of its edges", "to"), rows, caption, wide=(3,))
 
 
-def _next(commands: Sequence[str]) -> str:
-    if not commands:
-        return ""
-    return f"<section><h2>What to do</h2><pre>{escape(chr(10).join(commands))}</pre></section>"
-
-
-def _notes(notes: Sequence[str]) -> str:
-    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
-    return f'<section><h2>Notes</h2><ul class="notes">{items}</ul></section>' if items else ""
+def _frame_row(graph: ViewGraph, diagnosis: Diagnosis, bad: Ints, frame: int) -> tuple[str, ...]:
+    own = bad[(graph.edges[bad] == frame).any(axis=1)]
+    others = np.where(graph.edges[own, 0] == frame, graph.edges[own, 1], graph.edges[own, 0])
+    total = int((graph.edges == frame).any(axis=1).sum())
+    return str(graph.vertex_ids[frame]), str(len(own)), str(total), in_runs(np.unique(others), graph.vertex_ids)
 
 
 def edge_table(contents: PageContents) -> Table:
@@ -161,7 +150,7 @@ def edge_table(contents: PageContents) -> Table:
         "where its ends lie; at 100 % the scene falls apart without it. Cycles: the product of motions around them."
     )
     header = ("edge", "verdict", "what to do", "cycles against", "cycles for", "source", "right", "off by", "say")
-    return Table("Edges, the worst first", header, rows, caption, 6)
+    return Table("Edges, the worst first", header, rows, caption, 6, wide=(3, 4))
 
 
 def _edge_row(contents: PageContents, row: int) -> tuple[str, ...]:
@@ -191,10 +180,10 @@ def _cycles(contents: PageContents, rows: Ints) -> str:
     return "; ".join(list(told.values())[:CYCLES_EACH]) or "none"
 
 
-def _suggestions(contents: PageContents) -> str:
+def _suggestions(contents: PageContents) -> Iterator[Section]:
     found = contents.suggestions
     if found is None or not len(found.pairs):
-        return ""
+        return
     rows = []
     for (i, j), score, resistance, tests, reason in zip(
         contents.graph.vertex_ids[found.pairs].tolist(),
@@ -211,7 +200,7 @@ def _suggestions(contents: PageContents) -> str:
         "edges it would put into a triangle. Resistance: variance between the two, in units of one edge's."
     )
     header = ("pair", "why", "nats", "resistance", "edges it tests")
-    return _table(Table("Pairs to register next", header, tuple(rows), caption, 2))
+    yield Section.of(Table("Pairs to register next", header, tuple(rows), caption, 2))
 
 
 def energy_table(rows: Sequence[EnergyRow]) -> Table:
@@ -260,42 +249,7 @@ def pieces_table(graph: ViewGraph, diagnosis: Diagnosis) -> Table:
     return Table("Pieces", ("piece", "frames", "which"), tuple(rows), caption + more, 3)
 
 
-def _edge_pictures(contents: PageContents, edge: EdgePictures) -> str:
+def _edge_pictures(contents: PageContents, edge: EdgePictures) -> Section:
     i, j = contents.graph.vertex_ids[contents.graph.edges[edge.row]]
-    verdict = str(contents.diagnosis.verdict[edge.row])
-    reason = contents.diagnosis.reason[edge.row]
-    figures = "".join(_figure(each) for each in edge.plots)
-    return (
-        f'<section><h2>{escape(f"{i}–{j}")}: <span class="{escape(verdict)}">{escape(verdict)}</span></h2>'
-        f'<p class="caption">{escape(reason)}</p><div class="plots">{figures}</div></section>'
-    )
-
-
-def _figures(title: str, plots: Sequence[Plot]) -> str:
-    figures = "".join(_figure(plot) for plot in plots)
-    return f'<section><h2>{escape(title)}</h2><div class="plots">{figures}</div></section>' if figures else ""
-
-
-def _figure(plot: Plot) -> str:
-    kind = "jpeg" if plot.png.startswith(b"\xff\xd8") else "png"
-    return (
-        f'<figure><h3>{escape(plot.title)}</h3><img alt="{escape(plot.title)}. {escape(plot.caption)}" '
-        f'src="data:image/{kind};base64,{b64encode(plot.png).decode()}">'
-        f"<figcaption>{escape(plot.caption)}</figcaption></figure>"
-    )
-
-
-def _table(table: Table) -> str:
-    def cells(tag: str, row: Sequence[str]) -> Iterator[str]:
-        for column, cell in enumerate(row):
-            known = (column < table.names, "word"), (cell in (WRONG, SUSPECT), cell), ("fails by" in cell, "cycles")
-            classes = " ".join(name for applies, name in (*known, ("closes to" in cell, "cycles")) if applies)
-            attribute = f' class="{classes}"' if classes else ""
-            yield f"<{tag}{attribute}>{escape(cell)}</{tag}>"
-
-    head = "".join(cells("th", table.header))
-    rows = "".join(f"<tr>{''.join(cells('td', row))}</tr>" for row in table.rows)
-    return (
-        f'<section><h2>{escape(table.title)}</h2><p class="caption">{escape(table.caption)}</p><div class="scroll">'
-        f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div></section>"
-    )
+    verdict, reason = str(contents.diagnosis.verdict[edge.row]), contents.diagnosis.reason[edge.row]
+    return Section(f"{i}–{j}", reason, pictures=edge.plots, mark=verdict)

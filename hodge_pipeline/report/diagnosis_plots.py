@@ -2,66 +2,53 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from hodge_pipeline.diagnosis.energy import ALL_EDGES, PARTS, EnergyRow
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
-from hodge_pipeline.report.plots import Plot
+from hodge_pipeline.report.document import Picture
+from hodge_pipeline.report.painting import flattest_plane, painted
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 COLOURS = {CONSISTENT: "#3c73e1", UNTESTABLE: "#7f7f7f", SUSPECT: "#e69f00", WRONG: "#d5308f"}
 """Blue, grey, amber, magenta, as in the recording; markers tell them apart without colour."""
 MARKERS = {CONSISTENT: "s", UNTESTABLE: "D", SUSPECT: "^", WRONG: "X"}
 PART_COLOURS = ("#56b4e9", "#e69f00", "#444444")
-DOTS_PER_INCH = 140
 GAP_SHARE = 0.25
 FEW = 15
 
 
-def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> tuple[Plot, ...]:
+def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> tuple[Picture, ...]:
     """Every picture that there are data for."""
     return tuple(_plots(graph, diagnosis, energy))
 
 
-def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> Iterator[Plot]:
+def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> Iterator[Picture]:
     if graph.edge_count:
-        yield plot(
+        yield painted(
             "Viewing graph by verdict",
             "A dot is an edge between the frames of its row and column. Above the diagonal: its verdict. Below: the "
             "probability that it is right; untestable edges have none.",
             lambda figure: _matrix(figure, graph, diagnosis),
         )
-        yield plot(
+        yield painted(
             "Edges from above",
             "The frames at their robust poses, seen across their flattest direction, with the edges by verdict; pieces "
             "that nothing sound connects are drawn beside each other.",
             lambda figure: _above(figure, graph, diagnosis),
         )
     if energy:
-        yield plot(
+        yield painted(
             "Energy of the residual motions",
             "Rotation left, translation right. Exact: what moving frames would take away. Co-exact: seen in triangles. "
             "Harmonic: around loops that no triangles fill.",
             lambda figure: _bars(figure, [row for row in energy if row.group == ALL_EDGES]),
         )
-
-
-def plot(title: str, caption: str, paint: Callable[[Figure], None], size: tuple[float, float] = (5.0, 4.2)) -> Plot:
-    """A painted figure as a picture."""
-    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    paint(figure)
-    target = io.BytesIO()
-    # savefig would lay out and draw it all twice
-    canvas.print_png(target, metadata={"Software": None})  # type: ignore[no-untyped-call]
-    return Plot(title, caption, target.getvalue())
 
 
 def _matrix(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
@@ -96,7 +83,9 @@ def _legend(figure: Figure, axes: Any) -> None:
 
 def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
     axes = figure.add_subplot()
-    places = flat(side_by_side(diagnosis.world_from_cam, diagnosis.piece)[:, :3, 3])
+    positions = side_by_side(diagnosis.world_from_cam, diagnosis.piece)[:, :3, 3]
+    origin, plane = flattest_plane(positions)
+    places = (positions - origin) @ plane.T
     for name in (CONSISTENT, UNTESTABLE, SUSPECT, WRONG):
         rows = np.flatnonzero(diagnosis.verdict == name)
         thick = 0.4 if name == CONSISTENT else 0.4 + 1.2 * _rarity(len(rows))
@@ -128,12 +117,6 @@ def side_by_side(world_from_cam: Floats, piece: Ints) -> Floats:
             placed[rows, 0, 3] += edge + gap - placed[rows, 0, 3].min()
         edge = placed[rows, 0, 3].max()
     return placed
-
-
-def flat(positions: Floats) -> Floats:
-    """The positions (V, 2) along the two directions in which they spread most."""
-    centred = positions - positions.mean(axis=0)
-    return np.asarray(centred @ np.linalg.eigh(centred.T @ centred)[1][:, :0:-1])
 
 
 def _bars(figure: Figure, rows: Sequence[EnergyRow]) -> None:

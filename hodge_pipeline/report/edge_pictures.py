@@ -1,25 +1,33 @@
-"""Pictures of single edges: their two clouds before and after, their two images with what matches."""
+"""Pictures of single edges: their two clouds before and after, cut open, and their two images with what matches."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import Diagnosis
-from hodge_pipeline.errors import SourceError
-from hodge_pipeline.report import splat
+from hodge_pipeline.evaluation.difference import length
+from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import EdgePictures
+from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.matches import side_by_side
-from hodge_pipeline.report.plots import Plot
-from hodge_pipeline.report.thumbnails import beside, thumbnail
-from hodge_pipeline.report.two_clouds import View, picture, views
+from hodge_pipeline.report.painting import painted
+from hodge_pipeline.report.photographs import images_of
 from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, PointCloud, ViewGraph
 
 IMAGE_WIDTH = 420
 LEAST_UP = 0.1
 """Of the mean up direction: where cameras look every way there is none."""
+SIZE = 360, 270
+STRAY_PERCENT = 1.0
+BLUE, ORANGE = (0, 114, 178), (230, 120, 0)
+CUT_SHARE, SEEN_SHARE = 0.04, 0.03
+"""How thick a cut through clouds is, and how large an offset must be to be seen in it: of the clouds' extent."""
+EXAGGERATIONS = (2, 5, 10, 20, 50, 100)
 
 
 def edge_pictures(
@@ -36,18 +44,21 @@ def edge_pictures(
 
 def _plots(
     graph: ViewGraph, diagnosis: Diagnosis, row: int, frames: Sequence[Frame], clouds: CloudSet | None
-) -> Iterator[Plot]:
+) -> Iterator[Picture]:
     i, j = graph.edges[row].tolist()
     names = graph.vertex_ids[i], graph.vertex_ids[j]
     if clouds is not None and len(clouds[i]) and len(clouds[j]):
-        known = [("As the edge says", graph.i_from_j[row])]
+        measured, known = graph.i_from_j[row], [("As the edge says", graph.i_from_j[row])]
+        up = _up(diagnosis, i)
         if diagnosis.piece[i] == diagnosis.piece[j]:
             robust = se3.inverse(diagnosis.world_from_cam[i]) @ diagnosis.world_from_cam[j]
             known.append(("As the robust poses say", robust))
-        seen = _views(clouds[i], clouds[j], [motion for _, motion in known], _up(diagnosis, i))
+            yield _cut(clouds[i], clouds[j], measured, robust, up, names[1])
+        views = _views(clouds[i], clouds[j], [motion for _, motion in known], up)
         shown = f"Frame {names[0]} blue, frame {names[1]} orange; left as camera {names[0]} looks, right from above."
         for title, motion in known:
-            yield Plot(title, shown, _clouds(clouds[i], clouds[j], motion, seen))
+            both = raster.two(clouds[i], clouds[j], motion, (BLUE, ORANGE))
+            yield Picture(title, shown, raster.jpeg(raster.beside([raster.picture(both, view) for view in views])))
     if frames:
         yield from _images(frames[i], frames[j])
 
@@ -60,32 +71,79 @@ def _up(diagnosis: Diagnosis, i: int) -> Floats:
     return np.asarray(poses[i, :3, :3].T @ (up / size) if size > LEAST_UP else np.array([0.0, -1.0, 0.0]))
 
 
-def _views(first: PointCloud, second: PointCloud, motions: Sequence[Floats], up_in_i: Floats) -> tuple[View, View]:
-    """The same views for every motion, so that the pictures compare."""
+def _views(
+    first: PointCloud, second: PointCloud, motions: Sequence[Floats], up_in_i: Floats
+) -> tuple[raster.View, raster.View]:
+    """As camera i looks, and from above: the same for every motion, so that the pictures compare."""
     moved = [se3.transform(motion, np.asarray(second.points_in_cam, float)) for motion in motions]
-    return views(np.concatenate([np.asarray(first.points_in_cam, float), *moved]), up_in_i)
+    points = np.concatenate([np.asarray(first.points_in_cam, float), *moved])
+    across = np.cross(-up_in_i, np.eye(3)[2])
+    across /= max(float(np.linalg.norm(across)), 1e-9)
+    above = np.stack([across, np.cross(-up_in_i, across), -up_in_i])
+    ahead, down = (raster.holding(axes, points, SIZE, STRAY_PERCENT) for axes in (np.eye(3), above))
+    return replace(ahead, culled=False), replace(down, culled=False)
 
 
-def _clouds(first: PointCloud, second: PointCloud, i_from_j: Floats, seen: tuple[View, View]) -> bytes:
-    return splat.jpeg(beside([picture(first, second, i_from_j, view) for view in seen]))
+def _cut(
+    first: PointCloud,
+    second: PointCloud,
+    measured: Floats,
+    robust: Floats,
+    up_in_i: Floats,
+    name: object,
+) -> Picture:
+    """Both clouds cut open along the offset between the edge and the robust poses, which is exaggerated if small."""
+    blue, points = np.asarray(first.points_in_cam, float), np.asarray(second.points_in_cam, float)
+    middle = points.mean(axis=0)
+    offset = se3.transform(measured, middle[None])[0] - se3.transform(robust, middle[None])[0]
+    size = float(np.linalg.norm(offset))
+    extent = float(np.linalg.norm(np.percentile(blue, 95, axis=0) - np.percentile(blue, 5, axis=0)))
+    times = _exaggeration(size, extent)
+    shown = robust @ se3.exp(times * se3.log(se3.inverse(robust) @ measured))
+    along = offset / size if size > 0 else np.eye(3)[0]
+    normal = up_in_i - (up_in_i @ along) * along
+    normal = normal / np.linalg.norm(normal) if np.linalg.norm(normal) > LEAST_UP else np.cross(along, np.eye(3)[0])
+    plane = np.stack([np.cross(normal, along), along])
+    orange = [se3.transform(motion, points) for motion in (shown, robust)]
+    height = float(np.median(orange[1] @ normal))
+
+    def paint(figure: Figure) -> None:
+        for axes, title, moved in zip(figure.subplots(1, 2), ("edge", "robust poses"), orange, strict=True):
+            for cloud, colour, marker in ((blue, BLUE, "o"), (moved, ORANGE, "^")):
+                x, y = plane @ cloud[np.abs(cloud @ normal - height) < CUT_SHARE * extent / 2].T
+                axes.scatter(x, y, s=2, color=np.array(colour) / 255, marker=marker, linewidths=0)
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.set_title(title, fontsize=9)
+            axes.tick_params(labelsize=7)
+
+    told = f", here {times} times as large" if times > 1 else ""
+    caption = (
+        f"A slice through both clouds, {length(CUT_SHARE * extent)} thick, along the offset: frame {name} (orange) "
+        f"lies {length(size)} apart{told}."
+    )
+    return painted("Cut open", caption, paint)
 
 
-def _images(first: Frame, second: Frame) -> Iterator[Plot]:
+def _exaggeration(size: float, extent: float) -> int:
+    """How many times an offset is enlarged, so that it is seen: 1 where it is anyway, or is nothing."""
+    if size <= 0 or size >= SEEN_SHARE * extent:
+        return 1
+    return next((times for times in EXAGGERATIONS if times * size >= SEEN_SHARE * extent), EXAGGERATIONS[-1])
+
+
+def _images(first: Frame, second: Frame) -> Iterator[Picture]:
     """The frames as their cameras saw them; a frame with nothing to show, or nothing that can be read, has none."""
-    try:
-        images = [thumbnail(frame, IMAGE_WIDTH) for frame in (first, second)]
-    except (SourceError, OSError):
-        return
-    shown = [image for image in images if image is not None]
+    shown = images_of((first, second), IMAGE_WIDTH)
     if len(shown) < 2:
         return
     title = f"Images of {first.frame_id} and {second.frame_id}"
     if first.read_colour is None or second.read_colour is None:
-        yield Plot(title, "Depth where there is no colour: the brighter, the farther.", splat.jpeg(beside(shown)))
+        caption = "Depth where there is no colour: the brighter, the farther."
+        yield Picture(title, caption, raster.jpeg(raster.beside(shown)))
         return
     found = side_by_side(*shown)
     caption = (
         f"{found.matches} SIFT matches; {found.agreeing} of them (green) agree on one relative pose. Places that look "
         "alike match too: see whether the whole views fit."
     )
-    yield Plot(title, caption, splat.jpeg(found.image))
+    yield Picture(title, caption, raster.jpeg(found.image))

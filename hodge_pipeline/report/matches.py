@@ -9,7 +9,7 @@ import numpy as np
 
 from hodge_pipeline.pairs.sift_matching import CONFIDENCE, MOST_RANSAC_STEPS
 from hodge_pipeline.registration.descriptors import match, root_sift
-from hodge_pipeline.report.thumbnails import GAP, beside
+from hodge_pipeline.report.raster import GAP, beside
 from hodge_pipeline.types import Bytes, Floats32, Ints
 
 RATIO = 0.8

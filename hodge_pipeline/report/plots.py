@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from hodge_pipeline.report.contents import Path3D, Report
+from hodge_pipeline.report.contents import Report
+from hodge_pipeline.report.document import Picture
+from hodge_pipeline.report.painting import error_plots, flattest_plane, painted
 from hodge_pipeline.report.verdict import GRAPH_NAMES
 from hodge_pipeline.types import Floats, Ints
 
@@ -25,7 +24,6 @@ STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#56B4E9", "linestyle": (0, (2, 2)), "linewidth": 1.4},
 )
 MARKERS = "osD^vP"
-DOTS_PER_INCH = 150
 HISTOGRAM_BINS = 40
 WIDE = 5
 """Values that differ by less than this factor are legible on a linear axis."""
@@ -33,53 +31,33 @@ SMALLEST_RESIDUAL = 1e-3
 """Where a logarithmic histogram begins, in centimetres and degrees: nothing below it is of interest."""
 
 
-@dataclass(frozen=True)
-class Plot:
-    """A picture with its title and what it shows, in a sentence."""
-
-    title: str
-    caption: str
-    png: bytes
-
-
-def draw(report: Report) -> tuple[Plot, ...]:
-    """Every plot that the report has data for."""
+def draw(report: Report) -> tuple[Picture, ...]:
+    """Every plot that the report has data for, but those of convergence."""
     return tuple(_plots(report))
 
 
-def _plots(report: Report) -> Iterator[Plot]:
+def draw_convergence(report: Report) -> tuple[Picture, ...]:
+    """How the solver came to its result."""
+    if not any(report.pictures.convergence.values()) and not report.loops:
+        return ()
+    caption = "Objective of the solver, and mean deviation of a loop, by iteration."
+    return (painted("Convergence", caption, lambda figure: _convergence(figure, report)),)
+
+
+def _plots(report: Report) -> Iterator[Picture]:
     pictures = report.pictures
     if any(np.isfinite(path.positions).any() for path in pictures.paths):
-        yield _plot(
-            "Trajectory from above", "Aligned to the reference, seen across its flattest direction.", _paths, report
-        )
+        caption = "Aligned to the reference, seen across its flattest direction."
+        yield painted("Trajectory from above", caption, lambda figure: _paths(figure, report))
+    yield from error_plots(report)
     if report.scores is not None and any(len(graph.pairs) for graph in report.scores.graphs):
-        yield _plot("Score of each pair", "Further right is better.", _score_histogram, report)
+        yield painted("Score of each pair", "Further right is better.", lambda figure: _score_histogram(figure, report))
     if any(len(residuals.translation_m) for residuals in pictures.residuals):
-        yield _plot(
-            "Residual of each edge", "Measured motions against the poses: further left is better.", _residuals, report
-        )
+        caption = "Measured motions against the poses: further left is better."
+        yield painted("Residual of each edge", caption, lambda figure: _residuals(figure, report))
     if pictures.graph is not None and pictures.graph.edge_count:
         caption = "Above the diagonal: where each edge comes from. Below: how far it is off the result."
-        yield _plot("Viewing graph", caption, _matrix, report)
-    if any(pictures.convergence.values()) or report.loops:
-        yield _plot(
-            "Convergence", "Objective of the solver, and mean deviation of a loop, by iteration.", _convergence, report
-        )
-
-
-def _plot(title: str, caption: str, paint: Callable[[Figure, Report], None], report: Report) -> Plot:
-    figure = Figure(figsize=(5.0, 3.9), dpi=DOTS_PER_INCH, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    paint(figure, report)
-    for axes in figure.axes:
-        axes.grid(alpha=0.25, linewidth=0.5)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
-    target = io.BytesIO()
-    # savefig would lay out and draw it all twice
-    canvas.print_png(target, metadata={"Software": None})  # type: ignore[no-untyped-call]
-    return Plot(title, caption, target.getvalue())
+        yield painted("Viewing graph", caption, lambda figure: _matrix(figure, report))
 
 
 def _style(report: Report, name: str) -> dict[str, Any]:
@@ -100,24 +78,14 @@ def _names(report: Report) -> list[str]:
 def _paths(figure: Figure, report: Report) -> None:
     axes = figure.add_subplot()
     paths, component = report.pictures.paths, report.pictures.component
-    origin, plane = _flattest_plane(paths[0])
+    origin, plane = flattest_plane(paths[0].positions)
     for path in paths:
         along, across = plane @ (_broken(path.positions, component) - origin).T
         axes.plot(along, across, label=path.name, **_style(report, path.name))
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("m")
-    axes.set_ylabel("m")
+    for label in (axes.set_xlabel, axes.set_ylabel):
+        label("m" if report.has_metres else "the source's unit")
     axes.legend(frameon=False, fontsize=9)
-
-
-def _flattest_plane(path: Path3D) -> tuple[Floats, Floats]:
-    """The mean of a path, and the two directions (2, 3) along which it spreads most."""
-    known = path.positions[np.isfinite(path.positions).all(axis=1)]
-    if not len(known):
-        return np.zeros(3), np.eye(3)[:2]
-    origin = known.mean(axis=0)
-    spread = (known - origin).T @ (known - origin)
-    return origin, np.linalg.eigh(spread)[1][:, :0:-1].T
 
 
 def _broken(positions: Floats, component: Ints) -> Floats:

@@ -1,4 +1,4 @@
-"""The report of a refined model."""
+"""What became of a refinement, as reports show it, and the report of a refined model."""
 
 from __future__ import annotations
 
@@ -7,29 +7,64 @@ from dataclasses import replace
 
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.recipe import binding
+from hodge_pipeline.refine.guard import Decision
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.report.contents import (
+    CandidateRow,
     EdgeRow,
+    MeasureRow,
     Path3D,
     Pictures,
+    RefinementSummary,
     Report,
     Residuals,
     SourceSummary,
     StageRow,
 )
-from hodge_pipeline.report.refinement import summary
 from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.store import yaml_file
 from hodge_pipeline.store.cost import Cost
 from hodge_pipeline.store.store import versions
 from hodge_pipeline.types.notes import Note, notes_of
 
+HEADLINES = {
+    "refined": "Better than the poses given",
+    "optimal": "The poses given were as good already: they are given back",
+    "worse": "Worse than the poses given: those are given back",
+    "forced": "Worse than the poses given, written all the same",
+    "nothing": "Nothing could be refined: no poses are written",
+}
+
+
+def summary(decision: Decision) -> RefinementSummary:
+    """The decision as the report shows it."""
+    rows = tuple(MeasureRow(m.name, m.before, m.after, m.better, m.unit, m.is_worse) for m in decision.measures)
+    change = "" if decision.change is None else f"The {decision.change}."
+    return RefinementSummary(decision.outcome, HEADLINES[decision.outcome], decision.reason, rows, change)
+
 
 def _scales(result: RefinedModel) -> str:
     before = "; ".join(str(scale) for scale in dict.fromkeys(result.scales))
     after = "" if not result.final_scale.is_observable else f". After: {result.final_scale}"
     return f"Before: {before}{after}."
+
+
+def _candidates(result: RefinedModel) -> tuple[CandidateRow, ...]:
+    return tuple(
+        CandidateRow(
+            name=name,
+            mean_px=cost.px,
+            median_px=cost.median_px,
+            observations=cost.observations,
+            behind=cost.behind,
+            distant=cost.distant,
+            beyond=cost.beyond,
+            images_off=len(cost.images_off),
+            is_kept=row == result.kept_row,
+        )
+        for row, (name, cost) in enumerate(result.candidates)
+    )
 
 
 def model_report(results: Sequence[RefinedModel], options: ModelRefinement, source: str, cost: Cost) -> Report:
@@ -56,9 +91,9 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
         )
     return Report(
         title=f"{source}, refined",
-        source=SourceSummary(f"COLMAP model, {quality.points} points", source, quality.images),
+        source=SourceSummary(f"{quality.points} points", source, quality.images, format="colmap", kind="images"),
         before="start",
-        refinement=replace(summary(first.decision), scale=_scales(first)),
+        refinement=replace(summary(first.decision), scale=_scales(first), candidates=_candidates(first)),
         graph=graph,
         worst_edges=worst,
         stages=(StageRow("refine", cost.wall_s, cost.cpu_s, cost.peak_mb),),
@@ -66,4 +101,5 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(options)),
         pictures=pictures,
+        has_metres=first.final_scale.is_observable,
     )

@@ -27,29 +27,46 @@ from hodge_pipeline.report.contents import (
     StageRow,
     TrajectoryRow,
 )
-from hodge_pipeline.report.refinement import summary
-from hodge_pipeline.report.sides import four_sides, worst_pairs
-from hodge_pipeline.report.summary import graph_summary, trajectory_rows, worst_edges
+from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
+from hodge_pipeline.report.refined import summary
+from hodge_pipeline.report.summary import graph_summary, trajectory_rows, weigh_wrong, worst_edges
 from hodge_pipeline.report.write import write_report
-from hodge_pipeline.scene import Round, Scene, has_truth, pose_sets, sequences_of, true_poses
+from hodge_pipeline.scene import (
+    START,
+    GivenFile,
+    KeyFrames,
+    Round,
+    Scene,
+    given_poses,
+    has_given,
+    has_truth,
+    pose_sets,
+    sequences_of,
+    true_poses,
+)
 from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import Store, versions
 from hodge_pipeline.types import Floats, Ints, Solution, Source, Trajectory
+from hodge_pipeline.types.text import file_stems
+
+KEY_OF_CACHE = r"-[0-9a-f]{12}$"
+"""What a cached folder's name ends with, which tells nobody anything."""
 
 
 def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
     """`poses.tum` and `poses.kitti`; of several sequences `poses-<sequence>.*` each, since their stamps may repeat.
 
-    A sequence named by folders, as a rig's cameras are, becomes one name: no file lies outside the folder.
+    A sequence named by folders, as a rig's cameras are, becomes one name: no file lies outside the folder, and no two
+    sequences have one file.
     """
     sequences = sequences_of(source)
-    for name, rows in sequences.items():
+    for stem, rows in zip(file_stems(list(sequences)), sequences.values(), strict=True):
         stamps = np.array([source.frames[row].stamp_s for row in rows])
         part = Source(source.name, source.path, trajectory=Trajectory(stamps, world_from_cam[rows]))
-        stem = "poses" if len(sequences) == 1 else "poses-" + re.sub(r"[/\\]", "_", name)
+        name = "poses" if len(sequences) == 1 else f"poses-{stem}"
         for writer in ("tum", "kitti"):
-            registry.load("writers", writer)().write(folder / f"{stem}.{writer}", part)
+            registry.load("writers", writer)().write(folder / f"{name}.{writer}", part)
 
 
 def write_graph(folder: Path, source: Source, last: Round) -> None:
@@ -68,31 +85,36 @@ def make_report(
     store: Store,
     scene: Scene,
     rounds: Sequence[Round],
+    world_from_cam: Floats,
     scores: ScoreTable | None,
     refined: Refined | None,
 ) -> Report:
-    """Everything that the run measured."""
+    """Everything that the run measured, `world_from_cam (N, 4, 4)` being the poses that it ends with."""
     last, whole, source = rounds[-1], scene.whole, scene.source
-    sets = pose_sets(rounds)
+    sets = pose_sets(rounds, source)
+    kept = refined is not None and refined.decision.keeps_input
     assert last.solution is not None
     component = last.solution.component
+    first = next(iter(sets))
+    shown = sets[first], sets["result"]
     worst = worst_edges(last.edges, last.vertex_ids)
     return Report(
-        title=f"{source.name}",
-        before=rounds[0].name,
+        title=re.sub(KEY_OF_CACHE, "", source.name),
+        before=first,
         source=SourceSummary(
             name=source.name,
             path=str(source.path),
             frames=len(whole.frames),
-            frames_with_truth=sum(frame.world_from_cam is not None for frame in whole.frames),
+            frames_with_truth=sum(frame.true_world_from_cam is not None for frame in whole.frames),
             key_frames=None if scene.key_frames.are_all else len(source.frames),
             sequences=tuple(name for name in sequences_of(source) if name),
             notes=source.notes,
+            format="" if recipe.source.reader is None else registry.name_of(recipe.source.reader),
             kind="scans" if all(frame.read_depth is None for frame in source.frames) else "frames",
             unordered=not scene.in_order,
         ),
         scores=scores,
-        trajectories=_trajectories(recipe, scene, sets, component),
+        trajectories=_trajectories(recipe, scene, sets, world_from_cam, component, kept=kept),
         loops=_loop_rows(last.solution),
         energies=_energy_rows(rounds),
         graph=graph_summary(last.edges, last.vertex_ids, component),
@@ -102,13 +124,25 @@ def make_report(
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(recipe)),
         last_shift_m=_last_shift(rounds, component),
+        wrong_edges=store.step(weigh_wrong, last, recipe.solver, title="diagnosis"),
+        unmeasured=_unmeasured(recipe, scores, last),
         pictures=dataclasses.replace(
             _pictures(source, rounds, sets),
-            sides=four_sides(scene.clouds, sets[rounds[0].name], sets["result"], component),
+            changed_most=changed_most(scene.clouds, *shown, last.graph.edges, last.vertex_ids.tolist(), component),
+            sides=four_sides(scene.clouds, *shown, component),
             worst_pairs=worst_pairs(source, worst),
         ),
         refinement=None if refined is None else summary(refined.decision),
     )
+
+
+def _unmeasured(recipe: Recipe, scores: ScoreTable | None, last: Round) -> str:
+    """Why there are no scores, where there are none."""
+    if scores is not None:
+        return ""
+    if not recipe.evaluation.tables:
+        return "the recipe asks for no scores (evaluation.tables is false), and there are no true poses."
+    return "scores are not measured after an edit, and there are no true poses." if last.edited else ""
 
 
 def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
@@ -122,16 +156,40 @@ def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
 
 
 def _trajectories(
-    recipe: Recipe, scene: Scene, sets: Mapping[str, Floats], component: Ints
+    recipe: Recipe, scene: Scene, sets: Mapping[str, Floats], final: Floats, component: Ints, *, kept: bool
 ) -> tuple[TrajectoryRow, ...]:
-    """The errors of each set of poses, over all frames, those that are not key frames included."""
+    """The errors of each set of poses, over all frames, those that are not key frames included; of a file of given
+    poses over all of its own. The result is what the run ends with: the input where it is kept.
+    """
     if not has_truth(scene.whole):
         return ()
-    every = {name: scene.key_frames.expand(poses) for name, poses in sets.items()}
+    if scene.given is not None:
+        return _of_file(scene.given, scene.key_frames, sets, recipe.evaluation.rpe_delta_frames, kept=kept)
+    every = {name: scene.key_frames.expand(poses) for name, poses in sets.items()} | {"result": final}
+    if has_given(scene.source):
+        every[START] = given_poses(scene.whole)
     sequences = [frame.sequence for frame in scene.whole.frames]
     delta_frames = recipe.evaluation.rpe_delta_frames
     component = component[scene.key_frames.key_of_frame]
     return trajectory_rows(every, true_poses(scene.whole), component, sequences, delta_frames=delta_frames)
+
+
+def _of_file(
+    given: GivenFile, key_frames: KeyFrames, sets: Mapping[str, Floats], delta_frames: int, *, kept: bool
+) -> tuple[TrajectoryRow, ...]:
+    """The errors of the poses of a file, as `evo_ape -a` and `evo_rpe` have them: one alignment, poses without a truth
+    left out first.
+    """
+    known = np.isfinite(given.true_world_from_cam).all(axis=(1, 2))
+    if not known.any():
+        return ()
+    every = {name: given.expand(key_frames, poses)[known] for name, poses in sets.items()}
+    every[START] = given.trajectory.world_from_cam[known]
+    if kept:
+        every["result"] = every[START]
+    rows = trajectory_rows(every, given.true_world_from_cam[known], delta_frames=delta_frames)
+    what = f"poses of {given.path.name}"
+    return tuple(dataclasses.replace(row, left_out=int((~known).sum()), of=what) for row in rows)
 
 
 def _energy_rows(rounds: Sequence[Round]) -> tuple[EnergyRow, ...]:
@@ -165,19 +223,25 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
     last = rounds[-1]
     assert last.solution is not None
     component = last.solution.component
-    shown = {name: sets[name] for name in (rounds[0].name, "result")}
+    first = next(iter(sets))
+    shown = {name: sets[name] for name in (first, "result")}
     if has_truth(source):
         truth = true_poses(source)
         aligned = {name: absolute_error(poses, truth, component).aligned for name, poses in shown.items()}
         shown = {"truth": truth, **aligned}
+    else:
+        shown[first] = absolute_error(shown[first], shown["result"], component).aligned
     paths = [Path3D(name, poses[:, :3, 3]) for name, poses in shown.items()]
-    residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in (rounds[0].name, "result"))
+    finite = next(name for name, poses in sets.items() if np.isfinite(poses).all())
+    residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in (finite, "result"))
     convergence = {
         f"round {number}": tuple(step.objective for step in one.solution.history)
         for number, one in enumerate(rounds)
         if one.solution is not None
     }
-    return Pictures(tuple(paths), component, residuals, last.graph, convergence)
+    names = tuple(str(frame.frame_id) for frame in source.frames)
+    stamps = np.array([frame.stamp_s for frame in source.frames])
+    return Pictures(tuple(paths), component, residuals, last.graph, convergence, names, stamps)
 
 
 def write(
@@ -200,6 +264,6 @@ def write(
         write_graph(folder, scene.source, rounds[-1])
         for name, path in models.items():
             artifacts.link_or_copy(path, folder / f"{name}.ply")
-    report = make_report(recipe, store, scene, rounds, scores, refined)
+    report = make_report(recipe, store, scene, rounds, world_from_cam, scores, refined)
     write_report(folder, report)
     return report

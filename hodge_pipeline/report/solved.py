@@ -8,7 +8,15 @@ from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.recording.solved import record_graph
 from hodge_pipeline.refine.pose_graph import RUN_GRAPH, SolvedFile, write_solved
-from hodge_pipeline.report.contents import Path3D, Pictures, Report, Residuals, SourceSummary, StageRow
+from hodge_pipeline.report.contents import (
+    Path3D,
+    Pictures,
+    RefinementSummary,
+    Report,
+    Residuals,
+    SourceSummary,
+    StageRow,
+)
 from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.store import artifacts
@@ -18,6 +26,7 @@ from hodge_pipeline.types import Edges, Floats
 from hodge_pipeline.types.notes import notes_of
 
 SOLVED = "solved.json"
+OBJECTIVES = {"full": "chi2", "isotropic": "F"}
 
 
 def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
@@ -45,13 +54,29 @@ def _before(solved: SolvedFile) -> dict[str, Floats]:
     return {} if solved.start is None else {"start": solved.start}
 
 
+def _outcome(solved: SolvedFile) -> RefinementSummary:
+    """What the solve did to its own objective: a file of edges has nothing else to measure poses by."""
+    summary = solved.summary()
+    before, after, name = summary["cost_before"], summary["cost_after"], OBJECTIVES[summary["objective"]]
+    fell = f"{name} {after:.6g}" if before is None else f"{name} {before:.6g} → {after:.6g}"
+    doubt = summary["confirmed"] is False or summary["certified"] is False or not summary["converged"]
+    proven = "; proven to be the global minimum" if summary["certified"] else ""
+    reason = f"{summary['edges']} edges, {summary['edges_ignored']} of them ignored{proven}"
+    if doubt:
+        return RefinementSummary("worse", f"Solved, but not to be trusted: {fell}", reason)
+    return RefinementSummary("solved", f"Solved: {fell}", reason)
+
+
 def _report(solved: SolvedFile) -> Report:
     source, graph, solution = solved.source, solved.graph, solved.solution
     sets = {**_before(solved), "result": solution.world_from_cam}
     return Report(
         title=source.name,
-        source=SourceSummary(source.name, str(source.path), graph.vertex_count, notes=source.notes),
+        source=SourceSummary(
+            source.name, str(source.path), graph.vertex_count, notes=source.notes, format="pose graph", kind="poses"
+        ),
         before="start",
+        refinement=_outcome(solved),
         graph=graph_summary(_edges(solved), graph.vertex_ids, solution.component),
         worst_edges=worst_edges(_edges(solved), graph.vertex_ids),
         stages=(StageRow("solve", solved.wall_s, solved.cpu_s, float("nan")),),

@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
 from hodge_pipeline.report.contents import RefinementSummary, Report
+from hodge_pipeline.report.document import Table
 from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m, judge, suspicions
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows of text under a header; the first `names` columns are words, the rest numbers. The caption explains it."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    caption: str = ""
-    names: int = 1
 
 
 def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
@@ -35,18 +24,21 @@ def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
         lines.append(("graph", f"{graph.edges} edges{sources}, {len(graph.components)} connected part(s)"))
     if report.stages:
         wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
-        lines.append(("time", f"{wall:.1f} s, {cpu:.1f} CPU s, at most {_peak(report):.0f} MB"))
+        lines.append(("time", f"{wall:.1f} s, {cpu:.1f} CPU s, at most {peak_mb(report):.0f} MB"))
     return (*lines, *(("note", str(note)) for note in suspicions(report)))
 
 
-def _peak(report: Report) -> float:
+def peak_mb(report: Report) -> float:
+    """The most memory that a stage took."""
     return max(stage.peak_mb for stage in report.stages)
 
 
 def score_tables(report: Report) -> Iterator[Table]:
     """Scores and trajectory errors of each set of poses, where they were measured."""
     if report.refinement is not None and report.refinement.measures:
-        yield _measures(report.refinement)
+        yield _measures(report.refinement, _of_key_frames(report))
+        if report.refinement.candidates:
+            yield _candidates(report.refinement)
     if report.scores is not None:
         yield _scores(report)
     if report.trajectories:
@@ -67,15 +59,34 @@ def graph_tables(report: Report) -> Iterator[Table]:
         yield _loops(report)
 
 
-def _measures(refinement: RefinementSummary) -> Table:
+def _of_key_frames(report: Report) -> str:
+    count = report.source.key_frames
+    return "" if count is None else f"Of the {count} key frames. "
+
+
+def _measures(refinement: RefinementSummary, of: str) -> Table:
     rows = tuple(
         (row.name, f"{row.before:.4g}", f"{row.after:.4g}", row.unit, row.better, "worse" if row.is_worse else "ok")
         for row in refinement.measures
     )
     header = ("measure", "before", "after", "unit", "better", "judgement")
-    caption = "Where one is worse by more than its own noise the input is kept. "
+    caption = f"{of}Where one is worse by more than its own noise the input is kept. "
     caption += " ".join(filter(None, (refinement.change, refinement.scale)))
     return Table("Measures", header, rows, caption)
+
+
+def _candidates(refinement: RefinementSummary) -> Table:
+    rows = tuple(
+        (f"{row.name}{' (kept)' if row.is_kept else ''}", f"{row.mean_px:.4g}", f"{row.median_px:.4g}", str(row.behind),
+         str(row.distant), f"{row.beyond:.2%}", str(row.images_off))
+        for row in refinement.candidates
+    )  # fmt: skip
+    header = ("candidate", "mean, px", "median, px", "behind", "distant", "beyond the cap", "images off")
+    caption = (
+        f"Each on the same {refinement.candidates[0].observations} observations; a mean is of errors up to the cap. "
+        "Lost or behind a camera, or distant (with no parallax where most candidates have one) counts as the cap."
+    )
+    return Table("Candidates", header, rows, caption)
 
 
 def _scores(report: Report) -> Table:
@@ -87,12 +98,18 @@ def _scores(report: Report) -> Table:
         (name, *(cell for graph in table.graphs for cell in _score_cells(graph, row)))
         for row, name in enumerate(table.names)
     ]
-    caption = (
+    caption = _of_key_frames(report) + (
         f"How well overlapping clouds lie on each other, on the pairs of the {table.reference} poses ({counts}). "
         f"d: mean point-to-plane distance; score: mean of exp(−d / {table.scale * SIGMA_M * 1000:g} mm), 1 is perfect. "
         "Compare rows with each other: a score has no meaning alone."
     )
-    return Table("Scores", ("poses", *(cell for column in columns for cell in column)), tuple(rows), caption)
+    return Table(
+        "Scores",
+        ("poses", *(cell for column in columns for cell in column)),
+        tuple(rows),
+        caption,
+        highlighted=report.after,
+    )
 
 
 def _score_cells(graph: GraphScores, row: int) -> tuple[str, str, str]:
@@ -115,13 +132,15 @@ def _trajectories(report: Report) -> Table:
         )
         for row in report.trajectories
     )
-    delta = report.trajectories[0].rpe_delta_frames if report.trajectories else 1
+    row = report.trajectories[0]
+    of = "Distance" if row.of == "frames" else f"Of the {row.frames} {row.of}: distance"
+    noun = row.of.split()[0].removesuffix("s")
+    step = "next" if row.rpe_delta_frames == 1 else f"one {row.rpe_delta_frames} {noun}s on"
     caption = (
-        "Distance from the true positions after the best rigid alignment (ATE, root mean square), and error of the "
-        f"motion from each frame to {'the next' if delta == 1 else f'the one {delta} frames on'} (RPE). The truth of a "
-        "benchmark has errors of its own."
+        f"{of} from the true positions after the best rigid alignment (ATE, root mean square), and error of the "
+        f"motion from each {noun} to the {step} (RPE). The truth of a benchmark has errors of its own."
     )
-    return Table("Trajectory", header, rows, caption)
+    return Table("Trajectory", header, rows, caption, highlighted=report.after)
 
 
 def _graph(report: Report) -> Table:
@@ -166,7 +185,8 @@ def source_table(report: Report) -> Table:
     """What was read."""
     source = report.source
     rows = [
-        ("format", source.name),
+        *((("format", source.format),) if source.format else ()),
+        ("name", source.name),
         ("path", source.path),
         ("frames", str(source.frames)),
         *((("key frames", str(source.key_frames)),) if source.key_frames is not None else ()),
@@ -186,7 +206,7 @@ def worst_edges_table(report: Report) -> Table:
             edge.source,
             number(edge.fitness, ".2f"),
             number(edge.weight, ".2g"),
-            number(edge.residual_m * 100, ".1f", " cm"),
+            report.length(edge.residual_m, report.worst_edges[0].residual_m),
             number(edge.residual_deg, ".2f", "°"),
             edge.verdict or "–",
         )
@@ -205,7 +225,7 @@ def stages_table(report: Report) -> Table:
     """What each stage cost, with the total."""
     rows = [(s.name, f"{s.wall_s:.1f} s", f"{s.cpu_s:.1f} s", f"{s.peak_mb:.0f} MB") for s in report.stages]
     wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
-    rows.append(("all", f"{wall:.1f} s", f"{cpu:.1f} s", f"{_peak(report):.0f} MB"))
+    rows.append(("all", f"{wall:.1f} s", f"{cpu:.1f} s", f"{peak_mb(report):.0f} MB"))
     caption = "CPU time and peak memory are summed over all processes; a stage that was resumed cost nothing."
     return Table("Time", ("stage", "wall", "CPU", "peak memory"), tuple(rows), caption)
 

@@ -22,13 +22,16 @@ UNMATCHED_SHARE = 0.01
 UNSETTLED_M, UNSETTLED_SHARE = 0.05, 0.01
 """By how much (root mean square), and by which share of the path, the last of several rounds may move the positions.
 Runs that end near the truth move by less than 1 cm, one whose edges slide along a bare floor by 30."""
+NOTHING_MOVED_M = 0.0005
+"""The least movement that is told in a room."""
+TRUTH = "truth"
 MOST_SIZES = 3
 """Pieces whose sizes a headline tells."""
-NO_MEASURE = "there were neither overlapping clouds nor true poses to compare the poses by."
+NO_MEASURE = "nothing was there to compare the poses by, before and after."
 
 
 REFINEMENTS: dict[str, Outcome] = {
-    "refined": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
+    "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",
 }  # fmt: skip
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
@@ -37,7 +40,7 @@ GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 @dataclass(frozen=True)
 class Verdict:
     """The outcome of all measures in one word; a headline, which begins with the pieces where there are several; the
-    details, and the changes they rest on.
+    details, and the changes they rest on. `reason` is why a refinement, or a solve, came out as it did.
     """
 
     outcome: Outcome
@@ -45,11 +48,19 @@ class Verdict:
     details: str
     changes: tuple[Change, ...]
     pieces: int = 1
+    reason: str = ""
 
     @property
     def sentence(self) -> str:
         """Headline and details in one."""
         return f"{self.headline}. {_capital(self.details)}"
+
+    @property
+    def points(self) -> tuple[str, ...]:
+        """What the headline rests on, a short line each."""
+        if not self.changes and not self.reason:
+            return (_capital(self.details),)
+        return (*filter(None, [_capital(self.reason)]), *(change.line for change in self.changes))
 
     @property
     def mark(self) -> Outcome:
@@ -64,10 +75,11 @@ def judge(report: Report) -> Verdict:
     """
     changes = (*_score_changes(report), *_trajectory_changes(report))
     outcome, headline, details = _judged(report, changes)
-    pieces = _pieces(report)
+    pieces, reason = _pieces(report), report.refinement.reason if report.refinement else ""
     if pieces:
-        headline = f"{pieces}: {headline[:1].lower()}{headline[1:]}"
-    return Verdict(outcome, headline, details, changes, max(len(_joined(report)), 1))
+        all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
+        headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
+    return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason)
 
 
 def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, str]:
@@ -81,7 +93,7 @@ def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, 
             return "mixed", f"{refinement.headline}, but {but}", f"{refinement.reason}."
         return outcome, refinement.headline, f"{refinement.reason}."
     if not changes:
-        return "not measured", "Not measured", NO_MEASURE
+        return "not measured", "Not measured", report.unmeasured or NO_MEASURE
     if better and worse:
         good = min(better, key=lambda change: change.share).briefly
         good += f" and {len(better) - 1} more better" if len(better) > 1 else ""
@@ -94,15 +106,9 @@ def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _joined(report: Report) -> list[int]:
-    """The frames of each piece that joins at least two, most first."""
-    parts = () if report.graph is None else report.graph.components
-    return sorted((part.count for part in parts if part.count > 1), reverse=True)
-
-
 def _pieces(report: Report) -> str:
     """What is in one piece and what is not, in words; empty where it goes without saying."""
-    graph, sizes = report.graph, _joined(report)
+    graph, sizes = report.graph, report.pieces
     if graph is None or graph.vertices < 2:
         return ""
     of_all = f"of {graph.vertices} {report.source.vertex_name}"
@@ -134,6 +140,9 @@ def _trajectory_changes(report: Report) -> Iterator[Change]:
     before, after = rows[report.before], rows[report.after]
     floor = floor_m(report)
     yield Change("the error of the trajectory (ATE)", "ATE", before.ate_rmse_m, after.ate_rmse_m, floor)
+    largest = Change("the largest error of a position", "largest error", before.ate_max_m, after.ate_max_m, floor)
+    if largest.sign < 0:
+        yield largest
     if not np.isfinite(before.rpe_translation_m):
         return
     step = "from frame to frame" if before.rpe_delta_frames == 1 else f"over {before.rpe_delta_frames} frames"
@@ -158,7 +167,9 @@ def suspicions(report: Report) -> tuple[Note, ...]:
         *_unsettled(report),
         *report.notes,
         *(() if report.graph is None else _graph_suspicions(report.graph)),
+        *_wrong(report),
         *_edge_suspicions(report),
+        *_above_truth(report),
         *_unmatched(report),
         *(note for row in report.trajectories for note in _trajectory_suspicions(row)),
     )
@@ -166,9 +177,10 @@ def suspicions(report: Report) -> tuple[Note, ...]:
 
 
 def _unsettled(report: Report) -> Iterator[Note]:
-    scale = report.scores.scale if report.scores else 1.0
     path_m = max((_path_m(path.positions) for path in report.pictures.paths if path.name == report.after), default=0.0)
-    if report.last_shift_m is not None and report.last_shift_m > max(UNSETTLED_M * scale, UNSETTLED_SHARE * path_m):
+    if report.last_shift_m is not None and report.last_shift_m > max(
+        UNSETTLED_M * report.scale, UNSETTLED_SHARE * path_m
+    ):
         yield Note("unsettled", detail=length(report.last_shift_m))
 
 
@@ -184,11 +196,36 @@ def _graph_suspicions(graph: GraphSummary) -> Iterator[Note]:
         yield Note("alone", alone, str(graph.vertices))
     if graph.edges_ignored:
         yield Note("edges ignored", graph.edges_ignored, str(graph.edges))
-    wrong, suspect = graph.verdicts_in_use.get("wrong", 0), graph.verdicts_in_use.get("suspect", 0)
-    if wrong or suspect:
-        yield Note("edges wrong", wrong + suspect, f"{wrong} are judged wrong and {suspect} suspect")
+    if suspect := graph.verdicts_in_use.get("suspect", 0):
+        yield Note("suspect", suspect)
     if untestable := graph.verdicts.get("untestable", 0):
         yield Note("untestable", untestable, str(graph.edges))
+
+
+def _wrong(report: Report) -> Iterator[Note]:
+    """The edges called wrong, weighed by what they do."""
+    wrong = report.wrong_edges
+    if wrong is None or not wrong.count:
+        return
+    moved = report.length(max(wrong.moved_m, NOTHING_MOVED_M * report.scale))
+    if not wrong.matters(report.scale):
+        yield Note("harmless", wrong.count, f"{wrong.frames}; without them no pose moves by more than {moved}")
+    elif wrong.pieces_more:
+        yield Note(
+            "wrong", wrong.count, f"{wrong.frames}; without them the scene falls into {wrong.pieces_more} more pieces"
+        )
+    else:
+        yield Note("wrong", wrong.count, f"{wrong.frames}; without them poses move by up to {moved}")
+
+
+def _above_truth(report: Report) -> Iterator[Note]:
+    """Why clouds can fit better than at the true poses."""
+    table = report.scores
+    if table is None or TRUTH not in table.names or report.after not in table.names:
+        return
+    truth, after = table.names.index(TRUTH), table.names.index(report.after)
+    if any(graph.mean_score[after] > graph.mean_score[truth] for graph in table.graphs):
+        yield Note("above truth")
 
 
 def _edge_suspicions(report: Report) -> Iterator[Note]:
@@ -202,7 +239,7 @@ def _edge_suspicions(report: Report) -> Iterator[Note]:
 
 
 def _large_m(report: Report) -> float:
-    return LARGE_RESIDUAL_M * (report.scores.scale if report.scores else 1.0)
+    return LARGE_RESIDUAL_M * report.scale
 
 
 def _unmatched(report: Report) -> Iterator[Note]:
@@ -218,6 +255,6 @@ def _unmatched(report: Report) -> Iterator[Note]:
 
 def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[Note]:
     if row.left_out:
-        yield Note("not in the error", row.left_out, row.name)
+        yield Note("not in the error", row.left_out, f"{row.name}, {row.of}")
     if row.degenerate:
         yield Note("degenerate", detail=row.name)

@@ -20,8 +20,8 @@ from hodge_pipeline.report.contents import (
     StageRow,
     TrajectoryRow,
 )
-from hodge_pipeline.report.page import render
-from hodge_pipeline.report.plots import draw
+from hodge_pipeline.report.document import render
+from hodge_pipeline.report.run_page import document
 from hodge_pipeline.report.verdict import judge, suspicions
 from hodge_pipeline.store.artifacts import write_json, write_text
 
@@ -48,7 +48,7 @@ FORMAT_VERSION = 3
 def write_report(folder: Path, report: Report) -> tuple[Path, Path]:
     """Write `report.html` and `report.json` into a folder that exists, and give back their paths."""
     page, numbers = folder / "report.html", folder / "report.json"
-    write_text(page, render(report, draw(report)))
+    write_text(page, render(document(report, str(folder))))
     write_json(numbers, as_json(report))
     return page, numbers
 
@@ -74,6 +74,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "loops": [{**asdict(row), "mean": row.mean} for row in report.loops],
         "energies": [asdict(row) for row in report.energies],
         "graph": None if report.graph is None else asdict(report.graph),
+        "wrong_edges": None if report.wrong_edges is None else asdict(report.wrong_edges),
         "worst_edges": [asdict(row) for row in report.worst_edges],
         "convergence": {name: list(series) for name, series in report.pictures.convergence.items()},
         "stages": [asdict(row) for row in report.stages],

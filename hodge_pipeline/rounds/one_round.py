@@ -71,10 +71,11 @@ class Work:
         )  # fmt: skip
         return with_start_edges(proposed, scene.first)
 
-    def register(self, number: int, edges: Edges, world_from_cam: Floats) -> Registered:
-        """The candidates registered from these poses, and accepted or rejected."""
+    def register(self, number: int, edges: Edges, before: Round) -> Registered:
+        """The candidates registered from the poses of the round before, and accepted or rejected."""
+        world_from_cam, earlier = before.world_from_cam, before.registered(self.measured) if number > 1 else None
         registered = self.steps.step(
-            register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam,
+            register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,
             title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
         )  # fmt: skip
         fresh = np.flatnonzero(registered.status != HELD_OUT)
@@ -83,8 +84,12 @@ class Work:
 
     def accept(self, edges: Edges) -> Edges:
         """The table with the status of every registered pair."""
-        scale = self.recipe.scale if isinstance(self.recipe.scale, float) else 1.0
-        return accepted(edges, self.recipe.acceptance, self.scene.drift, scale)
+        return accepted(edges, self.recipe.acceptance, self.scene.drift, self.scale)
+
+    @property
+    def scale(self) -> float:
+        """What lengths that are written for rooms are multiplied by."""
+        return self.recipe.scale if isinstance(self.recipe.scale, float) else 1.0
 
     def with_measured(self, edges: Edges) -> Edges:
         """The table with the edges that came measured at its end."""

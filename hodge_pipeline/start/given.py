@@ -11,6 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.evaluation.trajectory import associate
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.scene import (
@@ -19,9 +20,11 @@ from hodge_pipeline.scene import (
     KeyFrames,
     Round,
     Scene,
+    has_truth,
     key_source,
     sequence_numbers,
     sequences_of,
+    true_poses,
     vertex_ids,
 )
 from hodge_pipeline.se3 import spread_correction
@@ -35,7 +38,7 @@ from hodge_pipeline.types import Edges, Floats, Source, Trajectory
 from hodge_pipeline.types.notes import Note, notes_of
 
 SAME_M = 1e-6
-"""Metres: poses of a file that are this near the frames' own are the frames' own."""
+"""Metres: given poses that are this near the true ones are the true ones."""
 
 
 @dataclass(frozen=True, config=OPTIONS)
@@ -85,7 +88,7 @@ class GivenStart:
             poses, list(sequences_of(source).values()), self.distance_m, self.angle_deg, self.every
         )
         steps.note(Note("key frames", len(rows), str(len(source.frames))))
-        whole = without_truth(source, poses, rows, own=self.poses == "frames")
+        whole = given_away(source, poses, rows)
         count = len(poses)
         key_frames = KeyFrames(
             rows=rows,
@@ -114,9 +117,12 @@ class GivenStart:
             return matched, None
         if self.path is None:
             raise RecipeError("start.path: no file of poses named: give one, or set start.poses to frames")
-        trajectory = _trajectory(self.path, steps)
+        trajectory = read_trajectory(self.path, steps)
         matched = match_poses(trajectory, source.frames, self.match, self.max_gap_s, str(self.path))
-        return matched, GivenFile(self.path, trajectory, matched.pose_times)
+        true = _true_at(matched.pose_times, matched, source)
+        if has_truth(source) and not np.isfinite(true).any():
+            steps.note(Note("no truth near", detail=str(self.path)))
+        return matched, GivenFile(self.path, trajectory, matched.pose_times, true)
 
     def _bridged(
         self, source: Source, matched: Matched, clouds: CloudOptions, steps: Steps, workers: Workers
@@ -138,19 +144,35 @@ class GivenStart:
         return spread_correction(times, odometry, times[known], odometry[known], matched.world_from_cam[known])
 
 
-def without_truth(source: Source, poses: Floats, rows: np.ndarray, *, own: bool) -> Source:
-    """The source; its frames' own poses are no truth to compare with where the run starts from them.
-
-    Nor are they where a file holds the very poses that the frames have, as a SLAM system's log beside its images.
+def given_away(source: Source, poses: Floats, rows: np.ndarray) -> Source:
+    """The source without its frames' own poses, since the run starts from given ones, and without true poses where
+    those are the given ones: there is nothing to compare with then.
     """
-    given = [(source.frames[row].world_from_cam, poses[row]) for row in rows]
-    same = [known is not None and np.abs(known - pose).max() < SAME_M for known, pose in given]
-    if own or sum(same) > len(same) / 2:
-        return replace(source, frames=tuple(replace(frame, world_from_cam=None) for frame in source.frames))
-    return source
+    given = [(source.frames[row].true_world_from_cam, poses[row]) for row in rows]
+    same = [true is not None and np.abs(true - pose).max() < SAME_M for true, pose in given]
+    is_truth = sum(same) > len(same) / 2
+    frames = tuple(
+        replace(frame, world_from_cam=None, true_world_from_cam=None if is_truth else frame.true_world_from_cam)
+        for frame in source.frames
+    )
+    return replace(source, frames=frames)
 
 
-def _trajectory(path: Path, steps: Steps) -> Trajectory:
+def _true_at(times: Floats, matched: Matched, source: Source) -> Floats:
+    """The truth (P, 4, 4) nearest to each given pose, on the clock that these were matched by."""
+    true = true_poses(source)
+    known = np.isfinite(true).all(axis=(1, 2))
+    true_times, true = matched.frame_times[known], true[known]
+    if matched.how == "stamp" and known.any() and source.trajectory is not None:
+        true_times, true = source.trajectory.stamps_s, source.trajectory.world_from_cam
+    rows, true_rows = associate(times, true_times)
+    found = np.full((len(times), 4, 4), np.nan)
+    found[rows] = true[true_rows]
+    return found
+
+
+def read_trajectory(path: Path, steps: Steps) -> Trajectory:
+    """The poses in a file of any format that a reader opens; its reader's notes are told. Raises `SourceError`."""
     opened = guess_reader(path).open(path)
     if opened.graph is not None and opened.graph.edge_count:
         raise SourceError(f"{path}: a graph of measured edges, which needs no frames: give it to hodge solve")

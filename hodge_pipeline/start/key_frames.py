@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import Odometry, chained
+from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.scene import KeyFrames, Scene, sequence_numbers, sequences_of, stamps_of, vertex_ids
@@ -31,7 +33,8 @@ class Tracked:
     """What tracking found: the K key frames among the N frames, and the key frame that each frame was registered to.
 
     `anchors (N,)` counts among the K, `key_from_frame (N, 4, 4)` is the motion, `found (N,)` whether there is one;
-    `world_from_key (K, 4, 4)` are the poses that `steps` led to, `piece (K,)` the part that they hold together.
+    `world_from_key (K, 4, 4)` are the poses that `steps` led to, `piece (K,)` the part that they hold together;
+    `sightings` is the folder of what the frames of each block saw of their key frames.
     """
 
     clouds: CloudSet
@@ -42,6 +45,7 @@ class Tracked:
     world_from_key: Floats
     piece: Ints
     steps: Edges
+    sightings: Path
 
 
 @dataclass(frozen=True, config=OPTIONS)
@@ -61,6 +65,11 @@ class KeyFrameStart(OdometryStart):
         "between two key frames is known from its own tracking to a few millimetres",
     )
     angle_deg: float = Field(default=8.0, ge=0, description="degrees, likewise")
+    repose: bool = Field(
+        default=True,
+        description="pose every frame between key frames anew, once these are solved, by the corners that it saw of "
+        "its key frame; not of a camera whose depth and colour are not calibrated to each other, as that of 7-Scenes",
+    )
 
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """The key frames of a long source, every frame of a short one, with their clouds and poses by odometry."""
@@ -71,13 +80,14 @@ class KeyFrameStart(OdometryStart):
         found = steps.step(track, source, options, title="tracking", total=len(source.frames), workers=workers)
         steps.remember(found.clouds, steps.key(found) + "clouds")
         odometry = Odometry(found.world_from_key, found.steps, ())
-        return self.joined(source, found.clouds, odometry, followers(source, found), steps, workers)
+        scene = self.joined(source, found.clouds, odometry, followers(source, found), steps, workers)
+        steps.remember(found.sightings, steps.key(found) + "sightings")
+        return replace(scene, sightings=found.sightings if self.repose else None)
 
     def _tracking(self, clouds: CloudOptions) -> TrackingOptions:
-        """How frames are followed: landmarks only where odometry registers by them, in smaller images."""
+        """How frames are followed."""
         return TrackingOptions(
             clouds=self.cloud_options(clouds, apart=True),
-            followed=replace(clouds, landmark_scale=2 * clouds.landmark_scale),
             odometry=self.odometry,
             distance_m=self.distance_m,
             angle_rad=float(np.deg2rad(self.angle_deg)),
@@ -118,8 +128,12 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     key_sequences = [np.flatnonzero(np.isin(key_rows, rows)) for rows in sequences]
     poses = chained(len(key_rows), key_sequences, edges)
     held, poses = bridge(clouds, key_sequences, edges, poses, options.odometry, workers)
+    sightings = folder / "sightings"
+    sightings.mkdir(exist_ok=True)
+    blocks.keep_sightings(sightings)
     tracked = Tracked(
         clouds=CloudSet.open(clouds),
+        sightings=sightings,
         key_rows=key_rows,
         world_from_key=poses,
         piece=connected_components(held.pairs, len(key_rows)),
@@ -127,6 +141,7 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
         **_anchored(parts, cut, key_of_row),
     )
     tracked = _without_lonely(tracked)
+    _move_landmarks(source, tracked)
     blocks.remove()
     step.note(*_notes(source, tracked, parts))
     return tracked
@@ -167,6 +182,21 @@ def _without_lonely(tracked: Tracked) -> Tracked:
     """A key frame that no step holds, and its followers, were not found, as frames in the dark are not."""
     lonely = np.bincount(tracked.piece)[tracked.piece] == 1
     return tracked if lonely.all() else replace(tracked, found=tracked.found & ~lonely[tracked.anchors])
+
+
+def _move_landmarks(source: Source, tracked: Tracked) -> None:
+    """Move the landmarks of the key frames, in their file, to where they were at the stamps of their frames."""
+    if not len(tracked.clouds.mark_points):
+        return
+    first = tracked.world_from_key[tracked.anchors] @ tracked.key_from_frame
+    twists = velocities(first, stamps_of(source), sequence_numbers(source), tracked.found)
+    assert tracked.clouds.folder is not None
+    points = np.load(tracked.clouds.folder / "mark_points.npy", mmap_mode="r+")
+    for key, row in enumerate(tracked.key_rows.tolist()):
+        own, frame = slice(*tracked.clouds.marks[key : key + 2].tolist()), source.frames[row]
+        if frame.camera is not None:
+            points[own] = at_frame_stamp(points[own].astype(float), frame.camera, frame.colour_delay_s, twists[row])
+    points.flush()
 
 
 def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[Note, ...]:

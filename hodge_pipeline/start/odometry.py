@@ -69,7 +69,7 @@ class OdometryStart(OdometryOptions):
         )
         several = int((np.bincount(part) > 1).sum()) > 1
         if self.relocalise is True or (self.relocalise == "auto" and several):
-            first = join_parts(keys, clouds, first, self.unordered, steps, workers)
+            first = join_parts(keys, clouds, first, drift, self.unordered, steps, workers)
         return Scene(source, keys, key_frames, clouds, first, drift)
 
 

@@ -34,8 +34,8 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text atomically."""
-    write_atomically(path, lambda stream: stream.write(text.encode()))
+    """Write UTF-8 text atomically; what is no text in a file name becomes its escape."""
+    write_atomically(path, lambda stream: stream.write(text.encode(errors="backslashreplace")))
 
 
 def json_text(data: Any) -> str:

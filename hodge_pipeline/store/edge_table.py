@@ -16,7 +16,8 @@ from hodge_pipeline.errors import WorkspaceError, not_written
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Edges
 from hodge_pipeline.types.edges import Words
-from hodge_pipeline.types.input_files import read_input_text
+from hodge_pipeline.types.input_files import read_input
+from hodge_pipeline.types.text import cell, cell_text
 
 COLUMNS = {
     "source": "proposed_by",
@@ -45,9 +46,13 @@ def write_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic]) -> No
     edges = edges.select(np.argsort(~edges.in_graph, kind="stable"))
     columns = [_cells(name, getattr(edges, field)) for name, field in COLUMNS.items()]
     text = io.StringIO(newline="")
-    table = csv.writer(text, lineterminator="\n")
+    # A lone \r ends a line for those who read the table, and the writer does not quote for it.
+    everywhere = any("\r" in str(name) for name in vertex_ids)
+    table = csv.writer(text, csv.unix_dialect) if everywhere else csv.writer(text, lineterminator="\n")
     table.writerow(("i", "j", *COLUMNS))
-    table.writerows(zip(*vertex_ids[edges.pairs].T.tolist(), *columns, strict=True))
+    names = [cell(str(name)) if isinstance(name, str) else name for name in vertex_ids.tolist()]
+    ends = [[names[vertex] for vertex in side] for side in edges.pairs.T.tolist()]
+    table.writerows(zip(*ends, *columns, strict=True))
     try:
         artifacts.write_text(path, text.getvalue())
     except OSError as error:
@@ -56,7 +61,7 @@ def write_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic]) -> No
 
 def _cells(name: str, column: NDArray[Any]) -> list[Any]:
     if column.dtype.kind != "f":
-        return list(column.tolist())
+        return [cell(value) if isinstance(value, str) else value for value in column.tolist()]
     return [
         f"{value:.6g}" if isfinite(value) else "" for value in (np.rad2deg(column) if name.endswith("_deg") else column)
     ]
@@ -68,13 +73,15 @@ def read_edges(path: Path) -> tuple[Edges, Words]:
     Raises `WorkspaceError` for a table without the ends, source and status of its rows.
     """
     try:
-        rows = list(csv.DictReader(io.StringIO(read_input_text(path))))
+        rows = list(csv.DictReader(io.StringIO(read_input(path).decode("utf-8-sig"), newline="")))
     except (OSError, ValueError, csv.Error) as error:
         raise WorkspaceError(f"{path}: is no table of edges ({error}): run the same recipe again") from error
     header = ("i", "j", *COLUMNS) if not rows else tuple(rows[0])
     if missing := [name for name in LEAST if name not in header]:
         raise WorkspaceError(f"{path}: has no column {missing[0]!r}: run the same recipe again")
-    names, ends = np.unique(np.array([(row["i"], row["j"]) for row in rows], np.str_), return_inverse=True)
+    names, ends = np.unique(
+        np.array([(cell_text(row["i"]), cell_text(row["j"])) for row in rows], np.str_), return_inverse=True
+    )
     edges = Edges.of(ends.reshape(-1, 2))
     columns = {field: [row[name] or "" for row in rows] for name, field in COLUMNS.items() if name in header}
     edges = replace(edges, **{field: _column(getattr(edges, field), cells) for field, cells in columns.items()})
@@ -83,5 +90,5 @@ def read_edges(path: Path) -> tuple[Edges, Words]:
 
 def _column(like: NDArray[Any], cells: list[str]) -> NDArray[Any]:
     if like.dtype.kind == "U":
-        return np.array(cells, np.str_)
+        return np.array([cell_text(text) for text in cells], np.str_)
     return np.array([float(cell or "nan") for cell in cells]).astype(like.dtype)

@@ -7,14 +7,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hodge_pipeline.types.text import visible
+
 log = logging.getLogger("hodge_pipeline")
+
+
+class _OneLine(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        """The record on one line: a name with a line end in it would write a line of its own."""
+        return visible(super().format(record))
 
 
 @contextmanager
 def logging_to(path: Path) -> Iterator[None]:
     """Add what the run logs to a file, each line with its time."""
     handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler.setFormatter(_OneLine("%(asctime)s %(levelname)s %(message)s"))
     log.addHandler(handler)
     log.setLevel(logging.INFO)
     log.propagate = False

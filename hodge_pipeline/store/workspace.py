@@ -6,6 +6,7 @@ import errno
 import hashlib
 import os
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,8 +15,9 @@ from typing import IO, Any
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.types.input_files import read_input
+from hodge_pipeline.types.text import command
 
-RECIPE_FILE = "recipe.yaml"
+RECIPE_FILE, LOCK_FILE = "recipe.yaml", ".lock"
 OLD_KEY_FILE = "key.json"
 """In each stage of the layout before `Store`."""
 RUN, REFINEMENT = "stages", "refinement"
@@ -60,11 +62,11 @@ class Workspace:
         Raises `WorkspaceError` where the folder is something else, belongs to another recipe (without `overwrite`;
         `refusal` then says so, with the first `{change}`), holds a symbolic link or is in use.
         """
-        if (folder / RECIPE_FILE).exists():
-            _refuse_links(folder)
+        if os.path.lexists(folder / RECIPE_FILE):
+            _refuse_irregular(folder)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lock = (folder / ".lock").open("a+")
+            lock = _open_lock(folder)
         except OSError as error:
             raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
         _hold(lock, folder)
@@ -85,7 +87,7 @@ class Workspace:
 
         Raises `WorkspaceError` as `open` does, and where another version, which knew other options, has made it.
         """
-        again = f"hodge run {folder / RECIPE_FILE} --out {folder} --overwrite"
+        again = command("hodge", "run", folder / RECIPE_FILE, "--out", folder, "--overwrite")
         refusal = f"was made by another version (the recipe's {{change}}): '{again}' brings it up to date first"
         return cls.open(folder, recipe, refusal=refusal)
 
@@ -108,9 +110,9 @@ class Workspace:
 @contextmanager
 def holding(folder: Path) -> Iterator[None]:
     """While the body runs no run uses the folder. Raises `WorkspaceError` where one does already."""
-    _refuse_links(folder)
+    _refuse_irregular(folder)
     try:
-        lock = (folder / ".lock").open("a+")
+        lock = _open_lock(folder)
     except OSError as error:
         raise WorkspaceError(f"{folder}: cannot be written ({error.strerror})") from error
     with lock:
@@ -118,15 +120,26 @@ def holding(folder: Path) -> Iterator[None]:
         yield
 
 
-def _refuse_links(folder: Path) -> None:
-    """A run folder may be a stranger's: through a link in it what is written, or emptied, would lie elsewhere."""
+def _refuse_irregular(folder: Path) -> None:
+    """A run folder may be a stranger's: through a link in it what is written, or emptied, would lie elsewhere, and a
+    pipe would be waited for.
+    """
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
-            if os.path.islink(os.path.join(parent, name)):
+            mode = os.lstat(os.path.join(parent, name)).st_mode
+            if stat.S_ISLNK(mode):
                 raise WorkspaceError(
                     f"{os.path.join(parent, name)}: is a symbolic link, which no run makes, and would be written "
                     "through: remove it, or put what it leads to in its place"
                 )
+            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+                raise WorkspaceError(f"{os.path.join(parent, name)}: is no file, and no run makes the like: remove it")
+
+
+def _open_lock(folder: Path) -> IO[str]:
+    """The file whose lock is the folder's; neither through a link nor by waiting."""
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    return os.fdopen(os.open(folder / LOCK_FILE, flags, 0o644), "r+")
 
 
 def _hold(lock: IO[str], folder: Path) -> None:
@@ -158,9 +171,9 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal
         if not overwrite and _has_stages(folder / kind):
             change = _first_change(yaml_file.read(path).data, recipe)
             raise WorkspaceError(f"{folder}: {refusal.replace('{change}', change)}")
-    elif any(entry.name != ".lock" for entry in folder.iterdir()):
+    elif any(entry.name != LOCK_FILE for entry in folder.iterdir()):
         with suppress(OSError):
-            (folder / ".lock").unlink()
+            (folder / LOCK_FILE).unlink()
         raise WorkspaceError(f"{folder}: is not empty and not a run folder: give another --out")
     with disk_errors(path):
         artifacts.write_text(path, text)

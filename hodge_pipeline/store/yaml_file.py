@@ -10,6 +10,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq, TaggedScalar
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.types.input_files import read_input_text
@@ -17,6 +18,10 @@ from hodge_pipeline.types.input_files import read_input_text
 MAX_BYTES = 100_000
 """A recipe with every default written out has about 3 kB; what is this long takes up to 4 s to parse."""
 MAX_NODES = 20_000
+MAX_DEPTH = 50
+"""Levels: a recipe has five."""
+MAX_INT = 1 << 63
+"""No option counts so far, and Python does not write numbers of more than 4300 digits."""
 
 Keys = tuple[str | int, ...]
 
@@ -49,11 +54,14 @@ def read(path: Path) -> Document:
 def parse(text: str, name: str) -> Document:
     """The mapping in a YAML text; `name` stands for the file in origins and errors."""
     try:
+        _check_depth(text, name)
         root = YAML(typ="rt", pure=True).load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1
         raise RecipeError(f"{name}:{line}: {str(error.problem).splitlines()[0]}") from error
+    except AttributeError as error:  # of ruamel, at `&a {<<: *a}`
+        raise RecipeError(f"{name}: not YAML: a mapping is merged into itself") from error
     except (YAMLError, ValueError, RecursionError) as error:
         raise RecipeError(f"{name}: not YAML: {str(error).splitlines()[0]}") from error
     if root is None:
@@ -64,6 +72,16 @@ def parse(text: str, name: str) -> Document:
     budget = iter(range(MAX_NODES))
     data = _plain(root, (), 1, name, origins, budget)
     return Document(data, origins)
+
+
+def _check_depth(text: str, name: str) -> None:
+    """Refuse what is nested deeper than any recipe before it is built: 5000 levels take seconds and the stack."""
+    depth = 0
+    for event in YAML(typ="rt", pure=True).parse(text):
+        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        if depth > MAX_DEPTH:
+            line = event.start_mark.line + 1
+            raise RecipeError(f"{name}:{line}: more than {MAX_DEPTH} levels: this is no recipe")
 
 
 def parse_value(text: str, name: str) -> Document:
@@ -86,8 +104,8 @@ def dump(data: dict[str, Any]) -> str:
 
 def _plain(node: Any, path: Keys, line: int, name: str, origins: dict[Keys, str], budget: Iterator[int]) -> Any:
     """A node as dict, list or scalar; refuses tags, and more nodes than any recipe has (aliases multiply)."""
-    if next(budget, None) is None:
-        raise RecipeError(f"{name}:{line}: more than {MAX_NODES} values: this is no recipe")
+    if next(budget, None) is None or len(path) > MAX_DEPTH:  # an alias of what it lies in never ends
+        raise RecipeError(f"{name}:{line}: more than {MAX_NODES} values, or {MAX_DEPTH} levels: this is no recipe")
     origins[path] = f"{name}:{line}"
     tag = getattr(getattr(node, "tag", None), "value", None)
     if isinstance(node, TaggedScalar) or tag is not None:
@@ -119,6 +137,8 @@ def _key(key: Any, name: str, line: int) -> str:
 def _scalar(node: Any, name: str, line: int) -> Any:
     if isinstance(node, str) and ("\0" in node or not node.isascii() and any("\ud800" <= c <= "\udfff" for c in node)):
         raise RecipeError(f"{name}:{line}: {node!r} holds a character that no file can have")
+    if isinstance(node, int) and not -MAX_INT <= node < MAX_INT:
+        raise RecipeError(f"{name}:{line}: a whole number of {node.bit_length()} bits has no use in a recipe")
     for kind in (bool, int, float, str):
         if isinstance(node, kind):
             return kind(node)

@@ -22,7 +22,10 @@ from hodge_pipeline.types.edges import ViewGraph as ViewGraph
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: `u = fx x / z + cx`, `v = fy y / z + cy`, in pixels; `fy` is negative where y points up."""
+    """A pinhole camera: `u = fx x / z + cx`, `v = fy y / z + cy`, in pixels; `fy` is negative where y points up.
+
+    `readout_s` is how much later its last row is read than its first one, by a rolling shutter; 0: all at once.
+    """
 
     width: int
     height: int
@@ -30,11 +33,27 @@ class Camera:
     fy: float
     cx: float
     cy: float
+    readout_s: float = 0.0
 
     @property
     def matrix(self) -> Floats:
         """The 3x3 intrinsic matrix K, `(u, v, 1) ~ K p_cam`."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """The colour image that a frame is made from, as its file holds it, the lens's distortion included.
+
+    `lens` is a camera model by COLMAP's name (PINHOLE, OPENCV, …) and `params` are its parameters in COLMAP's order, in
+    pixels of which 0, 0 is the outer corner of the image.
+    """
+
+    path: Path
+    width: int
+    height: int
+    lens: str
+    params: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -92,8 +111,11 @@ class Frame:
 
     - `read_depth()` gives (H, W) float32 metres, 0 where there is no measurement.
     - `read_colour()` gives (H, W, 3) uint8 RGB.
-    - `world_from_cam` is the pose that the source gives (a benchmark's truth, a SLAM estimate); None where it has
-      none. The pipeline evaluates against it and never starts from it unless a recipe says so.
+    - `stamp_s` is the moment of the depth image; the colour image was taken `colour_delay_s` later.
+    - `image` is the file behind the colour, which may be another camera's where that is undistorted; None without one.
+    - `world_from_cam` is the pose that the source gives; None where it has none. The result is compared with it; the
+      pipeline never starts from it unless a recipe says so.
+    - `true_world_from_cam` is the true pose: of a benchmark, or of what the user names as the truth; else None.
     """
 
     frame_id: int | str
@@ -104,8 +126,11 @@ class Frame:
     read_points: Callable[[], PointCloud] | None = None
     encoded_depth: Callable[[], EncodedImage] | None = None
     encoded_colour: Callable[[], EncodedImage] | None = None
+    image: ImageFile | None = None
     world_from_cam: Floats | None = None
+    true_world_from_cam: Floats | None = None
     sequence: str = ""
+    colour_delay_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -123,7 +148,7 @@ class Trajectory:
 class Source:
     """What a reader's `open` gives: any of lazy frames, a trajectory, a measured graph.
 
-    - `trajectory` is the whole reference trajectory on its own stamps, where there is one.
+    - `trajectory` is the whole trajectory that the frames' poses come from, on its own stamps, where there is one.
     - `notes` say what was skipped or repaired, with counts: one line each.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
     """
@@ -214,7 +239,8 @@ class ModelQuality:
     """How well the points of a model fit its images: of N observations, pixels between a point seen and projected.
 
     `keypoints (N, 2)`: the row in `image_names`, and which of the image's keypoints; `errors_px (N,)`: infinite where
-    the point lies behind the camera; beyond `cap_px` an observation is wrong, and how far off tells no more.
+    the point lies behind the camera; `parallaxes_deg (N,)` between the rays to the point, and in how many images it is
+    seen, `track_lengths (N,)`.
     """
 
     images: int
@@ -223,7 +249,8 @@ class ModelQuality:
     image_names: tuple[str, ...]
     keypoints: Ints
     errors_px: Floats
-    cap_px: float
+    parallaxes_deg: Floats
+    track_lengths: Ints
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,12 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.FACT,
         "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an instant",
     ),
+    "misfits": (
+        Rank.LOOK,
+        "{count} frames fit nothing that their key frame saw ({detail}): their poses follow from its own",
+    ),
+    "truth": (Rank.FACT, "{count} of {detail} frames have a true pose, by the truth that was named"),
+    "no truth near": (Rank.LOOK, "{detail}: no pose has a true one near in time: its error is not measured"),
     "carried": (Rank.LOOK, "{count} frames without a given pose are carried from the nearest ones by odometry"),
     "left apart": (Rank.LOOK, "nothing joins what tracking left apart: it starts where the guessed motion puts it"),
     "matched": (Rank.FACT, "{count} pairs between pieces matched, {detail}"),
@@ -88,19 +94,27 @@ WORDING: dict[str, tuple[Rank, str]] = {
     ),
     "alone": (Rank.LOOK, "{count} of {detail} frames have no edge at all: they keep the pose they started with."),
     "edges ignored": (Rank.FACT, "The solver ignored {count} of {detail} edges (weight 0)."),
-    "edges wrong": (Rank.LOOK, "Of the edges that the solver used {detail}: hodge diagnose shows them."),
+    "wrong": (Rank.LOOK, "{count} of the edges used are judged wrong, {detail}: hodge diagnose shows them."),
+    "harmless": (Rank.FACT, "{count} of the edges used are judged wrong, {detail}: nothing to do."),
+    "suspect": (Rank.FACT, "{count} of the edges used are suspect: hodge diagnose shows them."),
+    "above truth": (
+        Rank.FACT,
+        "The clouds lie closer together at the result than at the true poses: a score measures how well clouds fit, "
+        "and the noise of depth, or an error of the truth, moves the best fit away from it. Errors of the "
+        "trajectory do not depend on that.",
+    ),
     "untestable": (
         Rank.LOOK,
         "{count} of {detail} edges are untestable: nothing in the graph says whether they are right.",
     ),
     "edges far off": (
-        Rank.LOOK,
+        Rank.FACT,
         "At least {count} edges that the solver used are more than {detail} off the result: see the worst edges.",
     ),
     "unmatched": (Rank.LOOK, "{detail} of each other."),
     "not in the error": (
         Rank.FACT,
-        "{detail}: {count} frames without a true pose, or joined to no other, are not in its error.",
+        "{detail}: {count} without a true pose, or joined to no other, are not in the error.",
     ),
     "degenerate": (
         Rank.FACT,

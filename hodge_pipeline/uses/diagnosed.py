@@ -21,8 +21,9 @@ from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.pairs.edits import joining, pair_names, read_history
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
-from hodge_pipeline.report.diagnosis_page import PageContents, render
+from hodge_pipeline.report.diagnosis_page import PageContents, document
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
+from hodge_pipeline.report.document import render
 from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.sources.inspect import guess_reader
@@ -32,6 +33,7 @@ from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, USED
+from hodge_pipeline.types.text import command
 
 PICTURED, LEAST_PICTURED = 6, 2
 SUGGESTED, REGISTERED = 12, 6
@@ -184,16 +186,16 @@ def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> t
     wrong = pair_names(subject.graph.vertex_ids, subject.graph.edges[rows])
     if not subject.is_run:
         if len(wrong) > COMMANDED:
-            return (f"hodge solve {subject.path} --out solved.g2o --robust",)
-        off = " ".join(f"--disable {pair}" for pair in wrong)
-        return (f"hodge solve {subject.path} --out solved.g2o {off}",) if wrong else ()
+            return (command("hodge", "solve", subject.path, "--out", "solved.g2o", "--robust"),)
+        off = [word for pair in wrong for word in ("--disable", pair)]
+        return (command("hodge", "solve", subject.path, "--out", "solved.g2o", *off),) if wrong else ()
     useful = suggestions.pairs[suggestions.score >= subject.suggestions.min_gain][:REGISTERED]
     if not wrong and not len(useful):
         return ()
-    edit = f"--disable {','.join(wrong) if len(wrong) <= COMMANDED else WRONG}"
+    edit = "--disable", ",".join(wrong) if len(wrong) <= COMMANDED else WRONG
     if not wrong:
-        edit = f"--register {','.join(pair_names(subject.graph.vertex_ids, useful))}"
-    return f"hodge edit {subject.path} {edit}", f"hodge solve {subject.path}"
+        edit = "--register", ",".join(pair_names(subject.graph.vertex_ids, useful))
+    return command("hodge", "edit", subject.path, *edit), command("hodge", "solve", subject.path)
 
 
 def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:
@@ -206,7 +208,7 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) 
     residuals = {"residual_m": found.residual_m, "residual_rad": np.deg2rad(found.residual_deg)}
     write_edges(out / "edges.csv", replace(found.put_into(subject.edges), **residuals), subject.graph.vertex_ids)
     _write_poses(out / "poses.tum", subject, found)
-    artifacts.write_text(out / "diagnosis.html", render(_page(diagnosed)))
+    artifacts.write_text(out / "diagnosis.html", render(document(_page(diagnosed))))
     if recording:
         from hodge_pipeline.recording.diagnosis_file import write_diagnosis
 

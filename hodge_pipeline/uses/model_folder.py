@@ -14,7 +14,6 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recipe import binding
-from hodge_pipeline.recording.run import FILE
 from hodge_pipeline.recording.solved import record_graph
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
@@ -54,18 +53,13 @@ def write_run_folder(
 ) -> None:
     """Write it all; the models in one step, so that the folder holds those of one run."""
     try:
-        models = [model for result in results if _is_result(result) for model in result.kept]
+        models = [model for result in results for model in result.kept]
         _write_models(out, models)
         _write_tables(out, results)
         write_report(out, model_report(results, options, options.source or "pycolmap", cost))
         _record(out, results[0])
     except OSError as error:
         raise WorkspaceError(f"{out}: cannot be written ({error.strerror}): give another --out") from error
-
-
-def _is_result(result: RefinedModel) -> bool:
-    """Whether anything was measured: where every edge was rejected nothing is written but the report."""
-    return result.solved is not None and bool(result.solved.kept.any())
 
 
 def _write_models(out: Path, models: Sequence[TrackedModel]) -> None:
@@ -90,23 +84,20 @@ def _write_models(out: Path, models: Sequence[TrackedModel]) -> None:
 
 def _record(out: Path, first: RefinedModel) -> None:
     """The recording of the first result, which has most images: its poses before and after, its edges, the solve."""
-    if first.solved is None:
-        (out / FILE).unlink(missing_ok=True)
-        return
     sets = {"start": first.start.world_from_body, "refined": first.model.world_from_body}
-    record_graph(out, first.model.name, first.solved.graph, sets["start"], first.solved.solution, sets, first.notes)
+    solved = first.solved
+    graph, solution = (None, None) if solved is None else (solved.graph, solved.solution)
+    record_graph(out, first.model.name, graph, sets["start"], solution, sets, first.notes)
 
 
 def _write_tables(out: Path, results: Sequence[RefinedModel]) -> None:
     for number, result in enumerate(results):
-        if not _is_result(result):
-            continue
         suffix = "" if len(results) == 1 else f"-{number}"
         frames = [frame for model in result.kept for frame in model.frames]
         poses = np.array([frame.world_from_cam for frame in frames])
         trajectory = Trajectory(np.arange(len(poses), dtype=float), poses)
         source = Source(result.model.name, out, trajectory=trajectory)
         registry.load("writers", "tum")().write(out / f"poses{suffix}.tum", source)
-        assert result.solved is not None
-        edges = result.solved.edges(result.model.world_from_body)
-        write_edges(out / f"edges{suffix}.csv", edges, result.solved.graph.vertex_ids)
+        if result.solved is not None:
+            edges = result.solved.edges(result.model.world_from_body)
+            write_edges(out / f"edges{suffix}.csv", edges, result.solved.graph.vertex_ids)

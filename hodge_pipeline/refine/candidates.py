@@ -1,0 +1,201 @@
+"""The candidates of a refined model: what bundle adjustment makes of each way to start it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.refine.judge import SAME_COST, Cost, best, costs
+from hodge_pipeline.refine.model_edges import DepthEdges, depth_edges, no_depth_edges
+from hodge_pipeline.refine.model_options import ModelRefinement
+from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
+from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
+from hodge_pipeline.types import Bools, Floats, PositionPriors, ViewGraph
+
+MODEL = "model"
+GIVEN, ADJUSTED, RESECTED = "as given", "bundle adjustment", "resection and bundle adjustment"
+CONSISTENT, MENDED = "consistent poses and bundle adjustment", "images that are off placed anew and bundle adjustment"
+MENDINGS = 3
+"""Rounds: an image placed anew gives its neighbours points to be placed by."""
+NO_EDGE = "no edge was found: no two images share enough points, matches or depth (model.min_shared)"
+NO_EDGE_LEFT = "every edge was rejected: no two of them agree"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model that might be kept, under the name by which a report calls it."""
+
+    name: str
+    model: TrackedModel
+
+
+@dataclass(frozen=True)
+class Found:
+    """The candidates in the order in which they were made, the joined input first, and what each costs.
+
+    `inputs` is the cost of the input models, each in its own gauge. The consistent solve is None where it was not
+    needed, or nothing was measured.
+    """
+
+    inputs: Cost
+    candidates: Sequence[Candidate]
+    costs: Sequence[Cost]
+    solved: Solved | None
+    depth: DepthEdges
+    notes: tuple[str, ...]
+
+    @property
+    def best(self) -> int:
+        """The row of the candidate with the lowest cost."""
+        return best(self.costs)
+
+    @property
+    def with_depth(self) -> bool:
+        """Whether edges by depth took part in the solve."""
+        return self.solved is not None and bool((self.solved.kept & (self.solved.graph.source == "depth")).any())
+
+
+class _Weighing:
+    """The candidates so far; each new one is a step, and one whose adjustment fails is a note."""
+
+    def __init__(self, inputs: Sequence[TrackedModel], start: TrackedModel, steps: Steps) -> None:
+        self._inputs, self._steps = [model.quality for model in inputs], steps
+        self.candidates, self.notes = [Candidate(GIVEN, start)], list[str]()
+        self.update()
+
+    def update(self) -> None:
+        self.inputs, *self.costs = costs(self._inputs, [one.model.quality for one in self.candidates])
+
+    @property
+    def best(self) -> int:
+        return best(self.costs)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing is left to explain, or two ways came to one optimum."""
+        lowest = self.costs[self.best]
+        same = [cost for cost in self.costs[1:] if cost.px <= (1 + SAME_COST) * lowest.px]
+        return lowest.is_sound or (len(same) > 1 and not lowest.images_off)
+
+    def add(
+        self, name: str, model: TrackedModel, poses: Floats | None = None, priors: PositionPriors | None = None
+    ) -> None:
+        try:
+            found = self._steps.step(adjusted_model, model, poses, priors, title=name)
+        except SourceError as error:
+            self.notes.append(f"{name}: {error}")
+            return
+        adjusted = model.read_back(found.folder, found.notes)
+        self._steps.remember(adjusted, self._steps.key(found))
+        self.candidates.append(Candidate(name, adjusted))
+        self.update()
+
+
+def weigh(
+    inputs: Sequence[TrackedModel],
+    start: TrackedModel,
+    options: ModelRefinement,
+    steps: Steps,
+    workers: Workers,
+    is_metric: bool,
+) -> Found:
+    """Make candidates, the cheapest first, until nothing is left that another could explain.
+
+    Depth takes part where the model is in metres: else its clouds are in another unit, or not of these images.
+    """
+    weighing = _Weighing(inputs, start, steps)
+    weighing.add(ADJUSTED, start)
+    if not weighing.costs[0].is_sound:
+        weighing.add(RESECTED, start, steps.step(resected_poses, start, None, title="resection").poses)
+    depth = depth_edges(start, options, steps, workers) if is_metric else no_depth_edges(start)
+    solved = None
+    if not weighing.is_settled or start.held_apart or depth.graph.edge_count:
+        solved = _consistent(weighing, start, depth, options, steps)
+    _mend(weighing, steps)
+    notes = (*depth.notes, *weighing.notes)
+    return Found(weighing.inputs, weighing.candidates, weighing.costs, solved, depth, notes)
+
+
+def _consistent(
+    weighing: _Weighing, start: TrackedModel, depth: DepthEdges, options: ModelRefinement, steps: Steps
+) -> Solved | None:
+    """The solve of all edges, whose poses become a candidate."""
+    measured, left_out = steps.step(measured_edges, start, title="edges")
+    weighing.notes += left_out
+    graph = ViewGraph.joined([measured, depth.graph])
+    if not graph.edge_count:
+        weighing.notes.append(NO_EDGE)
+        return None
+    solved = solve_bodies(graph, start.world_from_body, options.solver)
+    weighing.notes += solved.solution.notes
+    if not solved.kept.any():
+        weighing.notes.append(NO_EDGE_LEFT)
+        return solved
+    with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
+    priors = position_priors(solved, options.depth_weight) if with_depth else None
+    weighing.add(CONSISTENT, start, solved.solution.world_from_cam, priors)
+    return solved
+
+
+def _mend(weighing: _Weighing, steps: Steps) -> None:
+    """The best so far, with the images that are off placed anew by the points that the others hold."""
+    for _ in range(MENDINGS):
+        at = weighing.best
+        off = weighing.costs[at].images_off
+        if not off:
+            return
+        model = weighing.candidates[at].model
+        names = np.array([str(frame.frame_id) for frame in model.frames])
+        bodies = np.zeros(len(model.body_names), bool)
+        bodies[model.body_of_frame[np.isin(names, off)]] = True
+        poses = steps.step(resected_poses, model, bodies, title="resection").poses
+        weighing.add(MENDED, model, poses)
+        if weighing.best == at:
+            return
+
+
+@dataclass(frozen=True)
+class BodyPoses:
+    """Poses (B, 4, 4) of a model's bodies."""
+
+    poses: Floats
+
+
+def resected_poses(model: TrackedModel, bodies: Bools | None, *, step: Step) -> BodyPoses:
+    """Step: where the points put these bodies."""
+    return BodyPoses(model.resected(bodies))
+
+
+def measured_edges(model: TrackedModel, *, step: Step) -> tuple[ViewGraph, tuple[str, ...]]:
+    """Step: the model's edges from what its images share, and what was left out."""
+    return model.measured()
+
+
+@dataclass(frozen=True)
+class AdjustedModel:
+    """A folder with what bundle adjustment wrote, and remarks."""
+
+    folder: Path
+    notes: tuple[str, ...]
+
+
+def adjusted_model(
+    start: TrackedModel, poses: Floats | None, priors: PositionPriors | None, *, step: Step
+) -> AdjustedModel:
+    """Step: the bundle adjustment from the model's own poses or from these, with points that a match calls one merged.
+
+    What it brings together can be merged after it, and is then adjusted once more.
+    """
+    model = start if poses is None else start.moved(poses).merged()
+    adjusted = model.adjusted(priors)
+    if poses is not None:
+        merged = adjusted.merged()
+        adjusted = adjusted if merged is adjusted else merged.moved(merged.world_from_body).adjusted(priors)
+    folder = step.folder / MODEL
+    folder.mkdir(exist_ok=True)
+    adjusted.write(folder)
+    return AdjustedModel(folder, tuple(adjusted.notes))

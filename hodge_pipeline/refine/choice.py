@@ -1,0 +1,145 @@
+"""Which candidate is kept: the lowest cost, and the input itself unless another one is clearly better."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline.evaluation.scores import SIGMA_M
+from hodge_pipeline.evaluation.trajectory import absolute_error
+from hodge_pipeline.refine.candidates import CONSISTENT, Found
+from hodge_pipeline.refine.guard import Measure
+from hodge_pipeline.refine.judge import LEAST_CAP_PX
+from hodge_pipeline.stages import Step, Steps, TrackedModel
+from hodge_pipeline.types import Floats
+
+LEAST_GAIN = 0.01
+"""Of the cost: less is what an adjustment gains by fitting the noise of the keypoints."""
+CLEAR_GAIN = 0.5
+"""Of the cost: half of it is more than any way to weigh observations; below it observations held out decide as well."""
+LEAST_MOVE, GAIN_TO_MOVE = 1e-3, 0.2
+"""Of the extent of the cameras: poses that move by more need a gain of a fifth, since a lens that does not quite fit
+moves them by as much and gains a few per cent."""
+MERGE_LOSS = 0.05
+"""Of the cost: so much more of it is the price of points that a match makes one."""
+MERGED_MORE = 1.25
+"""Times the points that the input's own poses allow to be merged: then the matches speak against those poses."""
+HELD_OUT_SHARE = 0.1
+"""Of the observations."""
+SCORE_TOLERANCE = 0.002
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The row of the candidate that is kept, and why the input would be kept: empty where the candidate is better."""
+
+    row: int
+    reason: str
+
+
+def choose(found: Found, distances_m: Floats, seed: int, steps: Steps, *, force: bool = False) -> Choice:
+    """The candidate to keep, by its cost and by what each candidate makes of the pairs held out (K, H), metres.
+
+    With `force` the best of those that are not the input.
+    """
+    merging = _merging(found)
+    at = _best(found, merging, distances_m)
+    reason = "no candidate costs less" if at == 0 else ""
+    by_depth = found.with_depth and found.candidates[at].name == CONSISTENT and _fits_depth(distances_m[[0, at]])
+    if at and not merging[at] and not by_depth:
+        reason = _reason_to_keep(found, at, seed, steps)
+    if not reason:
+        return Choice(at, "")
+    if not force or len(found.costs) == 1:
+        return Choice(0, reason)
+    return Choice(min(range(1, len(found.costs)), key=lambda row: found.costs[row].px), reason)
+
+
+def _best(found: Found, merging: Sequence[bool], distances_m: Floats) -> int:
+    """The lowest cost, or a little more where further measurements took part: points that matches merged, or depth
+    whose pairs held out fit no worse.
+    """
+    at = found.best
+    for row, candidate in enumerate(found.candidates):
+        if _per_freedom(found, row) > (1 + MERGE_LOSS) * _per_freedom(found, at):
+            continue
+        with_depth = found.with_depth and candidate.name == CONSISTENT
+        if merging[row] > merging[at] or (with_depth and _fits_depth(distances_m[[0, row]])):
+            at = row
+    return at
+
+
+def _per_freedom(found: Found, row: int) -> float:
+    """The cost as it would be were nothing fitted: fewer points have less to fit noise with."""
+    model, cost = found.candidates[row].model, found.costs[row]
+    numbers = 2.0 * len(model.quality.errors_px)
+    fitted = 3.0 * model.quality.points + 6.0 * len(model.body_names)
+    return cost.px * float(np.sqrt(numbers / max(numbers - fitted, 1.0)))
+
+
+def _fits_depth(distances_m: Floats) -> bool:
+    """Whether the pairs held out, before and after (2, H), fit better than by chance."""
+    return bool(distances_m.size) and held_out_score(distances_m).is_better
+
+
+def _merging(found: Found) -> Sequence[bool]:
+    """For each candidate whether it makes one of points that a match calls one, far more than the input's poses can."""
+    models = [candidate.model for candidate in found.candidates]
+    points = models[0].quality.points
+    fewer = [points - model.quality.points for model in models]
+    possible = points - models[0].merged().quality.points if any(fewer) else 0
+    return [count > MERGED_MORE * possible for count in fewer]
+
+
+def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
+    """Why the input is kept all the same, empty where the candidate is clearly better."""
+    before, after = found.costs[0], found.costs[at]
+    start, model = found.candidates[0].model, found.candidates[at].model
+    gain = 1.0 - after.px / before.px if before.px > 0 else 0.0
+    if gain < LEAST_GAIN:
+        return f"the best candidate gains {gain:.2%} of the mean error, less than its noise"
+    if gain >= CLEAR_GAIN:
+        return ""
+    moved = absolute_error(model.world_from_body, start.world_from_body, with_scale=True).rmse_m
+    extent = float(np.linalg.norm(np.ptp(start.world_from_body[:, :3, 3], axis=0)))
+    share = moved / extent if extent > 0 else 0.0
+    if share > LEAST_MOVE and gain < GAIN_TO_MOVE:
+        return f"the best candidate gains {gain:.1%} of the mean error and moves cameras by {share:.2%} of their extent"
+    errors = steps.step(held_out_errors, start, model, seed, title="observations held out").errors_px
+    if not errors.size:
+        return ""
+    medians, capped = np.median(errors, axis=1), np.minimum(errors, LEAST_CAP_PX).mean(axis=1)
+    if medians[1] < medians[0] and capped[1] < capped[0]:
+        return ""
+    return f"observations held out are {medians[0]:.4g} px off, {medians[1]:.4g} px after the best candidate"
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """Errors (2, H) in pixels of the observations held out, before and after."""
+
+    errors_px: Floats
+
+
+def held_out_errors(start: TrackedModel, model: TrackedModel, seed: int, *, step: Step) -> HeldOutErrors:
+    """Step: errors at observations that points were not adjusted to, nor the poses of the model; the start's stay."""
+    out = []
+    for one, moves in ((start, False), (model, True)):
+        chosen = np.random.default_rng(seed).random(len(one.quality.errors_px)) < HELD_OUT_SHARE
+        out.append(one.held_out_errors(chosen, move_bodies=moves))
+    if len(out[0]) != len(out[1]):  # tracks were merged: they are not the same observations
+        return HeldOutErrors(np.zeros((2, 0)))
+    return HeldOutErrors(np.array(out))
+
+
+def held_out_score(distances_m: Floats) -> Measure:
+    """The score of the pairs held out (2, H), before and after; its noise is that of the mean of their differences."""
+    scores = np.exp(-distances_m / SIGMA_M)
+    scores = scores[:, np.isfinite(scores).all(axis=0)]
+    count = scores.shape[1]
+    noise = 2 * float((scores[1] - scores[0]).std()) / np.sqrt(max(count, 1))
+    before, after = scores.mean(axis=1) if count else (np.nan, np.nan)
+    name = f"cloud-to-cloud score of {count} held-out pairs"
+    return Measure(name, float(before), float(after), "higher", max(noise, SCORE_TOLERANCE))

@@ -1,0 +1,127 @@
+"""Optical flow: the corners of a key frame followed into other frames, and the motion that they show.
+
+Every frame is followed from its key frame, not from the frame before it: no error adds up, and a blurred frame costs
+the next one nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.registration.landmarks import sound_depth
+from hodge_pipeline.registration.resection import Resection, back_project, project, resect
+from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame
+
+CORNERS = 300
+"""Of a key frame, at most: more cost time and add nothing (TUM fr1)."""
+CORNER_QUALITY, CORNERS_APART_PX = 0.01, 8.0
+WINDOW_PX, LEVELS = 15, 3
+"""Of the flow: with a predicted motion it finds a corner within about 60 pixels of where it should be."""
+BACKWARD_PX = 0.7
+"""A corner that is followed back must end this near to where it began."""
+
+
+@dataclass(frozen=True)
+class FlowImage:
+    """One frame as the flow wants it: its grey image and its depth image (H, W), its camera, its range of depth."""
+
+    grey: Bytes
+    depth: Floats32
+    camera: Camera
+    range_m: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Corners of a key frame: `pixels (n, 2)` and `points (n, 3)` in its camera's axes."""
+
+    image: FlowImage
+    pixels: Floats32
+    points: Floats
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What a frame shows of its key frame's corners: rows (m,) of those that agree on its motion, and where it saw
+    them, `seen (m, 3)`, columns u, v, z (NaN: no depth there); the motion, its information, and the `share` of those
+    followed that agree.
+    """
+
+    rows: Any
+    seen: Floats
+    key_from_view: Floats
+    information: Floats
+    share: float
+    rmse_m: float
+
+
+def flow_image(frame: Frame, range_m: tuple[float, float]) -> FlowImage | None:
+    """The frame's image; None where it has no colour, depth or camera, or its files cannot be read."""
+    if frame.read_colour is None or frame.read_depth is None or frame.camera is None:
+        return None
+    try:
+        colour, depth = frame.read_colour(), frame.read_depth()
+    except (SourceError, OSError):
+        return None
+    grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
+    if grey.shape != depth.shape:
+        grey = cv2.resize(grey, depth.shape[::-1], interpolation=cv2.INTER_AREA)
+    return FlowImage(np.asarray(grey, np.uint8), depth, frame.camera, range_m)
+
+
+def find_corners(image: FlowImage) -> Corners:
+    """The strongest corners of an image that have a depth."""
+    found = cv2.goodFeaturesToTrack(image.grey, 2 * CORNERS, CORNER_QUALITY, CORNERS_APART_PX)
+    pixels = np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
+    seen = _seen(image, pixels)
+    kept = np.flatnonzero(np.isfinite(seen[:, 2]))[:CORNERS]
+    return Corners(image, pixels[kept], back_project(seen[kept], image.camera))
+
+
+def follow(corners: Corners, view: FlowImage, guess: Floats) -> Followed | None:
+    """The key frame's corners in another frame, from a guess (4, 4) of its motion; None where too few agree on one."""
+    expected = project(se3.transform(se3.inverse(guess), corners.points), view.camera)[:, :2]
+    height, width = view.depth.shape
+    inside = np.flatnonzero(((expected >= 0) & (expected < [width, height])).all(axis=1))
+    if not len(inside):
+        return None
+    begun, start = corners.pixels[inside], expected[inside].astype(np.float32)
+    ends, there = _flow(corners.image, view, begun, start)
+    back, here = _flow(view, corners.image, ends, begun + (ends - start))
+    kept = (there & here & (np.abs(back - begun) < BACKWARD_PX).all(axis=1)).nonzero()[0]
+    rows, seen = inside[kept], _seen(view, ends[kept])
+    found = resect(corners.points[rows], seen, view.camera, guess)
+    return None if found is None else _followed(corners, rows, seen, view.camera, found)
+
+
+def _followed(corners: Corners, rows: Any, seen: Floats, camera: Camera, found: Resection) -> Followed:
+    kept = rows[found.inliers]
+    ends = se3.transform(found.known_from_cam, back_project(seen[found.inliers], camera))
+    apart = np.linalg.norm(corners.points[kept] - ends, axis=1)
+    apart = apart[np.isfinite(apart)]
+    rmse_m = float(np.sqrt(np.mean(apart**2))) if len(apart) else float("nan")
+    share = len(kept) / len(rows)
+    return Followed(kept, seen[found.inliers], found.known_from_cam, found.information, share, rmse_m)
+
+
+def _flow(one: FlowImage, other: FlowImage, pixels: Floats32, start: Floats32) -> tuple[Floats32, Any]:
+    ends, status, _ = cv2.calcOpticalFlowPyrLK(
+        one.grey, other.grey, pixels[:, None], start[:, None].copy(), winSize=(WINDOW_PX, WINDOW_PX),
+        maxLevel=LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    return np.asarray(ends, np.float32).reshape(-1, 2), np.asarray(status).reshape(-1) == 1
+
+
+def _seen(image: FlowImage, pixels: Floats32) -> Floats:
+    """Columns u, v, z (n, 3); z is NaN where the depth image has none that is sound."""
+    z, sound = sound_depth(image.depth, np.round(pixels).astype(np.int64), *image.range_m)
+    return np.column_stack([pixels, np.where(sound, z, np.nan)]).astype(float)

@@ -1,0 +1,104 @@
+"""Every frame posed anew, each by itself, against the corners of its key frame where the solve has put them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.registration.resection import back_project, project, resect
+from hodge_pipeline.registration.shutter import at_frame_stamp
+from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.types import Bools, Camera, Floats, Ints
+
+FEWEST_POINTS = 20
+"""That must agree on a pose for it to be believed."""
+
+
+@dataclass(frozen=True)
+class PosedBlock:
+    """Sightings and, of their frames and key frames `rows (R,)`, what is known so far: poses (R, 4, 4), whether each
+    `is_key (R,)`, velocities (R, 6), the cameras, and by how many seconds colour is later than depth (R,).
+    """
+
+    sightings: Sightings
+    rows: Ints
+    world_from_cam: Floats
+    is_key: Bools
+    twists: Floats
+    cameras: tuple[Camera, ...]
+    colour_delays_s: Floats
+
+
+@dataclass(frozen=True)
+class Reposed:
+    """Rows (R,) of the frames that were posed anew, their poses (R, 4, 4), and the rows of those that fit nothing."""
+
+    rows: Ints
+    world_from_cam: Floats
+    misfits: Ints
+
+
+def repose(block: PosedBlock) -> Reposed:
+    """The frames of a block, posed anew; key frames stay where the solve has put them."""
+    sightings, at = block.sightings, {int(row): place for place, row in enumerate(block.rows)}
+    seen = _at_stamps(block, at)
+    corners = _solved_corners(block, at, seen)
+    rows, poses, misfits = [], [], []
+    for row, own in _groups(sightings.frame):
+        place = at[row]
+        if block.is_key[place]:
+            continue
+        points, start = corners[sightings.corner[own]], block.world_from_cam[place]
+        found = resect(points, seen[own], block.cameras[place], start)
+        if found is None or found.inliers.sum() < FEWEST_POINTS:
+            misfits.append(row)
+        else:
+            rows.append(row)
+            poses.append(found.known_from_cam)
+    return Reposed(np.array(rows, np.int64), np.array(poses).reshape(-1, 4, 4), np.array(misfits, np.int64))
+
+
+def _groups(labels: Ints) -> list[tuple[int, Ints]]:
+    """The rows of each label, labels ascending."""
+    order = np.argsort(labels, kind="stable")
+    values, begin = np.unique(labels[order], return_index=True)
+    return list(zip(values.tolist(), np.split(order, begin[1:]), strict=True))
+
+
+def _at_stamps(block: PosedBlock, at: dict[int, int]) -> Floats:
+    """Columns u, v, z (S, 3) of all sightings as they would be at the stamps of their frames."""
+    sightings, out = block.sightings, block.sightings.seen.copy()
+    world_from_key = block.world_from_cam[[at[int(row)] for row in sightings.key]]
+    corners_in_world = np.einsum("nij,nj->ni", world_from_key[:, :3, :3], sightings.points) + world_from_key[:, :3, 3]
+    for row, own in _groups(sightings.frame):
+        place = at[row]
+        camera, delay_s, twist = block.cameras[place], float(block.colour_delays_s[place]), block.twists[place]
+        seen = sightings.seen[own]
+        expected = se3.transform(se3.inverse(block.world_from_cam[place]), corners_in_world[sightings.corner[own]])
+        no_depth = np.isnan(seen[:, 2])
+        whole = np.column_stack([seen[:, :2], np.where(no_depth, expected[:, 2], seen[:, 2])])
+        moved = project(at_frame_stamp(back_project(whole, camera), camera, delay_s, twist), camera)
+        moved[no_depth, 2] = np.nan
+        out[own] = moved
+    return out
+
+
+def _solved_corners(block: PosedBlock, at: dict[int, int], seen: Floats) -> Floats:
+    """Corners (C, 3) in the world: the mean of what their own key frame and the others that saw them measured."""
+    sightings = block.sightings
+    total, count = np.zeros((len(sightings.key), 3)), np.ones(len(sightings.key))
+    for row, own in _groups(sightings.key):
+        place = at[row]
+        delay_s = float(block.colour_delays_s[place])
+        points = at_frame_stamp(sightings.points[own], block.cameras[place], delay_s, block.twists[place])
+        total[own] = se3.transform(block.world_from_cam[place], points)
+    for row, own in _groups(sightings.frame):
+        place = at[row]
+        own = own[np.isfinite(seen[own]).all(axis=1)]
+        if block.is_key[place] and len(own):
+            points = back_project(seen[own], block.cameras[place])
+            total[sightings.corner[own]] += se3.transform(block.world_from_cam[place], points)
+            count[sightings.corner[own]] += 1
+    return total / count[:, None]

@@ -1,0 +1,119 @@
+"""The pose of a camera from known points: their pixels and, where the depth image has them, their depths.
+
+Pixel and depth errors are apart here: what a rolling shutter, blur and optical flow do to a pixel has nothing to do
+with what the depth camera does to a distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.registration.visual import depth_sigma
+from hodge_pipeline.types import Bools, Camera, Floats
+
+PIXEL_SIGMA = 0.75
+"""Pixels: of a corner followed by optical flow, on TUM fr1."""
+DEPTH_SIGMAS = 2.0
+"""What `depth_sigma`, the noise of one pixel on a plane, is taken times: corners lie where depth is worst."""
+GATE_PX = 4.0
+"""Pixels beyond which a point is no inlier; also the last scale at which a residual weighs half."""
+ANNEALED = (8.0, 4.0, 2.0, 1.0, 1.0, 1.0, 1.0)
+"""Cauchy scales of the steps, times its last one: a wrong start may be off by tens of pixels."""
+FEWEST = 12
+"""Points of a pose: four are the least, three times as many leave some to disagree."""
+
+
+@dataclass(frozen=True)
+class Resection:
+    """`known_from_cam (4, 4)`, its information (6, 6) over `known_from_cam exp(ξ)`, and which points (n,) agree."""
+
+    known_from_cam: Floats
+    information: Floats
+    inliers: Bools
+
+
+def project(points_in_cam: Floats, camera: Camera) -> Floats:
+    """Columns u, v, z (n, 3) of points (n, 3): pixels and metres; not finite where a point is not before the camera."""
+    z = np.where(points_in_cam[:, 2] > 1e-3, points_in_cam[:, 2], np.nan)
+    u = camera.fx * points_in_cam[:, 0] / z + camera.cx
+    v = camera.fy * points_in_cam[:, 1] / z + camera.cy
+    return np.stack([u, v, z], axis=1)
+
+
+def back_project(seen: Floats, camera: Camera) -> Floats:
+    """Points (n, 3) in the camera's axes of columns u, v, z (n, 3)."""
+    z = seen[:, 2]
+    return np.stack([(seen[:, 0] - camera.cx) / camera.fx * z, (seen[:, 1] - camera.cy) / camera.fy * z, z], axis=1)
+
+
+def resect(points: Floats, seen: Floats, camera: Camera, known_from_cam: Floats) -> Resection | None:
+    """The pose that sees points (n, 3) at `seen (n, 3)`, columns u, v, z (NaN: no depth there), from a guess.
+
+    None where fewer than 12 points agree on it.
+    """
+    pose = known_from_cam
+    for scale in ANNEALED:
+        found = _step(points, seen, camera, pose, scale)
+        if found is None:
+            return None
+        step, information = found
+        pose = pose @ se3.exp(step)
+        if scale == 1.0 and np.abs(step).max() < 1e-6:
+            break
+    inliers = _agree(points, seen, camera, pose)
+    return Resection(pose, information, inliers) if inliers.sum() >= FEWEST else None
+
+
+def _residuals(points: Floats, seen: Floats, camera: Camera, pose: Floats) -> tuple[Floats, Floats]:
+    """Points (n, 3) in the camera, and seen less expected u, v, z; of no depth 0, of a point behind it NaN."""
+    in_cam = (points - pose[:3, 3]) @ pose[:3, :3]
+    residual = seen - project(in_cam, camera)
+    residual[np.isnan(seen[:, 2]), 2] = 0.0
+    return in_cam, residual
+
+
+def _agree(points: Floats, seen: Floats, camera: Camera, pose: Floats) -> Bools:
+    in_cam, residual = _residuals(points, seen, camera, pose)
+    near = np.hypot(residual[:, 0], residual[:, 1]) < GATE_PX
+    sigma_z = DEPTH_SIGMAS * depth_sigma(in_cam[:, 2])
+    return np.asarray(near & (np.abs(residual[:, 2]) < GATE_PX / PIXEL_SIGMA * sigma_z))
+
+
+def _step(points: Floats, seen: Floats, camera: Camera, pose: Floats, scale: float) -> tuple[Floats, Floats] | None:
+    """The Gauss-Newton step ξ (6,) and the information (6, 6), with Cauchy weights."""
+    in_cam, residual = _residuals(points, seen, camera, pose)
+    usable = np.isfinite(residual).all(axis=1)
+    if usable.sum() < FEWEST:
+        return None
+    in_cam, residual = in_cam[usable], residual[usable]
+    x, y, z = in_cam.T
+    sigma_z = DEPTH_SIGMAS * depth_sigma(z)
+    white = residual / np.stack([np.full_like(z, PIXEL_SIGMA), np.full_like(z, PIXEL_SIGMA), sigma_z], axis=1)
+    weight = 1 / (1 + (white**2).sum(axis=1) / (3 * scale**2))
+    no_depth = np.isnan(seen[usable, 2])
+    rows_u = _pixel_rows(camera.fx / (PIXEL_SIGMA * z), x / z, 0, in_cam)
+    rows_v = _pixel_rows(camera.fy / (PIXEL_SIGMA * z), y / z, 1, in_cam)
+    rows_z = _moved(in_cam, 2) * np.where(no_depth, 0.0, 1 / sigma_z)[:, None]
+    root = np.sqrt(weight)[:, None]
+    jacobian = np.concatenate([rows_u * root, rows_v * root, rows_z * root])
+    information = jacobian.T @ jacobian
+    gradient = jacobian.T @ (white * root).T.ravel()
+    damped = information + 1e-9 * np.trace(information) * np.eye(6)
+    return np.linalg.solve(damped, gradient), information
+
+
+def _moved(in_cam: Floats, axis: int) -> Floats:
+    """d(coordinate)/dξ (n, 6) of points in a camera that moves by exp(ξ): they move by −(φ × p + ρ)."""
+    out = np.zeros((len(in_cam), 6))
+    one, two = (axis + 1) % 3, (axis + 2) % 3
+    out[:, one], out[:, two] = -in_cam[:, two], in_cam[:, one]
+    out[:, 3 + axis] = -1.0
+    return out
+
+
+def _pixel_rows(gain: Floats, slope: Floats, axis: int, in_cam: Floats) -> Floats:
+    """d(pixel)/dξ (n, 6) over the pixel's sigma: of `f x/z`, with `gain` f/(σ z) and `slope` x/z."""
+    return np.asarray(gain[:, None] * (_moved(in_cam, axis) - slope[:, None] * _moved(in_cam, 2)))

@@ -1,0 +1,53 @@
+"""Rolling shutter: where points would have been seen had all of an image been taken at the moment of its frame.
+
+A camera reads its rows one after the other, and its colour image is rarely of the same moment as its depth image. With
+the camera's velocity from the frames around, each point is moved to where it was at the frame's own stamp.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.registration.resection import project
+from hodge_pipeline.types import Bools, Camera, Floats, Ints
+
+LONGEST_SPAN_S = 0.5
+"""Between the two frames that a velocity is taken from: a hand-held camera turns back within half a second."""
+
+
+def velocities(world_from_cam: Floats, times_s: Floats, sequence: Ints, found: Bools) -> Floats:
+    """Twists (N, 6) a second in each camera's axes, from the frames before and after it, or from one of them.
+
+    Zero where a frame has no neighbour near in time with a pose of its own.
+    """
+    rows = np.arange(len(times_s))
+
+    def near(other: Ints) -> Bools:
+        inside = (other >= 0) & (other < len(rows))
+        at = np.clip(other, 0, len(rows) - 1)
+        return np.asarray(inside & found & found[at] & (sequence == sequence[at]))
+
+    before = np.where(near(rows - 1), rows - 1, rows)
+    after = np.where(near(rows + 1), rows + 1, rows)
+    span = times_s[after] - times_s[before]
+    known = (span > 0) & (span <= LONGEST_SPAN_S)
+    twists = se3.log(se3.inverse(world_from_cam[before]) @ world_from_cam[after])
+    return np.asarray(np.where(known[:, None], twists / np.where(known, span, 1.0)[:, None], 0.0))
+
+
+def at_frame_stamp(points_in_cam: Floats, camera: Camera, colour_delay_s: float, twist: Floats) -> Floats:
+    """Points (n, 3), their pixels of the colour image and their depths of the depth image, at the frame's stamp.
+
+    `twist (6,)` is the camera's velocity in its own axes, `colour_delay_s` how much later the middle row of its colour
+    image was taken than that of its depth image, whose moment the frame's stamp is. Both shutters roll alike.
+    """
+    if not (camera.readout_s or colour_delay_s) or not twist.any():
+        return points_in_cam
+    row = project(points_in_cam, camera)[:, 1]
+    after_depth_s = camera.readout_s * (row / camera.height - 0.5)
+    velocity = -(np.cross(twist[:3], points_in_cam) + twist[3:])
+    z = points_in_cam[:, 2]
+    at_colour = points_in_cam * (1 + velocity[:, 2] * colour_delay_s / z)[:, None]
+    moved = at_colour - velocity * (colour_delay_s + after_depth_s)[:, None]
+    return np.asarray(np.where(np.isfinite(moved), moved, points_in_cam))

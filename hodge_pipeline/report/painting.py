@@ -1,0 +1,131 @@
+"""How plots are painted, and those of the errors along the path: over time, per axis, and as its colour."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from hodge_pipeline.report.contents import Report
+from hodge_pipeline.report.document import Picture
+from hodge_pipeline.types import Floats
+
+DOTS_PER_INCH = 150
+SIZE = 5.0, 3.9
+"""Inches."""
+TRUTH = "truth"
+LINES = (":", "#D55E00"), ("-", "#0072B2")
+"""Before and after, as in every plot."""
+
+
+def painted(title: str, caption: str, paint: Callable[[Figure], None], size: tuple[float, float] = SIZE) -> Picture:
+    """A painted figure as a picture."""
+    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    paint(figure)
+    for axes in figure.axes:
+        axes.grid(alpha=0.25, linewidth=0.5)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+    target = io.BytesIO()
+    # savefig would lay out and draw it all twice
+    canvas.print_png(target, metadata={"Software": None})  # type: ignore[no-untyped-call]
+    return Picture(title, caption, target.getvalue())
+
+
+def error_plots(report: Report) -> Iterator[Picture]:
+    """The errors along the path against the truth; without one, how far the run moved each frame."""
+    errors = offsets(report)
+    if not errors:
+        return
+    against = "from the truth, aligned" if has_truth(report) else f"from the {report.before} poses, aligned"
+    title = "Error" if has_truth(report) else "Movement"
+    yield painted(
+        f"{title} over time, per axis", f"How far each frame lies {against}.", lambda figure: _over_time(figure, report)
+    )
+    last = report.after if report.after in errors else next(iter(errors))
+    yield painted(
+        f"{title} along the path", f"{last}: the colour says how far each frame lies {against}.",
+        lambda figure: _coloured_path(figure, report, last),
+    )  # fmt: skip
+
+
+def has_truth(report: Report) -> bool:
+    """Whether the positions can be compared with true ones."""
+    return any(path.name == TRUTH for path in report.pictures.paths)
+
+
+def offsets(report: Report) -> dict[str, Floats]:
+    """How far (N, 3) each set of positions lies from the truth, without one the result from the poses before it."""
+    paths = {path.name: path.positions for path in report.pictures.paths}
+    if not paths.keys() >= {report.before, report.after}:
+        return {}
+    shown = {name: paths[name] for name in (report.before, report.after)}
+    if TRUTH not in paths:
+        shown = {report.after: shown[report.after]}
+    found = {name: positions - paths.get(TRUTH, paths[report.before]) for name, positions in shown.items()}
+    return found if all(np.isfinite(each).any() for each in found.values()) else {}
+
+
+def _unit(report: Report, offsets: Sequence[Floats]) -> tuple[str, float]:
+    """The unit that suits these offsets, and how many of them a metre has."""
+    if not report.has_metres:
+        return "the source's unit", 1.0
+    largest = max(float(np.nanmax(np.abs(each), initial=0.0)) for each in offsets)
+    return ("mm", 1000.0) if largest < 0.02 else ("cm", 100.0) if largest < 1 else ("m", 1.0)
+
+
+def _over_time(figure: Figure, report: Report) -> None:
+    errors = offsets(report)
+    unit, factor = _unit(report, list(errors.values()))
+    times, label = _times(report, len(next(iter(errors.values()))))
+    panels = figure.subplots(3, 1, sharex=True)
+    for axis, (axes, name) in enumerate(zip(panels, "xyz", strict=True)):
+        for rank, (poses, offset) in enumerate(errors.items()):
+            style = {
+                "linestyle": "-" if poses == report.after else ":",
+                "color": ("#D55E00", "#0072B2")[rank - len(errors)],
+            }
+            line, colour = LINES[rank - len(errors)]
+            axes.plot(times, offset[:, axis] * factor, linewidth=1.1, label=poses, **style)
+        axes.set_ylabel(f"{name}, {unit}", fontsize=8)
+    panels[-1].set_xlabel(label)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False, fontsize=8)
+
+
+def _times(report: Report, count: int) -> tuple[Floats, str]:
+    stamps = report.pictures.stamps_s
+    if len(stamps) == count and count > 1 and (np.diff(stamps) > 0).all():
+        return stamps - stamps[0], "s"
+    return np.arange(count, dtype=float), "frame"
+
+
+def _coloured_path(figure: Figure, report: Report, name: str) -> None:
+    positions = next(path.positions for path in report.pictures.paths if path.name == name)
+    size = np.linalg.norm(offsets(report)[name], axis=1)
+    unit, factor = _unit(report, [size])
+    origin, plane = flattest_plane(positions)
+    along, across = plane @ (positions - origin).T
+    axes = figure.add_subplot()
+    axes.plot(along, across, color="#bbbbbb", linewidth=0.6, zorder=0)
+    worst_last = np.argsort(np.nan_to_num(size, nan=-1.0), kind="stable")
+    dots = axes.scatter(
+        along[worst_last], across[worst_last], c=size[worst_last] * factor, s=14, cmap="viridis_r", linewidths=0
+    )
+    figure.colorbar(dots, ax=axes, label=unit, shrink=0.8)
+    axes.set_aspect("equal", adjustable="datalim")
+    for label in (axes.set_xlabel, axes.set_ylabel):
+        label("m" if report.has_metres else "the source's unit")
+
+
+def flattest_plane(positions: Floats) -> tuple[Floats, Floats]:
+    """The mean of positions (N, 3), and the two directions (2, 3) along which they spread most."""
+    known = positions[np.isfinite(positions).all(axis=1)]
+    if not len(known):
+        return np.zeros(3), np.eye(3)[:2]
+    origin = known.mean(axis=0)
+    spread = (known - origin).T @ (known - origin)
+    return origin, np.linalg.eigh(spread)[1][:, :0:-1].T

@@ -1,0 +1,56 @@
+"""The poses of all frames, once those of the key frames are solved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hodge_pipeline.complex.components import in_runs
+from hodge_pipeline.registration.reposing import PosedBlock, repose
+from hodge_pipeline.registration.shutter import velocities
+from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.scene import KeyFrames, Scene, stamps_of, vertex_ids
+from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.types import Floats, Source
+from hodge_pipeline.types.notes import Note
+
+
+def pose_all_frames(scene: Scene, world_from_key: Floats, steps: Steps, workers: Workers) -> Floats:
+    """Poses (N, 4, 4) of all frames that follow from those (K, 4, 4) of the key frames."""
+    poses = scene.key_frames.expand(world_from_key)
+    if scene.sightings is None:
+        return poses
+    return steps.step(
+        pose_frames, scene.whole, scene.key_frames, scene.sightings, poses, title="all frames",
+        total=len(poses), workers=workers,
+    )  # fmt: skip
+
+
+def pose_frames(
+    source: Source, key_frames: KeyFrames, sightings: Path, world_from_cam: Floats, *, workers: Workers, step: Step
+) -> Floats:
+    """Step: each frame posed anew by what it saw of its key frame; one that fits nothing keeps its pose (N, 4, 4)."""
+    twists = velocities(world_from_cam, stamps_of(source), key_frames.sequence, key_frames.found)
+    is_key = np.zeros(len(world_from_cam), bool)
+    is_key[key_frames.rows] = True
+    poses, misfits = world_from_cam.copy(), list[int]()
+
+    def block(path: Path) -> PosedBlock:
+        own = artifacts.load(path, Sightings)
+        rows = np.union1d(own.key, own.frame)
+        frames = [source.frames[row] for row in rows]
+        cameras = tuple(frame.camera for frame in frames if frame.camera is not None)
+        delays_s = np.array([frame.colour_delay_s for frame in frames])
+        return PosedBlock(own, rows, world_from_cam[rows], is_key[rows], twists[rows], cameras, delays_s)
+
+    paths = sorted(sightings.glob("*.npz"))
+    for _, found in workers.map(repose, [block(path) for path in paths]):
+        poses[found.rows] = found.world_from_cam
+        misfits.extend(found.misfits.tolist())
+        step.advance(len(found.rows) + len(found.misfits))
+    if misfits:
+        names = in_runs(np.array(sorted(misfits)), vertex_ids(source))
+        step.note(Note("misfits", len(misfits), names))
+    return poses

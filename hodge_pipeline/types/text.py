@@ -1,0 +1,48 @@
+"""Text that may hold what a stranger wrote: shown without effect on a terminal, a log, a shell or a spreadsheet."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+_UNSEEN = "\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ud800-\udfff\ufeff\ufff9-\ufffb"
+_ONE_LINE, _LINES = re.compile(f"[{_UNSEEN}]"), re.compile(f"(?![\n\t])[{_UNSEEN}]")
+_FORMULA = re.compile(r"['=+\-@\t\r]")
+_NO_STEM = re.compile(r"[^\w.+-]+")
+MAX_STEM = 100
+"""Characters: with a beginning and an ending they stay below the 255 bytes that file systems allow."""
+
+
+def visible(text: object, *, lines: bool = False) -> str:
+    r"""The text on one line, each character that moves a cursor, colours, hides or turns round shown as `\x1b`.
+
+    With `lines` line ends and tabs stay.
+    """
+    return (_LINES if lines else _ONE_LINE).sub(lambda found: ascii(found[0])[1:-1], str(text))
+
+
+def command(*words: object) -> str:
+    """The words as a shell takes them, to be copied from a page."""
+    return shlex.join(map(str, words))
+
+
+def cell(text: str) -> str:
+    """The text as a cell of a table that a spreadsheet opens: one that it would compute begins with `'`."""
+    return f"'{text}" if _FORMULA.match(text) else text
+
+
+def cell_text(text: str) -> str:
+    """What `cell` was given."""
+    return text[1:] if _FORMULA.match(text[1:2]) and text.startswith("'") else text
+
+
+def file_stems(names: list[str]) -> list[str]:
+    """A name without folders for each of these, all different, however they are written."""
+    stems: list[str] = []
+    for name in names:
+        stem = wanted = _NO_STEM.sub("_", name)[:MAX_STEM]
+        number = 2
+        while stem.casefold() in {other.casefold() for other in stems}:
+            stem, number = f"{wanted}-{number}", number + 1
+        stems.append(stem)
+    return stems

@@ -1,0 +1,191 @@
+"""Optical flow, poses by corners, and the rolling shutter."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_adapters.tum import READOUT_S, TumReader
+from hodge_pipeline import se3
+from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.registration.flow import Corners, FlowImage, find_corners, flow_image, follow
+from hodge_pipeline.registration.reposing import PosedBlock, repose
+from hodge_pipeline.registration.resection import project, resect
+from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
+from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.types import Camera, Floats, Source
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+ROLLING = Camera(640, 480, 525.0, 525.0, 319.5, 239.5, readout_s=0.0225)
+MOTION = se3.exp(np.array([0.03, -0.05, 0.02, 0.04, -0.02, 0.03]))
+RANGE = (0.2, 6.0)
+
+
+def points_in_view(count: int, seed: int = 0) -> Floats:
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(1.0, 3.0, count)
+    return np.stack([rng.uniform(-0.5, 0.5, count) * z, rng.uniform(-0.4, 0.4, count) * z, z], axis=1)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Source:
+    options = DemoOptions(frames=4, width=320, height=240, stride=1, turns=0.01)
+    return TumReader().open(make_sequence(tmp_path_factory.mktemp("flow") / "sequence", options))
+
+
+def corners_of(source: Source) -> Corners:
+    image = flow_image(source.frames[0], RANGE)
+    assert image is not None
+    return find_corners(image)
+
+
+def test_a_pose_is_found_through_outliers_and_without_most_depths() -> None:
+    points = points_in_view(100)
+    seen = project(se3.transform(se3.inverse(MOTION), points), CAMERA)
+    seen[:30, :2] += 40.0
+    seen[40:90, 2] = np.nan
+    found = resect(points, seen, CAMERA, np.eye(4))
+    assert found is not None
+    np.testing.assert_allclose(found.known_from_cam, MOTION, atol=1e-4)
+    np.testing.assert_array_equal(found.inliers, np.arange(100) >= 30)
+
+
+def test_its_information_says_how_far_noise_moves_it() -> None:
+    rng, errors = np.random.default_rng(1), []
+    for seed in range(40):
+        points = points_in_view(200, seed)
+        seen = project(se3.transform(se3.inverse(MOTION), points), CAMERA)
+        seen[:, :2] += rng.normal(0, 0.75, (200, 2))
+        seen[:, 2] = np.nan
+        found = resect(points, seen, CAMERA, MOTION)
+        assert found is not None
+        error = se3.log(se3.inverse(MOTION) @ found.known_from_cam)
+        errors.append(error @ found.information @ error)
+    assert 3.0 < np.mean(errors) < 9.0  # χ² of six degrees of freedom; Cauchy weights make it less
+
+
+def test_too_few_points_or_no_agreement_give_no_pose() -> None:
+    points = points_in_view(11)
+    assert resect(points, project(points, CAMERA), CAMERA, np.eye(4)) is None
+    assert resect(points_in_view(60), project(points_in_view(60, 5), CAMERA), CAMERA, np.eye(4)) is None
+
+
+def test_corners_are_followed_to_the_motion_of_the_camera(source: Source) -> None:
+    first, last = source.frames[0], source.frames[3]
+    view = flow_image(last, RANGE)
+    assert view is not None
+    found = follow(corners_of(source), view, np.eye(4))
+    assert found is not None and len(found.rows) > 50 and found.share > 0.7
+    assert first.world_from_cam is not None and last.world_from_cam is not None
+    true = se3.inverse(first.world_from_cam) @ last.world_from_cam
+    error = se3.log(se3.inverse(true) @ found.key_from_view)
+    assert np.linalg.norm(true[:3, 3]) > 0.05
+    # Colour is up to 6 ms earlier or later than depth, whose moment the true poses are of.
+    assert np.linalg.norm(error[3:]) < 0.01 and np.linalg.norm(error[:3]) < 0.008
+
+
+def test_a_black_frame_shows_nothing(source: Source) -> None:
+    corners = corners_of(source)
+    shape = corners.image.depth.shape
+    black = FlowImage(np.zeros(shape, np.uint8), np.zeros(shape, np.float32), corners.image.camera, RANGE)
+    assert len(find_corners(black)) == 0
+    assert follow(corners, black, np.eye(4)) is None
+
+
+@pytest.mark.parametrize("delay_s", [-0.018, 0.0, 0.015])
+def test_a_point_goes_back_to_where_it_was_at_the_stamp(delay_s: float) -> None:
+    twist = np.array([0.4, -0.3, 0.2, 0.3, 0.2, -0.3])
+    at_stamp = points_in_view(50)
+    seen = at_stamp
+    for _ in range(5):  # the row says when it is seen, which says where
+        rolled_s = ROLLING.readout_s * (project(seen, ROLLING)[:, 1] / ROLLING.height - 0.5)
+        world_from_cam = se3.exp(twist * (rolled_s + delay_s)[:, None])
+        seen = np.stack(
+            [se3.transform(se3.inverse(T), p[None])[0] for T, p in zip(world_from_cam, at_stamp, strict=True)]
+        )
+    by_depth = np.stack(
+        [se3.transform(se3.exp(-twist * s), p[None])[0] for s, p in zip(rolled_s, at_stamp, strict=True)]
+    )
+    mixed = seen * (by_depth[:, 2] / seen[:, 2])[:, None]  # the pixel of colour, the distance of depth
+    before = np.linalg.norm(mixed - at_stamp, axis=1)
+    after = np.linalg.norm(at_frame_stamp(mixed, ROLLING, delay_s, twist) - at_stamp, axis=1)
+    assert before.max() > 0.004 and after.max() < 0.0006
+
+
+def test_without_a_shutter_or_a_motion_nothing_moves() -> None:
+    points = points_in_view(10)
+    np.testing.assert_array_equal(at_frame_stamp(points, CAMERA, 0.0, np.ones(6)), points)
+    np.testing.assert_array_equal(at_frame_stamp(points, ROLLING, 0.01, np.zeros(6)), points)
+
+
+def test_velocities_come_from_the_frames_around_and_not_from_over_a_gap() -> None:
+    twist, times = np.array([0.1, 0.2, -0.1, 0.3, 0.0, 0.2]), np.array([0.0, 0.04, 0.07, 3.0, 3.03, 3.06])
+    poses, found = se3.exp(twist * times[:, None]), np.array([True, True, True, True, True, False])
+    speeds = velocities(poses, times, np.zeros(6, np.int64), found)
+    np.testing.assert_allclose(speeds[[0, 1]], [twist, twist], atol=1e-12)
+    np.testing.assert_array_equal(speeds[[2, 3, 5]], np.zeros((3, 6)))  # over the gap, or without a pose
+    np.testing.assert_array_equal(velocities(poses, times, np.arange(6), found), np.zeros((6, 6)))
+
+
+def rolling_block(readout_s: float) -> tuple[PosedBlock, Floats]:
+    """Three frames of a camera that speeds up, the first and the last are key frames; and the true poses."""
+    times = np.array([0.0, 1 / 30, 2 / 30])
+    twist = np.array([0.5, 0.4, 0.3, 0.4, -0.3, 0.2])
+
+    def world_from_cam(times: Floats) -> Floats:
+        return se3.exp(twist * (times + 10 * times**2)[:, None])
+
+    poses = world_from_cam(times)
+    world = points_in_view(80)
+
+    def seen(frame: int) -> Floats:
+        out = project(se3.transform(se3.inverse(poses[frame]), world), CAMERA)
+        for _ in range(5):
+            late = times[frame] + ROLLING.readout_s * (out[:, 1] / CAMERA.height - 0.5)
+            views = se3.inverse(world_from_cam(late))
+            out = project(np.einsum("nij,nj->ni", views[:, :3, :3], world) + views[:, :3, 3], CAMERA)
+        return out
+
+    first = seen(0)
+    rays = np.stack([(first[:, 0] - CAMERA.cx) / CAMERA.fx, (first[:, 1] - CAMERA.cy) / CAMERA.fy, np.ones(80)], axis=1)
+    key, corner = np.zeros(80, np.int64), np.tile(np.arange(80), 2)
+    sightings = Sightings(key, rays * first[:, 2:], np.repeat([1, 2], 80), corner, np.concatenate([seen(1), seen(2)]))
+    camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5, readout_s)
+    start = poses.copy()
+    start[1, :3, 3] += 0.02
+    twists = twist * (1 + 20 * times)[:, None]
+    return PosedBlock(
+        sightings, np.arange(3), start, np.array([True, False, True]), twists, (camera,) * 3, np.zeros(3)
+    ), poses
+
+
+def test_frames_between_key_frames_are_posed_anew_at_the_shutter_of_their_camera() -> None:
+    errors = []
+    for readout_s in (0.0, ROLLING.readout_s):
+        block, poses = rolling_block(readout_s)
+        found = repose(block)
+        assert found.rows.tolist() == [1] and len(found.misfits) == 0
+        errors.append(np.abs(found.world_from_cam[0] - poses[1]).max())
+    assert errors[1] < 1e-4 < errors[0]
+
+
+def test_a_frame_that_fits_nothing_is_named() -> None:
+    block, _ = rolling_block(0.0)
+    block.sightings.seen[:80] = project(points_in_view(80, 9), CAMERA)
+    found = repose(block)
+    assert found.misfits.tolist() == [1] and len(found.rows) == 0
+
+
+def test_readers_tell_the_shutter_and_by_how_much_colour_is_late(tmp_path: Path, source: Source) -> None:
+    folder = tmp_path / "rgbd_dataset_freiburg1_rolling"
+    make_sequence(folder, DemoOptions(frames=3, width=64, height=48, stride=1))
+    lines = (folder / "rgb.txt").read_text().splitlines()
+    rows = [line.split() for line in lines if not line.startswith("#")]
+    late = [f"{float(stamp) + 0.012:.6f} {name}" for stamp, name in rows]
+    (before, *_) = TumReader(camera="fr1").open(folder).frames
+    (folder / "rgb.txt").write_text("\n".join(late) + "\n")
+    (frame, *_) = TumReader(camera="fr1").open(folder).frames
+    assert frame.camera is not None and frame.camera.readout_s == READOUT_S
+    assert 0 < abs(before.colour_delay_s) < 0.006
+    assert frame.colour_delay_s - before.colour_delay_s == pytest.approx(0.012, abs=1e-6)
+    assert source.frames[0].camera is not None and source.frames[0].camera.readout_s == 0.0

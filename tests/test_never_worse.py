@@ -1,0 +1,68 @@
+"""A real model disturbed and refined is never worse than its input or plain bundle adjustment (more: benchmarks)."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+import hodge_pipeline
+from hodge_adapters.colmap_ties import Ties, similarity
+from test_refine_colmap import FREE
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+from colmap import MOST_WORSE_PERCENT, PEER, compared, cpu_of, disturbed, same_bytes
+
+CASES = [
+    ("mouse_good", "given"),
+    ("mouse_good", "big"),
+    ("mouse_good", "wrong"),
+    ("mouse_good", "halves"),
+    ("mouse_good", "renamed"),
+    ("maupertuis_good", "noise"),
+    ("maupertuis_good", "wrong"),
+    ("maupertuis_good", "halves"),
+]
+
+
+@pytest.mark.parametrize(("name", "kind"), CASES)
+def test_never_worse_than_the_input_or_plain_bundle_adjustment(
+    data_dir: Path, tmp_path: Path, name: str, kind: str
+) -> None:
+    good, out = data_dir / "colmap/disturbed" / name, tmp_path / "out"
+    starts = disturbed(good, tmp_path / "start", kind, 0)
+    worst = []
+    for number, start in enumerate(starts):
+        peer = tmp_path / f"peer{number}"
+        peer.mkdir()
+        cpu_of([sys.executable, "-c", PEER, str(start), str(peer)])
+        worst.append(min(compared(good, one, kind)[0] for one in (start, peer)))
+    done = hodge_pipeline.refine_colmap(tmp_path / "start", database="none", images="none", out=out, overrides=FREE)
+    assert done.exit_code == 0 and len(done.models) == 1, "halves are joined"
+    assert compared(good, out / "sparse/0", kind)[0] <= max(worst) + MOST_WORSE_PERCENT
+    if kind == "given":
+        assert same_bytes(starts[0], [out / "sparse/0"])
+
+
+def test_the_models_that_came_out_worse_before(data_dir: Path, tmp_path: Path) -> None:
+    for name, good in (("mouse_noise", "mouse_good"), ("maupertuis_wrong", "maupertuis_good")):
+        folder = data_dir / "colmap/disturbed"
+        done = hodge_pipeline.refine_colmap(folder / name, out=tmp_path / name, overrides=FREE)
+        assert done.results[0].decision.outcome == "refined"
+        assert compared(folder / good, tmp_path / name / "sparse/0", "noise")[0] < 0.001
+
+
+def test_a_join_is_as_exact_as_the_images_that_both_models_have(data_dir: Path) -> None:
+    first = pycolmap.Reconstruction(data_dir / "colmap/disturbed/mouse_good")
+    second = pycolmap.Reconstruction(first)
+    ids = sorted(first.points3D)[:600]
+    rng = np.random.default_rng(0)
+    size = np.ptp([point.xyz for point in first.points3D.values()], axis=0).max()
+    for key in ids[:280]:  # ties by matches: the same points, triangulated apart
+        second.points3D[key].xyz = second.points3D[key].xyz + rng.normal(scale=0.003 * size, size=3)
+    second.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0.3, 0.5, -0.2])), np.array([1.0, 2.0, 3.0])))
+    found = similarity(first, second, Ties(np.array([ids, ids]).T))
+    assert found is not None and found[0].scale == pytest.approx(0.5, rel=1e-9)
