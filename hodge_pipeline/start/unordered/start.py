@@ -67,7 +67,8 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     views = Views.make(scene.frames, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
     if scene.drift is not None:
-        far = hypotheses.counts & strays(hypotheses, scene.drift)
+        counted = np.flatnonzero(hypotheses.counts)
+        far = counted[strays(hypotheses.select(counted), scene.drift)]
         hypotheses = hypotheses.put(far, status=REJECTED, why="farther off than odometry drifts")
     notes.append(_tried(len(rows), pairs, hypotheses))
     labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
