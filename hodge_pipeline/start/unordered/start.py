@@ -61,7 +61,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     by_image = uses_images(clouds, options)
     registrar: GlobalRegistrar = options.images if by_image else options.registrar
     describe_clouds(scene.clouds, registrar, rows, scratch / DESCRIBED, workers, advance)
-    notes = [] if by_image else [*check_scans(clouds, scene.vertex_ids)]
+    notes = [] if by_image or scene.given is not None else [*check_scans(clouds, scene.vertex_ids)]
     pairs = propose(scene, clouds, rows, scratch / DESCRIBED, options)
     matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
     views = Views.make(scene.frames, scratch / VIEWS, workers)
