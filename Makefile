@@ -6,13 +6,14 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 BASELINE ?= ../hodge-baseline
 
-.PHONY: help setup demo paper test fuzz baseline compare-baseline docs lint format clean
+.PHONY: help setup demo paper test faults faults-full faults-mutants baseline compare-baseline docs lint format clean
 help:
-	@echo "make setup   system libraries, $(VENV) and everything in it"
+	@echo "make setup   system libraries, $(VENV) and everything in it: 3 GB"
 	@echo "make demo    make a room, reconstruct it: runs/demo"
 	@echo "make paper   the paper's tables for every sequence that is there: runs/paper"
 	@echo "make test    the tests"
-	@echo "make fuzz    every reader on 2000 damaged inputs"
+	@echo "make faults  crashes, damage, full disks, hostile files: about 10 minutes; faults-full: every case"
+	@echo "make faults-mutants  whether the faults find faults"
 	@echo "make baseline          what real data gives now, kept in $(BASELINE)"
 	@echo "make compare-baseline  what has changed since"
 	@echo "make docs    docs/recipes.md from the code"
@@ -21,7 +22,8 @@ help:
 $(STAMP): pyproject.toml constraints.txt tools/system-libraries.sh
 	sh tools/system-libraries.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "no venv: apt-get install python3-venv"; exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@echo "into $(VENV): about 3 GB with all libraries, of which 1 GB is downloaded; some minutes"
+	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
 setup: $(STAMP)
@@ -36,8 +38,14 @@ paper: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-fuzz: $(STAMP)
-	PYTHONWARNINGS=ignore $(BIN)/python tests/fuzz_readers.py 2000
+faults: $(STAMP)
+	$(BIN)/python -W ignore tests/faults/faults.py $(FAULTS_ARGS)
+
+faults-full: $(STAMP)
+	$(BIN)/python -W ignore tests/faults/faults.py --full $(FAULTS_ARGS)
+
+faults-mutants: $(STAMP)
+	$(BIN)/python -W ignore tests/faults/mutants.py
 
 baseline: $(STAMP)
 	$(BIN)/python benchmarks/baseline.py store $(BASELINE)

@@ -42,8 +42,30 @@ def measure(recipe: str, source: Path, frames: int, overrides: list[str]) -> dic
         subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
         after = os.times()
         report: dict[str, Any] = json.loads((out / "report.json").read_text())
+        posed = sum(not line.startswith("#") for line in (out / "poses.tum").read_text().splitlines())
     cpu = after.children_user + after.children_system - before.children_user - before.children_system
-    return {**report, "total_cpu_s": cpu, "total_wall_s": time.perf_counter() - begin}
+    return {**report, "frames": posed, "total_cpu_s": cpu, "total_wall_s": time.perf_counter() - begin}
+
+
+def errors(report: dict[str, Any]) -> str:
+    """The cells of a result's errors and scores; a dash where there is no truth."""
+    row = {row["name"]: row for row in report["trajectories"]}.get("result")
+    if row is None:
+        return "– | – | – | –"
+    return (
+        f"{100 * row['ate_rmse_m']:.2f} | {100 * row['ate_max_m']:.1f} | {1e3 * row['rpe_translation_m']:.1f} | "
+        f"{scores(report)}"
+    )
+
+
+def scores(report: dict[str, Any]) -> str:
+    """Mean scores on both graphs, those of the true poses in brackets."""
+    table = report["scores"]
+    if not table:
+        return "–"
+    poses = [graph["poses"] for graph in table["graphs"].values()]
+    cells = [f"{one['result']['score']:.4f} ({one['truth']['score']:.4f})" for one in poses]
+    return ", ".join(cells)
 
 
 def main() -> None:
@@ -56,19 +78,26 @@ def main() -> None:
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     options = parser.parse_args()
     print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}\n")
-    print("| frames | CPU s | wall s | peak MB | ATE m |")
-    print("|---|---|---|---|---|")
+    print("| frames | CPU s | CPU ms a frame | wall s | peak MB | ATE cm | largest cm | RPE mm | scores (truth's) |")
+    print("|---|---|---|---|---|---|---|---|---|")
     last: dict[str, Any] = {}
     for frames in options.frames:
         runs = [measure(options.recipe, options.source, frames, options.overrides) for _ in range(options.repeat)]
         cpu, wall = (statistics.median(run[key] for run in runs) for key in ("total_cpu_s", "total_wall_s"))
         peak = statistics.median(max(stage["peak_mb"] for stage in run["stages"]) for run in runs)
-        ate = {row["name"]: row["ate_rmse_m"] for row in runs[0]["trajectories"]}.get("result", float("nan"))
-        print(f"| {frames} | {cpu:.1f} | {wall:.1f} | {peak:.0f} | {ate:.4f} |", flush=True)
+        posed = runs[0]["frames"]
+        print(
+            f"| {posed} | {cpu:.1f} | {1e3 * cpu / posed:.0f} | {wall:.1f} | {peak:.0f} | {errors(runs[0])} |",
+            flush=True,
+        )
         last = runs[0]
-    print(f"\n| stage ({options.frames[-1]} frames) | CPU s | wall s | peak MB |\n|---|---|---|---|")
+    posed = last["frames"]
+    print(f"\n| stage ({posed} frames) | CPU s | CPU ms a frame | wall s | peak MB |\n|---|---|---|---|---|")
     for stage in last["stages"]:
-        print(f"| {stage['name']} | {stage['cpu_s']:.1f} | {stage['wall_s']:.1f} | {stage['peak_mb']:.0f} |")
+        each = 1e3 * stage["cpu_s"] / posed
+        print(
+            f"| {stage['name']} | {stage['cpu_s']:.1f} | {each:.1f} | {stage['wall_s']:.1f} | {stage['peak_mb']:.0f} |"
+        )
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.global_registrars import FpfhConsensus, FpfhFgr, FpfhRansac, KissMatcher
 from hodge_pipeline.stages import GlobalRegistrar
 from hodge_pipeline.start.unordered.options import HypothesisLimits
-from hodge_pipeline.types import Floats, PointCloud
+from hodge_pipeline.types import Floats, PointCloud, number_of
 
 REFINE = Gicp(distances_m=(0.3, 0.1, 0.05), source_points=(2000, 4000, 8000))
 
@@ -65,7 +65,7 @@ def main() -> None:
     clouds_of = CloudOptions(voxel_m=0.03, min_range_m=0.0, max_range_m=200.0)
     clouds = [make_cloud(frame, clouds_of)[0] for frame in frames]
     listed = read_log_file(options.gt_log)
-    row_of = {frame.frame_id: at for at, frame in enumerate(frames)}
+    row_of = {number_of(frame): at for at, frame in enumerate(frames)}
     truth = {
         (row_of[i], row_of[j]): motion
         for (i, j), motion in zip(listed.pairs.tolist(), listed.i_from_j, strict=True)

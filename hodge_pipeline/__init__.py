@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from hodge_pipeline.pipeline import run, solve_again
     from hodge_pipeline.recipe.schema import Recipe, load_recipe
     from hodge_pipeline.refine.open3d_objects import solve_pose_graph
+    from hodge_pipeline.review.opening import open_review
     from hodge_pipeline.run_folder import Run
     from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
     from hodge_pipeline.solvers.editing import GraphEditor
@@ -65,8 +66,9 @@ if TYPE_CHECKING:
 __all__ = [
     "Camera", "Diagnosis", "Edges", "Frame", "GraphEditor", "HodgeError", "PointCloud", "Priors", "Recipe",
     "Registration", "Run", "Solution", "Source", "Trajectory", "ViewGraph", "diagnose", "frames_from_images",
-    "load_recipe", "marginal_covariances", "open_source", "refine_colmap", "refine_trajectory", "register",
-    "register_clouds", "relative_covariances", "run", "solve", "solve_again", "solve_pose_graph", "solve_robust",
+    "load_recipe", "marginal_covariances", "open_review", "open_source", "refine_colmap", "refine_trajectory",
+    "register", "register_clouds", "relative_covariances", "run", "solve", "solve_again", "solve_pose_graph",
+    "solve_robust",
 ]  # fmt: skip
 
 _NAMES_IN = {
@@ -79,6 +81,7 @@ _NAMES_IN = {
     "refine.open3d_objects": ("solve_pose_graph",),
     "uses.trajectory": ("frames_from_images", "refine_trajectory"),
     "uses.registration": ("register", "register_clouds"),
+    "review.opening": ("open_review",),
     "run_folder": ("Run",),
     "solvers.covariance": ("marginal_covariances", "relative_covariances"),
     "solvers.editing": ("GraphEditor",),

@@ -31,12 +31,12 @@ from hodge_pipeline.rounds.suggested import suggested_rounds
 from hodge_pipeline.run_folder import Run, begin, check_layout, end, opening_of
 from hodge_pipeline.scene import Round, Scene
 from hodge_pipeline.sources.measured_edges import measured_edges
-from hodge_pipeline.sources.opening import open_with_reader, remembered
+from hodge_pipeline.sources.opening import Fingerprints, changed_since, fingerprints, open_with_reader, remembered
 from hodge_pipeline.start.truth import with_truth
 from hodge_pipeline.store.log import logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
-from hodge_pipeline.store.workspace import RECIPE_FILE, Workspace
+from hodge_pipeline.store.workspace import RECIPE_FILE, Workspace, disk_errors
 from hodge_pipeline.types import Floats, Source, ViewGraph
 from hodge_pipeline.types.notes import Note, notes_of
 
@@ -50,12 +50,14 @@ def run(
     watcher: Watcher | None = None,
     live: str | None = None,
     dask: str | None = None,
+    strict: bool = False,
 ) -> Run:
     """Run a recipe (its name, its file or itself) into the folder `out`, going on where an earlier run stopped.
 
     A `source` may be opened already; a run of frames that are in memory cannot be resumed by another process.
     `live` is the address of a Rerun viewer that shows the run as it happens; `dask` that of a Dask scheduler whose
-    workers see the same files, and which is trusted to run code here.
+    workers see the same files, and which is trusted to run code here. Input that changes during the run is noted at its
+    end: by sizes and times, and with `strict` by hashes of every file.
     Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     if isinstance(recipe, str):
@@ -66,9 +68,10 @@ def run(
     folder = Path(out)
     with (
         Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace,
+        disk_errors(folder),
         logging_to(folder / "log.txt"),
     ):
-        return _Job(recipe, workspace, Store(workspace.steps, watcher), live, dask, opened).run()
+        return _Job(recipe, workspace, Store(workspace.steps, watcher), live, dask, opened, strict=strict).run()
 
 
 def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str | None = None) -> Run:
@@ -81,7 +84,11 @@ def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str
     listed_edges(folder)
     check_layout(folder)
     recipe = load_recipe(str(folder / RECIPE_FILE))
-    with Workspace.reopen(folder, binding.unbind(recipe)) as workspace, logging_to(folder / "log.txt"):
+    with (
+        Workspace.reopen(folder, binding.unbind(recipe)) as workspace,
+        disk_errors(folder),
+        logging_to(folder / "log.txt"),
+    ):
         return _Job(recipe, workspace, Store(workspace.steps, watcher), dask=dask, again=True).run()
 
 
@@ -96,10 +103,11 @@ class _Job:
     dask: str | None = None
     opened: Source | None = None
     again: bool = False
+    strict: bool = False
 
     def run(self) -> Run:
         """The finished run."""
-        source = self.read()
+        source, before = self.read()
         job = _Job(**{**vars(self), "recipe": with_scale(self.recipe, source, self.store)})
         with ExitStack() as pool:
             workers = pool.enter_context(open_workers(job.recipe.executor, job.dask))
@@ -115,10 +123,11 @@ class _Job:
                 keys_only = job.again and rounds[-1].edited
                 models = fuse_all(job.recipe.fusion, scene, poses, job.store, keys_only=keys_only)
                 recording.models(models)
+        self.store.note(*changed_since(before, strict=self.strict))
         return job.finish(scene, rounds, poses, models, scores, refined)
 
-    def read(self) -> Source:
-        """The source, opened; its images stay on disk."""
+    def read(self) -> tuple[Source, Fingerprints]:
+        """The source, opened, and what its files are like now; its images stay on disk."""
         path = self.recipe.source.path
         if path is None:
             raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
@@ -130,7 +139,9 @@ class _Job:
         self.store.note(*notes_of("reader", source.notes))
         if len(source.frames) == 1:
             self.store.note(Note("single frame", detail=str(path)))
-        return with_truth(remembered(source, reader, self.store), self.recipe.evaluation.truth, self.store)
+        prints = fingerprints(source.files, strict=self.strict)
+        source = remembered(source, reader, self.store, prints)
+        return with_truth(source, self.recipe.evaluation.truth, self.store), prints
 
     def measured(self, scene: Scene) -> ViewGraph:
         """The edges that come measured, over the key frames: they join every round's graph as they are."""

@@ -34,6 +34,14 @@ def test_help_opens_with_examples_and_imports_nothing_heavy() -> None:
     assert done.stdout.index("Examples") < done.stdout.index("Commands")
 
 
+def test_the_usual_short_options_and_a_source_in_the_wrong_place() -> None:
+    assert hodge("-h").stdout == hodge("--help").stdout and hodge("run", "-h").returncode == 0
+    assert "may be repeated" in hodge("run", "--help").stdout and "--install-completion" in hodge("-h").stdout
+    stray = hodge("run", "tum", "some/folder", "-o", "x")
+    assert stray.returncode == 2 and "'some/folder': use --source" in stray.stderr
+    assert "STRAY" not in hodge("run", "-h").stdout.upper()
+
+
 def test_ctrl_c_before_the_command_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
@@ -99,7 +107,7 @@ def test_a_run_that_never_began_does_not_hold_its_folder(tmp_path: Path) -> None
 
 def test_version_and_the_schema_of_both_kinds_of_recipe() -> None:
     assert hodge("--version").stdout.startswith("hodge-pipeline 0.")
-    run, model = (json.loads(hodge("recipes", *name, "--schema").stdout) for name in ((), ("colmap-refine",)))
+    run, model = (json.loads(hodge("recipes", *name, "--schema").stdout) for name in ((), ("colmap_refine",)))
     assert "outer_iterations" in run["properties"] and "held_out_share" not in run["properties"]
     assert "held_out_share" in model["properties"] and "outer_iterations" not in model["properties"]
 

@@ -16,6 +16,7 @@ from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError
 from hodge_pipeline.pairs.edits import Edit, History, read_history, write_history
 from hodge_pipeline.pipeline import Run, solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.rounds.more import Placed
 from hodge_pipeline.rounds.one_round import solve_edges
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.types import ViewGraph
@@ -49,6 +50,29 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 def statuses(folder: Path) -> dict[str, str]:
     return {f"{row['i']}-{row['j']}": row["status"] for row in rows_of(folder)}
+
+
+def test_edits_with_guesses_and_right_pairs_are_read_back(tmp_path: Path) -> None:
+    guess = tuple(se3.exp(np.array([0.1, 0, 0, 1.0, 2, 3])).reshape(-1).tolist())
+    history = History((Edit(register=("1-9",), right=("2-3",), guesses=(("1-9", guess),)),))
+    write_history(tmp_path, history)
+    assert read_history(tmp_path) == history
+    assert history.switches == {"1-9": "registered", "2-3": "right"} and history.right == history.enabled == ("2-3",)
+    assert np.array_equal(history.guesses["1-9"], np.reshape(guess, (4, 4)))
+    for bad in (guess[:15], (9.0, *guess[1:])):
+        write_history(tmp_path, History((Edit(register=("1-9",), guesses=(("1-9", bad),)),)))
+        with pytest.raises(WorkspaceError, match="is not a history of edits"):
+            read_history(tmp_path)
+
+
+def test_a_guess_by_hand_goes_before_that_of_the_poses() -> None:
+    poses = se3.exp(np.random.default_rng(0).normal(size=(4, 6)))
+    placed = Placed(poses, np.array([0, 0, 1, 1]))
+    pairs, by_hand = np.array([[0, 1], [0, 2], [1, 2], [2, 3]]), np.full((4, 4, 4), np.nan)
+    by_hand[[1, 3]] = np.eye(4)
+    found = placed.guesses(pairs, by_hand)
+    assert np.allclose(found[0], se3.inverse(poses[0]) @ poses[1])
+    assert np.array_equal(found[[1, 3]], by_hand[[1, 3]]) and np.isnan(found[2]).all()
 
 
 def test_the_latest_edit_of_a_pair_counts_and_undo_takes_it_back() -> None:

@@ -13,12 +13,12 @@ from rerun.chunk import RrdReader
 from hodge_pipeline import registry, se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.fusion.ply import write_ply
 from hodge_pipeline.recording import layout
 from hodge_pipeline.report.compared import write_comparison
 from hodge_pipeline.report.comparison import compare, tables
 from hodge_pipeline.report.write import Report, SourceSummary, write_report
 from hodge_pipeline.types import Floats, Model, Source, Trajectory
+from hodge_pipeline.types.ply import model_parts
 from test_recording import circle, rows
 from test_report import read_page
 
@@ -33,7 +33,8 @@ def make_run(folder: Path, poses: Floats, recipe: str = "seed: 0\n", first_stamp
     (folder / "recipe.yaml").write_text(recipe)
     write_report(folder, Report(folder.name, SourceSummary("s", "x", len(poses))))
     points = se3.transform(poses, np.array([[0, 0, 1.0], [0.1, 0, 1.0]])).reshape(-1, 3).astype(np.float32)
-    write_ply(folder / "cloud.ply", Model("cloud", points, colours=np.full((len(points), 3), 99, np.uint8)))
+    model = Model("cloud", points, colours=np.full((len(points), 3), 99, np.uint8))
+    (folder / "cloud.ply").write_bytes(b"".join(model_parts(model)))
     return folder
 
 

@@ -11,6 +11,7 @@ from rich.progress import Task
 
 from hodge_pipeline.cli import console
 from hodge_pipeline.cli.console import RateColumn, Terminal
+from hodge_pipeline.types.notes import Note
 
 
 def work(terminal: Terminal) -> None:
@@ -22,7 +23,7 @@ def work(terminal: Terminal) -> None:
 
 
 def test_plain_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    work(Terminal(quiet=False))
+    work(Terminal(quiet=False, verbose=True))
     out, err = capsys.readouterr()
     lines = err.splitlines()
     assert out == ""
@@ -30,6 +31,20 @@ def test_plain_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> N
     assert lines[1].startswith("clouds: done, 50 in ") and lines[1].endswith(" a second")
     assert lines[-1] == "a [note]"
     assert "\x1b" not in err
+
+
+def test_what_nobody_waited_for_is_no_line_and_facts_wait_for_the_report(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([0.0, 0.4, 1.0, 3.0, 4.0, 4.1])
+    monkeypatch.setattr(console.time, "perf_counter", lambda: next(clock))
+    terminal = Terminal(quiet=False)
+    work(terminal)
+    terminal.note(Note("solver", detail="a fact"))
+    terminal.note(Note("parts", 2))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["clouds: done, 50 in 2.0 s, 25 a second", "a [note]"]
+    assert len(lines) == 3 and "falls into 2 parts" in lines[2]
 
 
 def test_a_stage_that_fails_prints_no_line(capsys: pytest.CaptureFixture[str]) -> None:

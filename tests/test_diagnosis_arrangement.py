@@ -12,7 +12,7 @@ from hodge_pipeline.diagnosis.arrangement_evidence import arrangement_log_eviden
 from hodge_pipeline.diagnosis.arrangements import FAIR_SHARES, best_arrangement
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.improve import improved
+from hodge_pipeline.diagnosis.rearrange import rearranged
 from hodge_pipeline.diagnosis.robust_poses import Fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.types import ViewGraph
@@ -57,7 +57,7 @@ def test_a_part_that_lies_elsewhere_is_laid_back(solved: tuple[Evidence, ViewGra
     moved = np.where(PART[:, None, None], ASIDE @ found.poses, found.poses)
     i, j = evidence.edges.T
     wrong = replace(found, poses=moved, component=PART * int(not in_one_piece), used=found.used & (PART[i] == PART[j]))
-    back = improved(evidence, graph, wrong, FAIR_SHARES)
+    back = rearranged(evidence, graph, wrong, FAIR_SHARES[0])[-1]
     assert np.ptp(back.component) == 0
     relative = se3.inverse(back.poses[:1]) @ back.poses, se3.inverse(found.poses[:1]) @ found.poses
     assert np.linalg.norm((relative[0] - relative[1])[:, :3, 3], axis=1).max() < 0.3

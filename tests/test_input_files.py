@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from fuzz_targets import TARGETS
 from hodge_adapters.colmap_database import database_names
 from hodge_adapters.mcap_records import MAGIC
 from hodge_adapters.pcd_points import MAX_EXPANDED_BYTES, read_pcd
 from hodge_adapters.ply_points import read_ply
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types.input_files import beginning, open_input, read_input, read_input_text
+from reading_targets import TARGETS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 AT_ONCE_CPU_S = 10.0

@@ -10,7 +10,10 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
+from hodge_adapters.colmap_refining import ColmapModels
 from hodge_adapters.colmap_ties import Ties, similarity
+from hodge_pipeline import se3
+from hodge_pipeline.refine.model_solve import calibrated
 from test_refine_colmap import FREE
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
@@ -66,3 +69,47 @@ def test_a_join_is_as_exact_as_the_images_that_both_models_have(data_dir: Path) 
     second.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0.3, 0.5, -0.2])), np.array([1.0, 2.0, 3.0])))
     found = similarity(first, second, Ties(np.array([ids, ids]).T))
     assert found is not None and found[0].scale == pytest.approx(0.5, rel=1e-9)
+
+
+def carried_along(good: Path, start: Path) -> None:
+    """Move each point of the disturbed model by the mean of what moved its images: no point is right any more."""
+    old, new = pycolmap.Reconstruction(good), pycolmap.Reconstruction(start)
+    by_name = {image.name: image for image in old.images.values()}
+    moves = {
+        key: image.cam_from_world().inverse() * by_name[image.name].cam_from_world()
+        for key, image in new.images.items()
+    }
+    for point in new.points3D.values():
+        point.xyz = np.mean([moves[one.image_id] * point.xyz for one in point.track.elements], axis=0)
+    new.write(start)
+
+
+def test_poses_come_back_where_the_points_are_wrong_as_well(data_dir: Path, tmp_path: Path) -> None:
+    good, out = data_dir / "colmap/disturbed/mouse_good", tmp_path / "out"
+    (start,) = disturbed(good, tmp_path / "start", "big", 0)
+    carried_along(good, start)
+    (tmp_path / "peer").mkdir()
+    cpu_of([sys.executable, "-c", PEER, str(start), str(tmp_path / "peer")])
+    done = hodge_pipeline.refine_colmap(start, database="none", images="none", out=out, overrides=FREE)
+    assert compared(good, tmp_path / "peer", "big")[0] > 1.0 > 100 * compared(good, out / "sparse/0", "big")[0]
+    assert len(done.results[0].candidates) > 2
+
+
+def test_edges_of_shared_points_are_right(data_dir: Path, tmp_path: Path) -> None:
+    good = data_dir / "colmap/disturbed/mouse_good"
+    (start,) = disturbed(good, tmp_path / "start", "big", 0)
+    (right,), (model,) = (ColmapModels(database="none", images="none").open_models(one) for one in (good, start))
+    graph, _ = model.measured()
+    i, j = graph.edges.T
+    poses = right.world_from_body
+    turn = se3.so3_log((se3.inverse(graph.i_from_j) @ se3.inverse(poses[i]) @ poses[j])[:, :3, :3])
+    angle_deg = np.degrees(np.linalg.norm(turn, axis=1))
+    assert len(angle_deg) > 500 and angle_deg.max() < 10 and np.median(angle_deg) < 0.3
+
+
+def test_the_noise_of_edges_is_that_of_their_cycles_whatever_the_poses(data_dir: Path) -> None:
+    (model,) = ColmapModels(database="none", images="none").open_models(data_dir / "colmap/disturbed/mouse_good")
+    graph, _ = model.measured()
+    disturbed_poses = model.world_from_body @ se3.exp(np.random.default_rng(0).normal(scale=0.1, size=(56, 6)))
+    right, wrong = (calibrated(graph, poses).information for poses in (model.world_from_body, disturbed_poses))
+    np.testing.assert_array_equal(right, wrong)

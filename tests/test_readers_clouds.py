@@ -10,15 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters import ply_points, point_columns
+from hodge_adapters import point_columns
 from hodge_adapters.clouds import CloudFolderReader, PlyWriter
+from hodge_adapters.kitti_scans import read_bin
 from hodge_adapters.log_text import read_log_file
 from hodge_adapters.pcd_points import expand_lzf, read_pcd
 from hodge_adapters.ply_points import read_ply, write_ply
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.sources.measured_edges import GraphFile, MeasuredOptions, measured_edges
 from hodge_pipeline.testing import check_reader
-from hodge_pipeline.types import PointCloud
+from hodge_pipeline.types import PointCloud, Source
+from hodge_pipeline.types import ply as ply
 from readers_data import some_poses
 
 
@@ -107,13 +110,13 @@ def test_a_folder_with_poses_and_pairs(tmp_path: Path) -> None:
     blocks = [log_block(5 * k, 5 * k, pose) for k, pose in enumerate(poses[:2])]
     (folder / "all.log").write_text("".join([*blocks, log_block(0, 5, poses[2]), log_block(0, 99, poses[2])]))
     source = check_reader(CloudFolderReader(), folder)
-    assert [frame.frame_id for frame in source.frames] == [0, 5, 10]
+    assert [frame.frame_id for frame in source.frames] == ["cloud_bin_0.ply", "cloud_bin_5.ply", "cloud_bin_10.ply"]
     np.testing.assert_allclose(source.frames[1].world_from_cam, poses[1], atol=1e-12)
     assert source.frames[2].world_from_cam is None and len(source.trajectory) == 2
     assert source.graph.edges.tolist() == [[0, 1]]
     np.testing.assert_allclose(source.graph.i_from_j[0], poses[2], atol=1e-12)
     assert any("1 pairs of the log" in note for note in source.notes)
-    assert any("1 of 3 fragments have no pose: 10" in note for note in source.notes)
+    assert any("1 of 3 fragments have no pose: cloud_bin_10.ply" in note for note in source.notes)
     scaled = CloudFolderReader(units_per_metre=1000.0).open(folder).frames[0].read_points()
     np.testing.assert_allclose(scaled.points_in_cam * 1000, cloud(seed=0).points_in_cam, rtol=1e-5)
 
@@ -190,9 +193,79 @@ def test_files_are_read_in_parts_as_they_are_whole(tmp_path: Path, monkeypatch: 
         whole = read(path)
         monkeypatch.setattr(point_columns, "LINES_IN_PART", 7)
         monkeypatch.setattr(point_columns, "ROWS_IN_PART", 9)
-        monkeypatch.setattr(ply_points, "ROWS_IN_PART", 9)
+        monkeypatch.setattr(ply, "ROWS_IN_PART", 9)
         parts = read(path)
         monkeypatch.undo()
         assert np.array_equal(whole.points_in_cam, parts.points_in_cam) and len(parts) == 50
         assert np.array_equal(whole.colours, parts.colours)  # type: ignore[arg-type]
         np.testing.assert_array_equal(parts.colours, expected.colours)
+
+
+def lidar_scan(count: int = 48, seed: int = 0) -> np.ndarray:
+    """Points (count, 3) round a scanner, in the order in which it turns."""
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    radius = 10 + np.random.default_rng(seed).uniform(0, 0.1, count)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, -1.7)]).astype("<f4")
+
+
+def columns_of_kitti(kind: str) -> np.ndarray:
+    points, rng = lidar_scan(), np.random.default_rng(1)
+    match kind:
+        case "three":
+            return points
+        case "three, no coordinate below 0":
+            return points + np.float32(20)
+        case "share":
+            return np.column_stack([points, rng.uniform(0, 1, len(points)).astype("<f4")])
+        case "whole":
+            return np.column_stack([points, rng.integers(0, 256, len(points)).astype("<f4")])
+    return np.column_stack([points + np.float32(20), rng.uniform(0, 255, len(points)).astype("<f4")])
+
+
+@pytest.mark.parametrize("kind", ["three", "three, no coordinate below 0", "share", "whole", "up to 255"])
+def test_columns_of_kittis_scans_are_told_apart(tmp_path: Path, kind: str) -> None:
+    """48 points of three columns have the bytes of 36 of four, and 48 of four those of 64 of three."""
+    table = columns_of_kitti(kind)
+    (tmp_path / "000000.bin").write_bytes(table.tobytes())
+    found = read_bin(tmp_path / "000000.bin")
+    np.testing.assert_array_equal(found.points_in_cam, table[:, :3])
+
+
+def test_a_folder_of_kitti_with_calibration_and_poses(tmp_path: Path) -> None:
+    folder, poses, camera_from_scan = tmp_path / "07/velodyne", some_poses(3), some_poses(1, seed=5)[0]
+    folder.mkdir(parents=True)
+    for number in (0, 2, 7):
+        (folder / f"{number:06d}.bin").write_bytes(lidar_scan(seed=number).tobytes())
+    (folder / "velodyne.bin").write_bytes(b"no scan")
+
+    def twelve(pose: np.ndarray) -> str:
+        return " ".join(map(repr, pose[:3].ravel().tolist()))
+
+    (tmp_path / "07/poses.txt").write_text("".join(twelve(pose) + "\n" for pose in poses))
+    (tmp_path / "07/calib.txt").write_text(f"P0: {twelve(np.eye(4))}\nTr: {twelve(camera_from_scan)}\n")
+    source = check_reader(CloudFolderReader(), folder)
+    assert [frame.frame_id for frame in source.frames] == ["000000.bin", "000002.bin", "000007.bin"]
+    np.testing.assert_allclose(source.frames[1].world_from_cam, poses[2] @ camera_from_scan, atol=1e-12)
+    assert source.frames[2].world_from_cam is None and any("no pose: 000007.bin" in note for note in source.notes)
+    assert all(frame.true_world_from_cam is None for frame in source.frames), "given, and no more"
+    (tmp_path / "07/calib.txt").write_text("P0: 1 2 3\n")
+    with pytest.raises(SourceError, match="no line `Tr:`"):
+        CloudFolderReader().open(folder)
+    (folder / "000002.bin").write_bytes(b"\0" * 13)
+    with pytest.raises(SourceError, match="13 bytes are no float32 rows"):
+        read_bin(folder / "000002.bin")
+
+
+def test_scans_of_kitti_07(data_dir: Path) -> None:
+    source = CloudFolderReader().open(data_dir / "scans/kitti_07_5scans")
+    sizes = [len(frame.read_points()) for frame in source.frames if frame.read_points]
+    assert [frame.frame_id for frame in source.frames] == [f"{row:06d}.bin" for row in range(5)]
+    assert sizes == [21562, 24703, 24573, 16911, 19872]
+
+
+def test_a_graph_of_numbers_joins_scans_with_names(tmp_path: Path) -> None:
+    frames = CloudFolderReader().open(fragments(tmp_path / "f")).frames
+    (tmp_path / "edges.log").write_text(log_block(0, 5, some_poses(1)[0]))
+    options = MeasuredOptions(files=(GraphFile(tmp_path / "edges.log"),))
+    found, _ = measured_edges(Source("f", tmp_path, frames), options)
+    assert found.edges.tolist() == [[0, 1]]

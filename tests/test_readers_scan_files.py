@@ -30,7 +30,9 @@ def test_las_files_count_from_one_corner(tmp_path: Path) -> None:
 def test_each_scan_of_an_e57_is_a_posed_frame(tmp_path: Path) -> None:
     poses = some_poses(3)
     source = check_reader(CloudFolderReader(), write_e57(tmp_path / "hall.e57", poses))
-    assert [frame.frame_id for frame in source.frames] == [0, 1, 2] and len(source.trajectory) == 3
+    assert [frame.frame_id for frame in source.frames] == [f"hall.e57/{row}" for row in range(3)] and len(
+        source.trajectory
+    ) == 3
     for frame, pose in zip(source.frames, poses, strict=True):
         np.testing.assert_allclose(frame.world_from_cam, pose, atol=1e-9)
         cloud = frame.read_points()

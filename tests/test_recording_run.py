@@ -17,13 +17,13 @@ from rerun.chunk import RrdReader
 import hodge_pipeline
 from hodge_pipeline import se3
 from hodge_pipeline.errors import HodgeError, SourceError, WorkspaceError
-from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recording import binary, layout, shapes
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.start.odometry import chain
 from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.store import stored
+from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.uses.record_again import record_again
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_pipeline import SMALL, Log, small_recipe
@@ -240,7 +240,7 @@ def test_verdicts_model_and_errors_read_back(run: Run) -> None:
         (lines,) = rows(path, layout.verdict(str(name)), "LineStrips3D:strips")
         assert len(lines) == np.count_nonzero(edges.verdict == name)
     (points,) = rows(path, layout.MODEL, "Points3D:positions")
-    np.testing.assert_array_equal(np.float32(points), read_ply(run.folder / "cloud.ply").points_in_world)
+    np.testing.assert_array_equal(np.float32(points), read_model(run.folder / "cloud.ply").points_in_world)
     grown = sum(
         len(row)
         for step in range(24)

@@ -178,7 +178,7 @@ def test_a_database_of_other_images_is_said_to_be_one(tmp_path: Path) -> None:
     (result,) = hodge_pipeline.refine_colmap(model, out=tmp_path / "out", overrides=FREE).results
     assert any("none of the model's" in note for note in result.notes)
     (opened,) = ColmapModels().open_models(model)
-    assert set(opened.measured()[0].source) == {"covisibility"}
+    assert set(opened.measured()[0].source) == {"structure"}
 
 
 def test_images_without_a_pose_stay_without(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """`hodge refine trajectory` on a small rendered sequence: formats, guard, sparse poses, bad input."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,14 @@ from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app, main
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.evaluation.trajectory import absolute_error, relative_error
+from hodge_pipeline.start.clouds import clouds as clouds_step
+from hodge_pipeline.start.given import gaps_between
 from hodge_pipeline.start.match_poses import poses_at
+from hodge_pipeline.store.store import stored
+from hodge_pipeline.store.workspace import RUN
 from hodge_pipeline.types import Floats, Trajectory
+from mcap_scene import BEGIN_S, write_clouds
+from readers_data import points_in_cam
 
 SMALL = (
     "clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1", "start.every=2",
@@ -56,7 +63,7 @@ def refine(poses: Path, frames: Path, out: Path, *more: str) -> Result:
         *sets,
         *more,
         "--recipe",
-        "slam-refine",
+        "slam_refine",
     ]
     return CliRunner().invoke(app, arguments)
 
@@ -148,7 +155,7 @@ def test_a_worse_result_is_not_written_but_with_force(
              "--set", "registration.points_per_sample=0.01")  # fmt: skip
     arguments = [str(tmp_path / "slam.tum"), "--frames", str(sequence), "--out", str(tmp_path / "run"), *blind]
     sets = [argument for override in SMALL for argument in ("--set", override)]
-    monkeypatch.setattr("sys.argv", ["hodge", "refine", "trajectory", *arguments, *sets, "--recipe", "slam-refine"])
+    monkeypatch.setattr("sys.argv", ["hodge", "refine", "trajectory", *arguments, *sets, "--recipe", "slam_refine"])
     with pytest.raises(SystemExit) as stopped:
         main()
     assert stopped.value.code == 3 and outcome(tmp_path / "run") == "worse"
@@ -174,6 +181,48 @@ def test_sparse_poses_are_carried_over_all_frames(
     poses = parse_tum(tmp_path / "run" / "poses.tum").trajectory
     np.testing.assert_array_equal(poses.stamps_s, truth.stamps_s)
     assert error_m(poses.world_from_cam, truth) < 0.03
+
+
+def test_one_frame_without_a_pose_costs_no_whole_odometry(sequence: Path, truth: Trajectory, tmp_path: Path) -> None:
+    kept = np.arange(len(truth)) != 8
+    write_tum(tmp_path / "slam.txt", Trajectory(truth.stamps_s[kept], truth.world_from_cam[kept]))
+    found = refine(tmp_path / "slam.txt", sequence, tmp_path / "run", "--set", "start.max_gap_s=0.01")
+    assert found.exit_code == 0, found.output
+    sizes = [len(clouds) for clouds in stored(tmp_path / "run" / RUN, clouds_step)]
+    assert min(sizes) == 4 and max(sizes) < len(truth), "the frame, the two before and the one after; key frames"
+    poses = parse_tum(tmp_path / "run" / "poses.tum").trajectory
+    assert len(poses) == len(truth) and error_m(poses.world_from_cam, truth) < 0.03
+
+
+def test_gaps_hold_the_frames_without_a_pose_and_those_around_them() -> None:
+    known = np.array([True, True, True, False, True, True, True, True, False, True, True, False])
+    (first, second), gaps = (np.arange(6), np.arange(6, 12)), gaps_between
+    assert [gap.tolist() for gap in gaps(known, [first, second])] == [[1, 2, 3, 4], [6, 7, 8, 9, 10, 11]]
+    assert [gap.tolist() for gap in gaps(known[:6], [first])] == [[1, 2, 3, 4]]
+    assert [gap.tolist() for gap in gaps(~known[:3], [np.arange(3)])] == [[0, 1, 2]], "a sequence without a pose"
+
+
+def test_scans_of_a_street_scale_the_recipe_themselves(
+    sequence: Path, truth: Trajectory, drifted: Trajectory, tmp_path: Path
+) -> None:
+    """The room, twenty times as large, as point clouds in an MCAP recording: 1.2 m of drift."""
+    size, frames = 20.0, TumReader().open(sequence).frames
+    clouds = [size * points_in_cam(frame.read_depth(), frame.camera, 1) for frame in frames if frame.read_depth]
+    large = [larger(trajectory, size) for trajectory in (truth, drifted)]
+    posed = [replace(frame, world_from_cam=pose) for frame, pose in zip(frames, large[0].world_from_cam, strict=True)]
+    log = write_clouds(tmp_path / "log.mcap", posed, clouds)
+    for name, trajectory in zip(("true.txt", "slam.txt"), large, strict=True):
+        write_tum(tmp_path / name, Trajectory(trajectory.stamps_s + BEGIN_S, trajectory.world_from_cam))
+    found = refine(tmp_path / "slam.txt", log, tmp_path / "run", "--truth", str(tmp_path / "true.txt"))
+    assert found.exit_code == 0, found.output
+    rows = {row["name"]: row for row in json.loads((tmp_path / "run/report.json").read_text())["trajectories"]}
+    assert rows["start"]["ate_rmse_m"] > 0.3 and rows["result"]["ate_rmse_m"] < 0.3 * rows["start"]["ate_rmse_m"]
+
+
+def larger(trajectory: Trajectory, factor: float) -> Trajectory:
+    poses = trajectory.world_from_cam.copy()
+    poses[:, :3, 3] *= factor
+    return Trajectory(trajectory.stamps_s, poses)
 
 
 def test_all_edges_rejected_leaves_the_report_alone(

@@ -237,6 +237,6 @@ def test_a_graph_is_sent_to_solve(tmp_path: Path) -> None:
     )
     depth = np.full((24, 32), 2.0, np.float32)
     made = hodge_pipeline.frames_from_images([depth, depth], np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]))
-    recipe = load_recipe("slam-refine", [f"start.path={tmp_path / 'graph.g2o'}"])
+    recipe = load_recipe("slam_refine", [f"start.path={tmp_path / 'graph.g2o'}"])
     with pytest.raises(SourceError, match="give it to hodge solve"):
         hodge_pipeline.run(recipe, tmp_path / "run", source=Source("memory", Path("memory"), made))

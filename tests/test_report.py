@@ -16,10 +16,11 @@ from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
 from hodge_pipeline.evaluation.difference import MEASURABLE, length, percent, sign_of
 from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.evaluation.scores import GraphScores, ScoreTable
+from hodge_pipeline.report.brief import all_notes, brief
 from hodge_pipeline.report.contents import RefinementSummary, WrongEdges
 from hodge_pipeline.report.run_page import document
 from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows, weigh_wrong, worst_edges
-from hodge_pipeline.report.tables import score_tables, summary_lines
+from hodge_pipeline.report.tables import score_tables
 from hodge_pipeline.report.verdict import judge, suspicions
 from hodge_pipeline.report.write import (
     EdgeRow,
@@ -264,9 +265,9 @@ def test_what_can_be_measured_goes_by_the_extent_of_the_scene() -> None:
     [
         ([0] * 12 + [1] * 8, False, "In 2 pieces (12, 8 of 20 frames): improved against odometry"),
         ([0] * 12 + [1] * 3 + [2] * 3 + [3] * 2, False, "In 4 pieces (12, 3, 3, … of 20 frames): improved against"),
-        ([0] * 19 + [1], False, "19 of 20 frames in one piece: improved against odometry"),
+        ([0] * 19 + [1], False, "19 of 20 frames joined: improved against odometry"),
         ([0] * 20, False, "Improved against odometry"),
-        ([0] * 20, True, "20 of 20 scans in one piece"),
+        ([0] * 20, True, "20 of 20 scans joined"),
         (list(range(20)), True, "No two of 20 scans joined: improved against odometry"),
     ],
 )
@@ -285,7 +286,7 @@ def test_pieces_come_first_in_the_headline(
     page, numbers = write_report(tmp_path, shown)
     assert headline in read_page(page)[0]
     assert json.loads(numbers.read_text("utf-8"))["verdict"]["sentence"].startswith(headline)
-    assert dict(reversed(summary_lines(shown)))["verdict"].startswith(headline), "the terminal says the same"
+    assert headline in " ".join(line.strip() for line in brief(shown, "runs/a")), "the terminal says the same"
 
 
 def test_a_refinement_whose_error_against_the_truth_rose_is_mixed() -> None:
@@ -454,9 +455,20 @@ def test_tables_and_terminal_lines(report: Report) -> None:
     scores, trajectory = score_tables(report)
     assert scores.rows[1][:4] == ("odometry", "0.7486", "20.00 mm", "3")
     assert all(len(row) == len(table.header) for table in (scores, trajectory) for row in table.rows)
-    labels = [label for label, _ in summary_lines(report)]
-    assert labels[:4] == ["verdict", "source", "graph", "time"]
-    assert dict(summary_lines(report))["time"] == "3.0 s, 4.0 CPU s, at most 300 MB"
+    assert all_notes(report)[0] == "note     2 pairs were tried twice"
+
+
+def test_the_terminal_gets_ten_lines_of_80_columns(report: Report) -> None:
+    notes = (Note("parts", 3), Note("carried", 7), Note("scale", detail="word " * 60))
+    for shown in (report, replace(report, notes=notes)):
+        lines = brief(shown, "runs/a")
+        assert len(lines) <= 10 and max(map(len, lines)) <= 80
+        assert lines[0] == "verdict  Improved against odometry" and lines[1].startswith("  - distance of clouds")
+        assert "time     3.0 s, 4.0 CPU s, at most 300 MB" in lines
+        assert lines[-2:] == ["report   runs/a/report.html", "next     hodge view runs/a --web"]
+    assert "  - … and 4 more measures: --verbose" in lines
+    assert any(line.startswith("look     The viewing graph falls into 3 parts") for line in lines), "doubt comes first"
+    assert any(line.endswith(" …") for line in lines), "a long note is cut"
 
 
 def test_numbers_in_words() -> None:

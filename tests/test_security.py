@@ -89,7 +89,7 @@ def test_a_recipe_reaches_no_cluster(tmp_path: Path, stranger: Stranger) -> None
 
 def test_nor_does_one_that_refines_a_model(tmp_path: Path, stranger: Stranger) -> None:
     path = tmp_path / "theirs.yaml"
-    path.write_text(f'extends: colmap-refine\nexecutor: {{stage: dask, address: "{stranger.address}"}}\n')
+    path.write_text(f'extends: colmap_refine\nexecutor: {{stage: dask, address: "{stranger.address}"}}\n')
     with pytest.raises(RecipeError, match=r"theirs.yaml:2: executor.address: .*--dask ADDRESS"):
         load_model_refinement(str(path))
     assert not stranger.calls

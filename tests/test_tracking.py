@@ -27,7 +27,7 @@ from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source
-from hodge_pipeline.sources.opening import remembered
+from hodge_pipeline.sources.opening import fingerprints, remembered
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start import key_frames as tracked
 from hodge_pipeline.start import odometry as odometry_start
@@ -159,7 +159,8 @@ def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(sequence: Path,
 def test_a_source_that_is_short_enough_is_registered_whole(sequence: Path, tmp_path: Path) -> None:
     recipe = small_recipe(sequence, "start.whole_up_to=64")
     steps, reader = Store(tmp_path), TumReader()
-    source = remembered(reader.open(sequence), reader, steps)
+    opened = reader.open(sequence)
+    source = remembered(opened, reader, steps, fingerprints(opened.files))
     scene = recipe.start.begin(source, recipe.clouds, steps, InProcess())
     assert scene.key_frames.are_all and len(scene.first.world_from_cam) == len(scene.clouds) == FRAMES
     assert scene.source.frames == scene.whole.frames

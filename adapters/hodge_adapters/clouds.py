@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.colmap_files import natural
+from hodge_adapters.kitti_scans import is_scan, read_bin, scan_poses
 from hodge_adapters.log_text import read_log_file
 from hodge_adapters.pcd_points import read_pcd
 from hodge_adapters.ply_points import read_ply, write_ply
@@ -50,13 +51,15 @@ class CloudFolderReader:
             names = [path.name] if path.is_file() else os.listdir(path)
         except OSError:
             return Sniff(0.0, "not a folder that can be read")
-        count = sum(Path(name).suffix.lower() in READERS for name in names)
+        count = sum(_is_scan(name) for name in names)
         if not count:
             return Sniff(0.0, f"no {', '.join(READERS)}")
         return Sniff(0.8 if count * 2 > len(names) else 0.4, f"{count} point clouds among {len(names)} files")
 
     def open(self, path: Path) -> Source:
-        """Fragments in natural order of their names; id and stamp are the last number in the name, else the row."""
+        """Fragments in natural order of their names. Ids are the names of the files, `a.e57/3` one scan of several;
+        stamps are the last numbers in the names, else the rows.
+        """
         path = Path(path)
         notes: list[str] = []
         files = [path] if path.is_file() else self._files(path, notes)
@@ -68,22 +71,25 @@ class CloudFolderReader:
         fragments, numbers = [fragments[row] for row in order], [numbers[row] for row in order]
         log = self._log(path if path.is_dir() else path.parent) if path.is_dir() or self.log != "auto" else None
         parsed = read_log_file(log) if log else None
-        poses = parsed.poses if parsed else {}
-        without = [number for number in numbers if number not in poses]
+        poses, beside = parsed.poses if parsed else {}, tuple(filter(None, [log]))
+        if not poses and is_scan(fragments[0].path.name):
+            poses, beside = scan_poses(fragments[0].path.parent, numbers, notes)
+        names = {number: fragment.name for number, fragment in zip(numbers, fragments, strict=True)}
+        without = [name for number, name in names.items() if number not in poses]
         if poses and without:
             notes.append(f"{len(without)} of {len(numbers)} fragments have no pose: {listed(without)}")
         frames = tuple(
             Frame(
-                frame_id=number,
+                frame_id=fragment.name,
                 stamp_s=float(number),
                 read_points=partial(read_fragment, fragment, units_per_metre=self.units_per_metre),
                 world_from_cam=poses.get(number, fragment.in_metres(self.units_per_metre)),
             )
             for number, fragment in zip(numbers, fragments, strict=True)
         )
-        graph = _graph(numbers, parsed.pairs, parsed.i_from_j, notes) if parsed and len(parsed.pairs) else None
+        graph = _graph(names, parsed.pairs, parsed.i_from_j, notes) if parsed and len(parsed.pairs) else None
         every = frames[:: self.every]
-        read = (*files, *filter(None, [log]))
+        read = (*files, *beside)
         return Source(path.resolve().name, path, every, posed_frames(frames), graph, tuple(notes), read)
 
     def _files(self, path: Path, notes: list[str]) -> list[Path]:
@@ -91,7 +97,7 @@ class CloudFolderReader:
             listing = [file for file in path.glob(self.pattern) if not file.name.startswith(".")]
         except (OSError, ValueError, NotImplementedError) as error:
             raise SourceError(f"{path}: cannot be listed with pattern {self.pattern!r}: {error}") from error
-        found = [file for file in listing if file.suffix.lower() in READERS and file.is_file()]
+        found = [file for file in listing if _is_scan(file.name) and file.is_file()]
         if not found:
             raise SourceError(
                 f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it: give a folder of fragments"
@@ -146,6 +152,11 @@ class Fragment:
     corner: tuple[float, float, float] | None = None
     world_from_scan: tuple[float, ...] | None = None
 
+    @property
+    def name(self) -> str:
+        """What a person calls it."""
+        return self.path.name if self.row is None else f"{self.path.name}/{self.row}"
+
     def in_metres(self, units_per_metre: float) -> Floats | None:
         """`world_from_scan` (4, 4) in metres, None where the file gives none."""
         if self.world_from_scan is None:
@@ -192,7 +203,12 @@ READERS: Mapping[str, Callable[[Path], PointCloud]] = {
     ".las": read_las,
     ".laz": read_las,
     ".e57": read_e57,
+    ".bin": read_bin,
 }
+
+
+def _is_scan(name: str) -> bool:
+    return Path(name).suffix.lower() in READERS and (Path(name).suffix != ".bin" or is_scan(name))
 
 
 def _require(path: Path) -> None:
@@ -215,10 +231,10 @@ def _numbers(stems: list[str], notes: list[str]) -> list[int]:
     return list(range(len(stems)))
 
 
-def _graph(numbers: list[int], pairs: Any, i_from_j: Any, notes: list[str]) -> ViewGraph:
-    row_of = {number: row for row, number in enumerate(numbers)}
+def _graph(names: Mapping[int, str], pairs: Any, i_from_j: Any, notes: list[str]) -> ViewGraph:
+    row_of = {number: row for row, number in enumerate(names)}
     known = np.array([int(i) in row_of and int(j) in row_of for i, j in pairs], bool)
     if not known.all():
         notes.append(f"{int((~known).sum())} pairs of the log name fragments that are not there: left out")
     edges = np.array([(row_of[int(i)], row_of[int(j)]) for i, j in pairs[known]], np.int64).reshape(-1, 2)
-    return ViewGraph.from_edges(np.array(numbers), edges, i_from_j[known], source="log")
+    return ViewGraph.from_edges(np.array(list(names.values())), edges, i_from_j[known], source="log")

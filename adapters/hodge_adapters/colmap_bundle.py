@@ -2,38 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hodge_adapters.colmap_bodies import Bodies
-from hodge_adapters.colmap_reprojection import update_errors
 from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PositionPriors
 
 
 def adjust(
-    reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors | None, *, move_bodies: bool = True
-) -> None:
+    reconstruction: pycolmap.Reconstruction,
+    behind: Sequence[tuple[int, int]],
+    bodies: Bodies,
+    priors: PositionPriors | None,
+    *,
+    move_bodies: bool = True,
+) -> set[int]:
     """Adjust it in place with COLMAP's own options, cameras held; the points alone where bodies are not to move.
 
-    Without priors the gauge is that of two images; with them the model keeps to theirs. Raises `SourceError` where the
-    adjustment fails.
+    As in COLMAP, observations (image, keypoint) of points `behind` their camera take no part; gives the points whose
+    place is therefore not adjusted to their whole track. Without priors the gauge is that of two images; with them the
+    model keeps to theirs. Raises `SourceError` where the adjustment fails.
     """
-    alone = [key for key, point in reconstruction.points3D.items() if point.track.length() < 2]
-    part = reconstruction
-    if alone:  # they tell nothing; real models have such, and COLMAP refuses to adjust a model with them
-        part = pycolmap.Reconstruction(reconstruction)
-        for key in alone:
-            part.delete_point3D(key)
+    part = pycolmap.Reconstruction(reconstruction)
+    loose = {key for key, point in reconstruction.points3D.items() if point.track.length() < 2}
+    for key in loose:  # they tell nothing; real models have such, and COLMAP refuses to adjust a model with them
+        part.delete_point3D(key)
+    for image_id, column in behind:
+        seen = part.images[image_id].points2D[column]
+        if seen.has_point3D():
+            loose.add(seen.point3D_id)
+            part.delete_observation(image_id, column)
     if not part.num_points3D():
         raise SourceError("no point was seen by two images: nothing ties the poses: triangulate points first")
     _solve(_adjuster(part, bodies, priors, move_bodies))
-    if alone:
-        for frame_id in bodies.frame_ids:
-            reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
-        for key, point in part.points3D.items():
-            reconstruction.points3D[key].xyz = point.xyz
-    update_errors(reconstruction)
+    for frame_id in bodies.frame_ids:
+        reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
+    for key, point in part.points3D.items():
+        reconstruction.points3D[key].xyz = point.xyz
+    return loose
 
 
 def _adjuster(

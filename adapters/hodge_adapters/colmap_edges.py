@@ -11,9 +11,17 @@ from scipy.sparse import coo_array
 
 from hodge_adapters.colmap_cameras import colmap_camera
 from hodge_adapters.colmap_records import NO_POINT, Model
-from hodge_adapters.colmap_relative import Relative, Sighting, estimate
+from hodge_adapters.colmap_relative import Relative, Sighting, by_structure, estimate
 from hodge_adapters.pycolmap_import import pycolmap
+from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints, ViewGraph
+
+COVISIBILITY, STRUCTURE = "covisibility", "structure"
+"""Edges of two views alone, and of the points that they share."""
+CLEAR_SHARE = 0.8
+"""Of the shared points: where so many place both images there is nothing else to ask."""
+SAME_TURN = 0.035
+"""Radians: two degrees, what two views of a few dozen points leave open."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +40,12 @@ def measured_graph(model: Model, pairs: Iterator[Pair], min_inliers: int, seed: 
     kept: list[Pair] = []
     found: list[Relative] = []
     for pair in pairs:
-        result = estimate(pair.sighting, min_inliers, seed)
-        if isinstance(result, str):
-            refused[result] += 1
-        else:
-            kept.append(pair)
-            found.append(result)
+        for hypothesis, source in _hypotheses(pair, min_inliers, seed):
+            if isinstance(hypothesis, str):
+                refused[hypothesis] += 1
+            else:
+                kept.append(replace(pair, source=source))
+                found.append(hypothesis)
     notes += [f"{count} pairs of images left out: {why}" for why, count in sorted(refused.items())]
     graph = ViewGraph.from_edges(
         np.array([image.name for image in model.images]),
@@ -49,6 +57,27 @@ def measured_graph(model: Model, pairs: Iterator[Pair], min_inliers: int, seed: 
     shared = np.array([len(pair.sighting.pixels_i) for pair in kept], float)
     names = np.array([pair.source for pair in kept], np.str_)
     return replace(graph, source=names, correspondences=inliers, fitness=inliers / np.maximum(shared, 1))
+
+
+def _hypotheses(pair: Pair, min_inliers: int, seed: int) -> Iterator[tuple[Relative | str, str]]:
+    """What the two images may be to each other: as the points that they share place them, and as two views do.
+
+    The points decide where most agree; where two views say otherwise and few points agree both are given, and the
+    solver keeps the one that closes with other edges.
+    """
+    structure = by_structure(pair.sighting, min_inliers, seed) if pair.source == COVISIBILITY else None
+    if structure is not None and structure[1] >= CLEAR_SHARE:
+        yield structure[0], STRUCTURE
+        return
+    views = estimate(pair.sighting, min_inliers, seed)
+    if structure is None:
+        yield views, pair.source
+        return
+    yield structure[0], STRUCTURE
+    if not isinstance(views, str):
+        turn = se3.so3_log(se3.inverse(structure[0].i_from_j)[:3, :3] @ views.i_from_j[:3, :3])
+        if np.linalg.norm(turn) > SAME_TURN:
+            yield views, pair.source
 
 
 def covisible_pairs(model: Model, min_shared: int, max_per_image: int) -> Iterator[Pair]:
@@ -68,7 +97,7 @@ def covisible_pairs(model: Model, min_shared: int, max_per_image: int) -> Iterat
             second.pixels[at_j[rows_j[real]]],
             positions(model, common[real]),
         )
-        yield Pair(i, j, sighting, "covisibility")
+        yield Pair(i, j, sighting, COVISIBILITY)
 
 
 def camera_table(model: Model) -> Mapping[int, pycolmap.Camera]:

@@ -21,6 +21,8 @@ SCALE_PAIRS = 512
 START_MATCHES = 500
 """Of many matches, so many evenly serve to begin with; all of them refine it."""
 MAX_SCALE_SPREAD = 0.5
+LEAST_AGREEING, MOST_TRIALS = 0.5, 300
+"""Share of the shared points that place both images, and three times the trials that find three of those (1 - 1e-5)."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,60 @@ def estimate(sighting: Sighting, min_inliers: int, seed: int) -> Relative | str:
     scaled = i_from_j.copy()
     scaled[:3, 3] *= scale
     return Relative(scaled, (information + information.T) / 2, int(inlier.sum()))
+
+
+def by_structure(sighting: Sighting, min_inliers: int, seed: int) -> tuple[Relative, float] | None:
+    """The relative pose of the two images placed each by the shared points as the model has them, and the share of the
+    points that agree with both; None where too few do.
+
+    No ambiguity of two views is left, nor of their distance; it is as right as the points are to each other.
+    """
+    count = len(sighting.pixels_i)
+    rows = np.unique(np.linspace(0, count - 1, min(count, START_MATCHES)).round().astype(np.int64))
+    if not np.isfinite(sighting.xyz).all():
+        return None
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.random_seed, options.ransac.max_error = seed, MAX_ERROR_PX
+    options.ransac.min_inlier_ratio, options.ransac.max_num_trials = LEAST_AGREEING, MOST_TRIALS
+    motions, agreeing = [], np.ones(len(rows), bool)
+    for camera, pixels in ((sighting.camera_i, sighting.pixels_i), (sighting.camera_j, sighting.pixels_j)):
+        found = pycolmap.estimate_and_refine_absolute_pose(pixels[rows], sighting.xyz[rows], camera, options)
+        if found is None:
+            return None
+        motions.append(np.vstack([found["cam_from_world"].matrix(), [0.0, 0.0, 0.0, 1.0]]))
+        agreeing &= np.asarray(found["inlier_mask"], bool)
+        if agreeing.mean() < LEAST_AGREEING:
+            return None
+    share = float(agreeing.mean())
+    if share * count < min_inliers or not np.isfinite(motions).all():
+        return None
+    i_from_world, j_from_world = motions
+    used = rows[agreeing]
+    variance, normal = 0.0, np.zeros((6, 6))
+    pixel = 0.5 / sighting.camera_i.mean_focal_length() + 0.5 / sighting.camera_j.mean_focal_length()
+    for camera, pixels, motion in (
+        (sighting.camera_i, sighting.pixels_i, i_from_world),
+        (sighting.camera_j, sighting.pixels_j, j_from_world),
+    ):
+        seen = se3.transform(motion, sighting.xyz[used])
+        plane = seen[:, :2] / seen[:, 2:]
+        variance += 0.5 * float(np.nanmean((plane - np.asarray(camera.cam_from_img(pixels[used]))) ** 2))
+        normal = _pose_normal(seen)
+    sigma = max(float(np.sqrt(variance)), LEAST_ERROR_PX * pixel)
+    # both poses are as uncertain, and together twice
+    information = 0.5 * normal / sigma**2 * min(1.0, INDEPENDENT_POINTS / len(used))
+    return Relative(i_from_world @ se3.inverse(j_from_world), information, round(share * count)), share
+
+
+def _pose_normal(seen: Floats) -> Floats:
+    """JᵀJ (6, 6) of the image of points (N, 3) before a camera, over its motion (φ, ρ)."""
+    depth = np.maximum(seen[:, 2], 1e-12)
+    slopes = np.zeros((len(seen), 2, 3))
+    slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0 / depth
+    slopes[:, :, 2] = -seen[:, :2] / depth[:, None] ** 2
+    motion = np.concatenate([se3.hat(seen), np.broadcast_to(-np.eye(3), (len(seen), 3, 3))], axis=2)
+    jacobian = (slopes @ motion).reshape(-1, 6)
+    return np.asarray(jacobian.T @ jacobian)
 
 
 def _start(sighting: Sighting, seed: int) -> Floats | None:

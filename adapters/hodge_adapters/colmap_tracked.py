@@ -196,8 +196,20 @@ class ColmapModel:
     def adjusted(self, priors: PositionPriors | None = None) -> ColmapModel:
         """Bundle adjustment with cameras and rigs held; see `colmap_bundle`."""
         copy = self._copy()
-        adjust(copy, self.bodies, priors)
+        loose = adjust(copy, self._behind(), self.bodies, priors)
+        if loose:
+            after = refreshed(self.records, copy)
+            poses = np.array([image.world_from_cam for image in after.images])
+            for point_id, xyz in zip(after.points.ids.tolist(), points_of_rays(after, poses), strict=True):
+                if point_id in loose:
+                    copy.points3D[point_id].xyz = xyz
+        update_errors(copy)
         return replace(self, reconstruction=copy, files=(), tracks=self.records)
+
+    def _behind(self) -> list[tuple[int, int]]:
+        """Image and keypoint of each observation whose point lies behind the camera."""
+        keypoints = self.quality.keypoints[np.isinf(self.quality.errors_px)]
+        return [(self.records.images[row].image_id, int(column)) for row, column in keypoints]
 
     def standard_errors(self) -> Floats:
         """Of each body's rotation and position (B, 2), radians and units; see `colmap_uncertainty`."""
@@ -217,7 +229,7 @@ class ColmapModel:
                 held.append(at)
                 image = records.images[records.image_rows[at]]
                 copy.delete_observation(image.image_id, int(records.points.columns[at]))
-        adjust(copy, self.bodies, None, move_bodies=move_bodies)
+        adjust(copy, [], self.bodies, None, move_bodies=move_bodies)
         return reprojection_errors(refreshed(records, copy))[1][held]
 
     def write(self, folder: Path) -> None:

@@ -22,6 +22,7 @@ from hodge_adapters.pycolmap_import import pycolmap
 from hodge_adapters.text_rows import listed, write_bytes_atomically
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.types import Frame, Source
+from hodge_pipeline.types.input_files import read_input
 
 SAME = 1e-6
 """Of the positions' spread, and of a rotation's entries: poses that differ by less are the same."""
@@ -104,7 +105,7 @@ def _whole_model(source: Source, frames: list[Frame]) -> pycolmap.Reconstruction
 def _files_of(model: pycolmap.Reconstruction, form: str) -> dict[str, bytes]:
     with tempfile.TemporaryDirectory(prefix="hodge-colmap-") as scratch:
         (model.write_binary if form == "bin" else model.write_text)(scratch)
-        return {file.name: file.read_bytes() for file in sorted(Path(scratch).iterdir())}
+        return {file.name: read_input(file) for file in sorted(Path(scratch).iterdir())}
 
 
 def _lens(frame: Frame) -> Lens:

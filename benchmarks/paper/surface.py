@@ -81,7 +81,7 @@ def main() -> None:
     sets = {"truth": problem.truth}
     for name, (solutions, _) in found.items():
         sets |= {f"{name} {seed}": solution.world_from_cam for seed, solution in enumerate(solutions[:SCORED_SEEDS])}
-    with load_recipe("paper-distance").executor.open() as workers:
+    with load_recipe("paper_distance").executor.open() as workers:
         table = score_table(problem.clouds, sets, "truth", workers)
     scores = {graph.kind: dict(zip(table.names, graph.mean_score, strict=True)) for graph in table.graphs}
     truth = ", ".join(f"{kind} {score['truth']:.4f}" for kind, score in scores.items())

@@ -25,14 +25,20 @@ from rich.text import Text
 
 from hodge_pipeline.cli.guard import unguarded
 from hodge_pipeline.stages import Advance, no_progress
-from hodge_pipeline.types.notes import Note
+from hodge_pipeline.types.notes import Note, Rank
 from hodge_pipeline.types.text import visible
+
+WAITED_FOR_S = 1.0
+"""A stage that is over sooner is not worth a line."""
 
 
 class Terminal:
-    """A watcher that draws one bar for each stage on stderr; where that is not a terminal, one plain line for each."""
+    """A watcher that draws one bar for each stage on stderr; where that is not a terminal, a plain line for each stage
+    that took long enough to be waited for. `verbose`: for every stage, and every note.
+    """
 
-    def __init__(self, quiet: bool) -> None:
+    def __init__(self, quiet: bool, verbose: bool = False) -> None:
+        self._verbose = verbose
         self._console = Console(file=unguarded(sys.stderr), quiet=quiet, highlight=False, soft_wrap=True)
         self._tasks: dict[str, TaskID] = {}
         self._totals: dict[str, int] = {}
@@ -65,6 +71,8 @@ class Terminal:
         start = time.perf_counter()
         yield no_progress
         seconds = time.perf_counter() - start
+        if seconds < WAITED_FOR_S and not self._verbose:
+            return
         amount = f"{total} in {seconds:.1f} s, {total / seconds:.3g} a second" if total > 1 else f"{seconds:.1f} s"
         self.say(f"{title}: done, {amount}")
 
@@ -81,8 +89,9 @@ class Terminal:
         self._progress.update(task, completed=before + total)
 
     def note(self, note: Note) -> None:
-        """Its sentence."""
-        self.say(str(note))
+        """Its sentence, at once where it asks for a look."""
+        if self._verbose or note.rank < Rank.FACT:
+            self.say(str(note))
 
     def say(self, message: str) -> None:
         """One line above the bars."""

@@ -28,14 +28,15 @@ from hodge_pipeline.types.edges import DISABLED, REJECTED
 
 @dataclass(frozen=True)
 class Pairs:
-    """The pairs to disable, enable and register, as they were typed."""
+    """The pairs to disable, enable, register and hold for right, as they were typed."""
 
     disable: Sequence[str]
     enable: Sequence[str]
     register: Sequence[str]
+    right: Sequence[str] = ()
 
     def __bool__(self) -> bool:
-        return bool(self.disable or self.enable or self.register)
+        return bool(self.disable or self.enable or self.register or self.right)
 
 
 def edit(folder: Path, pairs: Pairs, *, undo: bool, listing: bool, quiet: bool, as_json: bool) -> None:
@@ -59,9 +60,10 @@ def _checked(folder: Path, listed: Listed, pairs: Pairs) -> Edit:
     """The edit with its pairs as they are written in `edges.csv`, each once."""
     off = listed.named(_verdicts_spelt_out(listed, _words(pairs.disable)))
     on = listed.named(_words(pairs.enable))
-    if both := set(off) & set(on):
+    right = listed.named(_words(pairs.right))
+    if both := set(off) & {*on, *right}:
         raise GraphError(f"{', '.join(sorted(both))}: is to be disabled and enabled at once: say one of them")
-    return Edit(off, on, _to_register(folder, _words(pairs.register)) if pairs.register else ())
+    return Edit(off, on, _to_register(folder, _words(pairs.register)) if pairs.register else (), right=right)
 
 
 def _to_register(folder: Path, words: Sequence[str]) -> tuple[str, ...]:

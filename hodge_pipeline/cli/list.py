@@ -23,9 +23,23 @@ def inspect(path: Path, *, reader: str | None, settings: Sequence[str], as_json:
 
         print(json_text(facts), end="")
         return
-    for name, value in facts.items():
+    for name, value in (*facts.items(), ("next", next_command(path, facts, reader))):
         for row, text in enumerate(_rows(value)):
             print(f"{name if row == 0 else '':<30}{text}")
+
+
+def next_command(path: Path, facts: dict[str, Any], reader: str | None) -> str:
+    """What to type next with such a path."""
+    if not facts["frames"]:
+        if facts.get("graph", {}).get("edges"):
+            return f"hodge solve {path} --out solved.g2o"
+        return f"hodge refine trajectory {path} --frames DIR --out runs/{path.stem}"
+    from hodge_pipeline.recipe.recipe_file import recipe_names
+
+    name = reader or next((guess["reader"] for guess in facts["formats"]), "")
+    recipe = {"clouds": "scans"}.get(name, name)
+    recipe = recipe if recipe in recipe_names() else "RECIPE"
+    return f"hodge run {recipe} --source {path} --out runs/{path.stem}"
 
 
 def _rows(value: Any) -> list[str]:

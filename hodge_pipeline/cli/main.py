@@ -11,7 +11,19 @@ import typer
 
 from hodge_pipeline.cli import refine as refining
 from hodge_pipeline.cli.guard import guard_streams, shown
-from hodge_pipeline.cli.options import Dask, Json, Out, Overrides, Overwrite, Quiet, Reader, ReaderSet, Truth
+from hodge_pipeline.cli.options import (
+    Dask,
+    Json,
+    Out,
+    Overrides,
+    Overwrite,
+    Quiet,
+    Reader,
+    ReaderSet,
+    Strict,
+    Truth,
+    Verbose,
+)  # fmt: skip
 
 # OpenBLAS starts a thread for each core even for matrices of ten rows, of which a run has thousands: the threads wait
 # for each other, and a diagnosis takes ten times the CPU time. What is large here is sparse and gains nothing by them.
@@ -32,14 +44,21 @@ Examples:
   hodge solve graph.g2o --out solved.g2o         any pose graph, or a run folder
   hodge solve graph.g2o --certificate --disable 12-87
   hodge diagnose runs/kitchen --out why          which edge is wrong?
+  hodge review runs/kitchen                      see the edges, decide by hand
   hodge edit runs/kitchen --disable 12-87        take an edge out of a run,
   hodge solve runs/kitchen                       and solve and fuse it again
   hodge refine trajectory poses.txt --frames DIR --out runs/better
   hodge refine colmap sparse/0 --out runs/model
 """
 
+HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
+
 app = typer.Typer(
-    help=HELP, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+    help=HELP,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings=HELP_OPTIONS,
 )
 
 app.add_typer(refining.group, name="refine")
@@ -72,24 +91,35 @@ def run(
     overwrite: Overwrite = False,
     dask: Dask = None,
     live: Annotated[bool, typer.Option("--live", help="Show the run as it happens in a Rerun viewer.")] = False,
+    stray: Annotated[list[str] | None, typer.Argument(hidden=True, metavar="--source PATH")] = None,
+    strict: Strict = False,
+    verbose: Verbose = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Run a recipe on a source: poses, fused model, report and recording in --out."""
+    if stray:
+        raise typer.BadParameter(f"'{stray[0]}': use --source to name what to read, one folder or file")
     from hodge_pipeline.cli import run as running
 
     sets = [*(overrides or []), *running.named_truth(truth)]
-    running.run(recipe, source, out, sets, overwrite=overwrite, quiet=quiet, as_json=json, live=live, dask=dask)
+    shown = {"quiet": quiet, "as_json": json, "live": live, "verbose": verbose}
+    running.run(recipe, source, out, sets, overwrite=overwrite, dask=dask, strict=strict, **shown)
 
 
 @app.command()
 def demo(
-    out: Out, overrides: Overrides = None, overwrite: Overwrite = False, dask: Dask = None, quiet: Quiet = False
+    out: Out,
+    overrides: Overrides = None,
+    overwrite: Overwrite = False,
+    dask: Dask = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
 ) -> None:
     """Make a furnished room with Kinect-like noise and run the recipe `demo` on it."""
     from hodge_pipeline.cli import run as running
 
-    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet, dask=dask)
+    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet, dask=dask, verbose=verbose)
 
 
 @app.command()
@@ -97,7 +127,9 @@ def solve(
     graph: Annotated[Path, typer.Argument(help="A pose graph (g2o, TORO, …) or a run folder.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="The result: .g2o or .json (Open3D) with edges; .tum, .kitti, .csv, .log without."),
+        typer.Option(
+            "--out", "-o", help="The result: .g2o or .json (Open3D) with edges; .tum, .kitti, .csv, .log without."
+        ),
     ] = None,
     objective: Annotated[
         str | None, typer.Option(help="full: g2o's chi2, the default; isotropic: SE-Sync's F, which can be certified.")
@@ -122,6 +154,7 @@ def solve(
     time_limit: Annotated[float, typer.Option(help="Seconds after which the best so far is given.")] = float("inf"),
     run_folder: Annotated[Path | None, typer.Option("--run", help="Folder for report, edges and recording.")] = None,
     dask: Dask = None,
+    verbose: Verbose = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -137,14 +170,15 @@ def solve(
         certificate=certificate,
         sesync_units=sesync_units,
     )
-    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json, dask=dask)
+    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json, dask=dask, verbose=verbose)
 
 
 @app.command()
 def diagnose(
     path: Annotated[Path, typer.Argument(help="A finished run, or a pose graph (g2o, TORO, Open3D, pair .log).")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for edges.csv, poses.tum, diagnosis.html and diagnosis.rrd.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for edges.csv, poses.tum, diagnosis.html and diagnosis.rrd."),
     ] = None,
     top: Annotated[
         int | None, typer.Option(min=0, help="Edges to print; default: those that are not consistent, 20 at most.")
@@ -172,6 +206,10 @@ def edit(
         list[str] | None,
         typer.Option(metavar="A-B", help="Switch them on: disabled ones again, rejected ones in spite of the reason."),
     ] = None,
+    right: Annotated[
+        list[str] | None,
+        typer.Option(metavar="A-B", help="Switch them on, and let no robust solver leave them out."),
+    ] = None,
     register: Annotated[
         list[str] | None,
         typer.Option(metavar="A-B", help="Register a pair that is no edge, as `hodge diagnose` suggests some."),
@@ -184,8 +222,20 @@ def edit(
     """Switch edges of a run off or on, or have more registered; `hodge solve RUN` then solves and fuses again."""
     from hodge_pipeline.cli import edit as editing
 
-    pairs = editing.Pairs(disable or [], enable or [], register or [])
+    pairs = editing.Pairs(disable or [], enable or [], register or [], right or [])
     editing.edit(run_folder, pairs, undo=undo, listing=listing, quiet=quiet, as_json=json)
+
+
+@app.command()
+def review(
+    path: Annotated[Path, typer.Argument(help="A run, or a pose graph (g2o, TORO, Open3D, pair .log).")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: a free one.")] = 0,
+    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+) -> None:
+    """See edges and their clouds on a page that only this machine can open, decide by hand, and watch the map mend."""
+    from hodge_pipeline.cli import review as reviewing
+
+    reviewing.review(path, port=port, browser=browser)
 
 
 @app.command()
@@ -260,7 +310,9 @@ def record(
 def compare(
     first: Annotated[Path, typer.Argument(help="A run folder.")],
     second: Annotated[Path, typer.Argument(help="Another run folder, of the same frames or not.")],
-    out: Annotated[Path | None, typer.Option(help="Folder for compare.html and .rrd; default: the second.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for compare.html and .rrd; default: the second.")
+    ] = None,
 ) -> None:
     """Compare two runs: numbers, options that differ, poses and models."""
     from hodge_pipeline.cli import record as recording

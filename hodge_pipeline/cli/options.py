@@ -9,16 +9,21 @@ import typer
 
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change an option, such as edges.max_edges_per_frame=6."),
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Change an option, such as edges.max_edges_per_frame=6; may be repeated."
+    ),
 ]
 Reader = Annotated[str | None, typer.Option(help="The reader by name; none: the surest of the path.")]
 ReaderSet = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="OPTION=VALUE", help="An option of the reader, such as tracks=false."),
+    typer.Option(
+        "--set", metavar="OPTION=VALUE", help="An option of the reader, such as tracks=false; may be repeated."
+    ),
 ]
-Out = Annotated[Path, typer.Option("--out", help="The run folder; the same command goes on where it stopped.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="The run folder; the same command goes on where it stopped.")]
 Overwrite = Annotated[bool, typer.Option(help="Replace the run of another recipe in --out.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+Verbose = Annotated[bool, typer.Option("--verbose", help="Print every stage, table and note, not ten lines.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Write the result even where it is worse.")]
 Truth = Annotated[
@@ -26,6 +31,9 @@ Truth = Annotated[
     typer.Option(
         "--truth", metavar="FILE", help="True poses to compare with: a file of poses; `frames`: the source's own."
     ),
+]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="Notice input that changes during the run by hashes of all its files.")
 ]
 Dask = Annotated[
     str | None,

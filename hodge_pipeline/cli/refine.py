@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hodge_pipeline.cli.options import Dask, Force, Json, Overrides, Overwrite, Quiet, Truth
+from hodge_pipeline.cli.options import Dask, Force, Json, Overrides, Overwrite, Quiet, Truth, Verbose
 
 HELP = """Make the poses of COLMAP or SLAM better, in their own format.
 
@@ -34,18 +34,21 @@ def trajectory(
         Path, typer.Argument(help="TUM, KITTI, EuRoC csv, Redwood .log, MCAP, 7-Scenes poses, Open3D JSON.")
     ],
     frames: Annotated[Path, typer.Option("--frames", help="The sequence the poses belong to, with depth or clouds.")],
-    out: Annotated[Path, typer.Option("--out", help="The run folder: refined.<suffix of POSES>, report, recording.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The run folder: refined.<suffix of POSES>, report, recording.")
+    ],
     match: Annotated[
         str, typer.Option(help="How a pose finds its frame: stamp, number, row (n-th pose, n-th frame), or auto.")
     ] = "auto",
     truth: Truth = None,
     force: Force = False,
     recipe: Annotated[
-        str, typer.Option("--recipe", help="A recipe like slam-refine, which is the default; for TUM slam-refine-tum.")
+        str, typer.Option("--recipe", help="A recipe like slam_refine, which is the default; for TUM slam_refine_tum.")
     ] = "",
     overrides: Overrides = None,
     dask: Dask = None,
     overwrite: Overwrite = False,
+    verbose: Verbose = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -64,6 +67,7 @@ def trajectory(
         overwrite=overwrite,
         quiet=quiet,
         as_json=json,
+        verbose=verbose,
         dask=dask,
     )
 
@@ -72,7 +76,8 @@ def trajectory(
 def colmap(
     model: Annotated[Path, typer.Argument(help="A COLMAP model, .bin or .txt; or the folder of several: 0, 1, …")],
     out: Annotated[
-        Path, typer.Option("--out", help="The run folder: sparse/0 (the model), report; it goes on where it stopped.")
+        Path,
+        typer.Option("--out", "-o", help="The run folder: sparse/0 (the model), report; it goes on where it stopped."),
     ],
     database: Annotated[
         Path | None,
@@ -95,7 +100,7 @@ def colmap(
         typer.Option("--depth-camera", help="FX FY CX CY of depth that is not on the pixels of the colour images."),
     ] = None,
     force: Force = False,
-    recipe: Annotated[str, typer.Option("--recipe", help="A recipe like colmap-refine, by name or file.")] = "",
+    recipe: Annotated[str, typer.Option("--recipe", help="A recipe like colmap_refine, by name or file.")] = "",
     overrides: Overrides = None,
     dask: Dask = None,
     overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,

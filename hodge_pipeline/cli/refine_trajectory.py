@@ -1,4 +1,4 @@
-"""`hodge refine trajectory`: the recipe `slam-refine` on given poses and frames."""
+"""`hodge refine trajectory`: the recipe `slam_refine` on given poses and frames."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ def refine(
     quiet: bool,
     as_json: bool,
     dask: str | None,
+    verbose: bool = False,
 ) -> None:
     """Run the recipe and print what came out; `CheckError`, exit code 3, where the poses given are kept as better."""
     if not poses.exists():
@@ -31,4 +32,14 @@ def refine(
     start = ["start.stage=given", f"start.path={json.dumps(str(poses))}", f"start.match={match}"]
     ours = [*start, f"guard.force={str(force).lower()}"]
     chosen = recipe or recipe_for(frames)
-    running.run(chosen, frames, out, [*ours, *overrides], overwrite=overwrite, quiet=quiet, as_json=as_json, dask=dask)
+    running.run(
+        chosen,
+        frames,
+        out,
+        [*ours, *overrides],
+        overwrite=overwrite,
+        quiet=quiet,
+        as_json=as_json,
+        dask=dask,
+        verbose=verbose,
+    )

@@ -31,6 +31,8 @@ def run(
     as_json: bool,
     live: bool = False,
     dask: str | None = None,
+    strict: bool = False,
+    verbose: bool = False,
 ) -> None:
     """Run a recipe and print what came out."""
     loaded = load_recipe(recipe, overrides, source)
@@ -38,9 +40,11 @@ def run(
         raise RecipeError(f"recipe '{recipe}' names no source: add --source PATH")
     from hodge_pipeline.pipeline import run as run_pipeline
 
-    with resumable(out), Terminal(quiet or as_json) as terminal, _viewer(live, terminal) as address:
-        result = run_pipeline(loaded, out, overwrite=overwrite, watcher=terminal, live=address, dask=dask)
-    print_result(result, quiet=quiet, as_json=as_json)
+    with resumable(out), Terminal(quiet or as_json, verbose) as terminal, _viewer(live, terminal) as address:
+        result = run_pipeline(
+            loaded, out, overwrite=overwrite, watcher=terminal, live=address, dask=dask, strict=strict
+        )
+    print_result(result, quiet=quiet, as_json=as_json, verbose=verbose)
     if result.refined is not None and result.refined.decision.exit_code:
         raise CheckError(result.refined.decision.reason)
 
@@ -50,15 +54,15 @@ def named_truth(truth: str | None) -> list[str]:
     return [] if truth is None else [f"evaluation.truth={json.dumps(truth)}"]
 
 
-def print_result(result: Run, *, quiet: bool, as_json: bool) -> None:
-    """Print the report of a run: tables and notes, or JSON."""
+def print_result(result: Run, *, quiet: bool, as_json: bool, verbose: bool = False) -> None:
+    """Print the report of a run: ten lines, with all tables and notes, or JSON."""
     if as_json:
         from hodge_pipeline.report.write import as_json as report_json
         from hodge_pipeline.store.artifacts import json_text
 
         print(json_text(report_json(result.report)), end="")
     elif not quiet:
-        _print_summary(result)
+        _print_summary(result, verbose=verbose)
 
 
 @contextmanager
@@ -97,21 +101,22 @@ def resumable(out: Path) -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def demo(out: Path, overrides: Sequence[str], *, overwrite: bool, quiet: bool, dask: str | None) -> None:
+def demo(out: Path, overrides: Sequence[str], *, overwrite: bool, quiet: bool, dask: str | None, verbose: bool) -> None:
     """Make the demo sequence, or find it in the cache, and run the recipe `demo` on it."""
     from hodge_pipeline.demo.sequence import DemoOptions, demo_source
 
     options = DemoOptions()
-    with Terminal(quiet) as terminal, terminal.stage("render the demo room", options.frames) as advance:
+    with Terminal(quiet, verbose) as terminal, terminal.stage("render the demo room", options.frames) as advance:
         folder = demo_source(options=options, advance=advance)
-    run("demo", folder, out, overrides, overwrite=overwrite, quiet=quiet, as_json=False, dask=dask)
+    run("demo", folder, out, overrides, overwrite=overwrite, quiet=quiet, as_json=False, dask=dask, verbose=verbose)
 
 
-def _print_summary(result: Run) -> None:
-    from hodge_pipeline.report.tables import graph_tables, score_tables, summary_lines
+def _print_summary(result: Run, *, verbose: bool) -> None:
+    from hodge_pipeline.report.brief import all_notes, brief
+    from hodge_pipeline.report.tables import graph_tables, score_tables
 
-    for table in (*score_tables(result.report), *graph_tables(result.report)):
-        print_table(table.title, table.header, table.rows)
-    for label, line in summary_lines(result.report):
-        print(f"{label:<8} {line}")
-    print(f"{'report':<8} {result.folder / 'report.html'}")
+    if verbose:
+        for table in (*score_tables(result.report), *graph_tables(result.report)):
+            print_table(table.title, table.header, table.rows)
+    lines = brief(result.report, str(result.folder))
+    print("\n".join([*(all_notes(result.report) if verbose else []), *lines]))

@@ -58,13 +58,14 @@ def solve(
     quiet: bool,
     as_json: bool,
     dask: str | None,
+    verbose: bool = False,
 ) -> None:
     """Solve a file, write what was asked for, print a summary; `CheckError` where the result fails its own checks.
 
     A run folder given alone is solved and fused again, with its edits, and brought up to date.
     """
     if out is None and run_folder is None and options == Choices() and (path / RECIPE_FILE).is_file():
-        _solve_run(path, quiet=quiet, as_json=as_json, dask=dask)
+        _solve_run(path, quiet=quiet, as_json=as_json, dask=dask, verbose=verbose)
         return
     if path.is_dir() and (history := read_history(path)).edits:
         options = replace(options, disable=(*options.disable, *history.disabled))
@@ -101,13 +102,13 @@ def _writer(out: Path, source: Source) -> str:
     return writer_name(out, source) if out.suffix.lower() in KNOWN_ENDINGS else "g2o"
 
 
-def _solve_run(folder: Path, *, quiet: bool, as_json: bool, dask: str | None) -> None:
+def _solve_run(folder: Path, *, quiet: bool, as_json: bool, dask: str | None, verbose: bool) -> None:
     from hodge_pipeline.cli.run import print_result
     from hodge_pipeline.pipeline import solve_again
 
-    with Terminal(quiet or as_json) as terminal:
+    with Terminal(quiet or as_json, verbose) as terminal:
         result = solve_again(folder, watcher=terminal, dask=dask)
-    print_result(result, quiet=quiet, as_json=as_json)
+    print_result(result, quiet=quiet, as_json=as_json, verbose=verbose)
 
 
 def _lines(

@@ -65,6 +65,10 @@ class Loops:
         entry = np.repeat(self.offsets[:-1][rows] - offsets[:-1], lengths) + np.arange(offsets[-1])
         return Loops(offsets, self.edge[entry], self.sign[entry])
 
+    def reversed_edges(self, turned: Bools) -> Loops:
+        """The same loops where some edges (E,) are written the other way round."""
+        return Loops(self.offsets, self.edge, np.where(turned[self.edge], -self.sign, self.sign))
+
 
 def spanning_forest(edges: Ints, vertex_count: int) -> SpanningForest:
     """A breadth-first tree of each component from its first vertex; the first of parallel edges is in the tree."""

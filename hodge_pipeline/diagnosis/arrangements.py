@@ -3,7 +3,8 @@
 Growing pieces best first can take a place for another that looks like it, and from there no single move leads back. So
 a second start uses only the edges between consecutive views, which are wrong more rarely; and from both the views are
 moved with two thresholds on the share of expected edges that a placement must have. Of all arrangements on the way the
-one with the largest log-evidence is taken, and improved while its log-evidence grows.
+one with the largest log-evidence is taken. Its pieces then grow into one another wherever edges agree on it: what keeps
+two pieces apart is no evidence on where they lie.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import numpy as np
 
 from hodge_pipeline.diagnosis.arrangement_evidence import arrangement_log_evidence
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.improve import improved
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.pieces import Alignment, align
 from hodge_pipeline.diagnosis.rearrange import rearranged
@@ -42,8 +42,9 @@ def best_arrangement(
     found = [one for begun in starts for share in FAIR_SHARES for one in rearranged(evidence, graph, begun, share)]
     models = [learn_scene_model(evidence, found[0]), learn_scene_model(evidence, found[-1])]
     values = [arrangement_log_evidence(evidence, one.poses, one.component, models) for one in found]
-    best = improved(evidence, graph, found[int(np.argmax(values))], FAIR_SHARES)
-    return fit(evidence, graph, Alignment(best.component, best.poses), ONCE)
+    best = found[int(np.argmax(values))]
+    grown = align(evidence, weight, cluster_gain, rng, Alignment(best.component, best.poses))
+    return fit(evidence, graph, grown, ONCE)
 
 
 def _in_order(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.judging import squares_at_both_ends
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.scene_model import SceneModel
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -83,10 +84,10 @@ class PlacementCriteria:
 
     def agreement(self, tails: Floats, heads: Floats) -> Floats:
         """From 1 down to 0 (E,) how well each edge agrees with the poses of its ends."""
-        noise, left = self.evidence.noise, se3.inverse(self.evidence.i_from_j) @ se3.inverse(tails) @ heads
-        cosine = np.clip((np.trace(left[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)
-        squares = (np.arccos(cosine) / noise.rotation_rad) ** 2
-        squares += np.einsum("ni,ni->n", left[:, :3, 3], left[:, :3, 3]) / noise.translation_m**2
+        noise, measured = self.evidence.noise, self.evidence.i_from_j
+        left = se3.log(se3.inverse(measured) @ se3.inverse(tails) @ heads)
+        turned, shifted = squares_at_both_ends(measured, left)
+        squares = turned / noise.rotation_rad**2 + shifted / noise.translation_m**2
         return np.asarray(np.sqrt(np.maximum(0.0, 1 - squares / GATE)))
 
 

@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.complex.free_directions import free_direction_notes
+from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.diagnosis.consensus import find_consensus
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.noise import Noise, edge_noise
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior, prior_by_cycles, right_by_gap
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
-from hodge_pipeline.diagnosis.robust_poses import Fit, left_over
+from hodge_pipeline.diagnosis.robust_poses import Fit
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors, short_cycles, with_cycles_of
 from hodge_pipeline.diagnosis.testing_cycles import (
@@ -29,6 +31,7 @@ from hodge_pipeline.diagnosis.testing_cycles import (
 )
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.diagnosis.working_point import recentred, working_point
+from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
@@ -41,6 +44,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     and edges that name no vertex.
     """
     check_graph(graph)
+    stated, (graph, turned) = graph, in_vertex_order(graph)
     prior = np.full(graph.edge_count, 0.5)
     if options.order_prior:
         prior = order_prior(graph.edges, graph.vertex_count)
@@ -83,8 +87,9 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     verdict = _verdicts(probability, untestable, consensus.fit.used, options)
     kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
     world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
-    found = _report(graph, cycles, probability, verdict, kept, undecided, consensus.fit, world_from_cam)
-    return replace(found, notes=(*found.notes, *noise.doubts))
+    cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))
+    found = _report(stated, cycles, probability, verdict, kept, undecided, consensus.fit, world_from_cam)
+    return replace(found, notes=(*found.notes, *noise.doubts, *free_direction_notes(stated)))
 
 
 def _with_witnesses(graph: ViewGraph, cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
@@ -123,7 +128,7 @@ def _report(
 ) -> Diagnosis:
     piece = connected_components(graph.edges[kept], graph.vertex_count)
     same = piece[graph.edges[:, 0]] == piece[graph.edges[:, 1]]
-    angle, displacement_m = left_over(graph, world_from_cam)
+    displacement_m, angle = edge_residuals(graph, world_from_cam)
     residual = np.where(same, displacement_m, np.nan), np.where(same, np.degrees(angle), np.nan)
     telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
     share = 1 - 1 / (1 + fit.resistance)

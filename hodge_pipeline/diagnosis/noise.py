@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.complex.cycles import Loops
-from hodge_pipeline.solvers.weights import edge_weights
+from hodge_pipeline.complex.judging import has_unit_information, mean_variances
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 MAXWELL_MEDIAN = 1.538
@@ -77,7 +77,7 @@ def edge_noise(
         shift = max(shift, LEVER * turn * reach_m)
     taken = turn == believed[0], shift == believed[1]
     changed = any(own and not 1 / TOLD_FROM < by < TOLD_FROM for own, by in zip(taken, believed, strict=True))
-    is_reported = informed and changed and any_cycle and not _is_unit(graph)
+    is_reported = informed and changed and any_cycle and not has_unit_information(graph)
     doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if is_reported else ()
     return Noise(turn * rotation, shift * translation, doubts)
 
@@ -110,15 +110,8 @@ def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
     same = graph.edge_count < 2 or bool((graph.information == graph.information[:1]).all())
     if same and (not graph.edge_count or np.array_equal(graph.information[0], np.eye(6))):
         return np.ones(graph.edge_count), np.ones(graph.edge_count), False
-    flat = graph.dimension == 2
-    weights = edge_weights(graph, 2 if flat else 3)
-    return _deviation(weights.kappa if flat else 2 * weights.kappa), _deviation(weights.tau), True
-
-
-def _is_unit(graph: ViewGraph) -> bool:
-    """Whether all edges have the identity that files hold for unknown information, of angles or of half angles."""
-    diagonal = graph.information[:, range(6), range(6)]
-    return bool(np.isin(diagonal[:, :3], (0, 0.25, 1)).all() and np.isin(diagonal[:, 3:], (0, 1)).all())
+    rotation, translation = mean_variances(graph, graph.dimension == 2)
+    return _deviation(1 / rotation), _deviation(1 / translation), True
 
 
 def _deviation(precision: Floats) -> Floats:

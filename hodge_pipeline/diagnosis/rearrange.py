@@ -34,7 +34,7 @@ LEAST_GAIN = 2.0
 
 
 @dataclass(frozen=True)
-class Move:
+class _Move:
     """Views `inside (V,)` that are moved by `motion (4, 4)` into a piece, and the log-evidence that is gained."""
 
     gain: float
@@ -71,22 +71,22 @@ def rearranged(evidence: Evidence, graph: ViewGraph, start: Fit, fair_share: flo
     for _ in range(ROUNDS):
         model = learn_scene_model(evidence, found[-1], model)
         criteria = placement_criteria(evidence, model, found[-1].poses, found[-1].component, fair_share)
-        best = best_moves(criteria, found[-1], propose(criteria, found[-1]))[:1]
-        if not best or best[0].gain <= LEAST_GAIN:
+        best = _best_move(criteria, found[-1], propose(criteria, found[-1]))
+        if best is None or best.gain <= LEAST_GAIN:
             break
-        found.append(fit(evidence, graph, best[0].made(found[-1]), ONCE))
+        found.append(fit(evidence, graph, best.made(found[-1]), ONCE))
     return found
 
 
-def best_moves(criteria: PlacementCriteria, found: Fit, proposals: Proposals) -> list[Move]:
-    """For each motion that is proposed the best set of views to move, by what they gain, the best first."""
+def _best_move(criteria: PlacementCriteria, found: Fit, proposals: Proposals) -> _Move | None:
+    """Of all motions that are proposed the one that gains most with its best set of views; None where none is."""
     now = _before(criteria, found)
     moves, left = [], np.ones(len(proposals.mover), bool)
     for _ in range(TRIED):
         if not left.any():
             break
-        moves.append(_move(criteria, now, proposals, proposals.next(left)))
-    return sorted((move for move in moves if move.inside.any()), key=lambda move: -move.gain)
+        moves.append(_moved(criteria, now, proposals, proposals.next(left)))
+    return max((move for move in moves if move.inside.any()), key=lambda move: move.gain, default=None)
 
 
 def _before(criteria: PlacementCriteria, found: Fit) -> _Now:
@@ -98,7 +98,7 @@ def _before(criteria: PlacementCriteria, found: Fit) -> _Now:
     return _Now(found, layers, runs, up, upright.log_evidence(poses[:, :3, :3], up))
 
 
-def _move(criteria: PlacementCriteria, now: _Now, proposals: Proposals, row: int) -> Move:
+def _moved(criteria: PlacementCriteria, now: _Now, proposals: Proposals, row: int) -> _Move:
     """The best set of views to move as one proposal has it."""
     poses, piece = now.found.poses, now.found.component
     home, movable = piece[proposals.stayer[row]], piece == piece[proposals.mover[row]]
@@ -121,7 +121,7 @@ def _move(criteria: PlacementCriteria, now: _Now, proposals: Proposals, row: int
         sets.append(_best_run(criteria, then, now.runs, held, movable))
     gains = [_gain(criteria, now.layers, then, held, inside) for inside in sets]
     best = int(np.argmax(gains))
-    return Move(gains[best], sets[best], motion, int(home))
+    return _Move(gains[best], sets[best], motion, int(home))
 
 
 def _gain(criteria: PlacementCriteria, now: Floats, then: Floats, held: Floats, inside: Bools) -> float:

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.judging import left_over, squares_at_both_ends
 from hodge_pipeline.diagnosis.clusters import DIMENSION, FREEDOM, Springs, clustered
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.pieces import Alignment
 from hodge_pipeline.diagnosis.resistance import effective_resistance
-from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.solvers.minimise import descend_isotropic
 from hodge_pipeline.solvers.newton import Limits
 from hodge_pipeline.solvers.setup import prepare
@@ -114,14 +114,8 @@ def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> 
 
 def _squares(evidence: Evidence, graph: ViewGraph, poses: Floats) -> Floats:
     """χ² (E,) by the noise of the edges, without that of the poses."""
-    angle, displacement_m = left_over(graph, poses)
-    return np.asarray((angle / evidence.noise.rotation_rad) ** 2 + (displacement_m / evidence.noise.translation_m) ** 2)
-
-
-def left_over(graph: ViewGraph, poses: Floats) -> tuple[Floats, Floats]:
-    """The angle (E,) in radians and distance (E,) in metres between each edge and the poses."""
-    displacement_m, angle = edge_residuals(graph, poses)
-    return angle, displacement_m
+    turned, shifted = squares_at_both_ends(graph.i_from_j, left_over(graph, poses))
+    return np.asarray(turned / evidence.noise.rotation_rad**2 + shifted / evidence.noise.translation_m**2)
 
 
 def chi2_at(evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats) -> Floats:
@@ -136,12 +130,11 @@ def _chi2(
 
     For an edge that was used with `student_weight (E,)` the χ² is what it would be at poses solved without it.
     """
-    angle, displacement_m = left_over(graph, poses)
+    turned, shifted = squares_at_both_ends(graph.i_from_j, left_over(graph, poses))
     finite_resistance = np.where(np.isfinite(resistance), resistance, 0.0)
-    without = 1 + student_weight * finite_resistance
-    angle, displacement_m = without * angle, without * displacement_m
+    without = (1 + student_weight * finite_resistance) ** 2
     turn, shift = evidence.noise.rotation_rad**2, evidence.noise.translation_m**2
     swing = turn * evidence.reach_m**2 * finite_resistance**3 / 3
-    chi2 = angle**2 / (turn * (1 + finite_resistance)) + displacement_m**2 / (shift * (1 + finite_resistance) + swing)
+    chi2 = turned / (turn * (1 + finite_resistance)) + shifted / (shift * (1 + finite_resistance) + swing)
     apart = component[graph.edges[:, 0]] != component[graph.edges[:, 1]]
-    return np.where(apart, np.inf, chi2)
+    return np.where(apart, np.inf, without * chi2)

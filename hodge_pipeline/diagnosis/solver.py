@@ -9,10 +9,10 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
+from hodge_pipeline.complex.judging import left_over, squares_at_both_ends
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.robust_poses import left_over
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.robust import CHI2_99_PLANAR, CHI2_99_SPATIAL, solve_robust
 from hodge_pipeline.solvers.weights import edge_weights
@@ -84,10 +84,10 @@ def _attempt(
 def _chi2(graph: ViewGraph, poses: Floats, piece: Ints) -> Floats:
     """χ² (E,) with isotropic weights; ∞ between two pieces."""
     weights = edge_weights(graph, 2 if graph.dimension == 2 else 3)
-    angle, displacement_m = left_over(graph, poses)
+    turned, shifted = squares_at_both_ends(graph.i_from_j, left_over(graph, poses))
     kappa = weights.kappa if graph.dimension == 2 else 2 * weights.kappa
     apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
-    return np.where(apart, np.inf, kappa * angle**2 + weights.tau * displacement_m**2)
+    return np.where(apart, np.inf, kappa * turned + weights.tau * shifted)
 
 
 def _whole(graph: ViewGraph, found: Diagnosis, attempt: _Attempt) -> Solution:

@@ -10,34 +10,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.complex.checks import check_motions
 from hodge_pipeline.errors import GraphError, WorkspaceError
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import read_edges
 from hodge_pipeline.store.workspace import REFINEMENT
-from hodge_pipeline.types import Bools, Edges, Ints
+from hodge_pipeline.types import Bools, Edges, Floats, Ints
 from hodge_pipeline.types.edges import DISABLED, HELD_OUT, Words
 from hodge_pipeline.types.text import command
 
 FILE = "edits.json"
 EDGES = "edges.csv"
 FORMAT_VERSION = 1
-ENABLED, REGISTERED = "enabled", "registered"
+ENABLED, RIGHT, REGISTERED = "enabled", "right", "registered"
+VERBS = ("disable", "enable", "right", "register")
+Guess = tuple[str, tuple[float, ...]]
+"""A pair to register, and the 16 numbers of the motion `i_from_j`, row by row, to register it from."""
 
 
 @dataclass(frozen=True)
 class Edit:
-    """One command: the pairs `a-b` of vertex ids that it switched off and on, and those to register; one that was
-    `undone` counts no more.
+    """One command: the pairs `a-b` of vertex ids that it switched off and on, those that are right whatever a robust
+    solver says, and those to register, some from `guesses`; one that was `undone` counts no more.
     """
 
     disable: tuple[str, ...] = ()
     enable: tuple[str, ...] = ()
     register: tuple[str, ...] = ()
     undone: bool = False
+    right: tuple[str, ...] = ()
+    guesses: tuple[Guess, ...] = ()
 
     def __str__(self) -> str:
-        parts = (("disable", self.disable), ("enable", self.enable), ("register", self.register))
-        told = "; ".join(f"{verb} {', '.join(pairs)}" for verb, pairs in parts if pairs)
+        told = "; ".join(f"{verb} {', '.join(pairs)}" for verb in VERBS if (pairs := getattr(self, verb)))
         return f"{told} (undone)" if self.undone else told
 
 
@@ -49,12 +54,14 @@ class History:
 
     @property
     def switches(self) -> dict[str, str]:
-        """What the edits come to: disabled, enabled or registered for each pair; the latest edit of a pair counts."""
+        """What the edits come to: disabled, enabled, right or registered for each pair; the latest edit of a pair
+        counts.
+        """
         out: dict[str, str] = {}
         for edit in self.edits:
             if not edit.undone:
-                out |= dict.fromkeys(edit.register, REGISTERED)
-                out |= dict.fromkeys(edit.disable, DISABLED) | dict.fromkeys(edit.enable, ENABLED)
+                out |= dict.fromkeys(edit.register, REGISTERED) | dict.fromkeys(edit.disable, DISABLED)
+                out |= dict.fromkeys(edit.enable, ENABLED) | dict.fromkeys(edit.right, RIGHT)
         return dict(sorted(out.items()))
 
     @property
@@ -64,13 +71,24 @@ class History:
 
     @property
     def enabled(self) -> tuple[str, ...]:
-        """The pairs that are on by hand."""
-        return tuple(pair for pair, switch in self.switches.items() if switch == ENABLED)
+        """The pairs that are on by hand, the right ones among them."""
+        return tuple(pair for pair, switch in self.switches.items() if switch in (ENABLED, RIGHT))
+
+    @property
+    def right(self) -> tuple[str, ...]:
+        """The pairs that a robust solver may not leave out."""
+        return tuple(pair for pair, switch in self.switches.items() if switch == RIGHT)
 
     @property
     def registered(self) -> tuple[str, ...]:
         """The pairs to register, those that were switched off or on later too."""
         return tuple(sorted({pair for edit in self.edits if not edit.undone for pair in edit.register}))
+
+    @property
+    def guesses(self) -> dict[str, Floats]:
+        """The motions (4, 4) to register pairs from; the latest edit of a pair counts."""
+        guesses = [guess for edit in self.edits if not edit.undone for guess in edit.guesses]
+        return {pair: np.reshape(numbers, (4, 4)) for pair, numbers in guesses}
 
     def added(self, edit: Edit) -> History:
         """The history with one more edit."""
@@ -78,22 +96,36 @@ class History:
 
     def undo(self) -> History:
         """The history with the latest edit that counts taken back. Raises `GraphError` where there is none."""
-        counting = [row for row, edit in enumerate(self.edits) if not edit.undone]
-        if not counting:
+        if (row := self.latest) is None:
             raise GraphError("there is no edit to undo")
-        last = counting[-1]
-        return History((*self.edits[:last], replace(self.edits[last], undone=True), *self.edits[last + 1 :]))
+        return self._put(row, undone=True)
+
+    def redo(self, row: int) -> History:
+        """The history with this edit, which was taken back, counting again."""
+        return self._put(row, undone=False)
+
+    @property
+    def latest(self) -> int | None:
+        """The row of the latest edit that counts."""
+        return max((row for row, edit in enumerate(self.edits) if not edit.undone), default=None)
+
+    def _put(self, row: int, *, undone: bool) -> History:
+        return History((*self.edits[:row], replace(self.edits[row], undone=undone), *self.edits[row + 1 :]))
 
 
 def read_history(folder: Path) -> History:
     """The edits of a run folder, none where there is no file. Raises `WorkspaceError` where it cannot be read."""
-    path = folder / FILE
+    return read_history_file(folder / FILE)
+
+
+def read_history_file(path: Path) -> History:
+    """The edits in a file, none where there is no file. Raises `WorkspaceError` where it cannot be read."""
     if not path.exists():
         return History()
     try:
         data = artifacts.read_json(path)
         edits = tuple(_edit(item) for item in data["edits"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, GraphError) as error:
         raise WorkspaceError(f"{path}: is not a history of edits ({error}): mend it, or remove it") from error
     return History(edits)
 
@@ -102,19 +134,31 @@ def _edit(item: Any) -> Edit:
     if not isinstance(item, dict):
         raise ValueError("expected a mapping for each edit")
     undone = item.get("undone", False)
-    names = [item.get(verb, []) for verb in ("disable", "enable", "register")]
+    pairs = {verb: item.get(verb, []) for verb in VERBS}
     if not isinstance(undone, bool) or not all(
-        isinstance(n, list) and all(isinstance(p, str) for p in n) for n in names
+        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in pairs.values()
     ):
         raise ValueError("expected lists of pairs, and undone true or false")
-    return Edit(tuple(names[0]), tuple(names[1]), tuple(names[2]), undone)
+    guesses = tuple(_guess(guess) for guess in item.get("guesses", []))
+    return Edit(**{verb: tuple(names) for verb, names in pairs.items()}, undone=undone, guesses=guesses)
+
+
+def _guess(item: Any) -> Guess:
+    pair, numbers = item
+    if not isinstance(pair, str) or len(numbers) != 16 or not np.isfinite(np.asarray(numbers, float)).all():
+        raise ValueError("expected a pair and 16 finite numbers for each guess")
+    check_motions(np.reshape(np.asarray(numbers, float), (1, 4, 4)), "guesses", lambda _: f"the guess of {pair}")
+    return pair, tuple(map(float, numbers))
 
 
 def write_history(folder: Path, history: History) -> None:
     """Write the edits into a run folder, atomically."""
-    artifacts.write_json(
-        folder / FILE, {"format_version": FORMAT_VERSION, "edits": [asdict(edit) for edit in history.edits]}
-    )
+    write_history_file(folder / FILE, history)
+
+
+def write_history_file(path: Path, history: History) -> None:
+    """Write the edits into a file, atomically."""
+    artifacts.write_json(path, {"format_version": FORMAT_VERSION, "edits": [asdict(edit) for edit in history.edits]})
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ class RecordingOptions:
         "below; full: all, thinned only where max_megabytes asks for it",
     )
     max_megabytes: float = Field(
-        default=150.0,
+        default=100.0,
         gt=0,
-        description="10^6 bytes: bound on the file; 85 % of it for images, the rest for clouds, model and solver; 150 "
-        "holds 1000 VGA colour and depth images",
+        description="10^6 bytes: bound on the file; 85 % of it for images, the rest for clouds, model and solver; 100 "
+        "holds 650 VGA colour and depth images",
     )
     image_every: int = Field(default=1, ge=1, description="frames: record every n-th frame's images")
     cloud_points: int = Field(

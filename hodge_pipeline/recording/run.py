@@ -13,7 +13,6 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
-from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recipe.schema import Recipe
@@ -30,6 +29,7 @@ from hodge_pipeline.store.workspace import RUN, identity_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
 from hodge_pipeline.types.input_files import read_input_text
 from hodge_pipeline.types.notes import notes_of
+from hodge_pipeline.types.ply import read_model
 
 FILE = "recording.rrd"
 RECORDING = "recording"
@@ -125,7 +125,7 @@ class Recording:
             self._part(
                 "model",
                 inputs,
-                lambda to: tuple(n for path in models.values() for n in to.model(read_ply(path), clouds, poses)),
+                lambda to: tuple(n for path in models.values() for n in to.model(read_model(path), clouds, poses)),
             )
 
     def _part(self, name: str, inputs: tuple[Any, ...], write: Callable[[Recorder], Notes]) -> None:

@@ -29,7 +29,7 @@ def record_graph(
     """
     result = start if solution is None else solution.world_from_cam
     identity = hashlib.sha256(np.ascontiguousarray(result).tobytes()).hexdigest()[:32]
-    with tempfile.TemporaryDirectory(dir=folder) as parts:
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".recording-") as parts:
         recorder = Recorder(Path(parts), identity)
         left_out = [*recorder.frames(name, (), tuple(notes))]
         left_out += [note for label, poses in sets.items() for note in recorder.poses(label, poses)]

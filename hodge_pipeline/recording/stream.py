@@ -109,10 +109,11 @@ def frame_columns(frames: Sequence[Frame], count: int, rows: Ints) -> list[rr.Ti
 
 
 def has_real_stamps(frames: Sequence[Frame]) -> bool:
-    """Whether the stamps are a clock's: finite, not all one value, and not merely the frame numbers."""
+    """Whether the stamps are a clock's: finite, not all one value, and not merely numbers of frames or of rows."""
     stamps = np.array([frame.stamp_s for frame in frames])
-    ids = np.array([frame.frame_id if isinstance(frame.frame_id, int) else np.nan for frame in frames])
-    return bool(len(stamps) and np.isfinite(stamps).all() and np.ptp(stamps) > 0 and not (stamps == ids).all())
+    if not len(stamps) or not np.isfinite(stamps).all() or not np.ptp(stamps) > 0:
+        return False
+    return bool(stamps.min() > UNIX_STAMP_S or (np.mod(stamps, 1) != 0).any())
 
 
 def log_notes(stream: rr.RecordingStream, slot: int, notes: Iterable[str], level: str = "INFO") -> None:

@@ -145,7 +145,7 @@ def _mend(weighing: _Weighing, steps: Steps) -> None:
     """The best so far, with the images that are off placed anew by the points that the others hold."""
     for _ in range(MENDINGS):
         at = weighing.best
-        off = weighing.costs[at].images_off
+        off = weighing.costs[at].images_in_doubt if at else ()
         if not off:
             return
         model = weighing.candidates[at].model

@@ -19,6 +19,8 @@ FREE_OF_A_POINT = 3
 """Coordinates that each point takes from the 2 n numbers of its n observations: those tell nothing of the poses."""
 SAME_COST = 1e-4
 """Relative: two candidates nearer than this have come to the same optimum."""
+OFF_SHARE, DOUBTFUL_SHARE = 0.5, 0.1
+"""Of the observations of an image."""
 SOUND_SHARE = 0.05
 """Of the observations beyond the cap: as many are wrong in models that nothing is the matter with."""
 
@@ -29,7 +31,8 @@ class Cost:
 
     `px`: the mean error, each capped at `cap_px`, where an observation that is lost, behind its camera or without the
     parallax it should have counts as the cap; `median_px` likewise. Of `observations`, so many are `behind`, `distant`
-    (without parallax), and the share `beyond` lies beyond the cap; `images_off`: where most do.
+    (without parallax), and the share `beyond` lies beyond the cap; `images_off`: where most do; `images_in_doubt`:
+    where a tenth does.
     """
 
     px: float
@@ -40,6 +43,7 @@ class Cost:
     distant: int
     beyond: float
     images_off: tuple[str, ...]
+    images_in_doubt: tuple[str, ...]
 
     @property
     def is_sound(self) -> bool:
@@ -75,15 +79,16 @@ _PARTS = ("errors_px", "parallaxes_deg", "track_lengths")
 def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, names: Sequence[str]) -> list[Cost]:
     if not len(weights):
         nan = float("nan")
-        return [Cost(nan, nan, nan, 0, 0, 0, 1.0, ()) for _ in errors_px]
+        return [Cost(nan, nan, nan, 0, 0, 0, 1.0, (), ()) for _ in errors_px]
     behind = np.isinf(errors_px)
     effective = np.where(distant | behind, np.inf, errors_px)
     medians = np.median(effective, axis=1)
     cap_px = max(LEAST_CAP_PX, CAP_MEDIANS * float(medians.min())) if np.isfinite(medians).any() else LEAST_CAP_PX
+    total = np.bincount(image, minlength=len(names))
     out = []
     for row, errors in enumerate(effective):
         beyond = errors > cap_px
-        off = np.bincount(image, beyond, minlength=len(names)) > 0.5 * np.bincount(image, minlength=len(names))
+        share = np.bincount(image, beyond, minlength=len(names)) / np.maximum(total, 1)
         capped = np.minimum(errors, cap_px)
         out.append(
             Cost(
@@ -94,7 +99,8 @@ def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, name
                 behind=int(behind[row].sum()),
                 distant=int((distant[row] & ~behind[row]).sum()),
                 beyond=float(weights @ beyond / weights.sum()),
-                images_off=tuple(name for name, is_off in zip(names, off.tolist(), strict=True) if is_off),
+                images_off=tuple(name for name, one in zip(names, share.tolist(), strict=True) if one > OFF_SHARE),
+                images_in_doubt=tuple(n for n, one in zip(names, share.tolist(), strict=True) if one > DOUBTFUL_SHARE),
             )
         )
     return out

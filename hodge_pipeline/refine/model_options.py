@@ -1,4 +1,4 @@
-"""What the refinement of a model with tracks can be told: the recipe `colmap-refine`."""
+"""What the refinement of a model with tracks can be told: the recipe `colmap_refine`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, ModelReader, Registrar
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
-RECIPE = "colmap-refine"
+RECIPE = "colmap_refine"
 
 
 @dataclass(frozen=True, config=OPTIONS)

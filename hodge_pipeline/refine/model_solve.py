@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.short_cycles import short_cycles
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.solvers.covariance import marginal_covariances
@@ -18,6 +19,8 @@ MEDIAN_CHI2 = 5.348
 OUTLIER_CHI2 = 16.812
 """Its 99 % quantile."""
 ROUNDS = 2
+LEAST_TRIANGLES, TRIANGLES_PER_EDGE = 10, 8
+"""Below it their median says little; of each edge so many serve."""
 KEPT = 1e-3
 
 
@@ -51,22 +54,45 @@ def edge_chi2(graph: ViewGraph, world_from_body: Floats) -> Floats:
 
 
 def calibrated(graph: ViewGraph, world_from_body: Floats) -> ViewGraph:
-    """The graph with the information of each kind of edge scaled so that half of them lie within the median of χ².
+    """The graph with the information of each kind of edge scaled so that half of its triangles close within the median
+    of χ²; of a kind with few triangles, so that half of its edges fit the poses.
 
     What a registrar or a two-view geometry says of itself leaves out what its points share (the lens, the sensor's
-    warp), so it is too sure, each kind by a factor of its own.
+    warp), so it is too sure, each kind by a factor of its own. The poses may be the disturbed ones: cycles are not.
     """
-    chi2 = edge_chi2(graph, world_from_body)
     factor = np.ones(graph.edge_count)
     for source in np.unique(graph.source):
         same = graph.source == source
-        middle = float(np.median(chi2[same]))
+        kind = graph.select(np.flatnonzero(same))
+        chi2 = triangle_chi2(kind)
+        if len(chi2) < LEAST_TRIANGLES:
+            chi2 = edge_chi2(kind, world_from_body)
+        middle = float(np.median(chi2))
         factor[same] = MEDIAN_CHI2 / middle if middle > 0 else 1.0
     return replace(graph, information=graph.information * factor[:, None, None])
 
 
+def triangle_chi2(graph: ViewGraph) -> Floats:
+    """χ² (T,) of the motion that each triangle of edges leaves over, by the covariances of its three edges."""
+    loops = short_cycles(graph.edges, graph.vertex_count, TRIANGLES_PER_EDGE)
+    first = loops.offsets[:-1][loops.lengths == 3]
+    at = first[:, None] + np.arange(3)
+    edge, forward = loops.edge[at], (loops.sign[at] > 0)[..., None, None]
+    motion = np.where(forward, graph.i_from_j[edge], se3.inverse(graph.i_from_j[edge]))
+    covariance = np.linalg.pinv(graph.information, hermitian=True)[edge]
+    turned = se3.adjoint(graph.i_from_j[edge])
+    covariance = np.where(forward, covariance, turned @ covariance @ np.swapaxes(turned, -1, -2))
+    total, rest = np.zeros((len(at), 6, 6)), np.broadcast_to(np.eye(4), (len(at), 4, 4))
+    for number in (2, 1, 0):
+        moved = se3.adjoint(se3.inverse(rest))
+        total = total + moved @ covariance[:, number] @ np.swapaxes(moved, -1, -2)
+        rest = motion[:, number] @ rest
+    xi = se3.log(rest)
+    return np.asarray(np.einsum("ta,tab,tb->t", xi, np.linalg.pinv(total, hermitian=True), xi))
+
+
 def solve_bodies(graph: ViewGraph, world_from_body: Floats, solver: ConsistencySolver) -> Solved:
-    """The consistent poses, from the model's own; the noise of each kind of edge is measured at the poses so far."""
+    """The consistent poses, from the model's own; the noise of edges without cycles is taken at those so far."""
     poses = world_from_body
     for _ in range(ROUNDS):
         right = calibrated(graph, poses)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.free_directions import named_direction
 from hodge_pipeline.types import Camera, Floats, Floats32
 
 SLIPPABLE = 0.015
@@ -16,7 +17,6 @@ FEWEST_SEEN = 30
 VIEW_WIDTH = 160
 MARGIN_M, MARGIN_PER_M2 = 0.06, 0.006
 """Depth noise of structured light grows with the square of the distance; a match is off by centimetres."""
-AXES = ("turning about", "sliding along")
 
 
 @dataclass(frozen=True)
@@ -104,12 +104,4 @@ def _slippable(matrix: Floats, radius_m: float) -> tuple[str, ...]:
     if not total > 0:
         return ("everything",)
     values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale / total)
-    return tuple(_named(vector) for value, vector in zip(values, vectors.T, strict=True) if value < SLIPPABLE)
-
-
-def _named(vector: Floats) -> str:
-    turning, sliding = vector[:3], vector[3:]
-    which = int(np.linalg.norm(sliding) > np.linalg.norm(turning))
-    axis = (turning, sliding)[which]
-    axis = axis / np.linalg.norm(axis) * (1 if axis[np.abs(axis).argmax()] > 0 else -1)
-    return f"{AXES[which]} ({', '.join(f'{x:.2f}' for x in np.round(axis, 2) + 0.0)})"
+    return tuple(named_direction(vector) for value, vector in zip(values, vectors.T, strict=True) if value < SLIPPABLE)

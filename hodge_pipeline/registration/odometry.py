@@ -41,12 +41,12 @@ class OdometryOptions:
         le=1,
         description="below it tracking is lost: no edge, the motion is the one before it, and it is said",
     )
-    max_drift: float = Field(
+    max_drift: float | None = Field(
         default=0.3,
         gt=0,
         description="share of the way between two frames (metres, and radians at 1 m) that odometry may err by; where "
         "it was not lost between them a pair that contradicts it by more is no edge. Of right pairs on three real "
-        "sequences 99 % stay below 0.27",
+        "sequences 99 % stay below 0.27. null: odometry rejects no pair",
     )
 
 

@@ -32,10 +32,11 @@ class Acceptance:
         le=1,
         description="share of cloud j with a point of cloud i nearby; below it too little holds the pair",
     )
-    max_rmse_m: float = Field(
+    max_rmse_m: float | None = Field(
         default=0.06,
         gt=0,
-        description="metres: RMS distance of those points; two 3 cm grids of one surface differ by 2 to 4 cm",
+        description="metres: RMS distance of those points; two 3 cm grids of one surface differ by 2 to 4 cm. "
+        "null: any",
     )
     min_spread: float = Field(
         default=0.02,
@@ -50,7 +51,8 @@ class Acceptance:
         """Why each pair (P,) is rejected by itself, an empty word where it is accepted."""
         out = np.full(len(registered.pairs), "", "U64")
         out[_slides(registered, self.min_spread)] = "what they share lets them slide"
-        out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
+        if self.max_rmse_m is not None:
+            out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
         out[~(registered.fitness >= self.min_fitness)] = "too little overlap"
         out[registered.correspondences == 0] = "nothing in common"
         return out

@@ -8,8 +8,8 @@ holds one block a worker, never the sequence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -92,11 +92,17 @@ def track_block(options: TrackingOptions, block: FrameBlock) -> TrackedBlock:
     return _Tracker(options, block).run()
 
 
+def read_once(frame: Frame) -> Frame:
+    """The frame, whose images are decoded once and kept as long as it is; an error is raised each time."""
+    depth, colour = frame.read_depth, frame.read_colour
+    return replace(frame, read_depth=depth and cache(depth), read_colour=colour and cache(colour))
+
+
 class _View:
     """A frame at its place in the block: its image, corners and cloud, each made when it is first needed."""
 
     def __init__(self, options: TrackingOptions, frame: Frame, place: int) -> None:
-        self._options, self._frame, self.place = options, frame, place
+        self._options, self._frame, self.place = options, read_once(frame), place
 
     @cached_property
     def image(self) -> FlowImage | None:

@@ -8,7 +8,6 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, WorkspaceError
-from hodge_pipeline.fusion.ply import read_ply
 from hodge_pipeline.recording.comparison import record_comparison
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.comparison import Comparison, RunFacts, tables
@@ -18,6 +17,7 @@ from hodge_pipeline.report.photographs import sides
 from hodge_pipeline.report.plots import draw
 from hodge_pipeline.store.artifacts import write_text
 from hodge_pipeline.types import Floats, Model
+from hodge_pipeline.types.ply import read_model
 
 
 def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
@@ -40,7 +40,7 @@ def _model(run: RunFacts, world_from_run: Floats) -> Model | None:
     if run.model is None:
         return None
     try:
-        model = read_ply(run.model)
+        model = read_model(run.model)
     except SourceError:
         return None
     turn = world_from_run[:3, :3].astype(np.float32)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -48,7 +50,7 @@ from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import Store, versions
 from hodge_pipeline.types import Floats, Ints, Solution, Source, Trajectory
-from hodge_pipeline.types.text import file_stems
+from hodge_pipeline.types.text import cell, file_stems
 
 KEY_OF_CACHE = r"-[0-9a-f]{12}$"
 """What a cached folder's name ends with, which tells nobody anything."""
@@ -67,6 +69,16 @@ def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
         name = "poses" if len(sequences) == 1 else f"poses-{stem}"
         for writer in ("tum", "kitti"):
             registry.load("writers", writer)().write(folder / f"{name}.{writer}", part)
+
+
+def write_pose_table(folder: Path, source: Source, world_from_cam: Floats) -> None:
+    """`poses.csv`: every frame by its name, and the 4x4 matrix world from camera (or scan), row by row."""
+    table = io.StringIO(newline="")
+    rows = csv.writer(table, csv.unix_dialect, quoting=csv.QUOTE_MINIMAL)
+    rows.writerow(["name", *(f"m{row}{column}" for row in range(4) for column in range(4))])
+    for frame, numbers in zip(source.frames, (world_from_cam + 0.0).reshape(-1, 16).tolist(), strict=True):
+        rows.writerow([cell(str(frame.frame_id)), *map(repr, numbers)])
+    artifacts.write_text(folder / "poses.csv", table.getvalue())
 
 
 def write_graph(folder: Path, source: Source, last: Round) -> None:
@@ -261,6 +273,7 @@ def write(
     """
     if refined is None or refined.decision.outcome != "nothing":
         write_poses(folder, scene.whole, world_from_cam)
+        write_pose_table(folder, scene.whole, world_from_cam)
         write_graph(folder, scene.source, rounds[-1])
         for name, path in models.items():
             artifacts.link_or_copy(path, folder / f"{name}.ply")

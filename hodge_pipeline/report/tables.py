@@ -10,22 +10,7 @@ from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
 from hodge_pipeline.report.contents import RefinementSummary, Report
 from hodge_pipeline.report.document import Table
-from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m, judge, suspicions
-
-
-def summary_lines(report: Report) -> tuple[tuple[str, str], ...]:
-    """The report in a few (label, text) lines for a terminal."""
-    lines = [("verdict", judge(report).sentence)]
-    source, graph = report.source, report.graph
-    lines.append(("source", f"{source.name}, {source.counted}, {source.frames_with_truth} with a true pose"))
-    if graph is not None:
-        by_source = ", ".join(f"{count} {name}" for name, count in graph.edges_by_source.items())
-        sources = f" ({by_source})" if by_source else ""
-        lines.append(("graph", f"{graph.edges} edges{sources}, {len(graph.components)} connected part(s)"))
-    if report.stages:
-        wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
-        lines.append(("time", f"{wall:.1f} s, {cpu:.1f} CPU s, at most {peak_mb(report):.0f} MB"))
-    return (*lines, *(("note", str(note)) for note in suspicions(report)))
+from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m
 
 
 def peak_mb(report: Report) -> float:

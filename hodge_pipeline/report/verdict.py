@@ -117,7 +117,8 @@ def _pieces(report: Report) -> str:
     if len(sizes) > 1:
         listed = [str(size) for size in sizes[:MOST_SIZES]] + ["…"] * (len(sizes) > MOST_SIZES)
         return f"In {len(sizes)} pieces ({', '.join(listed)} {of_all})"
-    return f"{sizes[0]} {of_all} in one piece" if sizes[0] < graph.vertices or report.source.unordered else ""
+    told = sizes[0] < graph.vertices or report.source.unordered or report.source.kind == "scans"
+    return f"{sizes[0]} {of_all} joined" if told else ""
 
 
 def _score_changes(report: Report) -> Iterator[Change]:

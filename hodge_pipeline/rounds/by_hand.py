@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, History, joining, read_history, vertex_rows
+from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, History, joining, read_history, vertex_rows
 from hodge_pipeline.rounds.more import Placed, register_more
 from hodge_pipeline.rounds.one_round import EDITED, Registered, Work
 from hodge_pipeline.scene import Round
@@ -23,6 +23,7 @@ from hodge_pipeline.types.notes import Note
 ARM_M = 1.0
 """A residual rotation counts as its arc at this distance."""
 BY_HAND = "by_hand"
+UNKNOWN = np.full((4, 4), np.nan)
 NEXT = "hodge edit --list shows them, hodge edit --undo takes the last back"
 
 
@@ -40,12 +41,13 @@ def edited_rounds(work: Work, folder: Path, rounds: Sequence[Round]) -> Iterator
     if history.registered:
         placed = _placed(work, edges.select(edges.counts).as_graph(ids))
         before, pairs = placed.world_from_cam, vertex_rows(ids, history.registered)
-        new = register_more(work, "registration, by hand", BY_HAND, pairs, placed)
+        guesses = np.array([history.guesses.get(pair, UNKNOWN) for pair in history.registered])
+        new = register_more(work, "registration, by hand", BY_HAND, pairs, placed, guesses)
         edges = _edited(work, Edges.joined([registered, new]), history)
         fresh = np.arange(len(registered), len(registered) + len(new))
     _tell(work, edges.select(edges.status != HELD_OUT), ids, history)
     start = _start(work, edges.select(edges.counts).as_graph(ids), rounds)
-    yield Registered(EDITED, edges, fresh, before, start)
+    yield Registered(EDITED, edges, fresh, before, start, edges.counts & _any_joining(edges, ids, history.right))
 
 
 def _placed(work: Work, graph: ViewGraph) -> Placed:
@@ -86,7 +88,7 @@ def _any_joining(edges: Edges, vertex_ids: NDArray[np.generic], pairs: tuple[str
 
 
 def _tell(work: Work, edges: Edges, vertex_ids: NDArray[np.generic], history: History) -> None:
-    for word in (DISABLED, ENABLED, REGISTERED):
+    for word in (DISABLED, ENABLED, RIGHT, REGISTERED):
         if pairs := [pair for pair, switch in history.switches.items() if switch == word]:
             work.steps.note(Note("edited", len(pairs), f"{word} {', '.join(pairs)} ({NEXT})"))
     found = {pair: joining(vertex_ids, edges.pairs, pair) for pair in history.switches}

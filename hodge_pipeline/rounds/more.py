@@ -32,26 +32,39 @@ class Placed:
         """Where (P,) a pair lies in two pieces."""
         return np.asarray(self.piece[pairs[:, 0]] != self.piece[pairs[:, 1]])
 
+    def guesses(self, pairs: Ints, given: Floats | None = None) -> Floats:
+        """The motions (P, 4, 4) `i_from_j` that are given or, where that is NaN, those of the poses; NaN for a pair
+        that lies in two pieces.
+        """
+        i, j = pairs.T
+        poses = se3.inverse(self.world_from_cam[i]) @ self.world_from_cam[j]
+        poses = np.where(self.across(pairs)[:, None, None], np.nan, poses)
+        return poses if given is None else np.where(np.isnan(given), poses, given)
 
-def register_more(work: Work, title: str, proposed_by: str, pairs: Ints, placed: Placed) -> Edges:
+
+def register_more(
+    work: Work, title: str, proposed_by: str, pairs: Ints, placed: Placed, guesses: Floats | None = None
+) -> Edges:
     """The pairs (P, 2) registered as the recipe says, those of one piece first.
 
-    A pair between two pieces is matched as the recipe's start matches without a guess, then registered from the match;
-    without a match that it accepts it is left out, and reported.
+    A pair is registered from its guess (P, 4, 4), or from the poses where that is NaN. One between two pieces without a
+    guess is matched as the recipe's start matches, then registered from the match; without a match that it accepts it
+    is left out, and reported.
     """
     matching = getattr(work.recipe.start, "unordered", work.recipe.start)
     matching = matching if isinstance(matching, GlobalStart) else GlobalStart()
+    guesses = placed.guesses(pairs, guesses)
     return work.steps.step(
-        register_named_pairs, pairs, proposed_by, placed, work.scene.source, work.scene.clouds,
-        work.recipe.registration, matching if placed.across(pairs).any() else None,
+        register_named_pairs, pairs, guesses, proposed_by, work.scene.source, work.scene.clouds,
+        work.recipe.registration, matching if np.isnan(guesses).any() else None,
         title=title, total=len(pairs), workers=work.workers,
     )  # fmt: skip
 
 
 def register_named_pairs(
     pairs: Ints,
+    guesses: Floats,
     proposed_by: str,
-    placed: Placed,
     source: Source,
     clouds: CloudSet,
     registrar: Registrar,
@@ -60,13 +73,11 @@ def register_named_pairs(
     workers: Workers,
     step: Step,
 ) -> Edges:
-    """Step: these pairs registered, with `matching` between two pieces."""
+    """Step: these pairs registered from their guesses (P, 4, 4), with `matching` where these are NaN."""
     assert clouds.folder is not None
-    across = placed.across(pairs)
-    near, far = pairs[~across], pairs[across]
-    i, j = near.T
-    guesses = se3.inverse(placed.world_from_cam[i]) @ placed.world_from_cam[j]
-    found = [register_pairs(clouds.folder, registrar, Edges.of(near), guesses, workers, step.advance)]
+    unknown = np.asarray(np.isnan(guesses).any(axis=(1, 2)))
+    near, far = pairs[~unknown], pairs[unknown]
+    found = [register_pairs(clouds.folder, registrar, Edges.of(near), guesses[~unknown], workers, step.advance)]
     if matching is not None:
         scratch = step.folder / "scratch"
         found.append(_without_guess(far, source, clouds.folder, registrar, matching, scratch, workers, step))

@@ -18,13 +18,16 @@ from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.registration.acceptance import accepted
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.scene import START, Round, Scene
+from hodge_pipeline.solvers.editing import GraphEditor
 from hodge_pipeline.sources.measured_edges import without_measured
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Step, Steps, Workers
 from hodge_pipeline.start.unordered.tour import propose_along_tour
-from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source, ViewGraph
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, ViewGraph
 from hodge_pipeline.types.edges import HELD_OUT
 from hodge_pipeline.types.notes import notes_of
 
+LEFT_OUT = 1e-3
+"""A weight below which a robust solver has left an edge out, whether or not it keeps a rest."""
 EDITED = "edited"
 """The name of a round that a person's edits made."""
 
@@ -32,7 +35,7 @@ EDITED = "edited"
 @dataclass(frozen=True)
 class Registered:
     """What a round is solved from: its pairs, measured ones last, of which it registered the rows `fresh (F,)` from the
-    poses `before (N, 4, 4)`; and the poses `start (N, 4, 4)` of the solve.
+    poses `before (N, 4, 4)`; and the poses `start (N, 4, 4)` of the solve, which may not leave out the rows `right`.
     """
 
     name: str
@@ -40,6 +43,7 @@ class Registered:
     fresh: Ints
     before: Floats
     start: Floats
+    right: Bools | None = None
 
     def graph(self, vertex_ids: NDArray[np.generic]) -> ViewGraph:
         """The viewing graph of the edges that count."""
@@ -148,6 +152,8 @@ def solve_edges(
 ) -> Round:
     """Step: the round of these edges and the poses consistent with them; `found` of ω at its start is kept."""
     edges, solution = registered.edges, solver.solve(graph, registered.start)
+    if registered.right is not None:
+        solution = with_right(graph, solution, registered.right[edges.counts])
     weights = np.zeros(len(edges))
     weights[edges.counts] = solution.weights
     solution = replace(solution, weights=weights[edges.in_graph])
@@ -156,6 +162,18 @@ def solve_edges(
         with_residuals(edges, solution.world_from_cam, solution.weights), graph.vertex_ids, solution.world_from_cam,
         solution, registered.fresh, registered.before, found, edited=registered.name == EDITED,
     )  # fmt: skip
+
+
+def with_right(graph: ViewGraph, solution: Solution, right: Bools) -> Solution:
+    """The solution with those of the edges that are right (E,) which a robust solver left out."""
+    left_out = np.flatnonzero(right & (solution.weights < LEFT_OUT))
+    if not len(left_out):
+        return solution
+    editor = GraphEditor(graph, solution)
+    editor.restore(left_out)
+    better = editor.solve()
+    note = f"edges that are right by hand and that the solver had left out: {len(left_out)}"
+    return replace(better, notes=(*solution.notes, note))
 
 
 def judge_edges(last: Round, options: DiagnosisOptions, *, step: Step) -> Round:

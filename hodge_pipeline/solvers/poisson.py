@@ -15,6 +15,7 @@ from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.complex.cycles import loop_deviation
 from hodge_pipeline.complex.edge_weights import EdgeWeighting, edge_weights
+from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.one_form import Logarithm, centroids, shifted
 from hodge_pipeline.solvers.potential import (
     AroundLoops,
@@ -31,8 +32,8 @@ WEIGHTS_SETTLED = 1e-3
 SMALLEST_WEIGHT = 1e-6  # a rejected edge still ties its ends together, so that no component falls apart
 SMALLEST_SCALE_M = 1e-6
 AFFORDABLE_BASIS = 1_000_000  # vertices times edges: a few tenths of a second
-MAD_TO_SIGMA = 1.4826
-TUNING = 3.0  # in sigmas: half weight at about 2 sigma
+MEDIAN_OF_SIX = 2.3126  # the median length of six unit Gaussians: of the 6-D residual whose median is taken
+TUNING = 10.29  # in standard deviations of an axis: 99.5 % efficient for six; half weight at about 3 median lengths
 
 
 @plain_dataclass(frozen=True)
@@ -73,8 +74,8 @@ class PoissonSolver:
     scale_m: float | None = Field(
         None,
         gt=0,
-        description="metres: the residual of a good edge (one sigma). Default: 1.4826 times the median residual, "
-        "taken anew in each reweighting step",
+        description="metres: the standard deviation of a good edge's residual on an axis. Default: the median residual "
+        "/ 2.31, since it has six axes, taken anew in each reweighting step",
     )
     reweighting_steps: int = Field(20, ge=1, description="at most so many IRLS steps; they end once weights settle")
     lever_arm_m: float = Field(
@@ -129,6 +130,7 @@ class PoissonSolver:
             notes=(
                 *notes,
                 *_edge_notes(proper, base_weights),
+                *free_direction_notes(graph),
                 *describe_components(problem.component, graph.vertex_ids),
                 *self._convergence_notes(problem, history),
             ),
@@ -187,9 +189,9 @@ def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam
 
 
 def _robust_scale(residual: Floats) -> float:
-    """One sigma in metres from the median; edges in no loop fit exactly and would drag it to 0, so they do not vote."""
+    """The standard deviation of an axis in metres, from the median; edges in no loop fit exactly and do not vote."""
     voting = residual[residual > 1e-9 * residual.max(initial=0.0)]
-    return max(MAD_TO_SIGMA * float(np.median(voting)) if len(voting) else 0.0, SMALLEST_SCALE_M)
+    return max(float(np.median(voting)) / MEDIAN_OF_SIX if len(voting) else 0.0, SMALLEST_SCALE_M)
 
 
 def _kernel(ratio: Floats) -> Floats:

@@ -14,12 +14,12 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
+from hodge_pipeline.complex.judging import chi2_by_information, left_over, mean_variances, squares_at_both_ends
 from hodge_pipeline.solvers.confirmation import confirmed
 from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.minimise import descend_isotropic
 from hodge_pipeline.solvers.newton import Limits, Point
-from hodge_pipeline.solvers.objective import residuals
 from hodge_pipeline.solvers.options import check_choice, check_positive
 from hodge_pipeline.solvers.setup import Setup, held_rows, prepare
 from hodge_pipeline.types import Floats, Solution, ViewGraph
@@ -27,6 +27,8 @@ from hodge_pipeline.types import Floats, Solution, ViewGraph
 Kernel: TypeAlias = Literal["truncated", "geman_mcclure"]
 CHI2_99_SPATIAL, CHI2_99_PLANAR = 16.812, 11.345
 """The 99 % quantiles of χ² with 6 and 3 degrees of freedom."""
+READMISSIONS = 3
+"""Solves in which edges that were left out count again, where they agree with the full information's minimum."""
 WEIGHT_FLOOR = 1e-9
 """An edge that is left out keeps this share of its weight, so that the Laplacians stay definite."""
 UNTESTED_WEIGHT = 0.1
@@ -82,25 +84,37 @@ def solve_robust(
     setup = replace(setup, problem=replace(problem, kappa=problem.kappa / 2)) if setup.dimension == 2 else setup
     corruption = _corruption(graph, setup, limit)
     share = np.ones(graph.edge_count) if confidence is None else np.asarray(confidence, float)
-    search = _Search(setup, share[setup.weights.used], limit, kernel)
+    search = _Search(setup, _Judge.of(graph, setup), share[setup.weights.used], limit, kernel)
     tried = [end for spread in TRUST_SPREADS for end in search.ends(_trust(corruption, spread))]
     last = min(tried, key=lambda end: search.truncated_cost(end.point))
     tested = int((~np.isnan(corruption)).sum())
     weights = np.zeros(graph.edge_count)
     weights[setup.weights.used] = np.round(last.weights) if kernel == "truncated" else last.weights
     weights = np.where(weights > LEAST_WEIGHT, weights * share, 0.0)
+
+    def solved(poses: Floats) -> Solution:
+        kept = np.flatnonzero(weights)
+        chosen = graph.select(kept)
+        return solve(
+            replace(chosen, information=weights[kept, None, None] * chosen.information),
+            start=poses,
+            initial="given" if graph.priors is None else "chordal",
+            objective=objective,
+            dimension=2 if setup.dimension == 2 else 3,
+            fixed=fixed,
+            certificate=certificate,
+        )
+
+    final = solved(setup.poses(last.point))
+    for _ in range(READMISSIONS if objective == "full" and setup.weights.definite else 0):
+        chi2 = chi2_by_information(graph, final.world_from_cam)
+        whole = final.component[graph.edges[:, 0]] == final.component[graph.edges[:, 1]]
+        back = setup.weights.used & (weights == 0) & whole & (chi2 <= limit)
+        if not back.any():
+            break
+        weights = np.where(back, share, weights)
+        final = solved(final.world_from_cam)
     kept = np.flatnonzero(weights)
-    chosen = graph.select(kept)
-    chosen = replace(chosen, information=weights[kept, None, None] * chosen.information)
-    final = solve(
-        chosen,
-        start=setup.poses(last.point),
-        initial="given" if graph.priors is None else "chordal",
-        objective=objective,
-        dimension=2 if setup.dimension == 2 else 3,
-        fixed=fixed,
-        certificate=certificate,
-    )
     notes = (
         *unheld,
         *(note for note in setup.weights.notes if note not in final.notes),
@@ -144,6 +158,7 @@ class _Search:
     """
 
     setup: Setup
+    judge: _Judge
     confidence: Floats
     limit: float
     kernel: Kernel
@@ -162,13 +177,13 @@ class _Search:
 
     def truncated_cost(self, point: Point) -> float:
         """The cost of the edges, none more than the limit."""
-        return float(self.confidence @ np.minimum(_squares(self.setup, point), self.limit))
+        return float(self.confidence @ np.minimum(self.judge.chi2(point), self.limit))
 
     def _truncated_after(self, smooth: _Round) -> _Round:
         """The end of rounds with weights 0 and 1 from there."""
         weights, point = smooth.weights, smooth.point
         for _ in range(MAX_ROUNDS):
-            new = _truncated(_squares(self.setup, point), self.limit, math.inf)
+            new = _truncated(self.judge.chi2(point), self.limit, math.inf)
             if np.array_equal(new, weights):
                 break
             weights, point = new, self._solved(new, point)
@@ -176,7 +191,7 @@ class _Search:
 
     def _graduate(self, trust: Floats, point: Point, kernel: Kernel) -> _Round:
         """Rounds of weighted solves in which the kernel goes from convex to its final shape."""
-        limit, squares = self.limit, _squares(self.setup, point)
+        limit, squares = self.limit, self.judge.chi2(point)
         seen = np.average(squares, weights=np.maximum(trust, WEIGHT_FLOOR)) if len(squares) else 0.0
         worst = float(max(np.max(squares[trust > KEPT_FROM], initial=0.0), seen))
         control = limit / (2 * worst - limit) if worst > limit else math.inf
@@ -187,7 +202,7 @@ class _Search:
             shape = _truncated if kernel == "truncated" else _geman_mcclure
             new = shape(squares, limit, control)
             point = self._solved(new, point)
-            squares = _squares(self.setup, point)
+            squares = self.judge.chi2(point)
             settled = np.abs(new - weights).max(initial=0.0) < SETTLED[kernel]
             weights = new
             if kernel == "truncated":
@@ -223,9 +238,26 @@ def _geman_mcclure(squares: Floats, limit: float, control: float) -> Floats:
     return np.asarray((control * limit / (squares + control * limit)) ** 2)
 
 
-def _squares(setup: Setup, point: Point) -> Floats:
-    """χ² (used edges,) with the weights as given."""
-    return residuals(setup.problem, point.rotations, point.translations).cost_per_edge
+@dataclass(frozen=True)
+class _Judge:
+    """The χ² of used edges, the same for one written the other way round: `graph` holds them alone."""
+
+    setup: Setup
+    graph: ViewGraph
+    rotation_variance: Floats
+    translation_variance: Floats
+
+    @classmethod
+    def of(cls, graph: ViewGraph, setup: Setup) -> _Judge:
+        """The judge of a graph's used edges."""
+        used = graph.select(np.flatnonzero(setup.weights.used))
+        return cls(setup, used, *mean_variances(used, setup.dimension == 2))
+
+    def chi2(self, point: Point) -> Floats:
+        """χ² (used edges,) at a point, in the mean variances of an axis."""
+        left = left_over(self.graph, self.setup.poses(point))
+        turned, shifted = squares_at_both_ends(self.graph.i_from_j, left)
+        return np.asarray(turned / self.rotation_variance + shifted / self.translation_variance)
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import FrameReader
-from hodge_pipeline.types import Bools, Edges, Frame, Ints, Source, ViewGraph
+from hodge_pipeline.types import Bools, Edges, Frame, Ints, Source, ViewGraph, number_of
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
@@ -111,9 +111,11 @@ def _between_frames(
 
 
 def _rows_of(graph: ViewGraph, frames: Sequence[Frame], first_frame: int) -> Ints:
-    """The row of the frame that each vertex is, -1 for none, or where several frames have its id."""
-    counts = Counter(frame.frame_id for frame in frames)
-    rows = {frame.frame_id: row for row, frame in enumerate(frames) if counts[frame.frame_id] == 1}
+    """The row of the frame that each vertex is by its id, or its number; -1 for none, or where several have it."""
+    numbered = graph.vertex_ids.dtype.kind in "iu"
+    names = [number_of(frame) if numbered else frame.frame_id for frame in frames]
+    counts = Counter(names)
+    rows = {name: row for row, name in enumerate(names) if counts[name] == 1}
     ids = graph.vertex_ids.tolist()
     if first_frame:
         ids = [vertex + first_frame if isinstance(vertex, int) else vertex for vertex in ids]

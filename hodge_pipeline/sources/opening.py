@@ -2,33 +2,61 @@
 
 from __future__ import annotations
 
-import os
 import uuid
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import Guess, guess_reader, guesses
 from hodge_pipeline.sources.unknown import without_frames
 from hodge_pipeline.stages import FrameReader, Steps
+from hodge_pipeline.store.store import file_facts
 from hodge_pipeline.types import Source
+from hodge_pipeline.types.notes import Note
 
 SURE = 0.6
 """Confidence of a reader from which a path is said to look like its format."""
+NAMED = 5
 MARGIN = 0.2
 """How much surer it must be than the reader of the recipe."""
 
 
-def remembered(source: Source, reader: FrameReader | None, steps: Steps) -> Source:
-    """The source, for which name, size and time of each of its files, and the reader's options, stand in keys.
+Fingerprints = dict[Path, tuple[Any, ...]]
+
+
+def remembered(source: Source, reader: FrameReader | None, steps: Steps, prints: Fingerprints) -> Source:
+    """The source, for which name and fingerprint of each of its files, and the reader's options, stand in keys.
 
     A source that no reader opened is in memory and cannot be told from its like: no other run has its key.
     """
-    files = [(str(path), status.st_size, status.st_mtime_ns) for path in source.files for status in [os.stat(path)]]
+    files = [(str(path), *found) for path, found in prints.items()]
     steps.remember(source, uuid.uuid4().hex if reader is None else steps.key([files, reader]))
     return source
+
+
+def fingerprints(files: Sequence[Path], *, strict: bool = False) -> Fingerprints:
+    """Size and time of each file, with its SHA-256 where `strict`; nothing for one that is not there."""
+    return {path: _fingerprint(path, strict) for path in files}
+
+
+def changed_since(before: Fingerprints, *, strict: bool = False) -> tuple[Note, ...]:
+    """A note where files are not as their `fingerprints` were: what came of both belongs to neither."""
+    now = fingerprints(list(before), strict=strict)
+    changed = [path.name for path in before if now[path] != before[path]]
+    return (Note("input changed", len(changed), ", ".join(changed[:NAMED])),) if changed else ()
+
+
+def _fingerprint(path: Path, strict: bool) -> tuple[Any, ...]:
+    try:
+        status = path.stat()
+        if not strict or not path.is_file():
+            return status.st_size, status.st_mtime_ns
+        return status.st_mtime_ns, *file_facts(path)
+    except OSError:
+        return ()
 
 
 def open_with_reader(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +12,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline import se3
 from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.evaluation.trajectory import associate
 from hodge_pipeline.registration.clouds import CloudOptions
@@ -34,7 +37,7 @@ from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_poses
 from hodge_pipeline.start.odometry import OPTIONS, chain
-from hodge_pipeline.types import Edges, Floats, Source, Trajectory
+from hodge_pipeline.types import Bools, Edges, Floats, Ints, Source, Trajectory
 from hodge_pipeline.types.notes import Note, notes_of
 
 SAME_M = 1e-6
@@ -127,21 +130,56 @@ class GivenStart:
     def _bridged(
         self, source: Source, matched: Matched, clouds: CloudOptions, steps: Steps, workers: Workers
     ) -> Floats:
-        """A pose for every frame: between the given ones the odometry's, bent so that it meets them.
+        """A pose for every frame: between the given ones the odometry's, bent so that it meets them. Odometry runs over
+        the gaps alone.
 
-        Where frames of a sequence have no given pose at all, the correction of the nearest given pose holds.
+        Where frames of a sequence have no given pose at all, they begin at the nearest given pose.
         """
-        known = np.flatnonzero(np.isfinite(matched.world_from_cam).all(axis=(1, 2)))
-        times = np.arange(len(source.frames), dtype=float)
-        steps.note(Note("carried", len(times) - len(known)))
-        every = make_clouds(source, clouds, steps, workers)
-        sequences, stamps = tuple(sequences_of(source).values()), np.array([f.stamp_s for f in source.frames])
+        given = matched.world_from_cam
+        known: Bools = np.asarray(np.isfinite(given).all(axis=(1, 2)))
+        steps.note(Note("carried", int((~known).sum())))
+        gaps = gaps_between(known, list(sequences_of(source).values()))
+        rows = np.concatenate(gaps)
+        part = key_source(source, rows)
+        steps.remember(part, steps.key([source, rows]))
+        made = make_clouds(part, clouds, steps, workers)
+        stamps = np.array([frame.stamp_s for frame in part.frames])
+        ends = np.cumsum([0, *map(len, gaps)])
+        places = tuple(np.arange(start, end) for start, end in pairwise(ends))
         title = "poses between the given ones"
-        found = steps.step(
-            chain, every, sequences, stamps, self.odometry, title=title, total=len(times), workers=workers
-        )
-        odometry = found.world_from_cam
-        return spread_correction(times, odometry, times[known], odometry[known], matched.world_from_cam[known])
+        found = steps.step(chain, made, places, stamps, self.odometry, title=title, total=len(rows), workers=workers)
+        poses = given.copy()
+        for gap, place in zip(gaps, places, strict=True):
+            poses[gap[~known[gap]]] = _carried(found.world_from_cam[place], gap, given, known)
+        return np.asarray(poses)
+
+
+def gaps_between(known: Bools, sequences: Sequence[Ints]) -> list[Ints]:
+    """Runs of rows of the sequences that hold every frame without a pose, with one known frame after it and two before,
+    so that odometry knows how fast it was.
+    """
+    runs = []
+    for rows in sequences:
+        missing = ~known[rows]
+        near = missing.copy()
+        near[1:] |= missing[:-1]
+        near[:-1] |= missing[1:]
+        near[:-2] |= missing[2:]
+        cuts = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(near)) + 1)
+        runs += [rows[cut] for cut in cuts if near[cut[0]]]
+    return runs
+
+
+def _carried(odometry: Floats, gap: Ints, given: Floats, known: Bools) -> Floats:
+    """Poses (M, 4, 4) of the frames of a gap that have none, by odometry (R, 4, 4) over it."""
+    inside = known[gap]
+    times = gap.astype(float)
+    if inside.any():
+        found = spread_correction(times, odometry, times[inside], odometry[inside], given[gap[inside]])
+        return found[~inside]
+    rows = np.flatnonzero(known)
+    nearest = rows[np.argmin(np.abs(rows - gap[0]))]
+    return np.asarray(given[nearest] @ se3.inverse(odometry[0]) @ odometry)
 
 
 def given_away(source: Source, poses: Floats, rows: np.ndarray) -> Source:

@@ -12,15 +12,15 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guesses
-from hodge_pipeline.types import Floats, Frame, Trajectory
+from hodge_pipeline.types import Floats, Frame, Trajectory, number_of
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
 SAME_STAMP_S = 1e-6
 LIKELY_SHARE = 0.5
 """Of the frames: fewer numbers in common may be a coincidence, since small numbers occur in every sequence."""
 
-RECIPE = "slam-refine"
-CALIBRATED = {"tum": "slam-refine-tum"}
+RECIPE = "slam_refine"
+CALIBRATED = {"tum": "slam_refine_tum"}
 """Recipes for the readers of formats whose depth and colour are calibrated to each other, where landmarks measure."""
 
 
@@ -93,7 +93,7 @@ def _by_stamp(trajectory: Trajectory, frames: Sequence[Frame], max_gap_s: float)
 
 
 def _by_number(trajectory: Trajectory, frames: Sequence[Frame]) -> Matched | None:
-    numbers = np.array([frame.frame_id for frame in frames])
+    numbers = np.array([number_of(frame) for frame in frames])
     whole = np.equal(np.mod(trajectory.stamps_s, 1), 0).all()
     if numbers.dtype.kind not in "iu" or not whole or (np.diff(numbers) <= 0).any():
         return None

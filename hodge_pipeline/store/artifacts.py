@@ -78,8 +78,11 @@ def _finite(value: Any) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """The value of a JSON file."""
-    return json.loads(read_input_text(path))
+    """The value of a JSON file. Raises `ValueError` where it holds none, `OSError` where it cannot be read."""
+    try:
+        return json.loads(read_input_text(path))
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

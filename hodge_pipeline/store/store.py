@@ -30,7 +30,7 @@ from hodge_pipeline.types.notes import Note
 
 T = TypeVar("T")
 LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless", "pycolmap")
-LAYOUT = 2
+LAYOUT = 3
 """Raised when steps are written in another form: those of before are computed again."""
 RECORD, KEY, INDEX = "step.json", "key.txt", "index.json"
 """Of a finished step: its key, the hash of each file, notes, cost; of a begun one: its key; of a run: its steps."""
@@ -124,7 +124,7 @@ class Store:
         if isinstance(value, bytes):
             return hashlib.sha256(value).hexdigest()
         if isinstance(value, Path):
-            return _facts(value) if value.is_file() else str(value)
+            return file_facts(value) if value.is_file() else str(value)
         if isinstance(value, Mapping):
             return {str(name): self.key(item) for name, item in value.items()}
         if isinstance(value, (list, tuple)):
@@ -160,7 +160,9 @@ class Store:
             codec.save(part, function(step=Step(part, advance, lambda *told: notes.update(dict.fromkeys(told)))))
         with disk_errors(part):
             (part / KEY).unlink()
-            files = {str(file.relative_to(part)): _facts(file) for file in sorted(part.rglob("*")) if file.is_file()}
+            files = {
+                str(file.relative_to(part)): file_facts(file) for file in sorted(part.rglob("*")) if file.is_file()
+            }
             facts = {"key": key, "title": title, "files": files, "notes": [vars(note) for note in notes]}
             _seal(part / RECORD, {**facts, "versions": versions(), "cost": vars(cost)})
             _commit(part, path)
@@ -224,7 +226,7 @@ def _check_files(path: Path, files: Mapping[str, list[Any]]) -> None:
     for name, known in files.items():
         if not (path / name).is_file():
             raise ValueError(f"{name} is gone")
-        if _facts(path / name) != known:
+        if file_facts(path / name) != known:
             raise ValueError(f"{name} has changed since it was written")
 
 
@@ -248,7 +250,7 @@ def _unsealed(path: Path) -> dict[str, Any]:
     return content
 
 
-def _facts(path: Path) -> list[Any]:
+def file_facts(path: Path) -> list[Any]:
     """Size and SHA-256 of a file."""
     total, size = hashlib.sha256(), 0
     with open_input(path) as stream:

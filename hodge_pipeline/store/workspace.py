@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import shutil
 import stat
 from collections.abc import Iterator
@@ -18,6 +19,9 @@ from hodge_pipeline.types.input_files import read_input
 from hodge_pipeline.types.text import command
 
 RECIPE_FILE, LOCK_FILE = "recipe.yaml", ".lock"
+_DRAFT = re.compile(r"\.[^.].*\.(csv|g2o|html|json|kitti|npz|ply|rrd|tum|txt|yaml)\.([a-z0-9_]{8}|draft|[0-9]+\.tmp)")
+_DRAFT_FOLDER = re.compile(r"\.(recording-|sparse\.)[a-z0-9_]{8}")
+"""What `artifacts`, the writers and the recording call a file or folder that is not whole yet."""
 OLD_KEY_FILE = "key.json"
 """In each stage of the layout before `Store`."""
 RUN, REFINEMENT = "stages", "refinement"
@@ -71,11 +75,13 @@ class Workspace:
             raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
         _hold(lock, folder)
         try:
-            _check_kind(folder, kind)
-            _check_recipe(folder, recipe, overwrite, refusal, kind)
-            (folder / kind).mkdir(exist_ok=True)
-            for old in (folder / kind).glob(f"*/{OLD_KEY_FILE}"):
-                shutil.rmtree(old.parent)
+            with disk_errors(folder):
+                _remove_drafts(folder)
+                _check_kind(folder, kind)
+                _check_recipe(folder, recipe, overwrite, refusal, kind)
+                (folder / kind).mkdir(exist_ok=True)
+                for old in (folder / kind).glob(f"*/{OLD_KEY_FILE}"):
+                    shutil.rmtree(old.parent)
         except BaseException:
             lock.close()
             raise
@@ -136,6 +142,17 @@ def _refuse_irregular(folder: Path) -> None:
                 raise WorkspaceError(f"{os.path.join(parent, name)}: is no file, and no run makes the like: remove it")
 
 
+def _remove_drafts(folder: Path) -> None:
+    """Take away what a process that was killed left between a temporary file and its name: nobody else writes here."""
+    for parent, folders, files in os.walk(folder):
+        for name in files:
+            if _DRAFT.fullmatch(name):
+                os.unlink(os.path.join(parent, name))
+        for name in [name for name in folders if _DRAFT_FOLDER.fullmatch(name)]:
+            folders.remove(name)
+            shutil.rmtree(os.path.join(parent, name), ignore_errors=True)
+
+
 def _open_lock(folder: Path) -> IO[str]:
     """The file whose lock is the folder's; neither through a link nor by waiting."""
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
@@ -175,8 +192,7 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal
         with suppress(OSError):
             (folder / LOCK_FILE).unlink()
         raise WorkspaceError(f"{folder}: is not empty and not a run folder: give another --out")
-    with disk_errors(path):
-        artifacts.write_text(path, text)
+    artifacts.write_text(path, text)
 
 
 def _is_text(path: Path, text: str) -> bool:

@@ -133,6 +133,12 @@ class Frame:
     colour_delay_s: float = 0.0
 
 
+def number_of(frame: Frame) -> int | str:
+    """The number of a frame: its id, or the whole number that is the stamp of a frame with a name; else the name."""
+    named = isinstance(frame.frame_id, str)
+    return int(frame.stamp_s) if named and float(frame.stamp_s).is_integer() else frame.frame_id
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Poses in time: `stamps_s (N,)` seconds, ascending; `world_from_cam (N, 4, 4)`."""

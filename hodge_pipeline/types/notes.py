@@ -26,6 +26,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "recording": (Rank.FACT, "{detail}"),
     "refinement": (Rank.FACT, "{detail}"),
     # What a run does.
+    "input changed": (
+        Rank.DOUBT,
+        "{count} files of the input changed while the run read them ({detail}): run the same command again once they "
+        "stay as they are.",
+    ),
     "single frame": (
         Rank.LOOK,
         "{detail}: has a single frame: there is nothing to register, the model is that frame alone",

@@ -80,7 +80,7 @@ def refine_trajectory(
     """Poses made better by the frames they belong to, one pose for each frame.
 
     `poses`: world_from_cam (N, 4, 4), or an `open3d.camera.PinholeCameraTrajectory`. `frames`: a path that a reader
-    opens, or frames (see `frames_from_images`). `recipe`: slam-refine, or slam-refine-tum for TUM's folders. `out`
+    opens, or frames (see `frames_from_images`). `recipe`: slam_refine, or slam_refine_tum for TUM's folders. `out`
     keeps the run folder with report and recording; `dask` is as of `run`. Files of poses go to `hodge refine
     trajectory`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """

@@ -1,0 +1,85 @@
+"""The χ² that judges an edge: ξᵀ Λ ξ with ξ = log(Z⁻¹ T_i⁻¹ T_j), the same for an edge written the other way round.
+
+Reversal gives ξ' = −Ad(Z) ξ, and information moves with it: Λ' = Ad(Z)⁻ᵀ Λ Ad(Z)⁻¹. Where only a spread of rotation
+and one of translation are known, they hold at both ends: Λ = ½ (Λ₀ + Ad(Z)ᵀ Λ₀ Ad(Z)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.types import Bools, Floats, ViewGraph
+
+UNMEASURED = 1e-9
+"""Of an eigenvalue, in units that make the information's diagonal one: where it is less, nothing was measured."""
+
+
+def left_over(graph: ViewGraph, world_from_cam: Floats) -> Floats:
+    """ξ (E, 6), rotation and translation in j's axes: the motion that each edge and the poses (V, 4, 4) leave over."""
+    i, j = graph.edges.T
+    return se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(world_from_cam[i]) @ world_from_cam[j])
+
+
+def chi2_by_information(graph: ViewGraph, world_from_cam: Floats) -> Floats:
+    """χ² (E,) by the graph's own information, 6 on average where information and poses are right."""
+    xi = left_over(graph, world_from_cam)
+    return np.asarray(np.einsum("ea,eab,eb->e", xi, graph.information, xi))
+
+
+def squares_at_both_ends(i_from_j: Floats, xi: Floats) -> tuple[Floats, Floats]:
+    """The squares (E,) of what is left over: rad² of rotation, m² of translation, the latter the mean of both ends."""
+    turn, here = xi[:, :3], xi[:, 3:]
+    there = here + np.cross(turn, _ahead(i_from_j))
+    return (turn**2).sum(axis=1), ((here**2).sum(axis=1) + (there**2).sum(axis=1)) / 2
+
+
+def _ahead(i_from_j: Floats) -> Floats:
+    """Frame i's origin (E, 3) in j's axes: where Ad(Z) takes a translation to be measured, up to a rotation."""
+    return np.asarray(-np.einsum("eji,ej->ei", i_from_j[:, :3, :3], i_from_j[:, :3, 3]))
+
+
+def in_vertex_order(graph: ViewGraph) -> tuple[ViewGraph, Bools]:
+    """The graph with every edge from the lower vertex row to the higher, and which edges (E,) were turned round.
+
+    Information moves with them, but for units that stand for unknown information.
+    """
+    turned = graph.edges[:, 0] > graph.edges[:, 1]
+    if not turned.any():
+        return graph, turned
+    edges, motions, information = graph.edges.copy(), graph.i_from_j.copy(), graph.information
+    edges[turned] = edges[turned, ::-1]
+    motions[turned] = se3.inverse(motions[turned])
+    if not has_unit_information(graph):
+        back = se3.adjoint(motions[turned])
+        information = information.copy()
+        information[turned] = np.swapaxes(back, 1, 2) @ information[turned] @ back
+    return replace(graph, edges=edges, i_from_j=motions, information=information), turned
+
+
+def has_unit_information(graph: ViewGraph) -> bool:
+    """Whether all edges have the identity that files hold for unknown information, of angles or of half angles."""
+    diagonal = graph.information[:, range(6), range(6)]
+    units = np.isin(diagonal[:, :3], (0, 0.25, 1)).all() and np.isin(diagonal[:, 3:], (0, 1)).all()
+    return bool(units and np.count_nonzero(graph.information) == np.count_nonzero(diagonal))
+
+
+def mean_variances(graph: ViewGraph, planar: bool) -> tuple[Floats, Floats]:
+    """The mean variances (E,) of an axis of rotation and of translation that the information states, the latter of both
+    ends: an edge written the other way round has the same. A direction that nothing measured has a very large one.
+    """
+    axes = np.array([2, 3, 4]) if planar else np.arange(6)
+    stated = graph.information[:, axes[:, None], axes]
+    diagonal = np.einsum("eii->ei", stated)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(stated * scale[:, :, None] * scale[:, None])
+    spread = scale[:, :, None] * vectors / np.sqrt(np.maximum(values, UNMEASURED))[:, None]
+    turn = int((axes < 3).sum())
+    at_i = np.zeros((len(stated), 6, len(axes)))
+    at_i[:, axes] = spread
+    at_i = (se3.adjoint(graph.i_from_j) @ at_i)[:, axes]
+    rotation = (spread[:, :turn] ** 2).sum(axis=(1, 2)) / turn
+    both = (spread[:, turn:] ** 2).sum(axis=(1, 2)) + (at_i[:, turn:] ** 2).sum(axis=(1, 2))
+    return rotation, both / (2 * (len(axes) - turn))

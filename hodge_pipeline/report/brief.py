@@ -1,0 +1,59 @@
+"""A report in ten lines of 80 columns, for a terminal."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+
+from hodge_pipeline.report.contents import Report
+from hodge_pipeline.report.run_page import duration, next_commands, worst_places
+from hodge_pipeline.report.tables import peak_mb
+from hodge_pipeline.report.verdict import judge, suspicions
+from hodge_pipeline.types.notes import Rank
+
+COLUMNS, LINES, LABEL = 80, 10, 9
+FEWEST_POINTS, MOST_NOTES, MOST_OF_A_NOTE = 2, 2, 2
+
+
+def brief(report: Report, folder: str) -> list[str]:
+    """The verdict as a short list, where it is worst, what to heed, and what to type next; `folder` is the report's."""
+    verdict = judge(report)
+    head = labelled("verdict", verdict.headline)
+    worrying = [str(note) for note in suspicions(report) if note.rank < Rank.FACT]
+    tail = [line for place in list(worst_places(report))[:1] for line in labelled("worst", place)]
+    for note in worrying[:MOST_NOTES]:
+        tail += _at_most(labelled("look", note), 1 if len(worrying) > 1 else MOST_OF_A_NOTE)
+    tail += list(_end(report, folder))
+    room = max(LINES - len(head) - len(tail), FEWEST_POINTS)
+    points = verdict.points
+    if len(points) > room:
+        left = len(points) - room + 1
+        points = (*points[: room - 1], f"… and {left} more measures: --verbose")
+    return [*head, *(line for point in points for line in _at_most(textwrap.wrap(f"  - {point}", COLUMNS), 1)), *tail]
+
+
+def all_notes(report: Report) -> list[str]:
+    """Every note, whole."""
+    return [line for note in suspicions(report) for line in labelled("note", str(note))]
+
+
+def _end(report: Report, folder: str) -> Iterator[str]:
+    if report.stages:
+        wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
+        yield from labelled("time", f"{duration(wall)}, {cpu:.1f} CPU s, at most {peak_mb(report):.0f} MB")
+    yield f"{'report':<{LABEL}}{folder}/report.html"
+    command = next(line for line in next_commands(report, folder) if not line.startswith("#"))
+    yield f"{'next':<{LABEL}}{command}"
+
+
+def labelled(label: str, text: str) -> list[str]:
+    """The text beside its label, in as many lines as it takes; a path or a command is never broken."""
+    lines = textwrap.wrap(text, COLUMNS - LABEL, break_long_words=False, break_on_hyphens=False) or [""]
+    return [f"{label:<{LABEL}}{lines[0]}", *(f"{'':<{LABEL}}{line}" for line in lines[1:])]
+
+
+def _at_most(lines: list[str], count: int) -> list[str]:
+    if len(lines) <= count:
+        return lines
+    cut = f"{lines[count - 1]} {lines[count].strip()}"[: COLUMNS - 1].rsplit(" ", 1)[0]
+    return [*lines[: count - 1], f"{cut} …"]

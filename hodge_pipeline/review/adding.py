@@ -1,0 +1,98 @@
+"""An edge put in by hand: a first guess, the run's own registrar, and what it says of the cycles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.recipe.schema import Recipe
+from hodge_pipeline.types import CloudSet, Edges, Floats, Registration, ViewGraph
+
+LEAST_POINTS = 3
+LEAST_SPREAD = 1e-3
+"""Second singular value over the first of the points clicked, below which they lie on a line."""
+
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A pair of vertex rows to be joined: its guess `i_from_j (4, 4)`, the points clicked in each cloud, then what the
+    registrar found, why acceptance rejects it (empty where it does not), and how far it is from the present poses.
+    """
+
+    i: int
+    j: int
+    guess: Floats
+    found: Registration | None = None
+    rejected: str = ""
+    residual_m: float = float("nan")
+    residual_deg: float = float("nan")
+    points_i: tuple[Point, ...] = ()
+    points_j: tuple[Point, ...] = ()
+
+    @property
+    def motion(self) -> Floats:
+        """The motion that was found, or else the guess."""
+        return self.guess if self.found is None else self.found.i_from_j
+
+    def clicked(self, point: Point) -> Candidate:
+        """With one more point, in turn in i's and in j's cloud; from three pairs on they make the guess."""
+        first, second = self.points_i, self.points_j
+        first, second = ((*first, point), second) if len(first) == len(second) else (first, (*second, point))
+        guess = self.guess
+        if len(first) == len(second) >= LEAST_POINTS:
+            guess = guess_from_points(np.array(first), np.array(second))
+        return Candidate(self.i, self.j, guess, points_i=first, points_j=second)
+
+
+def guess_from_poses(world_from_cam: Floats, i: int, j: int) -> Floats:
+    """The motion `i_from_j (4, 4)` by the present poses."""
+    return np.asarray(se3.inverse(world_from_cam[i]) @ world_from_cam[j])
+
+
+def guess_from_points(points_in_i: Floats, points_in_j: Floats) -> Floats:
+    """The rigid motion `i_from_j (4, 4)` that lays points (N, 3) of j best onto those of i (Arun 1987).
+
+    Raises `GraphError` for fewer than three pairs, or pairs on a line.
+    """
+    first, second = np.asarray(points_in_i, float), np.asarray(points_in_j, float)
+    if len(first) != len(second) or len(first) < LEAST_POINTS:
+        raise GraphError(f"{len(first)} and {len(second)} points clicked: click three pairs or more, in both clouds")
+    here, there = first - first.mean(axis=0), second - second.mean(axis=0)
+    for name, points in (("first", here), ("second", there)):
+        sizes = np.linalg.svd(points, compute_uv=False)
+        if sizes[1] <= LEAST_SPREAD * max(sizes[0], 1e-12):
+            raise GraphError(f"the points clicked in the {name} cloud lie on a line: click one beside it")
+    rotation = se3.project_to_so3(here.T @ there)
+    return np.asarray(se3.from_parts(rotation, first.mean(axis=0) - rotation @ second.mean(axis=0)))
+
+
+def register_candidate(recipe: Recipe, clouds: CloudSet, wanted: Candidate) -> Registration:
+    """What the run's registrar finds for the pair, from its guess. Raises `GraphError` where a frame has no cloud."""
+    for row in (wanted.i, wanted.j):
+        if not len(clouds[row]):
+            raise GraphError(f"frame {row} has no points: pick another")
+    registrar = recipe.registration
+    target, source = (registrar.prepare(clouds[row]) for row in (wanted.i, wanted.j))
+    return registrar.register(target, source, wanted.guess)
+
+
+def assessed(
+    recipe: Recipe, graph: ViewGraph, world_from_cam: Floats, wanted: Candidate, found: Registration
+) -> Candidate:
+    """The candidate with what was found, why the recipe's acceptance rejects it, and its distance from the poses."""
+    row = Edges.of([[wanted.i, wanted.j]]).with_registrations([found])
+    residual_m, residual_rad = edge_residuals(row.as_graph(graph.vertex_ids), world_from_cam)
+    return replace(
+        wanted,
+        found=found,
+        rejected=str(recipe.acceptance.reasons(row)[0]),
+        residual_m=float(residual_m[0]),
+        residual_deg=float(np.degrees(residual_rad[0])),
+    )

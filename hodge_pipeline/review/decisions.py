@@ -1,0 +1,165 @@
+"""Decisions about edges: kept as `hodge edit` keeps them, each with a line in a log; a stale one is refused."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError, not_written
+from hodge_pipeline.pairs.edits import VERBS, Edit, History, read_history_file, write_history_file
+from hodge_pipeline.store.workspace import holding
+
+COLUMNS = ("time", "who", "decision", "pairs", "verdict", "score", "residual_m", "residual_deg", "note")
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""What a spreadsheet takes for the beginning of a formula: such a cell gets an apostrophe."""
+
+
+class StaleError(HodgeError):
+    """A decision was made on a page that did not show the latest state."""
+
+
+class LockedError(HodgeError):
+    """No decision can be taken now."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """Who takes a decision, when (UTC, ISO 8601), why, and what was known of its edges."""
+
+    who: str = ""
+    time: str = ""
+    note: str = ""
+    verdict: str = ""
+    score: str = ""
+    residual_m: str = ""
+    residual_deg: str = ""
+
+
+class Decisions:
+    """The history of decisions in a file, at a revision that grows with each change, whoever makes it.
+
+    Each change takes the revision that its maker saw: a stale one raises `StaleError`, and so does the first after the
+    file was changed by another program. What is written is on disk when a method returns.
+    """
+
+    def __init__(self, file: Path, log: Path, *, run_folder: Path | None, locked: str = "") -> None:
+        self._file, self._log, self._run_folder, self._locked = file, log, run_folder, locked
+        self.history = read_history_file(file)
+        self.revision = 0
+        self._undone: list[int] = []
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether an edit was taken back since the last one, by this process."""
+        return bool(self._undone)
+
+    def why_locked(self) -> str:
+        """Why no decision can be taken now; empty where one can."""
+        try:
+            with _held(self._run_folder):
+                return self._locked
+        except LockedError as error:
+            return self._locked or str(error)
+
+    def refresh(self) -> bool:
+        """Read the file again; whether another program has changed it."""
+        found = read_history_file(self._file)
+        if found == self.history:
+            return False
+        self.history, self._undone = found, []
+        self.revision += 1
+        return True
+
+    def add(self, revision: int, edit: Edit, said: Said) -> None:
+        """One more decision. Raises `StaleError`, `LockedError`, `WorkspaceError`."""
+        with self._changing(revision):
+            self._put(self.history.added(edit), "", edit, said)
+            self._undone = []
+
+    def undo(self, revision: int, said: Said) -> None:
+        """Take the latest decision that counts back. Raises as `add`, and `GraphError` where there is none."""
+        with self._changing(revision):
+            row = self.history.latest
+            undone = self.history.undo()
+            assert row is not None
+            self._put(undone, "undo ", self.history.edits[row], said)
+            self._undone.append(row)
+
+    def redo(self, revision: int, said: Said) -> None:
+        """Let the decision that was taken back last count again. Raises as `undo`."""
+        with self._changing(revision):
+            if not self._undone:
+                raise GraphError("there is nothing to redo")
+            again = self.history.redo(self._undone[-1])
+            self._put(again, "redo ", again.edits[self._undone[-1]], said)
+            self._undone.pop()
+
+    def note(self, text: str, said: Said) -> None:
+        """A line in the log that is no edit."""
+        self._append([said.time, said.who, text, "", "", "", "", "", said.note])
+
+    def lines(self) -> list[dict[str, str]]:
+        """The log, oldest first."""
+        if not self._log.exists():
+            return []
+        with self._log.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
+    @contextmanager
+    def _changing(self, revision: int) -> Iterator[None]:
+        if self._locked:
+            raise LockedError(self._locked)
+        with _held(self._run_folder):
+            if self.refresh():
+                raise StaleError(
+                    "the edits were changed by another program: what you see is now up to date, look again"
+                )
+            if revision != self.revision:
+                raise StaleError(
+                    f"this page shows revision {revision}, the edits are at {self.revision}: another page has decided "
+                    "since; nothing was changed, look again"
+                )
+            yield
+
+    def _put(self, history: History, prefix: str, edit: Edit, said: Said) -> None:
+        try:
+            write_history_file(self._file, history)
+        except OSError as error:
+            raise not_written(self._file, error) from error
+        self.history = history
+        self.revision += 1
+        pairs = {verb: names for verb in VERBS if (names := getattr(edit, verb))}
+        named = " ".join(name for names in pairs.values() for name in names)
+        known = (said.verdict, said.score, said.residual_m, said.residual_deg)
+        self._append([said.time, said.who, prefix + " ".join(pairs), named, *known, said.note])
+
+    def _append(self, cells: Sequence[str]) -> None:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        if not self._log.exists():
+            writer.writerow(COLUMNS)
+        writer.writerow([_plain(cell) for cell in cells])
+        try:
+            with self._log.open("a", encoding="utf-8", newline="") as file:
+                file.write(text.getvalue())
+        except OSError as error:
+            raise not_written(self._log, error) from error
+
+
+def _plain(cell: str) -> str:
+    return f"'{cell}" if cell.startswith(FORMULA) else cell
+
+
+@contextmanager
+def _held(folder: Path | None) -> Iterator[None]:
+    with ExitStack() as stack:
+        if folder is not None:
+            try:
+                stack.enter_context(holding(folder))
+            except WorkspaceError as error:
+                raise LockedError(f"{error}; until then this review can only be looked at") from error
+        yield

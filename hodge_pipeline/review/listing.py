@@ -1,0 +1,224 @@
+"""The table of edges that a page shows: filtered, sorted, a piece at a time; and all that is known of one edge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from hodge_pipeline.diagnosis.advice import ORDER
+from hodge_pipeline.diagnosis.wording import cycle_error, name_cycle
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.pairs.edits import pair_names
+from hodge_pipeline.review.session import Session
+from hodge_pipeline.review.settle import Judged
+from hodge_pipeline.types import Bools, Floats, Ints
+
+Key = Literal["score", "residual", "turn", "gap", "cycles", "name"]
+MOST = 500
+"""Rows at most that a page gets at a time."""
+
+
+@dataclass(frozen=True)
+class Query:
+    """Which edges, and in which order: `verdicts` (none: all), at least so many frames apart and metres off, those of
+    one frame; from the row `first` on.
+    """
+
+    verdicts: Sequence[str] = ()
+    min_gap: int = 0
+    min_residual_m: float = 0.0
+    frame: str = ""
+    sort: Key = "score"
+    descending: bool = False
+    first: int = 0
+    count: int = 100
+
+    def __post_init__(self) -> None:
+        if self.sort not in get_args(Key):
+            raise GraphError(f"sort={self.sort}: expected {', '.join(get_args(Key))}")
+
+
+def list_edges(session: Session, query: Query) -> dict[str, Any]:
+    """How many edges the query has, and some of them."""
+    with session.changed:
+        table, settled, judged = session.table, session.settled, session.judged
+        switches = table.switches(session.decisions.history)
+        revision, selected = session.decisions.revision, session.look.selected
+    edges, ids = table.edges, table.graph.vertex_ids
+    passing, closing = cycle_counts(judged, len(edges))
+    known = np.isin(np.arange(len(edges)), () if judged is None else judged.rows)
+    rows = np.flatnonzero(_wanted(session, query))
+    rows = rows[_order(session, query, rows, passing - closing)]
+    total, rows = len(rows), rows[query.first : query.first + min(query.count, MOST)]
+    listed = [
+        {
+            "row": row,
+            "name": name,
+            "verdict": str(edges.verdict[row]),
+            "score": _number(edges.probability[row]),
+            "residual_m": _number(settled.residual_m[row]),
+            "residual_deg": _number(np.degrees(settled.residual_rad[row])),
+            "gap": int(abs(np.diff(table.graph.edges[row])[0])),
+            "source": str(edges.proposed_by[row]),
+            "cycles": int(passing[row]) if known[row] else None,
+            "closing": int(closing[row]),
+            "counts": bool(settled.weights[row] > 0),
+            "status": str(edges.status[row]),
+            "decision": str(switches[row]),
+            "reason": str(edges.why[row]),
+        }
+        for row, name in zip(rows.tolist(), pair_names(ids, table.graph.edges[rows]), strict=True)
+    ]
+    place = {"revision": revision, "selected": selected}
+    return {"total": total, "first": query.first, "edges": listed, **place}
+
+
+def _wanted(session: Session, query: Query) -> Bools:
+    table, settled = session.table, session.settled
+    pairs = table.graph.edges
+    wanted = np.abs(pairs[:, 0] - pairs[:, 1]) >= query.min_gap
+    if query.verdicts:
+        wanted &= np.isin(table.edges.verdict, query.verdicts)
+    if query.min_residual_m > 0:
+        wanted &= ~(settled.residual_m < query.min_residual_m)
+    if query.frame:
+        wanted &= (table.graph.vertex_ids[pairs].astype(str) == query.frame).any(axis=1)
+    return np.asarray(wanted)
+
+
+def _order(session: Session, query: Query, rows: Ints, failing: Ints) -> Ints:
+    """The order of rows, the worst first unless `descending` turns it round.
+
+    Edges with the same score keep their order, that of the residuals at first, while decisions move the poses.
+    """
+    edges, settled, pairs = session.table.edges, session.settled, session.table.graph.edges
+    residual_m = np.nan_to_num(settled.residual_m[rows], nan=np.inf)
+    first_m = np.full(len(edges), np.inf)
+    first_m[: len(session.first.residual_m)] = np.nan_to_num(session.first.residual_m, nan=np.inf)
+    keys: dict[str, tuple[Any, ...]] = {
+        "score": (-first_m[rows], _place(edges.probability[rows]), _ranks(edges.verdict[rows])),
+        "residual": (-residual_m,),
+        "turn": (-np.nan_to_num(settled.residual_rad[rows], nan=np.inf),),
+        "gap": (-np.abs(pairs[rows, 0] - pairs[rows, 1]),),
+        "cycles": (-failing[rows],),
+        "name": (pairs[rows, 1], pairs[rows, 0]),
+    }
+    order = np.lexsort(keys[query.sort])
+    return order[::-1] if query.descending else order
+
+
+def _place(score: Floats) -> Floats:
+    return np.asarray(np.nan_to_num(score, nan=0.5).round(2))
+
+
+def _ranks(verdict: np.ndarray[tuple[int, ...], Any]) -> Ints:
+    places = {name: place for place, name in enumerate(ORDER)}
+    return np.array([places.get(str(one), len(places)) for one in verdict], np.int64)
+
+
+def cycle_counts(judged: Judged | None, count: int) -> tuple[Ints, Ints]:
+    """How many listed cycles pass each edge (E,), and how many of these close; zeros while nothing is judged."""
+    passing, closing = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    if judged is not None:
+        cycles, rows = judged.diagnosis.cycles, judged.rows
+        closes = np.repeat(cycles.closes, cycles.loops.lengths)
+        passing[rows] = np.bincount(cycles.loops.edge, minlength=len(rows))
+        closing[rows] = np.bincount(cycles.loops.edge, closes, len(rows)).astype(np.int64)
+    return passing, closing
+
+
+def describe(session: Session, edge: int) -> dict[str, Any]:
+    """What the page says of the edge that is selected: the cycles that close over it and those that fail, by frames."""
+    with session.changed:
+        table, judged = session.table, session.judged
+    if not 0 <= edge < len(table):
+        raise GraphError(f"there is no edge {edge}: rows go from 0 to {len(table) - 1}")
+    cycles = [{"closes": closes, "text": text, "error": error} for closes, text, error, _ in witnesses(session, edge)]
+    (name,) = pair_names(table.graph.vertex_ids, table.graph.edges[[edge]])
+    beside = len(table.rows[name])
+    known = judged is not None and judged.row(edge) is not None
+    return {"row": edge, "name": name, "cycles": cycles, "beside": beside, "known": known}
+
+
+def witnesses(session: Session, edge: int) -> list[tuple[bool, str, str, Ints]]:
+    """The cycles that speak for and against an edge: whether each closes, its frames, by how much it fails, and the
+    vertex rows along it.
+    """
+    judged, table = session.judged, session.table
+    if judged is None or (row := judged.row(edge)) is None:
+        return []
+    found, graph = judged.diagnosis, table.graph.select(judged.rows)
+    out = []
+    for closes, telling in ((True, found.witnesses_for[row]), (False, found.witnesses_against[row])):
+        for cycle in telling[telling >= 0].tolist():
+            loops = found.cycles.loops
+            entry = slice(loops.offsets[cycle], loops.offsets[cycle + 1])
+            along = graph.edges[loops.edge[entry], np.where(loops.sign[entry] > 0, 0, 1)]
+            out.append((closes, name_cycle(graph, found.cycles, cycle), cycle_error(found.cycles, cycle), along))
+    return out
+
+
+def state(session: Session) -> dict[str, Any]:
+    """All that a page shows beside the table."""
+    with session.changed:
+        table, settled, decisions = session.table, session.settled, session.decisions
+        counted = settled.weights > 0
+        words, counts = np.unique(table.edges.verdict, return_counts=True)
+        latest, candidate = decisions.history.latest, session.candidate
+        look = session.look
+        return {
+            "version": session.version,
+            "revision": decisions.revision,
+            "settled_revision": settled.revision,
+            "name": session.subject.name,
+            "path": str(session.subject.path),
+            "locked": session.locked,
+            "message": session.message,
+            "doing": session.quick.doing or session.slow.doing,
+            "is_run": session.subject.is_run,
+            "has_clouds": session.subject.clouds is not None,
+            "notes": list(session.subject.notes),
+            "verdicts": dict(zip(words.tolist(), counts.tolist(), strict=True)),
+            "poses": len(settled.world_from_cam),
+            "edges": len(table),
+            "counting": int(counted.sum()),
+            "disabled": session.disabled,
+            "pieces": int(settled.component.max(initial=-1)) + 1,
+            "seconds": round(settled.seconds, 4),
+            "moved_m": _number(settled.moved_m),
+            "error_m": None if settled.error_m is None else _number(settled.error_m),
+            "first_error_m": None if session.first.error_m is None else _number(session.first.error_m),
+            "converged": settled.converged,
+            "latest": "" if latest is None else str(decisions.history.edits[latest]),
+            "can_undo": latest is not None,
+            "can_redo": decisions.can_redo,
+            "to_register": session.missing(),
+            "look": {**vars(look), "picked": [_name(session, row) for row in look.picked]},
+            "candidate": None if candidate is None else _candidate(session, candidate),
+        }
+
+
+def _name(session: Session, row: int) -> str:
+    return str(session.table.graph.vertex_ids[row])
+
+
+def _candidate(session: Session, candidate: Any) -> dict[str, Any]:
+    found = candidate.found
+    return {
+        "pair": f"{_name(session, candidate.i)}-{_name(session, candidate.j)}",
+        "registered": found is not None,
+        "fitness": None if found is None else _number(found.fitness),
+        "rmse_m": None if found is None else _number(found.rmse_m),
+        "rejected": candidate.rejected,
+        "points": min(len(candidate.points_i), len(candidate.points_j)),
+        "residual_m": _number(candidate.residual_m),
+        "residual_deg": _number(candidate.residual_deg),
+    }
+
+
+def _number(value: Any) -> float | None:
+    """A number for JSON, which has no NaN."""
+    return float(f"{value:.5g}") if np.isfinite(value) else None

@@ -1,0 +1,99 @@
+"""The two clouds that are looked at closely: where each lies, and which of their points are shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.review.adding import Candidate
+from hodge_pipeline.review.session import Session
+from hodge_pipeline.types import Bools, Floats, Floats32, PointCloud
+
+APART = 1.15
+"""Clouds side by side are so many of their widths apart."""
+EXTENT = 90
+"""Percentile of the distances from a cloud's middle that counts as its size."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Vertex rows of two clouds, the pose of each, the size of the first and where its middle is; a cut through them;
+    the candidate whose points are clicked, where some are.
+    """
+
+    i: int
+    j: int
+    world_from_i: Floats
+    world_from_j: Floats
+    middle: Floats
+    size_m: float
+    cut: float | None = None
+    candidate: Candidate | None = None
+
+    @property
+    def wants_points(self) -> bool:
+        """Whether a click picks a point."""
+        return self.candidate is not None
+
+    @property
+    def next_is_first(self) -> bool:
+        """Whether the next click is in the first cloud."""
+        return self.candidate is None or len(self.candidate.points_i) == len(self.candidate.points_j)
+
+    def picks(self) -> Floats:
+        """The points clicked (N, 3), in the world."""
+        if self.candidate is None:
+            return np.zeros((0, 3))
+        first = np.reshape(self.candidate.points_i, (-1, 3))
+        second = np.reshape(self.candidate.points_j, (-1, 3))
+        return np.concatenate([se3.transform(self.world_from_i, first), se3.transform(self.world_from_j, second)])
+
+    def kept(self, points: Floats32, world_from_cam: Floats, up: Floats, thickness: float) -> Bools:
+        """Which points (N, 3) of a cloud at a pose lie in the cut, `thickness` of the size thick."""
+        if self.cut is None:
+            return np.ones(len(points), bool)
+        heights = (se3.transform(world_from_cam, np.asarray(points, float)) - self.middle) @ up
+        return np.asarray(np.abs(heights - self.cut * self.size_m) <= thickness * self.size_m)
+
+
+def shown_pair(session: Session, flip: bool) -> Shown | None:
+    """What is looked at closely; None where the whole scene is. `flip` shows the other side of what blinks."""
+    look, clouds = session.look, session.subject.clouds
+    if look.mode == "all" or clouds is None:
+        return None
+    poses = session.settled.world_from_cam
+    if session.candidate is not None:
+        i, j, motion = session.candidate.i, session.candidate.j, session.candidate.motion
+    elif look.selected >= 0:
+        graph = session.table.graph
+        (i, j), motion = graph.edges[look.selected].tolist(), graph.i_from_j[look.selected]
+    else:
+        return None
+    middle, size_m = _extent(clouds[i])
+    inside = middle
+    by_edge, by_solution = poses[i] @ motion, poses[j]
+    share = {"edge": 0.0, "solution": 1.0, "blink": float(flip), "between": look.share}.get(look.mode, 0.0)
+    world_from_j = by_edge if share == 0 else by_solution if share == 1 else _between(by_edge, by_solution, share)
+    clicking = None
+    if look.mode == "apart":
+        beside = np.eye(4)
+        beside[0, 3] = APART * 2 * size_m
+        world_from_j, clicking = poses[i] @ beside, session.candidate
+        inside, size_m = middle + [APART * size_m, 0, 0], 2 * size_m
+    world = se3.transform(poses[i], inside[None])[0]
+    return Shown(i, j, poses[i], world_from_j, world, size_m, look.cut, clicking)
+
+
+def _between(first: Floats, second: Floats, share: float) -> Floats:
+    return np.asarray(se3.interpolate(first[None], second[None], np.array([share]))[0])
+
+
+def _extent(cloud: PointCloud) -> tuple[Floats, float]:
+    """The middle of a cloud, in its camera's axes, and its size."""
+    points = np.asarray(cloud.points_in_cam, float)
+    if not len(points):
+        return np.zeros(3), 1.0
+    middle = np.median(points, axis=0)
+    return middle, max(float(np.percentile(np.linalg.norm(points - middle, axis=1), EXTENT)), 1e-3)

@@ -1,0 +1,100 @@
+"""Open a review: the session, its scene and its door."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+
+from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.review.front import Front
+from hodge_pipeline.review.routes import site
+from hodge_pipeline.review.scene import Scene
+from hodge_pipeline.review.session import Session
+from hodge_pipeline.review.subject import open_for_review
+from hodge_pipeline.review.viewer import Viewer
+from hodge_pipeline.run_folder import Run
+
+
+class Review:
+    """A review that is open: its `session`, its 3-D `viewer` and the `address` of its page. Closed by `close`, or as a
+    context.
+    """
+
+    def __init__(self, path: Path, *, port: int = 0, scene: bool = True, who: str | None = None) -> None:
+        with ExitStack() as stack:
+            stack.enter_context(_alone(path))
+            self.session = Session(open_for_review(path), who=who)
+            stack.callback(self.session.close)
+            self.viewer = Viewer() if scene else None
+            if self.viewer is not None:
+                stack.callback(self.viewer.close)
+                stack.callback(Scene(self.session, self.viewer.server).close)
+            self._front = Front(site(self.session, None if self.viewer is None else self.viewer.path), port)
+            stack.callback(self._front.close)
+            self._stack = stack.pop_all()
+
+    @property
+    def address(self) -> str:
+        """Where the page is; whoever has it can decide."""
+        return self._front.address
+
+    def wait(self) -> None:
+        """Return when the review is interrupted (Ctrl-C)."""
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait()
+
+    def close(self) -> None:
+        """Serve no more. Every decision is on disk already."""
+        self._stack.close()
+
+    def __enter__(self) -> Review:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def open_review(run: Run | Path | str, *, port: int = 0, browser: bool = True) -> Review:
+    """Open a run, its folder or a pose-graph file for review on a page that only this machine can see, in the browser.
+
+    `port` 0 takes a free one. `review.close()` ends it; the decisions are in the run folder's `edits.json`, or beside
+    the graph, as soon as they are made. Raises `HodgeError` where the path holds neither, another review of it is
+    open, the port is taken or viser is missing.
+    """
+    review = Review(run.folder if isinstance(run, Run) else Path(run), port=port)
+    if browser:
+        import webbrowser
+
+        webbrowser.open(review.address)
+    return review
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """While the body runs no other review of this path is open. Raises `WorkspaceError` where one is already."""
+    try:
+        held = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        raise WorkspaceError(f"{path}: cannot be read ({error.strerror})") from error
+    try:
+        _lock(held, path)
+        yield
+    finally:
+        os.close(held)
+
+
+def _lock(held: int, path: Path) -> None:
+    try:
+        import fcntl
+    except ImportError:  # without flock two reviewers find each other by their revisions alone
+        return
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise WorkspaceError(f"{path}: is being reviewed already: use that page, or end it first") from error

@@ -1,0 +1,220 @@
+"""What a page of a review can ask for, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from hodge_pipeline.diagnosis.suggestions import suggest_pairs
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.pairs.edits import pair_names
+from hodge_pipeline.pipeline import solve_again
+from hodge_pipeline.report.document import JPEG
+from hodge_pipeline.review.front import Answer, Route, Site
+from hodge_pipeline.review.keeping import save_graph
+from hodge_pipeline.review.listing import Query, describe, list_edges, state
+from hodge_pipeline.review.pictures import Pictures
+from hodge_pipeline.review.session import MODES, Session
+from hodge_pipeline.stages import Advance
+from hodge_pipeline.types.notes import Note
+
+FILES = {
+    "": ("index.html", "text/html; charset=utf-8"),
+    "page.js": ("page.js", "text/javascript; charset=utf-8"),
+    "page.css": ("page.css", "text/css; charset=utf-8"),
+}
+SUGGESTED = 12
+Asked = dict[str, Any]
+
+
+def site(session: Session, viewer: Any = None) -> Site:
+    """The site of a session; `viewer` is the path of the socket of its 3-D viewer."""
+    routes: dict[tuple[str, str], Route] = {("GET", name): _file(*found) for name, found in FILES.items()}
+    routes |= {("GET", name): route for name, route in _shown(session).items()}
+    routes |= {("POST", name): _then_state(session, action) for name, action in _actions(session).items()}
+
+    def wait(version: int, seconds: float) -> tuple[int, dict[str, Any]]:
+        with session.changed:
+            session.changed.wait_for(lambda: session.version != version, timeout=seconds)
+            return session.version, state(session)
+
+    return Site(routes, wait, viewer)
+
+
+def _file(name: str, content_type: str) -> Route:
+    body = files("hodge_pipeline.review").joinpath("page", name).read_bytes()
+    return lambda _: Answer(body, content_type)
+
+
+def _then_state(session: Session, action: Callable[[Asked], Any]) -> Route:
+    def route(asked: Asked) -> Answer:
+        told = action(asked)
+        return Answer.json({"state": state(session), **({} if told is None else {"told": told})})
+
+    return route
+
+
+def _shown(session: Session) -> Mapping[str, Route]:
+    pictures = Pictures(session)
+
+    def edge(asked: Asked) -> Answer:
+        row = _whole(asked, "row")
+        titles = [{"title": plot.title, "caption": plot.caption} for plot in pictures.of(row)]
+        return Answer.json({**describe(session, row), "pictures": titles})
+
+    def picture(asked: Asked) -> Answer:
+        plots, number = pictures.of(_whole(asked, "row")), _whole(asked, "number")
+        if not 0 <= number < len(plots):
+            raise GraphError("there is no such picture")
+        image = plots[number].image
+        return Answer(image, "image/jpeg" if image.startswith(JPEG) else "image/png")
+
+    def log(_: Asked) -> Answer:
+        body = session.subject.log.read_bytes() if session.subject.log.exists() else b""
+        return Answer(body, "text/csv; charset=utf-8", session.subject.log.name)
+
+    return {
+        "state": lambda _: _opened(session),
+        "edges": lambda asked: Answer.json(list_edges(session, _query(asked))),
+        "edge": edge,
+        "picture": picture,
+        "log": lambda _: Answer.json(session.decisions.lines()),
+        "log.csv": log,
+        "suggestions": lambda _: Answer.json(suggestions(session)),
+    }
+
+
+def _opened(session: Session) -> Answer:
+    session.refresh()
+    return Answer.json(state(session))
+
+
+def _actions(session: Session) -> Mapping[str, Callable[[Asked], Any]]:
+    return {
+        "decide": lambda asked: session.decide(
+            _whole(asked, "revision"), str(asked.get("verb")), _rows(asked), _note(asked)
+        ),
+        "wrong": lambda asked: session.disable_wrong(_whole(asked, "revision"), _note(asked)),
+        "undo": lambda asked: session.undo(_whole(asked, "revision"), _note(asked)),
+        "redo": lambda asked: session.redo(_whole(asked, "revision"), _note(asked)),
+        "accept": lambda asked: session.accept(_whole(asked, "revision"), _note(asked)),
+        "select": lambda asked: session.select(_whole(asked, "row")),
+        "look": lambda asked: session.show(**_look(asked)),
+        "pick": lambda asked: session.pick(_frames(session, asked)),
+        "register": lambda _: session.register(),
+        "save": lambda _: f"written: {save_graph(session)}",
+        "solve": lambda _: solve_run(session),
+    }
+
+
+def solve_run(session: Session) -> None:
+    """Solve and fuse the run again with its decisions, while the pages go on; then show what came out."""
+    subject = session.subject
+    if not subject.is_run:
+        raise GraphError(f"{subject.path}: is no run: save it as a pose graph")
+
+    def job() -> None:
+        session.quick.wait()
+        solve_again(subject.path, watcher=_Told(session))
+        session.reopen(subject.path)
+        session.say("solved and fused: this is the run as it is now")
+
+    session.slow.put("fusing", job)
+    session.bump()
+
+
+class _Told:
+    """A watcher that tells the pages which stage is at work."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def stage(self, title: str, total: int) -> AbstractContextManager[Advance]:
+        """A context that tells the stage's title."""
+        self._session.say(f"hodge solve: {title}")
+        return nullcontext(lambda *_: None)
+
+    def note(self, note: Note) -> None:
+        """Nothing: the run's log has it."""
+
+
+def suggestions(session: Session) -> list[dict[str, Any]]:
+    """The pairs that the diagnosis would register next, the most informative first."""
+    with session.changed:
+        judged, table = session.judged, session.table
+    if judged is None:
+        return []
+    graph = table.graph.select(judged.rows)
+    found = suggest_pairs(graph, judged.diagnosis, SUGGESTED, tried=table.graph.edges)
+    names = pair_names(graph.vertex_ids, found.pairs)
+    rows = zip(names, found.pairs.tolist(), found.score.tolist(), found.reason.tolist(), strict=True)
+    return [{"pair": name, "frames": pair, "gain": round(score, 3), "reason": why} for name, pair, score, why in rows]
+
+
+def _whole(asked: Asked, key: str) -> int:
+    try:
+        return int(asked[key])
+    except (KeyError, TypeError, ValueError):
+        raise GraphError(f"{key}: expected a whole number, got {asked.get(key)!r}") from None
+
+
+def _rows(asked: Asked) -> list[int]:
+    rows = asked.get("rows")
+    if not isinstance(rows, list) or not all(isinstance(row, int) for row in rows):
+        raise GraphError("rows: expected a list of rows of edges")
+    return rows
+
+
+def _note(asked: Asked) -> str:
+    return str(asked.get("note", ""))
+
+
+def _query(asked: Asked) -> Query:
+    known = {field.name for field in fields(Query)}
+    if strange := set(asked) - known:
+        raise GraphError(f"{', '.join(sorted(strange))}: expected {', '.join(sorted(known))}")
+    try:
+        return Query(
+            verdicts=tuple(word for word in str(asked.get("verdicts", "")).split(",") if word),
+            min_gap=int(asked.get("min_gap") or 0),
+            min_residual_m=float(asked.get("min_residual_m") or 0),
+            frame=str(asked.get("frame", "")),
+            sort=asked.get("sort", "score"),
+            descending=asked.get("descending") == "true",
+            first=max(0, int(asked.get("first") or 0)),
+            count=max(1, int(asked.get("count") or 100)),
+        )
+    except ValueError as error:
+        raise GraphError(f"a filter is no number: {error}") from None
+
+
+def _look(asked: Asked) -> dict[str, Any]:
+    changes: dict[str, Any] = {}
+    if "mode" in asked:
+        if asked["mode"] not in MODES:
+            raise GraphError(f"mode: expected {', '.join(MODES)}")
+        changes["mode"] = asked["mode"]
+    if "share" in asked:
+        changes["share"] = float(np.clip(float(asked["share"]), 0.0, 1.0))
+    if "cut" in asked:
+        changes["cut"] = None if asked["cut"] is None else float(asked["cut"])
+    if "verdicts" in asked:
+        changes["verdicts"] = tuple(map(str, asked["verdicts"]))
+    return changes
+
+
+def _frames(session: Session, asked: Asked) -> list[int]:
+    """The rows of frames, given as such or named as the table names them."""
+    if "rows" in asked:
+        return [row for row in _rows(asked) if 0 <= row < session.table.graph.vertex_count]
+    names: Sequence[Any] = asked.get("frames") or ()
+    rows = {name: row for row, name in enumerate(session.table.graph.vertex_ids.astype(str).tolist())}
+    for name in names:
+        if str(name) not in rows:
+            raise GraphError(f"{name}: is no frame: give its id, as the table names it")
+    return [rows[str(name)] for name in names]

@@ -1,0 +1,283 @@
+"""The scene of a review: clouds, cameras, edges in the colour of their verdict, and the edge that is looked at."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG
+from hodge_pipeline.report.diagnosis_plots import COLOURS as REPORTED
+from hodge_pipeline.review.listing import witnesses
+from hodge_pipeline.review.looking import Shown, shown_pair
+from hodge_pipeline.review.picking import nearest_point, nearest_segment
+from hodge_pipeline.review.session import Session
+from hodge_pipeline.types import CloudSet, Floats, Floats32, Ints
+
+COLOURS = {verdict: tuple(bytes.fromhex(colour[1:])) for verdict, colour in REPORTED.items()}
+FIRST, SECOND = (0, 114, 178), (230, 120, 0)
+SELECTED, BEFORE = (190, 0, 190), (170, 170, 200)
+MOST_POINTS = 3_000_000
+"""Of the overview: 9 bytes each, 27 MB for a page to receive."""
+MOST_PAIR_POINTS = 200_000
+"""Of each of the two clouds that are looked at closely."""
+BLINK_S = 0.6
+CUT_SHARE = 0.04
+"""Thickness of a cut, of the size of what is cut."""
+BARELY = 1e-7
+"""A pose that changed by less stays where it is drawn."""
+
+
+class Scene:
+    """Draws a session with viser, and turns clicks into selections; a thread of its own follows the session."""
+
+    def __init__(self, session: Session, server: Any) -> None:
+        self._session, self._server = session, server
+        self._subject = session.subject
+        self._size = 1.0
+        self._poses = np.zeros((0, 4, 4))
+        self._clouds: dict[int, Any] = {}
+        self._shown: dict[str, tuple[Any, ...]] = {}
+        self._closed = threading.Event()
+        self._looked: dict[int, tuple[Any, Any]] = {}
+        self._begin()
+        server.scene.on_click()(lambda event: self._clicked(event, shift=False))
+        server.scene.on_click(modifier="shift")(lambda event: self._clicked(event, shift=True))
+        self._thread = threading.Thread(target=self._follow, name="scene", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Draw no more."""
+        self._closed.set()
+        self._session.bump()
+        self._thread.join()
+
+    def _begin(self) -> None:
+        """The scene of a subject that was just opened."""
+        scene, poses = self._server.scene, self._session.settled.world_from_cam
+        known = poses[np.isfinite(poses).all(axis=(1, 2))]
+        centre = np.median(known[:, :3, 3], axis=0) if len(known) else np.zeros(3)
+        spread = np.linalg.norm(known[:, :3, 3] - centre, axis=1) if len(known) else np.ones(1)
+        self._size = max(float(np.percentile(spread, 90)), 0.5)
+        up = -known[:, :3, 1].mean(axis=0) if len(known) and self._subject.clouds is not None else np.array([0, 0, 1.0])
+        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0, 0, 1.0])
+        side = np.cross(up, [1.0, 0.3, 0.2])
+        side /= np.linalg.norm(side)
+        scene.set_up_direction(tuple(up))
+        self._server.initial_camera.up = tuple(up)
+        self._server.initial_camera.position = tuple(centre + self._size * (2.2 * up + 1.6 * side))
+        self._server.initial_camera.look_at = tuple(centre)
+        self._up = up
+        self._clouds = {}
+        scene.add_frame("/clouds", show_axes=False)
+        scene.add_frame("/pair", show_axes=False)
+        if self._subject.clouds is not None:
+            self._add_clouds(self._subject.clouds, poses)
+        self._poses = poses.copy()
+
+    def _add_clouds(self, clouds: CloudSet, poses: Floats) -> None:
+        step = thinning(clouds.offsets, MOST_POINTS)
+        size = max(0.004 * self._size, 0.01)
+        for row in range(len(clouds)):
+            points, colours = thinned(clouds, row, step)
+            if len(points) and np.isfinite(poses[row]).all():
+                wxyz, position = _placed(poses[row])
+                self._clouds[row] = self._server.scene.add_point_cloud(
+                    f"/clouds/{row}", points, colours, point_size=size, point_shading="flat", wxyz=wxyz,
+                    position=position,
+                )  # fmt: skip
+
+    def _follow(self) -> None:
+        session, version, flip = self._session, -1, False
+        while not self._closed.is_set():
+            with session.changed:
+                blinks = session.look.mode == "blink"
+                seen = version
+                session.changed.wait_for(lambda: session.version != seen, timeout=BLINK_S if blinks else None)  # noqa: B023
+                flip = not flip if blinks and session.version == version else flip
+                version = session.version
+            if not self._closed.is_set():
+                self.draw(flip)
+
+    def draw(self, flip: bool = False) -> None:
+        """Bring the scene up to date with the session; what has not changed is not sent again."""
+        with self._session.changed:
+            session = self._session
+            settled, look, table = session.settled, session.look, session.table
+            is_new = session.subject is not self._subject
+            pair = shown_pair(session, flip)
+            cycles = witnesses(session, look.selected) if look.selected >= 0 else []
+            self._subject = session.subject
+        if is_new:
+            self._server.scene.reset()
+            self._shown = {}
+            self._begin()
+        with self._server.atomic():
+            self._move(settled.world_from_cam)
+            self._cameras(settled.world_from_cam)
+            for verdict in COLOURS:
+                rows = np.flatnonzero((table.edges.verdict == verdict) & (settled.weights > 0))
+                rows = rows if verdict in look.verdicts else rows[:0]
+                self._lines(f"/edges/{verdict}", settled.world_from_cam, table.graph.edges[rows], COLOURS[verdict], 2.5)
+            chosen = table.graph.edges[[look.selected]] if look.selected >= 0 else np.zeros((0, 2), np.int64)
+            self._lines("/edges/selected", settled.world_from_cam, chosen, SELECTED, 6.0)
+            for closes, name, colour in ((True, "closing", COLOURS[CONSISTENT]), (False, "failing", COLOURS[WRONG])):
+                around = [_around(along) for good, _, _, along in cycles if good == closes]
+                self._lines(f"/cycles/{name}", settled.world_from_cam, _joined(around), colour, 3.5)
+            self._pair(pair)
+
+    def _move(self, poses: Floats) -> None:
+        """The clouds at new poses, and a line where the cameras were before."""
+        if np.array_equal(poses, self._poses, equal_nan=True):
+            return
+        moved = np.flatnonzero(np.abs(poses - self._poses).max(axis=(1, 2)) > BARELY)
+        ways = np.stack([self._poses[:, :3, 3], poses[:, :3, 3]], axis=1)[moved]
+        for row in moved.tolist():
+            if row in self._clouds:
+                self._clouds[row].wxyz, self._clouds[row].position = _placed(poses[row])
+        self._poses = poses.copy()
+        self._draw_lines("/before", ways, BEFORE, 1.0)
+
+    def _cameras(self, poses: Floats) -> None:
+        if self._same("/cameras", poses):
+            return
+        known = poses[np.isfinite(poses).all(axis=(1, 2))]
+        length = 0.04 * self._size
+        self._server.scene.add_batched_axes(
+            "/cameras", _wxyz(known), known[:, :3, 3], axes_length=length,
+            axes_radius=length / 12,
+        )  # fmt: skip
+
+    def _lines(self, name: str, poses: Floats, pairs: Ints, colour: tuple[int, ...], width_px: float) -> None:
+        if not self._same(name, poses, pairs):
+            self._draw_lines(name, poses[pairs][:, :, :3, 3], colour, width_px)
+
+    def _draw_lines(self, name: str, segments: Floats, colour: tuple[int, ...], width_px: float) -> None:
+        segments = segments[np.isfinite(segments).all(axis=(1, 2))]
+        if not len(segments):
+            self._remove(name)
+            return
+        self._server.scene.add_line_segments(
+            name, segments.astype(np.float32), colour, thickness=width_px, thickness_units="screen"
+        )
+
+    def _pair(self, pair: Shown | None) -> None:
+        """The two clouds that are looked at, the others hidden meanwhile; nothing where none are."""
+        clouds = self._subject.clouds
+        self._server.scene.add_frame("/clouds", show_axes=False, visible=pair is None)
+        self._turn_to(pair)
+        if pair is None or clouds is None:
+            for name in ("first", "second", "picks"):
+                self._remove(f"/pair/{name}")
+            return
+        for name, row, colour, pose in (
+            ("first", pair.i, FIRST, pair.world_from_i), ("second", pair.j, SECOND, pair.world_from_j),
+        ):  # fmt: skip
+            if self._same(f"/pair/{name}", pose, np.array([row, pair.cut is None, pair.cut or 0.0])):
+                continue
+            points, _ = thinned(clouds, row, thinning(np.diff(clouds.offsets)[[row]].cumsum(), MOST_PAIR_POINTS))
+            points = points[pair.kept(points, pose, self._up, CUT_SHARE)]
+            wxyz, position = _placed(pose)
+            self._server.scene.add_point_cloud(
+                f"/pair/{name}", points, colour, point_size=max(0.003 * self._size, 0.006), precision="float32",
+                wxyz=wxyz, position=position,
+            )  # fmt: skip
+        picks = pair.picks()
+        if not self._same("/pair/picks", picks):
+            self._remove("/pair/picks", forget=False)
+            if len(picks):
+                self._server.scene.add_point_cloud(
+                    "/pair/picks", picks, SELECTED, point_size=0.02 * self._size, point_shape="circle",
+                    precision="float32",
+                )  # fmt: skip
+
+    def _turn_to(self, pair: Shown | None) -> None:
+        """Let every page look at the pair, and when it is left where it looked before."""
+        if self._same("eye", np.array([-1, -1, 0] if pair is None else [pair.i, pair.j, pair.wants_points])):
+            return
+        for number, client in self._server.get_clients().items():
+            if pair is not None:
+                self._looked.setdefault(number, (client.camera.position, client.camera.look_at))
+                back = pair.world_from_i[:3, 3] - pair.middle
+                way = back + 0.8 * np.linalg.norm(back) * self._up
+                client.camera.position = pair.middle + 2.2 * pair.size_m * way / max(float(np.linalg.norm(way)), 1e-9)
+                client.camera.look_at = pair.middle
+            elif number in self._looked:
+                client.camera.position, client.camera.look_at = self._looked.pop(number)
+
+    def _same(self, name: str, *drawn: Any) -> bool:
+        """Whether this was drawn with the same numbers before; else they are remembered."""
+        before = self._shown.get(name)
+        if before is not None and all(np.array_equal(a, b, equal_nan=True) for a, b in zip(before, drawn, strict=True)):
+            return True
+        self._shown[name] = tuple(np.array(one) for one in drawn)
+        return False
+
+    def _remove(self, name: str, *, forget: bool = True) -> None:
+        if forget:
+            self._shown.pop(name, None)
+        if self._server.scene.get_handle_by_name(name) is not None:
+            self._server.scene.remove_by_name(name)
+
+    def _clicked(self, event: Any, *, shift: bool) -> None:
+        """Select the edge, or with shift pick the frame, nearest to the click; in a pair pick a point of its clouds."""
+        origin, ray = np.asarray(event.ray_origin, float), np.asarray(event.ray_direction, float)
+        session = self._session
+        with session.changed:
+            pair = shown_pair(session, False)
+            poses, table, look = session.settled.world_from_cam, session.table, session.look
+            drawn = np.isin(table.edges.verdict, look.verdicts) & (session.settled.weights > 0)
+        if pair is not None and pair.wants_points and self._subject.clouds is not None:
+            self._pick_point(pair, origin, ray)
+        elif shift:
+            frame = nearest_point(origin, ray, np.nan_to_num(poses[:, :3, 3], nan=np.inf))
+            if frame is not None:
+                session.pick((*look.picked[-1:], frame))
+        elif pair is None:
+            rows = np.flatnonzero(drawn)
+            at = nearest_segment(origin, ray, poses[table.graph.edges[rows]][:, :, :3, 3])
+            if at is not None:
+                session.select(int(rows[at]))
+
+    def _pick_point(self, pair: Shown, origin: Floats, ray: Floats) -> None:
+        """One point of the first cloud, then one of the second."""
+        clouds = self._subject.clouds
+        assert clouds is not None
+        row, pose = (pair.i, pair.world_from_i) if pair.next_is_first else (pair.j, pair.world_from_j)
+        points = np.asarray(clouds[row].points_in_cam, float)
+        at = nearest_point(origin, ray, se3.transform(pose, points))
+        if at is not None:
+            self._session.click_point(points[at])
+
+
+def thinning(offsets: Ints, most: int) -> int:
+    """Every which point to take so that no more than `most` are left of clouds with these offsets (N + 1,)."""
+    return max(1, -(-int(offsets[-1]) // most))
+
+
+def thinned(clouds: CloudSet, row: int, step: int) -> tuple[Floats32, np.ndarray[Any, np.dtype[np.uint8]]]:
+    """Points and colours of a frame, each `step`th; grey where there is no colour."""
+    entry = slice(int(clouds.offsets[row]), int(clouds.offsets[row + 1]), step)
+    points, colours = np.asarray(clouds.points[entry]), np.asarray(clouds.colours[entry])
+    return points, colours if colours.any() else np.full_like(colours, 150)
+
+
+def _placed(pose: Floats) -> tuple[Floats, Floats]:
+    """A pose as viser takes it: quaternion (w first) and position."""
+    return _wxyz(pose), pose[:3, 3]
+
+
+def _wxyz(poses: Floats) -> Floats:
+    return np.asarray(se3.to_quat_xyzw(poses)[..., [3, 0, 1, 2]])
+
+
+def _around(along: Ints) -> Ints:
+    """The sides (n, 2) of a cycle by its vertices (n,)."""
+    return np.stack([along, np.roll(along, -1)], axis=1)
+
+
+def _joined(parts: Sequence[Ints]) -> Ints:
+    return np.concatenate([np.zeros((0, 2), np.int64), *parts])

@@ -1,0 +1,329 @@
+"""A review: decisions about edges, the poses that follow from each, verdicts, and what is being looked at."""
+
+from __future__ import annotations
+
+import getpass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from threading import Condition
+from typing import Any
+
+import numpy as np
+
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, Edit, pair_names, vertex_rows
+from hodge_pipeline.review.adding import Candidate, assessed, guess_from_poses, register_candidate
+from hodge_pipeline.review.decisions import Decisions, LockedError, Said
+from hodge_pipeline.review.jobs import Jobs
+from hodge_pipeline.review.settle import Judged, Settled, Settler, Table, judge
+from hodge_pipeline.review.subject import Subject, open_for_review
+from hodge_pipeline.types import Edges, Floats, Ints
+from hodge_pipeline.types.edges import DISABLED
+
+_EDITS: dict[str, Callable[[tuple[str, ...]], Edit]] = {
+    "disable": lambda pairs: Edit(disable=pairs),
+    "enable": lambda pairs: Edit(enable=pairs),
+    "right": lambda pairs: Edit(right=pairs),
+}
+_SWITCHES = {"disable": DISABLED, "enable": ENABLED, "right": RIGHT}
+VERBS = tuple(_EDITS)
+MODES = ("all", "edge", "solution", "blink", "between", "apart")
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the scene shows: the edge selected (a row, −1: none); everything, or the two clouds of that edge or of the
+    candidate alone, by which motion (`MODES`; between: a `share` of the way from the edge's to the solution's; apart:
+    side by side, to click points); a cut through them (at this share of their size above their middle; None: whole);
+    the frames picked to be joined, and the verdicts whose edges are drawn.
+    """
+
+    selected: int = -1
+    mode: str = "all"
+    share: float = 0.0
+    cut: float | None = None
+    picked: tuple[int, ...] = ()
+    verdicts: tuple[str, ...] = (WRONG, SUSPECT)
+
+
+class Session:
+    """The state that every page of a review shows. Its `version` grows with each change that can be seen."""
+
+    def __init__(self, subject: Subject, *, who: str | None = None, now: Callable[[], str] | None = None) -> None:
+        self.changed = Condition()
+        self.version = 0
+        self.message = ""
+        self.look = Look()
+        self.candidate: Candidate | None = None
+        self._who = getpass.getuser() if who is None else who
+        self._now = now or _utc_now
+        self.quick = Jobs("settle", self.say)
+        self.slow = Jobs("judge", self.say)
+        self._open(subject)
+
+    def _open(self, subject: Subject) -> None:
+        folder = subject.path if subject.is_run else None
+        self.subject = subject
+        self.decisions = Decisions(subject.edits, subject.log, run_folder=folder, locked=subject.locked)
+        self.locked = self.decisions.why_locked()
+        self._settler = Settler(subject)
+        self._adding: list[Candidate] = []
+        self.table: Table = self._settler.table
+        self.settled: Settled = self._settler.settled
+        self.judged: Judged | None = None
+        self.first = self.settled
+        if ((self.table.weights(self.decisions.history) > 0) != (self.settled.weights > 0)).any():
+            self.quick.put("solving", self._solve)
+        self.slow.put("registering", self._register_missing)
+        self.slow.put("judging", self._judge)
+
+    def close(self) -> None:
+        """End the threads."""
+        self.quick.close()
+        self.slow.close()
+
+    def wait(self) -> None:
+        """Return when the poses and the verdicts follow from the latest decision."""
+        self.quick.wait()
+        self.slow.wait()
+        self.quick.wait()
+
+    def say(self, message: str) -> None:
+        """A line for every page."""
+        with self.changed:
+            self.message = message
+            self.bump()
+
+    def bump(self) -> None:
+        """Let everything that shows the state look again."""
+        with self.changed:
+            self.version += 1
+            self.changed.notify_all()
+
+    def names(self, rows: Ints | Sequence[int]) -> list[str]:
+        """The names of edges: `12-87`."""
+        graph = self.table.graph
+        return pair_names(graph.vertex_ids, graph.edges[np.asarray(rows, np.int64)])
+
+    def decide(self, revision: int, verb: str, rows: Sequence[int], note: str = "") -> None:
+        """Disable or enable edges, or hold them for right, and solve. Raises as `Decisions.add`, and `GraphError`."""
+        count = len(self.table)
+        if verb not in VERBS or not rows or not all(0 <= row < count for row in rows):
+            raise GraphError(f"{verb}: expected {', '.join(VERBS)} and rows of edges from 0 to {count - 1}")
+        pairs = tuple(dict.fromkeys(self.names(rows)))
+        switches = self.decisions.history.switches
+        if all(switches.get(pair) == _SWITCHES[verb] for pair in pairs):
+            raise GraphError(f"{', '.join(pairs)}: {_SWITCHES[verb]} already")
+        self._change(lambda: self.decisions.add(revision, _EDITS[verb](pairs), self._said(rows, note)))
+
+    def disable_wrong(self, revision: int, note: str = "") -> None:
+        """Disable every edge that counts and is wrong."""
+        with self.changed:
+            off = self.table.switches(self.decisions.history) != ""
+            rows = np.flatnonzero((self.table.edges.verdict == WRONG) & (self.settled.weights > 0) & ~off)
+        if not len(rows):
+            raise GraphError("no edge that counts is wrong")
+        self.decide(revision, "disable", rows.tolist(), note)
+
+    def undo(self, revision: int, note: str = "") -> None:
+        """Take the latest decision back, and solve."""
+        self._change(lambda: self.decisions.undo(revision, self._said((), note)))
+
+    def redo(self, revision: int, note: str = "") -> None:
+        """Let the decision that was taken back last count again, and solve."""
+        self._change(lambda: self.decisions.redo(revision, self._said((), note)))
+
+    def accept(self, revision: int, note: str = "") -> None:
+        """Add the edge that was registered. Raises as `decide`."""
+        found = self.candidate
+        if found is None or found.found is None:
+            raise GraphError("there is no registered pair to add: pick two frames and register them")
+        graph = self.table.graph
+        (pair,) = pair_names(graph.vertex_ids, np.array([[found.i, found.j]]))
+        guess = (pair, tuple(found.found.i_from_j.reshape(-1).tolist()))
+        let_in = (pair,) if found.rejected else ()
+        edit = Edit(register=(pair,), enable=let_in, guesses=(guess,))
+
+        def change() -> None:
+            self.decisions.add(revision, edit, self._said((), note))
+            self._adding.append(found)
+            self.candidate = None
+
+        self._change(change)
+
+    def _change(self, change: Callable[[], None]) -> None:
+        with self.changed:
+            before = self.decisions.revision
+            try:
+                change()
+                self.message, self.locked = "", ""
+            except LockedError as error:
+                self.locked = str(error)
+                raise
+            finally:
+                if self.decisions.revision != before:
+                    self.quick.put("solving", self._solve)
+                self.bump()
+
+    def _said(self, rows: Sequence[int], note: str) -> Said:
+        """Who decides, and what is known of the edges: of several the worst."""
+        said = Said(self._who, self._now(), note[:1000])
+        if not len(rows):
+            return said
+        edges, settled = self.table.edges, self.settled
+        worst = min(rows, key=lambda row: np.nan_to_num(edges.probability[row], nan=1.0))
+        return replace(
+            said,
+            verdict=str(edges.verdict[worst]),
+            score=_number(float(edges.probability[worst])),
+            residual_m=_number(float(settled.residual_m[worst])),
+            residual_deg=_number(float(np.degrees(settled.residual_rad[worst]))),
+        )
+
+    def _solve(self) -> None:
+        with self.changed:
+            history, revision, settler = self.decisions.history, self.decisions.revision, self._settler
+            adding, self._adding = self._adding, []
+        for new in adding:
+            assert new.found is not None
+            settler.add(new.i, new.j, new.found)
+        self._publish(settler, settler.solve(history, revision))
+        better = settler.checked(history, revision)
+        if better is not None:
+            self._publish(settler, better)
+        self.slow.put("judging", self._judge)
+
+    def _publish(self, settler: Settler, settled: Settled) -> None:
+        with self.changed:
+            if settler is self._settler:
+                self.settled = settled
+                self.table = settler.table = _with_verdicts(settler.table, self.table.edges)
+            self.bump()
+
+    def _judge(self) -> None:
+        with self.changed:
+            history, table, recipe = self.decisions.history, self.table, self.subject.recipe
+        judged = judge(table, history, DiagnosisOptions() if recipe is None else recipe.diagnosis)
+        with self.changed:
+            if table is self.table:
+                self.judged = judged
+                self.table = replace(table, edges=judged.edges)
+            self.bump()
+
+    def _register_missing(self) -> None:
+        """Register again what an earlier review added and no solve has had: its motion is known, not how well."""
+        recipe, clouds, guesses = self.subject.recipe, self.subject.clouds, self.decisions.history.guesses
+        pairs = [pair for pair in self.decisions.history.registered if pair in guesses and not self.rows_of(pair)]
+        if recipe is None or clouds is None or not pairs:
+            return
+        for pair, (i, j) in zip(pairs, vertex_rows(self.table.graph.vertex_ids, pairs).tolist(), strict=True):
+            wanted = Candidate(i, j, guesses[pair])
+            found = register_candidate(recipe, clouds, wanted)
+            with self.changed:
+                self._adding.append(replace(wanted, found=found))
+        self.quick.put("solving", self._solve)
+
+    def show(self, **changes: Any) -> None:
+        """Change what the scene shows."""
+        with self.changed:
+            self.look = replace(self.look, **changes)
+            self.bump()
+
+    def select(self, row: int) -> None:
+        """Select an edge, −1: none. Raises `GraphError` for a row that is no edge's."""
+        if not -1 <= row < len(self.table):
+            raise GraphError(f"there is no edge {row}: rows go from 0 to {len(self.table) - 1}")
+        with self.changed:
+            self.candidate = None
+            self.show(selected=row, mode=self.look.mode if self.look.mode in MODES[:5] else "edge", picked=())
+
+    def pick(self, frames: Sequence[int]) -> None:
+        """Pick frames to be joined, by their rows: two of them are the candidate, its guess that of the poses."""
+        with self.changed:
+            frames = tuple(dict.fromkeys(frames))[-2:]
+            self.candidate = None
+            if len(frames) == 2:
+                i, j = sorted(frames)
+                self.candidate = Candidate(i, j, guess_from_poses(self.settled.world_from_cam, i, j))
+            self.show(picked=frames, selected=-1)
+
+    def click_point(self, point: Floats) -> None:
+        """One more point of the candidate's clouds, in its camera's axes."""
+        with self.changed:
+            if self.candidate is not None:
+                x, y, z = map(float, point)
+                try:
+                    self.candidate = self.candidate.clicked((x, y, z))
+                except GraphError as error:
+                    self.message = str(error)
+                self.bump()
+
+    def register(self) -> None:
+        """Register the candidate by the run's own registrar, while the pages go on."""
+        subject, wanted = self.subject, self.candidate
+        recipe, clouds = subject.recipe, subject.clouds
+        if wanted is None:
+            raise GraphError("pick two frames first")
+        if recipe is None or clouds is None:
+            raise GraphError(f"{subject.path}: has no clouds to register: add the edge to the graph's file")
+        chosen_recipe, chosen_clouds, chosen = recipe, clouds, wanted
+
+        def job() -> None:
+            found = register_candidate(chosen_recipe, chosen_clouds, chosen)
+            with self.changed:
+                if self.candidate is chosen:
+                    poses = self.settled.world_from_cam
+                    self.candidate = assessed(chosen_recipe, self.table.graph, poses, chosen, found)
+                self.bump()
+
+        self.slow.put("registering", job)
+        self.bump()
+
+    def refresh(self) -> None:
+        """Take over what another program has done to the edits, or with the folder."""
+        with self.changed:
+            self.locked = self.decisions.why_locked()
+            if self.decisions.refresh():
+                self.quick.put("solving", self._solve)
+            self.bump()
+
+    def reopen(self, path: Path) -> None:
+        """Read the subject again, after it was solved elsewhere."""
+        subject = open_for_review(path)
+        with self.changed:
+            self._open(subject)
+            self.look = Look()
+            self.bump()
+
+    def rows_of(self, pair: str) -> list[int]:
+        """The rows of the edges that join a pair `a-b`."""
+        return list(self.table.rows.get(pair, ()))
+
+    def missing(self) -> list[str]:
+        """The pairs that the decisions want registered and that are no edges yet."""
+        switches = self.decisions.history.switches
+        return [pair for pair, switch in switches.items() if switch == REGISTERED and not self.rows_of(pair)]
+
+    @property
+    def disabled(self) -> int:
+        """How many edges are off by hand."""
+        return int((self.table.switches(self.decisions.history) == DISABLED).sum())
+
+
+def _with_verdicts(table: Table, edges: Edges) -> Table:
+    """The table with the verdicts of edges that are its first rows."""
+    rows = np.arange(len(edges))
+    columns = {name: getattr(edges, name) for name in ("verdict", "probability", "why")}
+    return replace(table, edges=table.edges.put(rows, **columns))
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if np.isfinite(value) else ""
+
+
+def _utc_now() -> str:
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

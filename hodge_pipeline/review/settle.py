@@ -1,0 +1,228 @@
+"""Poses after each decision: the edges with the weights that the decisions give them, solved from where they are."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.result import Diagnosis
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.evaluation.trajectory import absolute_error, align
+from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, History, pair_names
+from hodge_pipeline.review.subject import Subject, base_weights, let_in
+from hodge_pipeline.rounds.by_hand import BY_HAND
+from hodge_pipeline.solvers.editing import GraphEditor
+from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.types import Bools, Edges, Floats, Ints, Registration, Solution, ViewGraph
+from hodge_pipeline.types.edges import DISABLED, REJECTED, USED, Words
+
+MOST_CHECKED = 20_000
+"""Edges up to which a solve is checked by one from the edges alone: that takes about 0.05 CPU seconds for each 1000."""
+LOWER = 1e-6
+"""Share by which a cost must be lower to count as lower."""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Poses (V, 4, 4) at a revision of the decisions, what each edge (E,) leaves of them, and what that took.
+
+    `moved_m` is the farthest that a pose moved since the last, `error_m` the trajectory's error where the truth is
+    known.
+    """
+
+    revision: int
+    world_from_cam: Floats
+    component: Ints
+    weights: Floats
+    residual_m: Floats
+    residual_rad: Floats
+    seconds: float = 0.0
+    moved_m: float = 0.0
+    error_m: float | None = None
+    converged: bool = True
+
+
+@dataclass(frozen=True)
+class Judged:
+    """All edges with their verdicts, and the diagnosis of those `rows` of them that could count."""
+
+    edges: Edges
+    diagnosis: Diagnosis
+    rows: Ints
+
+    def row(self, edge: int) -> int | None:
+        """The row of an edge in the diagnosis; None where it was not among the judged."""
+        at = int(np.searchsorted(self.rows, edge))
+        return at if at < len(self.rows) and self.rows[at] == edge else None
+
+
+@dataclass(frozen=True)
+class Table:
+    """All edges with their graph, row by row; the weight (E,) of each without a decision, where enabling gives it one,
+    where it was `added` in this review; and the `rows` of each pair `a-b`, in both directions.
+    """
+
+    edges: Edges
+    graph: ViewGraph
+    base: Floats
+    let_in: Bools
+    added: Bools
+    rows: dict[str, list[int]]
+
+    @classmethod
+    def of(cls, subject: Subject) -> Table:
+        """The edges of a subject."""
+        none = np.zeros(len(subject.edges), bool)
+        return cls(subject.edges, subject.graph, base_weights(subject), let_in(subject), none, _rows(subject.graph))
+
+    def __len__(self) -> int:
+        return len(self.edges)
+
+    def switches(self, history: History) -> Words:
+        """What the decisions say of each edge (E,): disabled, enabled, right, registered or nothing."""
+        out = np.full(len(self), "", dtype="U16")
+        for pair, switch in history.switches.items():
+            out[self.rows.get(pair, [])] = switch
+        return out
+
+    def weights(self, history: History) -> Floats:
+        """The weight (E,) of each edge by the decisions."""
+        switches, weights = self.switches(history), self.base.copy()
+        weights[switches == DISABLED] = 0.0
+        weights[(switches == ENABLED) & self.let_in] = 1.0
+        weights[(switches == RIGHT) | ((switches == REGISTERED) & self.added)] = 1.0
+        return weights
+
+    def with_edge(self, i: int, j: int, found: Registration, proposed_by: str) -> Table:
+        """The table with a new edge, which counts while the decisions say that it was registered."""
+        row = replace(Edges.of([[i, j]], proposed_by).with_registrations([found]), status=np.array([USED]))
+        edges = Edges.joined([self.edges, row])
+        graph = edges.as_graph(self.graph.vertex_ids)
+        graph = replace(graph, dimension=self.graph.dimension, fixed=self.graph.fixed, priors=self.graph.priors)
+        base, yes = np.append(self.base, 0.0), [True]
+        return Table(edges, graph, base, np.append(self.let_in, yes), np.append(self.added, yes), _rows(graph))
+
+
+def judge(table: Table, history: History, options: DiagnosisOptions) -> Judged:
+    """The verdicts by the edges that could count; those that are off keep the verdict that they had."""
+    without = table.weights(history) == 0
+    off = (table.switches(history) == DISABLED) | (without & (table.added | (table.edges.status == REJECTED)))
+    rows = np.flatnonzero(~off)
+    found = diagnose(table.graph.select(rows), options)
+    why = np.array(found.reason, dtype=np.str_)
+    edges = table.edges.put(rows, verdict=found.verdict, probability=found.probability, why=why)
+    return Judged(edges, found, rows)
+
+
+class Settler:
+    """The table of a subject solved at whatever the decisions come to; new edges join it."""
+
+    def __init__(self, subject: Subject) -> None:
+        self._truth = subject.truth
+        self._solution = subject.solution
+        self.table = Table.of(subject)
+        self._editor = _editor(subject.graph, replace(subject.solution, weights=self.table.base))
+        self.settled = self._settled(0, subject.solution, 0.0)
+
+    def add(self, i: int, j: int, found: Registration) -> None:
+        """Put a new edge into the table."""
+        self.table = self.table.with_edge(i, j, found, BY_HAND)
+        weights = np.zeros(len(self.table)) if self._editor is None else np.append(self._editor.weights, 0.0)
+        self._solution = replace(self._solution, weights=weights)
+        self._editor = _editor(self.table.graph, self._solution)
+
+    def solve(self, history: History, revision: int) -> Settled:
+        """The poses that the decisions lead to. Raises `GraphError` where no edge would count."""
+        weights, began = self.table.weights(history), time.perf_counter()
+        if not (weights > 0).any():
+            raise GraphError("no edge would count: enable one first")
+        if self._editor is None:
+            self._solution = _plain(self.table.graph, weights, self._solution.world_from_cam)
+        else:
+            changed = np.flatnonzero(weights != self._editor.weights)
+            self._editor.reweight(changed, weights[changed])
+            self._solution = self._editor.solve()
+        self.settled = self._settled(revision, replace(self._solution, weights=weights), time.perf_counter() - began)
+        return self.settled
+
+    def checked(self, history: History, revision: int) -> Settled | None:
+        """The poses from the edges alone, where these have a lower cost: the ones at hand, where wrong edges had put
+        them, may lead to a minimum that is none. None where they do not, or the graph is large and the solve converged.
+        """
+        counted = np.flatnonzero(self.table.weights(history) > 0)
+        before, began = self._solution, time.perf_counter()
+        if before.converged is not False and len(counted) > MOST_CHECKED or self._editor is None:
+            return None
+        found = solve(self.table.graph.select(counted))
+        if before.converged is not False and found.metrics["objective"] >= (1 - LOWER) * before.metrics["objective"]:
+            return None
+        poses, weights = found.world_from_cam, np.zeros(len(self.table))
+        weights[counted] = found.weights
+        if not len(self.table.graph.fixed):
+            poses = align(poses, before.world_from_cam).apply(poses)
+        self._solution = replace(found, world_from_cam=poses, weights=weights)
+        self._editor = _editor(self.table.graph, self._solution)
+        seconds = self.settled.seconds + time.perf_counter() - began
+        self.settled = self._settled(revision, self._solution, seconds)
+        return self.settled
+
+    def _settled(self, revision: int, solution: Solution, seconds: float) -> Settled:
+        residual_m, residual_rad = edge_residuals(self.table.graph, solution.world_from_cam)
+        before = self.settled.world_from_cam if revision else solution.world_from_cam
+        return Settled(
+            revision=revision,
+            world_from_cam=solution.world_from_cam,
+            component=solution.component,
+            weights=np.asarray(solution.weights),
+            residual_m=residual_m,
+            residual_rad=residual_rad,
+            seconds=seconds,
+            moved_m=moved_m(before, solution.world_from_cam),
+            error_m=error_m(solution.world_from_cam, self._truth),
+            converged=solution.converged is not False,
+        )
+
+
+def moved_m(before: Floats, after: Floats) -> float:
+    """The farthest that a position of the poses (V, 4, 4) lies from where it was, the two sets aligned."""
+    known = np.isfinite(before).all(axis=(1, 2)) & np.isfinite(after).all(axis=(1, 2))
+    if not known.any():
+        return 0.0
+    aligned = align(after[known], before[known]).apply(after[known])
+    return float(np.linalg.norm(aligned[:, :3, 3] - before[known, :3, 3], axis=1).max())
+
+
+def error_m(world_from_cam: Floats, truth: Floats) -> float | None:
+    """The RMS error of the positions after alignment; None where fewer than three true poses are known."""
+    if np.isfinite(truth).all(axis=(1, 2)).sum() < 3:
+        return None
+    return absolute_error(world_from_cam, truth).rmse_m
+
+
+def _editor(graph: ViewGraph, solution: Solution) -> GraphEditor | None:
+    """An editor of the graph; None where the graph has priors, which it does not take."""
+    if graph.priors is not None and len(graph.priors.vertices):
+        return None
+    return GraphEditor(graph, solution)
+
+
+def _rows(graph: ViewGraph) -> dict[str, list[int]]:
+    """The rows of the edges of each pair of vertex ids."""
+    rows: dict[str, list[int]] = {}
+    for pairs in (graph.edges, graph.edges[:, ::-1]):
+        for row, name in enumerate(pair_names(graph.vertex_ids, pairs)):
+            rows.setdefault(name, []).append(row)
+    return rows
+
+
+def _plain(graph: ViewGraph, weights: Floats, start: Floats) -> Solution:
+    counted = np.flatnonzero(weights > 0)
+    chosen = graph.select(counted)
+    chosen = replace(chosen, information=chosen.information * weights[counted, None, None])
+    found = solve(chosen, start=start, initial="given")
+    return replace(found, weights=weights)

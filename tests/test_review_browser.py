@@ -1,0 +1,239 @@
+"""A review in a real browser: the run of docs/which-edge.md mended by mouse, by keyboard, from two tabs."""
+
+import os
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from shutil import copytree
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hodge_pipeline
+from hodge_pipeline import se3
+from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.pairs.edits import read_history
+from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.review.looking import shown_pair
+from hodge_pipeline.review.opening import Review
+from hodge_pipeline.review.picking import nearest_point
+from hodge_pipeline.review.settle import error_m
+from hodge_pipeline.run_folder import Run
+from hodge_pipeline.scene import true_poses
+from review_page import Page, start_browser, why_no_browser
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "docs"))
+from make_which_edge import MISTAKEN, write_loops  # noqa: E402
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(why_no_browser()), reason=why_no_browser())]
+PLANTED = {f"{i}-{j}" for i, j in MISTAKEN}
+SMALL = (
+    "outer_iterations=1", "edges={stage: sequential, reach: 3}", "evaluation.tables=false", "clouds.voxel_m=0.06",
+    "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def spoiled_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("review")
+    source = make_sequence(folder / "demo", DemoOptions(width=160, height=120))
+    write_loops(folder / "loops.g2o", source)
+    recipe = load_recipe("demo", [*SMALL, f"measured.files=[{{path: {folder / 'loops.g2o'}}}]"], source)
+    hodge_pipeline.run(recipe, folder / "run")
+    return folder / "run"
+
+
+@pytest.fixture
+def run_folder(spoiled_run: Path, tmp_path: Path) -> Path:
+    return Path(copytree(spoiled_run, tmp_path / "room"))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    found = start_browser()
+    yield found
+    found.quit()
+
+
+@pytest.fixture
+def review(run_folder: Path) -> Iterator[Review]:
+    with Review(run_folder, who="ada") as opened:
+        opened.session.wait()
+        yield opened
+
+
+def error_of(folder: Path) -> float:
+    run = Run.load(folder)
+    found = error_m(run.result.world_from_cam, true_poses(run.source)[run.key_frames.rows])
+    assert found is not None
+    return found
+
+
+def test_three_wrong_edges_taken_out_by_mouse_and_the_run_solved(
+    browser: Any, review: Review, run_folder: Path
+) -> None:
+    session, before_m = review.session, error_of(run_folder)
+    page = Page(browser, review)
+    assert set(page.rows()) == PLANTED
+    page.click("th[data-sort=gap]")
+    page.click("th[data-sort=score]")
+    for name in sorted(PLANTED):
+        page.choose(name)
+        page.decided(lambda: page.click("#disable"))
+    mended_m = session.settled.error_m
+    assert before_m > 0.5 and mended_m is not None and mended_m < 0.05
+    page.decided(lambda: page.click("#undo"))
+    assert session.settled.error_m is not None and session.settled.error_m > 0.1
+    page.choose(sorted(PLANTED)[-1])
+    page.find("#note").send_keys("one desk taken for the other")
+    page.decided(lambda: page.click("#disable"))
+    assert session.settled.error_m == pytest.approx(mended_m, rel=0.05)
+    assert set(read_history(run_folder).disabled) == PLANTED
+    assert session.decisions.lines()[-1]["note"] == "one desk taken for the other"
+
+    page.click("#solve")
+    page.until(lambda: "solved and fused" in page.text("message"))
+    assert error_of(run_folder) < 0.05
+
+
+def test_the_same_by_keyboard(browser: Any, review: Review, run_folder: Path) -> None:
+    page = Page(browser, review)
+    for _ in PLANTED:
+        was = page.selected()
+        page.press("j")
+        page.until(lambda: page.selected() not in ("", was))  # noqa: B023
+        page.decided(lambda: page.press("d"))
+    page.decided(lambda: page.press("u"))
+    page.decided(lambda: page.press("y"))
+    assert set(read_history(run_folder).disabled) == PLANTED
+    assert review.session.settled.error_m is not None and review.session.settled.error_m < 0.05
+    page.press("2")
+    page.until(lambda: review.session.look.mode == "edge")
+
+
+def test_a_line_clicked_in_the_scene_is_selected(browser: Any, review: Review) -> None:
+    page, session = Page(browser, review), review.session
+    graph, poses = session.table.graph, session.settled.world_from_cam
+    lines = [poses[graph.edges[session.rows_of(name)[0]], :3, 3] for name in sorted(PLANTED)]
+    middle = next(ends.mean(axis=0) for ends in lines if page.place(ends.mean(axis=0)) is not None)
+    page.click_scene(middle)
+    page.until(page.selected)
+    assert page.selected() in PLANTED
+
+
+def test_an_edge_added_by_three_clicked_points(browser: Any, review: Review, run_folder: Path) -> None:
+    page, session = Page(browser, review), review.session
+    i, j = 4, 8
+    truth = true_poses(session.subject.source)
+    motion = se3.inverse(truth[i]) @ truth[j]
+    clouds = session.subject.clouds
+    assert clouds is not None and not session.rows_of(f"{i}-{j}")
+    page.browser.execute_script("document.getElementById('adding').open = true")
+    page.find("#first").send_keys(str(i))
+    page.find("#second").send_keys(str(j))
+    page.click("#pick")
+    page.until(lambda: page.find("#candidate").is_displayed())
+    page.click("#apart")
+    page.until(lambda: session.look.mode == "apart")
+    page.until(lambda: page.place(shown_pair(session, False).middle))  # type: ignore[union-attr]
+    for count, (here, there) in enumerate(matching(page, i, j, motion), start=1):
+        for point, done in ((here, (count, count - 1)), (there, (count, count))):
+            page.click_scene(point)
+            page.until(lambda: clicks(session) == done)  # noqa: B023
+    assert session.candidate is not None
+    off = se3.log(se3.inverse(motion) @ session.candidate.guess)
+    assert np.abs(off).max() < 0.25, off
+    page.click("#register")
+    page.until(lambda: session.candidate is not None and session.candidate.found is not None)
+    assert session.candidate.residual_m < 0.1 and not session.candidate.rejected
+    page.decided(lambda: page.click("#accept"))
+    assert session.settled.weights[session.rows_of(f"{i}-{j}")[0]] == 1
+    assert read_history(run_folder).registered == (f"{i}-{j}",)
+
+
+def clicks(session: Any) -> tuple[int, int]:
+    candidate = session.candidate
+    return len(candidate.points_i), len(candidate.points_j)
+
+
+def matching(page: Page, i: int, j: int, i_from_j: Any) -> list[tuple[Any, Any]]:
+    """Three places far from each other, in the world, that both clouds have and that a click at them picks."""
+    from scipy.spatial import cKDTree
+
+    pair, clouds = shown_pair(page.review.session, False), page.review.session.subject.clouds
+    assert pair is not None and clouds is not None
+    first, second = (np.asarray(clouds[row].points_in_cam, float) for row in (i, j))
+    distance, at = cKDTree(se3.transform(i_from_j, second)).query(first)
+    shown = se3.transform(pair.world_from_i, first), se3.transform(pair.world_from_j, second)
+    eye = np.asarray(page.scene.camera.position)
+
+    def picked(points: Any, row: int) -> bool:
+        return page.place(points[row]) is not None and nearest_point(eye, points[row] - eye, points) == row
+
+    near = np.flatnonzero(distance < 0.04)
+    seen = np.array([row for row in near[::12] if picked(shown[0], row) and picked(shown[1], at[row])])
+    ways = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0.3]])
+    corners = [int(seen[np.argmin(first[seen] @ way)]) for way in ways]
+    return [(shown[0][row], shown[1][at[row]]) for row in corners]
+
+
+def test_two_tabs_and_a_stale_decision(browser: Any, review: Review, run_folder: Path) -> None:
+    page, first = Page(browser, review), browser.current_window_handle
+    stale, fresh, _ = sorted(PLANTED)
+    page.choose(stale)
+    browser.execute_script("events.close()")  # this tab hears of nothing any more
+    browser.switch_to.new_window("tab")
+    other = Page(browser, review)
+    other.choose(fresh)
+    other.decided(lambda: other.click("#disable"))
+    browser.close()
+    browser.switch_to.window(first)
+    page.click("#disable")
+    page.until(lambda: "another page has decided" in page.text("message"))
+    assert read_history(run_folder).disabled == (fresh,)
+
+
+def test_a_server_that_is_killed_loses_no_decision(browser: Any, run_folder: Path) -> None:
+    name = sorted(PLANTED)[0]
+    serve = [sys.executable, "-m", "hodge_pipeline.cli.main", "review", str(run_folder), "--no-browser"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    for start in (1, 2):
+        process = subprocess.Popen(serve, stdout=subprocess.PIPE, text=True, env=environment)
+        try:
+            assert process.stdout is not None
+            address = process.stdout.readline().strip()
+            browser.get(address)
+            page = Page.__new__(Page)
+            page.browser = browser
+            page.until(lambda: page.data("doing") == "")  # noqa: B023
+            if start == 1:
+                page.choose(name)
+                page.click("#disable")
+                page.until(lambda: page.data("revision") == "1")  # noqa: B023
+            else:
+                page.until(lambda: "1 disabled" in page.text("facts"))  # noqa: B023
+                with pytest.raises(urllib.error.HTTPError, match="403"):
+                    urllib.request.urlopen(address.rsplit("/", 2)[0] + "/guessed/")
+        finally:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+    assert read_history(run_folder).disabled == (name,)
+
+
+def test_another_origin_gets_no_socket(browser: Any, review: Review) -> None:
+    """A page of a stranger's, opened in the same browser, that even knows the token."""
+    browser.get("data:text/html,<p>a stranger's page</p>")
+    script = """
+        const [address, done] = arguments;
+        const socket = new WebSocket(address.replace('http', 'ws') + 'scene', 'viser-v1.1.1');
+        socket.onopen = () => done('open'); socket.onerror = () => done('refused');
+    """
+    assert browser.execute_async_script(script, review.address) == "refused"
+    fetched = "const [a, done] = arguments; fetch(a + 'state').then(() => done('read'), () => done('refused'))"
+    assert browser.execute_async_script(fetched, review.address) == "refused"
+    assert review.viewer is not None and not review.viewer.server.get_clients()
