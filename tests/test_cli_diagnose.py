@@ -96,7 +96,7 @@ def test_the_page_needs_nothing_but_itself(wrong_edge: tuple[Path, str, ViewGrap
     folder, _, graph = wrong_edge
     page = (folder / "why/diagnosis.html").read_text()
     assert not re.search(r"(src|href)=[\"'](?!data:|#)", page)
-    assert "1 of 36 edges is wrong" in page
+    assert "1 of 36 edges is wrong" in page and '<span class="badge">wrong</span>' in page
     assert page.count("<img ") == 3
     i, j = graph.vertex_ids[graph.edges[17]]
     assert f'<td class="word">{i}–{j}</td><td class="word wrong">wrong</td>' in page

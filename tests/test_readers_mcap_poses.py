@@ -7,9 +7,21 @@ import pytest
 
 from hodge_adapters.mcap import McapReader
 from hodge_pipeline import se3
+from hodge_pipeline.sources.inspect import inspect
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Floats
-from mcap_data import depth_log, foxglove_header, odometry, pose_message, raw_image, ros_header, some_images, transforms
+from mcap_data import (
+    SECOND,
+    Log,
+    depth_log,
+    foxglove_header,
+    odometry,
+    pose_message,
+    raw_image,
+    ros_header,
+    some_images,
+    transforms,
+)
 from mcap_encoding import CDR, ENCODINGS, PROTOBUF
 from readers_data import HEIGHT, WIDTH, some_poses
 from synthetic import tiny_sequence  # noqa: F401
@@ -120,3 +132,22 @@ def test_ros_headers(tmp_path: Path) -> None:
     source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
     assert (source.frames[0].read_colour() == 9).all(), "a leading slash of a frame is the same frame"
     assert not any("colour is off" in note for note in source.notes)
+
+
+def test_topics_and_transforms_are_listed_with_counts_and_rates(tmp_path: Path) -> None:
+    """Those that are not taken too: ten messages of a type that no frame is made of, five a second."""
+    log = Log()
+    poses = some_poses(4)
+    for number in range(10):
+        log.add("/chatter", "foxglove.PackedElementField", {"name": "x"}, "json", number * SECOND // 5)
+    for number, pose in enumerate(poses):
+        log.add("/odom", "nav_msgs/msg/Odometry", odometry(1.0 + number, pose), "cdr", number * SECOND)
+    log.add("/tf", "tf2_msgs/msg/TFMessage", transforms((1.0, "map", "odom", poses[0])), "cdr", SECOND)
+    contents = McapReader().open(log.write(tmp_path / "log.mcap")).contents
+    assert contents == (
+        "/chatter (foxglove.PackedElementField): 10 messages, 5 a second",
+        "/odom (nav_msgs/msg/Odometry): 4 messages, 1 a second",
+        "/tf (tf2_msgs/msg/TFMessage): 1 messages",
+        "tf map -> odom: 1 poses",
+    )
+    assert inspect(tmp_path / "log.mcap")["contents"] == list(contents)

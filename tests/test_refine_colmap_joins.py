@@ -181,6 +181,17 @@ def test_a_database_of_other_images_is_said_to_be_one(tmp_path: Path) -> None:
     assert set(opened.measured()[0].source) == {"structure"}
 
 
+def test_a_database_of_old_is_left_out_with_a_note(tmp_path: Path) -> None:
+    model = noisy(tmp_path, database=True)
+    connection = sqlite3.connect(tmp_path / "database.db")
+    with connection:
+        connection.execute("ALTER TABLE two_view_geometries RENAME TO inlier_matches")
+    connection.close()
+    (opened,) = ColmapModels().open_models(model)
+    assert any("no two_view_geometries" in note for note in opened.notes)
+    assert set(opened.measured()[0].source) == {"structure"} and opened.held_apart == 0
+
+
 def test_images_without_a_pose_stay_without(tmp_path: Path) -> None:
     model = noisy(tmp_path)
     part = pycolmap.Reconstruction(model)

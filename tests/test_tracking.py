@@ -280,3 +280,13 @@ def test_the_same_command_again_computes_nothing(
     np.testing.assert_array_equal(again.result.world_from_cam, run.result.world_from_cam)
     stages = [stage["name"] for stage in json.loads((folder / "report.json").read_text())["stages"]]
     assert "tracking" in stages
+
+
+def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(sequence: Path, tmp_path: Path) -> None:
+    source = TumReader().open(sequence)
+    frames = [replace(frame, stamp_s=frame.stamp_s + 3600.0 * (row >= 30)) for row, frame in enumerate(source.frames)]
+    whole, _ = track(source, tmp_path / "whole")
+    found, _ = track(replace(source, frames=tuple(frames)), tmp_path / "stopped")
+    assert found.found.all()
+    poses, expected = (all_poses(source, one, one.world_from_key) for one in (found, whole))
+    assert np.abs(poses - expected).max() < 0.06

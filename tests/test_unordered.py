@@ -111,7 +111,7 @@ def test_pieces_lie_beside_each_other() -> None:
     poses = laid_apart(np.array([0, 1, 0]), POSES, clouds)
     relative = se3.inverse(poses[0]) @ poses[2]
     assert np.allclose(relative, se3.inverse(POSES[0]) @ POSES[2])
-    assert poses[1, 0, 3] - max(poses[0, 0, 3], poses[2, 0, 3]) > 20
+    assert poses[1, 0, 3] - max(poses[0, 0, 3], poses[2, 0, 3]) > 3 * clouds.reach_m
 
 
 def test_six_real_fragments_in_no_order(data_dir: Path, tmp_path: Path) -> None:

@@ -57,6 +57,19 @@ def database_names(path: Path) -> set[str]:
         raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
 
 
+def has_verified_pairs(path: Path) -> bool:
+    """Whether the database has COLMAP's table of verified pairs: old ones hold `inlier_matches` instead.
+
+    Raises `SourceError` where it is no database.
+    """
+    query = "SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'two_view_geometries'"
+    try:
+        with _opened(path) as database:
+            return bool(database.execute(query).fetchone()[0])
+    except (sqlite3.Error, OverflowError) as error:
+        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     """The database, read-only: `immutable` needs no write access, not even for a journal beside the file.

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters import images
 from hodge_adapters.colmap import ColmapReader
-from hodge_adapters.colmap_database import database_names
+from hodge_adapters.colmap_database import database_names, has_verified_pairs
 from hodge_adapters.colmap_depth import sensor_depth
 from hodge_adapters.colmap_files import find_database, find_models, model_ending, no_model
 from hodge_adapters.colmap_scale import other_camera_note
@@ -142,6 +142,9 @@ class ColmapModels:
             notes.append(f"no database.db beside or above the model: {COVISIBILITY}")
         elif not database_names(found) & frames.keys():
             notes.append(f"{found}: holds none of the model's images: {COVISIBILITY}")
+            return None
+        elif not has_verified_pairs(found):
+            notes.append(f"{found}: has no two_view_geometries, as databases of old: {COVISIBILITY}")
             return None
         return found
 

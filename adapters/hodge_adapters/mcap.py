@@ -104,6 +104,7 @@ class McapReader:
             trajectory=poses.trajectory,
             notes=tuple(notes),
             files=listing.all,
+            contents=recording.contents(),
         )
 
     def _frames(self, path: Path, recording: Recording, notes: list[str]) -> tuple[list[Frame], str]:

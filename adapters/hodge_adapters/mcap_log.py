@@ -50,6 +50,25 @@ class Logged(NamedTuple):
     place: Place
 
 
+@dataclass
+class Tally:
+    """How many messages of a topic were logged, wanted or not, and when the first and the last."""
+
+    count: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+    def add(self, log_time_ns: int) -> None:
+        """One message more."""
+        self.first_ns = min(self.first_ns, log_time_ns) if self.count else log_time_ns
+        self.last_ns = max(self.last_ns, log_time_ns)
+        self.count += 1
+
+    def __str__(self) -> str:
+        span_s = (self.last_ns - self.first_ns) * 1e-9
+        return f"{self.count} messages" + (f", {(self.count - 1) / span_s:.3g} a second" if span_s > 0 else "")
+
+
 Wanted = Callable[[Channel, Schema | None], bool]
 
 
@@ -62,6 +81,7 @@ class LogFile:
     complaints: Complaints
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
+    tallies: dict[str, Tally] = field(default_factory=dict)
     _is_wanted: dict[int, bool] = field(default_factory=dict)
     _chunk_offsets: list[int] = field(default_factory=list)
     _has_footer: bool = False
@@ -173,7 +193,9 @@ class LogFile:
         channel_id, _, log_time_ns, _ = _MESSAGE.unpack(read(record.start, _MESSAGE.size))
         if channel_id not in self.channels:
             self.complaints.count(self.path.name, "a message of a channel that the file does not define")
-        elif self._wants(channel_id):
+            return
+        self.tallies.setdefault(self.channels[channel_id].topic, Tally()).add(log_time_ns)
+        if self._wants(channel_id):
             channel = self.channels[channel_id]
             place = Place(record.start + _MESSAGE.size, record.length - _MESSAGE.size, chunk)
             if place.length > MAX_MESSAGE_BYTES:

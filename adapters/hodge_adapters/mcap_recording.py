@@ -29,7 +29,7 @@ from hodge_adapters.mcap_fields import (
     whole,
 )
 from hodge_adapters.mcap_images import ImageLayout, compressed_layout, raw_layout
-from hodge_adapters.mcap_log import LogFile, Logged
+from hodge_adapters.mcap_log import LogFile, Logged, Tally
 from hodge_adapters.mcap_records import Malformed
 from hodge_adapters.ros_tf import PoseColumns, TransformTree
 
@@ -83,17 +83,23 @@ class Recording:
     calibrations: dict[str, Calibration] = field(default_factory=dict)
     poses: dict[str, PoseTopic] = field(default_factory=dict)
     topics: dict[str, str] = field(default_factory=dict)
+    tallies: dict[str, Tally] = field(default_factory=dict)
     clock_differences_s: array[float] = field(default_factory=lambda: array("d"))
     _decoders: dict[tuple[str, str], Decoder | None] = field(default_factory=dict)
 
     def read_file(self, path: Path) -> None:
         """Go once through a file; raises `SourceError` only where it is no MCAP file or cannot be read."""
-        for logged in LogFile(path, self._wants, self.complaints).messages():
+        for logged in LogFile(path, self._wants, self.complaints, tallies=self.tallies).messages():
             topic = logged.channel.topic
             try:
                 self._add(path, logged)
             except Malformed as error:
                 self.complaints.count(topic, A_MESSAGE_WITH + str(error))
+
+    def contents(self) -> tuple[str, ...]:
+        """Its topics with type, count and rate, and its transforms, a line each."""
+        topics = ((topic, kind, self.tallies.get(topic, "no message")) for topic, kind in sorted(self.topics.items()))
+        return (*(f"{topic} ({kind}): {tally}" for topic, kind, tally in topics), *self.transforms.contents())
 
     def _wants(self, channel: Channel, schema: Schema | None) -> bool:
         name = schema.name if schema else ""

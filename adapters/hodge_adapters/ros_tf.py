@@ -50,6 +50,21 @@ class TransformTree:
         self.other_parents = 0
         """How many transforms were left out since their frame had another parent before."""
 
+    def contents(self) -> tuple[str, ...]:
+        """Its links, a line each, parents before children where the links form a tree."""
+        return tuple(
+            f"tf {parent} -> {child}: " + ("static" if child in self._static else f"{len(self._links[child])} poses")
+            for child, parent in sorted(self._parent.items(), key=lambda link: (len(self._above(link[0])), link))
+        )
+
+    def _above(self, child: str) -> list[str]:
+        """The frames from a child up to the root, or until they repeat."""
+        above: list[str] = []
+        while child in self._parent and child not in above:
+            above.append(child)
+            child = self._parent[child]
+        return above
+
     def add(self, parent: str, child: str, stamp_s: float, pose: tuple[float, ...], *, is_static: bool) -> None:
         """Add `parent_from_child` at a stamp. Add all before the first look-up."""
         if self._parent.setdefault(child, parent) != parent:

@@ -18,13 +18,13 @@ LEAST_SHOWN, MOST_BAD = 3, 20
 HEADER = ("edge", "verdict", "right", "why", "what to do")
 
 
-def diagnose(path: Path, out: Path | None, *, top: int | None, quiet: bool, as_json: bool) -> None:
+def diagnose(path: Path, out: Path | None, *, top: int | None, trust: str | None, quiet: bool, as_json: bool) -> None:
     """Judge every edge, print the worst, and leave the rest in a folder where one is given."""
     from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
 
     with Terminal(quiet or as_json) as terminal:
         with terminal.stage("diagnosis", 1):
-            found = diagnose_subject(open_subject(path))
+            found = diagnose_subject(open_subject(path, trust))
         if out is not None:
             with terminal.stage("pictures and recording", 1):
                 write_diagnosed(out, found)

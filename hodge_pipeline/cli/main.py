@@ -21,6 +21,7 @@ from hodge_pipeline.cli.options import (
     Reader,
     ReaderSet,
     Strict,
+    Trust,
     Truth,
     Verbose,
 )  # fmt: skip
@@ -143,6 +144,7 @@ def solve(
             "--robust", help="Find wrong edges and leave them out; exit code 3 where nothing confirms the rest."
         ),
     ] = False,
+    trust: Trust = None,
     certificate: Annotated[bool, typer.Option("--certificate", help="Prove the minimum global (isotropic).")] = False,
     sesync_units: Annotated[
         bool, typer.Option("--sesync-units", help="F as SE-Sync counts it: rotations weigh four times as much.")
@@ -167,6 +169,7 @@ def solve(
         disable or [],
         time_limit,
         robust=robust,
+        trust=trust,
         certificate=certificate,
         sesync_units=sesync_units,
     )
@@ -183,13 +186,14 @@ def diagnose(
     top: Annotated[
         int | None, typer.Option(min=0, help="Edges to print; default: those that are not consistent, 20 at most.")
     ] = None,
+    trust: Trust = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Say which edges are wrong, why, and what to do: by the cycles that they lie in, before any solve."""
     from hodge_pipeline.cli import diagnose as diagnosing
 
-    diagnosing.diagnose(path, out, top=top, quiet=quiet, as_json=json)
+    diagnosing.diagnose(path, out, top=top, trust=trust, quiet=quiet, as_json=json)
 
 
 @app.command()

@@ -44,3 +44,12 @@ Dask = Annotated[
         help="Register on the Dask cluster at tcp://HOST:8786, which is trusted to run code here.",
     ),
 ]
+Trust = Annotated[
+    str | None,
+    typer.Option(
+        "--trust",
+        metavar="auto|sequential|none|SOURCE",
+        help="Edges trusted as a backbone: as the graph shows (auto); consecutive ones; none; those of a source "
+        "(proposed_by).",
+    ),
+]

@@ -12,6 +12,7 @@ from hodge_pipeline.cli.paths import check_result, keep_source
 from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.pairs.edits import read_history
 from hodge_pipeline.refine.pose_graph import Choices, SolvedFile, solve_file, write_solved
+from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.newton import TIME_LIMIT_REACHED
 from hodge_pipeline.solvers.setup import InitialName
@@ -29,6 +30,7 @@ def choices(
     time_limit_s: float,
     *,
     robust: bool,
+    trust: str | None,
     certificate: bool,
     sesync_units: bool,
 ) -> Choices:
@@ -42,11 +44,13 @@ def choices(
             raise RecipeError(f"{option} {value}: expected {' or '.join(known)}")
     if named == "full" and (certificate or sesync_units):
         raise RecipeError("--certificate and --sesync-units are for the isotropic objective: add --objective isotropic")
+    if trust is not None and not robust:
+        raise RecipeError(f"--trust {trust}: only a robust solve trusts some edges more than others: add --robust")
     if not time_limit_s > 0:
         raise RecipeError(f"--time-limit {time_limit_s:g}: expected seconds above zero")
     initial: InitialName = "given" if start == "given" else "chordal"
     chosen: ObjectiveName = "isotropic" if named == "isotropic" else "full"
-    return Choices(chosen, initial, robust, certificate, sesync_units, tuple(disable), time_limit_s)
+    return Choices(chosen, initial, robust, certificate, sesync_units, tuple(disable), trust or AUTO, time_limit_s)
 
 
 def solve(

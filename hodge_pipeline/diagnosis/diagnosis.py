@@ -15,6 +15,7 @@ from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.diagnosis.consensus import find_consensus
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.noise import Noise, edge_noise
+from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior, prior_by_cycles, right_by_gap
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
@@ -32,6 +33,7 @@ from hodge_pipeline.diagnosis.testing_cycles import (
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.diagnosis.working_point import recentred, working_point
 from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
@@ -40,10 +42,13 @@ DEFAULTS = DiagnosisOptions()
 def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosis:
     """Every edge judged by the cycles it lies in and by the scene that most edges agree on; see `Diagnosis`.
 
-    No edge is trusted for its source. Deterministic for a seed. Raises `GraphError` for numbers that are not finite
+    No edge is trusted for its source unless the options say so, or the graph shows that its consecutive edges are a
+    backbone; then see `find_backbone`. Deterministic for a seed. Raises `GraphError` for numbers that are not finite
     and edges that name no vertex.
     """
     check_graph(graph)
+    if (backbone := find_backbone(graph, options.trust)) is not None:
+        return judged_on_backbone(graph, backbone, options)
     stated, (graph, turned) = graph, in_vertex_order(graph)
     prior = np.full(graph.edge_count, 0.5)
     if options.order_prior:

@@ -5,11 +5,19 @@ from __future__ import annotations
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline.solvers.backbone.trust import AUTO
+
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class DiagnosisOptions:
     """How edges are weighed against each other."""
 
+    trust: str = Field(
+        default=AUTO,
+        min_length=1,
+        description="edges that are trusted as a backbone: auto learns from the graph whether consecutive edges are "
+        "one; sequential trusts these, none no edge; any other word the edges that come from it (`proposed_by`)",
+    )
     cluster_gain: float = Field(
         default=2.0,
         ge=0,

@@ -13,6 +13,8 @@ from hodge_pipeline.complex.judging import left_over, squares_at_both_ends
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
+from hodge_pipeline.solvers.backbone.solve import solve_on_backbone
+from hodge_pipeline.solvers.backbone.trust import NONE, find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.robust import CHI2_99_PLANAR, CHI2_99_SPATIAL, solve_robust
 from hodge_pipeline.solvers.weights import edge_weights
@@ -52,7 +54,9 @@ class DiagnosedSolver:
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """The poses; each piece of the kept edges keeps its own gauge. Weights are 0 for edges left out."""
-        found = diagnose(graph, self.diagnosis)
+        if (backbone := find_backbone(graph, self.diagnosis.trust)) is not None:
+            return solve_on_backbone(graph, backbone, start=world_from_cam, objective=self.objective)
+        found = diagnose(graph, replace(self.diagnosis, trust=NONE))
         share = np.clip(np.nan_to_num(found.probability, nan=0.5), LEAST_WEIGHT, 1.0)
         rows, back = np.flatnonzero(found.kept), np.zeros(0, np.int64)
         attempt = _attempt(graph, found, share, rows, world_from_cam, self.objective)
@@ -76,7 +80,9 @@ def _attempt(
     finite = usual[rows][np.isfinite(usual[rows])]
     scale = max(float(np.median(finite)) / MEDIAN_CHI2[size], 1e-12) if len(finite) else 1.0
     limit = TAILS * (CHI2_99_PLANAR if size == 2 else CHI2_99_SPATIAL) * scale
-    solution = solve_robust(chosen, start=start, confidence=share[rows], threshold=limit, objective=objective)
+    solution = solve_robust(
+        chosen, start=start, confidence=share[rows], threshold=limit, objective=objective, trust=NONE
+    )
     chi2 = _chi2(graph, solution.world_from_cam, solution.component)
     return _Attempt(rows, solution, chi2, limit)
 

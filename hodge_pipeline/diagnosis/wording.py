@@ -56,13 +56,13 @@ def reasons(
             good = verdict[edge] == CONSISTENT
             witness = int(witnesses[0 if good else 1][edge, 0])
             text = f"{closed[edge]} of {passing[edge]} cycles close"
-            distance = _distance(residual[0][edge], residual[1][edge])
+            away = distance(residual[0][edge], residual[1][edge])
             if witness >= 0:
                 text += f"; {name_cycle(graph, cycles, witness)} {cycle_error(cycles, witness)}"
             elif not good:
                 text += _over_what(int(closed[edge]), int(sound[edge]))
-                distance = _against(bool(bridge[edge]), distance)
-            lines.append(f"{text}; {distance}")
+                away = _against(bool(bridge[edge]), away)
+            lines.append(f"{text}; {away}")
     return tuple(lines)
 
 
@@ -89,11 +89,11 @@ def _over_what(closed: int, sound: int) -> str:
     return f", {sound} of them over kept edges alone" if sound else ", each over another edge that is left out"
 
 
-def _against(is_bridge: bool, distance: str) -> str:
+def _against(is_bridge: bool, away: str) -> str:
     """Evidence against an edge none of whose cycles fails."""
     if is_bridge:
         return "it alone holds two parts together, which edges that were left out would join otherwise"
-    return f"against it speaks where all kept edges together lay its ends: {distance}"
+    return f"against it speaks where all kept edges together lay its ends: {away}"
 
 
 def _undecided(graph: ViewGraph, cycles: Cycles, row: int, doubted: Bools) -> str:
@@ -116,7 +116,8 @@ def cycle_error(cycles: Cycles, row: int) -> str:
     return f"{verb} {_amount(cycles.displacement_m[row], np.degrees(cycles.angle_rad[row]))}"
 
 
-def _distance(metres: float, degrees: float) -> str:
+def distance(metres: float, degrees: float) -> str:
+    """How far an edge is from the poses, in words; not finite between pieces."""
     if not np.isfinite(metres):
         return "its ends lie in different pieces"
     return f"{_amount(metres, degrees)} from the poses"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.judging import chi2_by_information
 from hodge_pipeline.diagnosis.short_cycles import short_cycles
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.residuals import with_residuals
@@ -42,15 +43,8 @@ class Solved:
 
     def chi2(self, world_from_body: Floats) -> float:
         """The mean over all edges of χ² per degree of freedom, an outlier's cut off where the solver cuts it."""
-        squares = np.minimum(edge_chi2(self.graph, world_from_body), OUTLIER_CHI2)
+        squares = np.minimum(chi2_by_information(self.graph, world_from_body), OUTLIER_CHI2)
         return float(squares.mean() / 6) if len(squares) else float("nan")
-
-
-def edge_chi2(graph: ViewGraph, world_from_body: Floats) -> Floats:
-    """ξᵀ Ω ξ (E,) of the motion that each edge and the poses (B, 4, 4) leave over."""
-    i, j = graph.edges.T
-    xi = se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(world_from_body[i]) @ world_from_body[j])
-    return np.asarray(np.einsum("ei,eij,ej->e", xi, graph.information, xi))
 
 
 def calibrated(graph: ViewGraph, world_from_body: Floats) -> ViewGraph:
@@ -66,7 +60,7 @@ def calibrated(graph: ViewGraph, world_from_body: Floats) -> ViewGraph:
         kind = graph.select(np.flatnonzero(same))
         chi2 = triangle_chi2(kind)
         if len(chi2) < LEAST_TRIANGLES:
-            chi2 = edge_chi2(kind, world_from_body)
+            chi2 = chi2_by_information(kind, world_from_body)
         middle = float(np.median(chi2))
         factor[same] = MEDIAN_CHI2 / middle if middle > 0 else 1.0
     return replace(graph, information=graph.information * factor[:, None, None])

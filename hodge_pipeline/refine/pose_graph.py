@@ -14,6 +14,7 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.pairs.edits import joining
+from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.robust import solve_robust
 from hodge_pipeline.solvers.setup import InitialName
@@ -38,6 +39,7 @@ class Choices:
     certificate: bool = False
     sesync_units: bool = False
     disable: Sequence[str] = ()
+    trust: str = AUTO
     time_limit_s: float = math.inf
 
 
@@ -133,7 +135,9 @@ def solve_file(path: Path, choices: Choices) -> SolvedFile:
 
 def _solved(graph: ViewGraph, start: Floats | None, choices: Choices) -> Solution:
     if choices.robust:
-        return solve_robust(graph, start=start, objective=choices.objective, certificate=choices.certificate)
+        return solve_robust(
+            graph, start=start, objective=choices.objective, certificate=choices.certificate, trust=choices.trust
+        )
     return solve(
         graph,
         start=start,

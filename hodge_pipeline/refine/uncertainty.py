@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.judging import chi2_by_information
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.guard import Change
 from hodge_pipeline.solvers.covariance import marginal_covariances
@@ -18,17 +19,10 @@ SIGMAS = 2.0
 LEAST_WEIGHT = 1e-3
 
 
-def edge_chi2(graph: ViewGraph, world_from_cam: Floats) -> Floats:
-    """χ² (E,) of each edge under the poses (V, 4, 4), 6 on average where information and poses are right."""
-    i, j = graph.edges.T
-    error = se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(world_from_cam[i]) @ world_from_cam[j])
-    return np.asarray(np.einsum("ea,eab,eb->e", error, graph.information, error))
-
-
 def mean_chi2(graph: ViewGraph, weights: Floats, world_from_cam: Floats) -> float:
     """The mean χ² of the edges, each by the weight (E,) that the solver gave it; NaN where none has any."""
     total = float(weights.sum())
-    return float(weights @ edge_chi2(graph, world_from_cam)) / total if total > 0 else float("nan")
+    return float(weights @ chi2_by_information(graph, world_from_cam)) / total if total > 0 else float("nan")
 
 
 def change(graph: ViewGraph, solution: Solution, before: Floats) -> Change:
@@ -54,7 +48,7 @@ def _sigmas(graph: ViewGraph, solution: Solution, used: Ints, rows: Ints) -> tup
     freedom = 6 * (len(used) - graph.vertex_count + 1 + int(solution.component.max(initial=0)))
     if freedom <= 0:
         return float("nan"), float("nan")
-    inflation = max(1.0, float(edge_chi2(chosen, solution.world_from_cam).sum()) / freedom)
+    inflation = max(1.0, float(chi2_by_information(chosen, solution.world_from_cam).sum()) / freedom)
     try:
         covariances = marginal_covariances(chosen, solution.world_from_cam, rows) * inflation
     except (GraphError, np.linalg.LinAlgError, RuntimeError):  # a singular graph has no covariance

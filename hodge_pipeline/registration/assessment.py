@@ -11,9 +11,9 @@ from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints, Registration
 
 MIN_POINTS = 10
-MIN_SIGMA_M, MIN_SIGMA_SHARE = 1e-3, 0.02
-"""No depth sensor is better, nor a scanner of small things than 1/50 of the distance that it is matched within: keeps
-noise-free (modelled) pairs finite."""
+MIN_SIGMA_SHARE = 0.02
+"""No sensor is better than 1/50 of the distance that it is matched within, 1 mm of 5 cm in a room: keeps noise-free
+(modelled) pairs finite in any unit."""
 
 FindNearest: TypeAlias = Callable[[Floats], tuple[Ints, Floats]]
 """Rows of the nearest target points, and squared distances in m², for query points (N, 3)."""
@@ -45,7 +45,7 @@ def assess(
 
     The information is that of the point-to-plane error e = n·(p − q) under `i_from_j exp(ξ)`, ξ = (rotation,
     translation) in j's axes: Σ JᵀJ / (s² c), J = (p_j × n_j, n_j), with s the RMS of e over this pair (at least
-    1 mm, or 1/50 of the distance). c = `points_per_sample` source points count as one independent measurement, since
+    1/50 of the distance). c = `points_per_sample` source points count as one independent measurement, since
     neighbours share their error. Directions that the surfaces do not fix, as within a plane, get none.
     """
     moved = se3.transform(i_from_j, source_points)
@@ -58,7 +58,7 @@ def assess(
         return NOTHING
     normals = target_normals[rows[near]]
     plane_errors = np.einsum("ij,ij->i", normals, moved[near] - target_points[rows[near]])
-    least = min(MIN_SIGMA_M, MIN_SIGMA_SHARE * max_distance_m)
+    least = MIN_SIGMA_SHARE * max_distance_m
     variance = max(float(np.mean(plane_errors**2)), least**2)
     jacobian = plane_jacobian(normals, source_points[near], i_from_j)
     return Assessment(

@@ -17,6 +17,7 @@ FEWEST_SEEN = 30
 VIEW_WIDTH = 160
 MARGIN_M, MARGIN_PER_M2 = 0.06, 0.006
 """Depth noise of structured light grows with the square of the distance; a match is off by centimetres."""
+NEAREST_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,13 @@ class FreeSpace:
         return self.before / total if total >= FEWEST_SEEN else float("nan")
 
 
-def free_space(view: DepthView, points_in_view: Floats) -> FreeSpace:
-    """Points (N, 3) of another frame, under a hypothesis, against this view; those behind its surface do not count."""
+def free_space(view: DepthView, points_in_view: Floats, scale: float = 1.0) -> FreeSpace:
+    """Points (N, 3) of another frame, under a hypothesis, against this view; those behind its surface do not count.
+
+    `scale` multiplies lengths that are for rooms.
+    """
     z = points_in_view[:, 2]
-    front = points_in_view[z > 0.1]
+    front = points_in_view[z > NEAREST_M * scale]
     camera, z = view.camera, front[:, 2]
     with np.errstate(over="ignore", invalid="ignore"):
         column = np.rint((camera.fx * front[:, 0] / z + camera.cx) / view.stride)
@@ -62,17 +66,19 @@ def free_space(view: DepthView, points_in_view: Floats) -> FreeSpace:
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     z = z[inside]
     surface = view.nearest_m[row[inside].astype(np.int64), column[inside].astype(np.int64)]
-    margin = MARGIN_M + MARGIN_PER_M2 * z**2
+    margin = MARGIN_M * scale + MARGIN_PER_M2 / scale * z**2
     measured = np.isfinite(surface)
     before = measured & (z < surface - margin)
     on = measured & (np.abs(z - surface) <= margin)
     return FreeSpace(int(before.sum()), int(on.sum()))
 
 
-def violation(views: tuple[DepthView, DepthView], clouds: tuple[Floats, Floats], i_from_j: Floats) -> float:
+def violation(
+    views: tuple[DepthView, DepthView], clouds: tuple[Floats, Floats], i_from_j: Floats, scale: float = 1.0
+) -> float:
     """The worse of the two shares: points (N, 3) of j that i saw through, and of i that j saw through; NaN: untold."""
-    into_i = free_space(views[0], se3.transform(i_from_j, clouds[1])).violation
-    into_j = free_space(views[1], se3.transform(se3.inverse(i_from_j), clouds[0])).violation
+    into_i = free_space(views[0], se3.transform(i_from_j, clouds[1]), scale).violation
+    into_j = free_space(views[1], se3.transform(se3.inverse(i_from_j), clouds[0]), scale).violation
     return float(np.fmax(into_i, into_j))
 
 

@@ -11,8 +11,6 @@ from hodge_pipeline.registration.one_thread import o3d
 from hodge_pipeline.registration.open3d_cloud import Open3dCloud, register_levels
 from hodge_pipeline.types import Floats, PointCloud, Registration
 
-ASSESSED_WITHIN_M = 0.1
-
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Ndt:
@@ -24,6 +22,9 @@ class Ndt:
         description="Metres, coarse to fine: side of a voxel. Below about 0.2 too few points of a 3 cm cloud fill one.",
     )
     max_iterations: int = Field(default=30, ge=1, description="Steps at each level, at most.")
+    assessed_within_m: float = Field(
+        default=0.1, gt=0, description="metres: points of j this near to one of i count in fitness and information"
+    )
     points_per_sample: float = Field(
         default=100.0, gt=0, description="Points that count as one independent measurement in the information."
     )
@@ -40,7 +41,7 @@ class Ndt:
             target,
             source,
             i_from_j,
-            max_distance_m=ASSESSED_WITHIN_M,
+            max_distance_m=self.assessed_within_m,
             points_per_sample=self.points_per_sample,
         )
 

@@ -20,7 +20,8 @@ from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
 STEPS_IN_BLOCK = 32
 WARM_UP_STEPS = 2
-SPACE_BETWEEN_SEQUENCES_M = 20.0
+REACHES_APART = 4.0
+"""What nothing joins begins so many reaches of a cloud apart: two clouds that face each other do not meet."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
@@ -82,7 +83,8 @@ def odometry(
     early to know its velocity, so that blocks run side by side and the result does not depend on the workers.
     `advance` counts frames.
     """
-    sizes = CloudSet.open(folder).sizes
+    clouds = CloudSet.open(folder)
+    sizes = clouds.sizes
     blocks = [block for rows in sequences for block in _blocks(rows[sizes[rows] > 0], stamps_s)]
     results: dict[int, Edges] = {}
     for number, result in workers.map(partial(_run_block, folder, options), blocks):
@@ -91,7 +93,7 @@ def odometry(
     steps = Edges.joined([results[number] for number in range(len(blocks))])
     gap = over_gap(steps.pairs, sequences, stamps_s)
     lost = ~(steps.fitness >= np.where(gap, max(options.sure_fitness, options.min_fitness), options.min_fitness))
-    poses = chained(len(sizes), sequences, steps)
+    poses = chained(len(sizes), sequences, steps, REACHES_APART * clouds.reach_m)
     notes = tuple(
         f"tracking was lost between rows {i} and {j} ({'a hole in the recording, ' if hole else ''}fitness "
         f"{fitness:.2f}): no edge there, the motion is guessed"
@@ -139,8 +141,10 @@ def _durations(stamps_s: Floats) -> Floats:
     return np.where((durations > 0).all(), durations, 1.0)
 
 
-def chained(count: int, sequences: Sequence[Ints], steps: Edges) -> Floats:
-    """Poses (count, 4, 4) that steps between rows of each sequence lead to; a sequence begins beside the one before."""
+def chained(count: int, sequences: Sequence[Ints], steps: Edges, space_m: float) -> Floats:
+    """Poses (count, 4, 4) that steps between rows of each sequence lead to; a sequence begins `space_m` beside
+    the one before.
+    """
     motion_to = {int(j): (int(i), motion) for (i, j), motion in zip(steps.pairs, steps.i_from_j, strict=True)}
     poses: Floats = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
     begin_x = 0.0
@@ -155,5 +159,5 @@ def chained(count: int, sequences: Sequence[Ints], steps: Edges) -> Floats:
             else:
                 poses[row, 0, 3] = begin_x
             before = row
-        begin_x = float(poses[rows, 0, 3].max()) + SPACE_BETWEEN_SEQUENCES_M
+        begin_x = float(poses[rows, 0, 3].max()) + space_m
     return poses

@@ -24,7 +24,6 @@ from hodge_pipeline.registration.visual import VisualMotion, visual_motion
 from hodge_pipeline.types import Floats, Ints, Landmarks, PointCloud, Registration
 
 ASSESSED_POINTS = 1000
-ASSESSED_WITHIN_M = 0.05
 SAME_FITNESS = 0.05
 """What the fitness of two registrations may differ by that surfaces cannot tell apart."""
 
@@ -64,6 +63,9 @@ class Rgbd:
         ge=0,
         description="metres: where too few matches agree, landmarks are matched again with those alone that lie this "
         "near where the surfaces' motion puts them, which tells the handles of a cabinet apart; 0: they are not",
+    )
+    assessed_within_m: float = Field(
+        default=0.05, gt=0, description="metres: points of j this near to one of i count in the fitness of landmarks"
     )
     matches_per_sample: float = Field(
         default=75.0,
@@ -116,10 +118,10 @@ class Rgbd:
         """Their motion. Its fitness, where it is low, is the other way round if this is larger: a frame that shows what
         is near and, behind it, what the other did not see shares little with it, but all of the other is in it.
         """
-        found = _assessed(target, source, visual)
+        found = self._assessed(target, source, visual)
         if found.fitness >= self.min_fitness:
             return found
-        back = _within(source, target, se3.inverse(found.i_from_j))
+        back = self._within(source, target, se3.inverse(found.i_from_j))
         return replace(found, fitness=max(found.fitness, back.fitness))
 
     def _by_surfaces(
@@ -131,8 +133,32 @@ class Rgbd:
         found = self.geometry.register(target, source, i_from_j)
         if hint is None or found.correspondences == 0:
             return found
-        mean = _assessed(target, source, _mean_motion(found, hint))
+        mean = self._assessed(target, source, _mean_motion(found, hint))
         return mean if mean.fitness >= found.fitness - SAME_FITNESS else found
+
+    def _within(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats) -> Assessment:
+        return assess(
+            source_points=source.sample_points(ASSESSED_POINTS),
+            target_points=target.points,
+            target_normals=target.normals,
+            find_nearest=target.find_nearest,
+            i_from_j=i_from_j,
+            max_distance_m=self.assessed_within_m,
+            points_per_sample=1.0,
+        )
+
+    def _assessed(self, target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
+        """The landmarks' motion with what the clouds say of it: a false one shows in the fitness."""
+        seen = self._within(target, source, visual.i_from_j)
+        return Registration(
+            i_from_j=visual.i_from_j,
+            information=visual.information,
+            fitness=seen.fitness,
+            rmse_m=seen.rmse_m,
+            correspondences=max(seen.correspondences, visual.inliers),
+            iterations=0,
+            converged=True,
+        )
 
 
 def _mean_motion(surfaces: Registration, landmarks: VisualMotion) -> VisualMotion:
@@ -151,29 +177,3 @@ class PreparedFrame(PreparedCloud):
         landmarks = cloud.landmarks or Landmarks.none()
         self.landmarks = np.asarray(landmarks.points_in_cam, np.float64)
         self.descriptors = root_sift(np.asarray(landmarks.descriptors))
-
-
-def _within(target: PreparedFrame, source: PreparedFrame, i_from_j: Floats) -> Assessment:
-    return assess(
-        source_points=source.sample_points(ASSESSED_POINTS),
-        target_points=target.points,
-        target_normals=target.normals,
-        find_nearest=target.find_nearest,
-        i_from_j=i_from_j,
-        max_distance_m=ASSESSED_WITHIN_M,
-        points_per_sample=1.0,
-    )
-
-
-def _assessed(target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
-    """The landmarks' motion with what the clouds say of it: a false one shows in the fitness."""
-    seen = _within(target, source, visual.i_from_j)
-    return Registration(
-        i_from_j=visual.i_from_j,
-        information=visual.information,
-        fitness=seen.fitness,
-        rmse_m=seen.rmse_m,
-        correspondences=max(seen.correspondences, visual.inliers),
-        iterations=0,
-        converged=True,
-    )

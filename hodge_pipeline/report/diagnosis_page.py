@@ -58,7 +58,7 @@ def document(contents: PageContents) -> Document:
         f"Which edge is wrong: {contents.title}",
         f"{contents.graph.vertex_count} frames, {contents.graph.edge_count} edges. Each edge is a measured motion "
         "between two frames; the cycles that it lies in test it.",
-        (Banner(MARKS[worst], sentence(contents.graph, contents.diagnosis), rest),),
+        (Banner(MARKS[worst], sentence(contents.graph, contents.diagnosis), rest, worst),),
         first=(Section("What to do", text="\n".join(contents.commands)),),
         sections=(
             *([Section.of(frames)] if frames.rows else []),

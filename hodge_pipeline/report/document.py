@@ -94,11 +94,14 @@ class Section:
 
 @dataclass(frozen=True)
 class Banner:
-    """A verdict: a mark, a headline, and what it rests on, a short line each."""
+    """A verdict: a mark, a headline, and what it rests on, a short line each. `word` stands in the badge in place of
+    the mark's own.
+    """
 
     mark: Mark
     headline: str
     points: tuple[str, ...] = ()
+    word: str = ""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ def error_plots(report: Report) -> Iterator[Picture]:
     errors = offsets(report)
     if not errors:
         return
-    against = "from the truth, aligned" if has_truth(report) else f"from the {report.before} poses, aligned"
+    against = "from the truth, aligned" if has_truth(report) else f"from where it lay in the {report.before} poses"
     title = "Error" if has_truth(report) else "Movement"
     yield painted(
         f"{title} over time, per axis", f"How far each frame lies {against}.", lambda figure: _over_time(figure, report)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.report.painting import error_plots, flattest_plane, painted
+from hodge_pipeline.report.painting import error_plots, flattest_plane, has_truth, painted
 from hodge_pipeline.report.verdict import GRAPH_NAMES
 from hodge_pipeline.types import Floats, Ints
 
@@ -47,7 +47,7 @@ def draw_convergence(report: Report) -> tuple[Picture, ...]:
 def _plots(report: Report) -> Iterator[Picture]:
     pictures = report.pictures
     if any(np.isfinite(path.positions).any() for path in pictures.paths):
-        caption = "Aligned to the reference, seen across its flattest direction."
+        caption = f"Seen across its flattest direction{', aligned to the truth' if has_truth(report) else ''}."
         yield painted("Trajectory from above", caption, lambda figure: _paths(figure, report))
     yield from error_plots(report)
     if report.scores is not None and any(len(graph.pairs) for graph in report.scores.graphs):

@@ -123,7 +123,7 @@ def _of_graph(path: Path) -> Subject:
     assert source.graph is not None
     graph = source.graph
     start = None if source.trajectory is None else source.trajectory.world_from_cam
-    solution = solve(graph, start=start, initial="chordal" if start is None else "given")
+    solution = solve(graph, start=start)
     kept = path if path.is_dir() else None
     return Subject(
         path=path,

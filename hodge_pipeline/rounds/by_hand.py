@@ -62,7 +62,7 @@ def _start(work: Work, graph: ViewGraph, rounds: Sequence[Round]) -> Floats:
 
     def distance(one: Round) -> float:
         translation_m, angle_rad = edge_residuals(graph, one.world_from_cam)
-        known = np.hypot(translation_m, ARM_M * angle_rad)
+        known = np.hypot(translation_m, ARM_M * float(work.recipe.scale) * angle_rad)
         return float(np.nanmean(known)) if np.isfinite(known).any() else np.inf
 
     apart = connected_components(rounds[-1].graph.edges, graph.vertex_count)

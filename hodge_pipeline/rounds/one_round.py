@@ -71,7 +71,7 @@ class Work:
         held_out = HeldOut(recipe.guard.held_out, recipe.seed) if scene.is_given else None
         proposed = self.steps.step(
             propose_edges, recipe.edges, scene.source, scene.clouds, before.world_from_cam, self.measured, held_out,
-            scene.in_order, title=f"edges, round {number}",
+            scene.in_order, self.scale, title=f"edges, round {number}",
         )  # fmt: skip
         return with_start_edges(proposed, scene.first)
 
@@ -116,6 +116,7 @@ def propose_edges(
     measured: ViewGraph,
     held_out: HeldOut | None,
     in_order: bool,
+    scale: float,
     *,
     step: Step,
 ) -> Edges:
@@ -126,7 +127,7 @@ def propose_edges(
     if in_order:
         candidates = builder.propose(source.frames, clouds, world_from_cam)
     else:
-        candidates = propose_along_tour(builder, source.frames, clouds, world_from_cam)
+        candidates = propose_along_tour(builder, source.frames, clouds, world_from_cam, scale)
     candidates = without_measured(candidates, measured)
     return candidates if held_out is None else candidates.put(held_out.of(candidates), status=HELD_OUT)
 

@@ -108,10 +108,18 @@ def unordered(count: int) -> Elimination:
     return Elimination(np.arange(count), 0, (), none, none, math.inf, math.inf)
 
 
-def plan_elimination(tail: Ints, head: Ints, count: int, core_order: Callable[[csc_matrix], Ordering]) -> Elimination:
+def plan_elimination(
+    tail: Ints,
+    head: Ints,
+    count: int,
+    core_order: Callable[[csc_matrix], Ordering],
+    most_neighbours: int = MOST_NEIGHBOURS,
+    fewest: int = FEWEST_IN_ROUND,
+) -> Elimination:
     """The rounds for a graph of `count` vertices with edges (tail, head); those at or past `count` are pinned.
 
-    `core_order` gives the elimination order of the core's pattern.
+    `core_order` gives the elimination order of the core's pattern. A vertex of more than `most_neighbours` stays in the
+    core, and so do all when a round would have less than `fewest`.
     """
     inside = (tail < count) & (head < count) & (tail != head)
     low, high = np.minimum(tail, head)[inside], np.maximum(tail, head)[inside]
@@ -122,7 +130,7 @@ def plan_elimination(tail: Ints, head: Ints, count: int, core_order: Callable[[c
     left = count
     while left:
         low, high = np.divmod(pairs, count)
-        chosen = _independent(low, high, alive, left, priority)
+        chosen = _independent(low, high, alive, left, priority, most_neighbours, fewest)
         if chosen is None:
             break
         touched = chosen[low] | chosen[high]
@@ -151,11 +159,13 @@ def _merged(ascending: Ints, more: list[Ints]) -> Ints:
     return keys[np.diff(keys, prepend=-1) > 0]
 
 
-def _independent(low: Ints, high: Ints, alive: Bools, left: int, priority: Ints) -> Bools | None:
+def _independent(
+    low: Ints, high: Ints, alive: Bools, left: int, priority: Ints, most_neighbours: int, fewest: int
+) -> Bools | None:
     """Vertices of few neighbours, no two of them neighbours; None where there are too few."""
     count = len(alive)
     degree = np.bincount(low, minlength=count) + np.bincount(high, minlength=count)
-    most = _highest_degree(degree[alive], left)
+    most = _highest_degree(degree[alive], left, most_neighbours, fewest)
     if most is None:
         return None
     candidate = alive & (degree <= most)
@@ -184,10 +194,10 @@ def independent_set(tail: Ints, head: Ints, candidate: Bools, rank: Ints, passes
     return chosen
 
 
-def _highest_degree(degrees: Ints, left: int) -> int | None:
+def _highest_degree(degrees: Ints, left: int, most_neighbours: int, fewest: int) -> int | None:
     """The least degree up to which there are enough vertices for a round."""
-    enough = max(SMALLEST_ROUND * left, FEWEST_IN_ROUND)
-    upto = np.cumsum(np.bincount(degrees, minlength=MOST_NEIGHBOURS + 1)[: MOST_NEIGHBOURS + 1])
+    enough = max(SMALLEST_ROUND * left, fewest)
+    upto = np.cumsum(np.bincount(degrees, minlength=most_neighbours + 1)[: most_neighbours + 1])
     found = np.flatnonzero(upto >= enough)
     return int(found[0]) if len(found) else None
 
@@ -292,8 +302,19 @@ def eliminate(
     plan: Elimination, matrix: bsr_matrix, factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]]
 ) -> BlockFactor:
     """The factor of a symmetric positive definite block matrix whose rows are in the plan's order."""
-    size = matrix.blocksize[0]
-    diagonal, rows = _unpacked(plan, matrix)
+    return eliminate_blocks(plan, *_unpacked(plan, matrix), factorise_core)
+
+
+def eliminate_blocks(
+    plan: Elimination,
+    diagonal: Floats,
+    rows: Floats,
+    factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]],
+) -> BlockFactor:
+    """The factor of the matrix of these blocks: `diagonal (n, s, s)`, and `rows (slots, s, s)` above it; both are
+    overwritten.
+    """
+    size = diagonal.shape[-1]
     flat = diagonal.reshape(-1, size * size), rows.reshape(-1, size * size)
     for group in plan.groups:
         _eliminate_group(group, diagonal, rows, flat)

@@ -1,7 +1,7 @@
 """Robust poses: graduated non-convexity from a start with edges that short cycles confirm.
 
-Yang, Antonante, Tzoumas and Carlone 2020. No edge is trusted for being sequential: where triangles test the edges they
-give the initial weights; where none does, all edges begin with the same weight.
+Yang, Antonante, Tzoumas and Carlone 2020, for graphs without a backbone that can be trusted. Where triangles test the
+edges they give the initial weights; where none does, all edges begin with the same weight.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
+from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.judging import chi2_by_information, left_over, mean_variances, squares_at_both_ends
+from hodge_pipeline.solvers.backbone.solve import solve_on_backbone
+from hodge_pipeline.solvers.backbone.trust import AUTO, find_backbone
 from hodge_pipeline.solvers.confirmation import confirmed
 from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
@@ -62,20 +65,27 @@ def solve_robust(
     objective: ObjectiveName = "full",
     dimension: Literal[2, 3] | None = None,
     certificate: bool = False,
+    trust: str = AUTO,
 ) -> Solution:
     """The poses of the edges that agree, with `weights` 1 for those and 0 for the others (between, for Geman–McClure).
 
     `threshold`: an edge is wrong where its χ² with isotropic weights exceeds this; None takes the 99 % quantile of
     right edges. `confidence (E,)`, above 0: what share of its information an edge weighs, and of its weight in the
     solution; the threshold is for its χ² with all of it. The graph's fixed vertices stay at their start. The
-    components are those of the edges that are kept. `confirmed` is False where edges are left out and the cycles
-    of those kept close no better than by chance.
+    components are those of the edges that are kept. `trust`: which edges are a backbone, see `find_backbone`; where
+    there is one, the loops that it and each other confirm are kept, and kernel and threshold have no part. `confirmed`
+    is False where edges are left out and the cycles of those kept close no better than by chance.
     """
     check_choice("kernel", kernel, Kernel)
     check_choice("objective", objective, ObjectiveName)
     if threshold is not None:
         check_positive("threshold", threshold, "χ²")
     start = None if start is None else np.asarray(start, float)
+    check_graph(graph, start)
+    if confidence is None and threshold is None and (backbone := find_backbone(graph, trust)) is not None:
+        return solve_on_backbone(
+            graph, backbone, start=start, objective=objective, dimension=dimension, certificate=certificate
+        )
     fixed, unheld = held_rows(graph, start)
     setup = prepare(graph, start, fixed, dimension)
     limit = threshold or (CHI2_99_PLANAR if setup.dimension == 2 else CHI2_99_SPATIAL)
@@ -273,9 +283,17 @@ class RobustSolver:
     objective: ObjectiveName = Field(
         "full", description="what the edges that are kept are solved with, as in `maximum_likelihood`"
     )
+    trust: str = Field(
+        AUTO, min_length=1, description="edges that are trusted as a backbone, as in the section `diagnosis`"
+    )
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """The poses; the first vertex of each component of all edges keeps its start pose."""
         return solve_robust(
-            graph, start=world_from_cam, kernel=self.kernel, threshold=self.threshold, objective=self.objective
+            graph,
+            start=world_from_cam,
+            kernel=self.kernel,
+            threshold=self.threshold,
+            objective=self.objective,
+            trust=self.trust,
         )

@@ -81,6 +81,7 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
             facts.update(trajectory_facts(source.trajectory, oddities) if source.graph is None else {})
     if source.graph is not None and source.graph.vertex_count:
         facts["graph"] = graph_facts(source.graph, oddities)
+    facts["contents"] = list(source.contents) or None
     facts["notes"] = list(source.notes)
     facts["oddities"] = oddities
     return {name: value for name, value in facts.items() if value is not None}

@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.odometry import Odometry, chained
+from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
@@ -126,7 +126,7 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     edges = Edges.joined([part.steps for part in parts])
     edges = replace(edges, pairs=_renumbered(edges.pairs, key_of_row))
     key_sequences = [np.flatnonzero(np.isin(key_rows, rows)) for rows in sequences]
-    poses = chained(len(key_rows), key_sequences, edges)
+    poses = chained(len(key_rows), key_sequences, edges, REACHES_APART * CloudSet.open(clouds).reach_m)
     held, poses = bridge(clouds, key_sequences, edges, poses, options.odometry, workers)
     sightings = folder / "sightings"
     sightings.mkdir(exist_ok=True)

@@ -157,6 +157,7 @@ class Source:
     - `trajectory` is the whole trajectory that the frames' poses come from, on its own stamps, where there is one.
     - `notes` say what was skipped or repaired, with counts: one line each.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
+    - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
     """
 
     name: str
@@ -166,6 +167,7 @@ class Source:
     graph: ViewGraph | None = None
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
+    contents: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]
@@ -321,7 +323,9 @@ class CloudSet(Sequence[PointCloud]):
     def save(self, folder: Path) -> None:
         """Write the columns into a folder that exists, one `.npy` each."""
         for name in self.FILES:
-            np.save(folder / f"{name}.npy", getattr(self, name))
+            with (folder / f"{name}.npy").open("wb") as file:
+                # Not numpy's own writing to files: on a disk that fills up its last bytes are lost without an error.
+                np.save(_Stream(file.write), getattr(self, name))
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -346,6 +350,18 @@ class CloudSet(Sequence[PointCloud]):
     def sizes(self) -> Ints:
         """Points of each cloud, (N,)."""
         return np.diff(self.offsets)
+
+    @property
+    def reach_m(self) -> float:
+        """How far the farthest point of any cloud is from its camera; 1 where there is none."""
+        return max((float(np.linalg.norm(c.points_in_cam, axis=1).max()) for c in self if len(c)), default=0.0) or 1.0
+
+
+class _Stream:
+    """A file that is written by Python alone."""
+
+    def __init__(self, write: Callable[[bytes], int]) -> None:
+        self.write = write
 
 
 def _offsets(sizes: Sequence[int]) -> Ints:

@@ -66,10 +66,16 @@ class Subject:
         return np.asarray(self.edges.status == DISABLED)
 
 
-def open_subject(path: Path) -> Subject:
-    """The graph of a run's last round, or of a file that a reader knows. Raises `HodgeError` where there is none."""
-    if is_run_folder(path):
-        return _run_subject(path, Run.load(path))
+def open_subject(path: Path, trust: str | None = None) -> Subject:
+    """The graph of a run's last round, or of a file that a reader knows. Raises `HodgeError` where there is none.
+
+    `trust`: which edges are a backbone, in place of what the run's recipe says.
+    """
+    subject = _run_subject(path, Run.load(path)) if is_run_folder(path) else _file_subject(path)
+    return subject if trust is None else replace(subject, options=replace(subject.options, trust=trust))
+
+
+def _file_subject(path: Path) -> Subject:
     source = read_graph(path)
     assert source.graph is not None
     name = path.stem if path.is_file() else path.name

@@ -10,6 +10,7 @@ import pytest
 import reading
 import repeated
 import strangers
+import units
 
 from reading_targets import TARGETS
 
@@ -51,6 +52,11 @@ def test_a_damaged_step_is_healed_or_refused(way: str, scratch: Path) -> None:
 @pytest.mark.parametrize("name", ["name/0", "name/2", "name/4", "run/link at log.txt", "hold/pipe at log.txt"])
 def test_what_a_stranger_wrote_has_no_effect(name: str, scratch: Path) -> None:
     assert sum(strangers.check(name, scratch).values()) == 1
+
+
+@pytest.mark.parametrize("stage", ["registration/ndt", "edges/overlap"])
+def test_millimetres_give_the_same_poses(stage: str, scratch: Path) -> None:
+    assert units.check(f"millimetres/{stage}", scratch) == {"the same poses": 1}
 
 
 @pytest.mark.parametrize("graph", repeated.GRAPHS)

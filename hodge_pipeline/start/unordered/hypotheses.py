@@ -53,7 +53,7 @@ def weigh(
     sizes = clouds.sizes
     smaller = np.minimum(sizes[chosen.pairs[:, 0]], sizes[chosen.pairs[:, 1]])
     overlap = np.minimum(1.0, registered.fitness * sizes[chosen.pairs[:, 1]] / np.maximum(smaller, 1))
-    seen_through = violations(clouds, chosen.pairs, registered.i_from_j, view_of)
+    seen_through = violations(clouds, chosen.pairs, registered.i_from_j, view_of, limits.room_m)
     reason = np.full(len(chosen), "", "U64")
     hue = hue_conflicts(clouds, chosen.pairs, registered.i_from_j)
     reason[hue > allowed_hue_conflict(hue, limits)] = "their colours differ"
@@ -78,14 +78,14 @@ def allowed_hue_conflict(conflicts: Floats, limits: HypothesisLimits) -> float:
     return max(USUAL_HUE_CONFLICTS * good, limits.hue_floor)
 
 
-def violations(clouds: CloudSet, pairs: Ints, i_from_j: Floats, view_of: ViewOf) -> Floats:
+def violations(clouds: CloudSet, pairs: Ints, i_from_j: Floats, view_of: ViewOf, scale: float = 1.0) -> Floats:
     """The free-space violation (P,) of each pair, NaN where a frame has no depth image."""
     points = {row: _sampled(clouds, row) for row in np.unique(pairs).tolist()}
     out = np.full(len(pairs), np.nan)
     for at, ((i, j), motion) in enumerate(zip(pairs.tolist(), i_from_j, strict=True)):
         first, second = view_of(i), view_of(j)
         if first is not None and second is not None:
-            out[at] = violation((first, second), (points[i], points[j]), motion)
+            out[at] = violation((first, second), (points[i], points[j]), motion, scale)
     return out
 
 

@@ -24,6 +24,9 @@ class HypothesisLimits:
         default=0.2, ge=0, le=1, description="share of the smaller cloud with a point of the other nearby"
     )
     max_rmse_m: float = Field(default=0.06, gt=0, description="metres: RMS distance of those points")
+    room_m: float = Field(
+        default=1.0, gt=0, description="metres: a metre of a room in this scene, for the margins of depth images"
+    )
     max_violation: float = Field(
         default=0.15,
         ge=0,

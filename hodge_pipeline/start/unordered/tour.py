@@ -17,10 +17,13 @@ METRES_A_RADIAN = 1.0
 """How far a camera may move for what it loses from view when it turns by a radian, in a room."""
 
 
-def tour(world_from_cam: Floats) -> Ints:
-    """The rows (N,) of poses (N, 4, 4) in the order of a greedy walk: near in place and in direction."""
+def tour(world_from_cam: Floats, scale: float = 1.0) -> Ints:
+    """The rows (N,) of poses (N, 4, 4) in the order of a greedy walk: near in place and in direction.
+
+    `scale` multiplies lengths that are for rooms.
+    """
     count = len(world_from_cam)
-    turn = np.sqrt(2.0) / 2 * METRES_A_RADIAN  # |R − R'| is √2 times the angle, for small ones
+    turn = np.sqrt(2.0) / 2 * METRES_A_RADIAN * scale  # |R − R'| is √2 times the angle, for small ones
     flat = np.concatenate([world_from_cam[:, :3, 3], turn * world_from_cam[:, :3, :3].reshape(count, 9)], axis=1)
     left = np.ones(count, bool)
     order = np.zeros(count, np.int64)
@@ -31,9 +34,11 @@ def tour(world_from_cam: Floats) -> Ints:
     return order
 
 
-def propose_along_tour(edges: EdgeBuilder, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
+def propose_along_tour(
+    edges: EdgeBuilder, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats, scale: float = 1.0
+) -> Edges:
     """What the builder proposes for the frames in the order of their tour; `sequential` pairs are called nearest."""
-    order = tour(world_from_cam)
+    order = tour(world_from_cam, scale)
     found = edges.propose(
         [frames[row] for row in order], CloudSet.from_clouds([clouds[row] for row in order]), world_from_cam[order]
     )

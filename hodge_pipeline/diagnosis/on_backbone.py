@@ -1,0 +1,130 @@
+"""The diagnosis of a graph with a trusted backbone: each loop judged by the backbone and the other loops."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.complex.cycles import Loops
+from hodge_pipeline.complex.series import series_classes
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.resistance import effective_resistance
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WITNESSES, WRONG, Cycles, Diagnosis
+from hodge_pipeline.diagnosis.short_cycles import cycle_errors
+from hodge_pipeline.diagnosis.wording import distance
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.trust import Backbone
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+
+MOST_ENTRIES = 500_000
+"""Edges of all cycles that are listed, the shortest first."""
+RIGHT_STEP = 0.99
+"""The probability of a step that confirmed loops pass over; what could be wrong with it, they would show."""
+
+
+def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisOptions) -> Diagnosis:
+    """The verdicts that follow from a backbone; its own edges are kept."""
+    kept = backbone.used
+    in_loop = np.zeros(graph.edge_count, bool)
+    in_loop[np.flatnonzero(kept)] = series_classes(graph.edges[kept], graph.vertex_count) >= 0
+    probability = np.where(backbone.steps, np.where(in_loop, RIGHT_STEP, np.nan), backbone.right)
+    untestable = np.isnan(probability)
+    wrong = ~kept & (probability < options.wrong_below)
+    verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
+    piece = connected_components(graph.edges[kept], graph.vertex_count)
+    displacement_m, angle = edge_residuals(graph, backbone.world_from_cam)
+    apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
+    residual_m = np.where(apart, np.nan, displacement_m)
+    residual_deg = np.where(apart, np.nan, np.degrees(angle))
+    resistance = effective_resistance(graph.edges, graph.vertex_count, kept)
+    cycles, cycle = _cycles(graph, backbone, in_loop)
+    counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
+    return Diagnosis(
+        verdict=verdict,
+        probability=probability,
+        reason=_reasons(backbone, verdict, (residual_m, residual_deg)),
+        kept=kept,
+        residual_m=residual_m,
+        residual_deg=residual_deg,
+        leverage=np.where(kept, 1 - 1 / (1 + resistance), 0.0),
+        cycles=cycles,
+        witnesses_for=_witnesses(np.where(kept, cycle, -1)),
+        witnesses_against=_witnesses(np.where(kept, -1, cycle)),
+        piece=piece,
+        world_from_cam=backbone.world_from_cam,
+        notes=(f"edges: {counts}", backbone.note, *describe_components(piece, graph.vertex_ids)),
+    )
+
+
+def _witnesses(cycle: Ints) -> Ints:
+    out = np.full((len(cycle), WITNESSES), -1, np.int64)
+    out[:, 0] = cycle
+    return out
+
+
+def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycles, Ints]:
+    """The cycle of each loop with the steps that it spans, and the row of each edge's (E,): of the shortest loops, and
+    of those whose steps confirmed loops pass over, since no step is to blame for a loop that fails alone.
+    """
+    chain = backbone.chain
+    same = chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]]
+    spans = np.where(same, chain.ends[:, 1] - chain.ends[:, 0], graph.edge_count)
+    bare = np.cumsum((chain.step_edge >= 0) & ~in_loop[chain.step_edge])
+    same &= bare[chain.ends[:, 1]] == bare[chain.ends[:, 0]]
+    order = np.argsort(spans, kind="stable")
+    order = order[same[order] & (np.cumsum(spans[order] + 1) <= MOST_ENTRIES)]
+    loops = _listed(graph, chain, order)
+    angle, displacement_m = cycle_errors(loops, graph.i_from_j)
+    edges = chain.loop_edge[order]
+    row = np.full(graph.edge_count, -1, np.int64)
+    row[edges] = np.arange(len(edges))
+    return Cycles(loops, angle, displacement_m, backbone.chi2[edges], backbone.used[edges]), row
+
+
+def _listed(graph: ViewGraph, chain: Chain, rows: Ints) -> Loops:
+    low, high = chain.ends[rows].T
+    lengths = high - low + 1
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    owner = np.repeat(np.arange(len(rows)), lengths)
+    place = low[owner] + 1 + np.arange(offsets[-1]) - offsets[owner]
+    is_loop = place > high[owner]
+    place = np.minimum(place, chain.size - 1)
+    edge = np.where(is_loop, chain.loop_edge[rows][owner], chain.step_edge[place])
+    begins = np.where(is_loop, chain.order[high[owner]], chain.order[place - 1])
+    return Loops(offsets, edge, np.where(graph.edges[edge, 0] == begins, 1, -1))
+
+
+def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floats, Floats]) -> tuple[str, ...]:
+    """One line for each edge: who confirms it, and how far it is from the poses."""
+    over = _passed_over(backbone)
+    others = int(backbone.found.used.sum())
+    lines = []
+    for edge, name in enumerate(verdict.tolist()):
+        away = distance(residual[0][edge], residual[1][edge])
+        if backbone.steps[edge]:
+            passed = f"{over[edge]} confirmed loops pass over it" if over[edge] else "no confirmed loop passes over it"
+            lines.append(f"an edge of the backbone: {passed}")
+        elif backbone.used[edge]:
+            lines.append(f"it agrees with the backbone and {others - 1} other loops: {away}")
+        elif name == UNTESTABLE:
+            lines.append("it joins two paths of the backbone that nothing else joins: nothing can test it")
+        elif not others:
+            lines.append(f"nothing confirms it, nor any other loop: {away}, which are the backbone's")
+        else:
+            fails = "it contradicts" if name == WRONG else "too little speaks for it beside"
+            lines.append(f"{fails} the backbone and {others} confirmed loops: {away}")
+    return tuple(lines)
+
+
+def _passed_over(backbone: Backbone) -> Ints:
+    """How many used loops (E,) pass over each step."""
+    chain, out = backbone.chain, np.zeros(len(backbone.steps), np.int64)
+    ends = chain.ends[backbone.found.used & (chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])]
+    change = np.bincount(ends[:, 0] + 1, minlength=chain.size + 1) - np.bincount(
+        ends[:, 1] + 1, minlength=chain.size + 1
+    )
+    steps = np.flatnonzero(chain.step_edge >= 0)
+    out[chain.step_edge[steps]] = np.cumsum(change)[steps]
+    return out

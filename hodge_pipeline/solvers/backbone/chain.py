@@ -1,0 +1,169 @@
+"""The backbone as paths of vertices: positions along them, motions from one to the next, and the loops between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.solvers.weights import PLANAR_AXES
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+
+LEAST_PRECISION, MOST_PRECISION = 1e-6, 1e6
+"""Of the median one, in units in which that is 1: eigenvalues of an information beyond are clipped."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Paths of vertices one after the other, and all other edges as loops between their positions.
+
+    - `order (n,)`: the vertex at each position; `path (n,)`: the path it lies on, ascending.
+    - `step (n, 4, 4)` from the position before, `step_covariance (n, p, p)` of ξ in `step · exp(ξ)`, and the graph's
+      edge `step_edge (n,)` that they come from; identity, zeros and −1 where a path begins.
+    - `loop_edge (M,)`; `ends (M, 2)`, the first the lower position; `motion (M, 4, 4)`; `covariance (M, p, p)`.
+    - `axes (p,)`: of a twist those that are free, three in the plane.
+    """
+
+    order: Ints
+    path: Ints
+    step: Floats
+    step_covariance: Floats
+    step_edge: Ints
+    loop_edge: Ints
+    ends: Ints
+    motion: Floats
+    covariance: Floats
+    axes: Ints
+
+    @property
+    def size(self) -> int:
+        """How many positions there are."""
+        return len(self.order)
+
+    def poses(self) -> Floats:
+        """World from each position (n, 4, 4), each path composed from the identity."""
+        out = np.empty((self.size, 4, 4))
+        before = np.eye(4)
+        for row in range(self.size):
+            before = self.step[row] if self.step_edge[row] < 0 else before @ self.step[row]
+            out[row] = before
+        return out
+
+    def adjoint(self, poses: Floats) -> Floats:
+        """Ad (..., p, p) of the free axes."""
+        return np.asarray(se3.adjoint(poses)[..., self.axes[:, None], self.axes])
+
+    def log(self, motions: Floats) -> Floats:
+        """Twists (..., p) of the free axes."""
+        return np.asarray(se3.log(motions)[..., self.axes])
+
+    def exp(self, twists: Floats) -> Floats:
+        """Motions (..., 4, 4) of twists (..., p)."""
+        xi = np.zeros((*twists.shape[:-1], 6))
+        xi[..., self.axes] = twists
+        return se3.exp(xi)
+
+
+def sequential_edges(graph: ViewGraph) -> Bools:
+    """Edges (E,) between vertices that follow each other in the order of their ids; the first of parallel ones."""
+    rank = np.argsort(np.argsort(graph.vertex_ids, kind="stable"), kind="stable") if _numbered(graph) else None
+    ranks = graph.edges if rank is None else rank[graph.edges]
+    low = ranks.min(axis=1, initial=len(graph.vertex_ids))
+    out = np.zeros(graph.edge_count, bool)
+    consecutive = np.flatnonzero(np.abs(ranks[:, 0] - ranks[:, 1]) == 1)
+    out[consecutive[np.unique(low[consecutive], return_index=True)[1]]] = True
+    return out
+
+
+def _numbered(graph: ViewGraph) -> bool:
+    return bool(graph.vertex_ids.dtype.kind in "iu")
+
+
+def linear_forest(edges: Ints, count: int, trusted: Bools) -> Bools:
+    """Trusted edges (E,) that make paths: no vertex of more than two, no cycle; those of neighbouring rows first."""
+    rows = np.flatnonzero(trusted & (edges[:, 0] != edges[:, 1]))
+    rows = rows[np.argsort(np.abs(edges[rows, 0] - edges[rows, 1]), kind="stable")]
+    degree, root = [0] * count, list(range(count))
+
+    def find(vertex: int) -> int:
+        while root[vertex] != vertex:
+            root[vertex] = root[root[vertex]]
+            vertex = root[vertex]
+        return vertex
+
+    out = np.zeros(len(edges), bool)
+    for row, (i, j) in zip(rows.tolist(), edges[rows].tolist(), strict=True):
+        if degree[i] < 2 and degree[j] < 2 and (a := find(i)) != (b := find(j)):
+            degree[i], degree[j], root[a] = degree[i] + 1, degree[j] + 1, b
+            out[row] = True
+    return out
+
+
+def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
+    """The chain of the backbone's edges (E,), which make paths; edges from a vertex to itself are left out."""
+    order, step_edge, path = _walk(graph.edges, graph.vertex_count, np.flatnonzero(backbone))
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    axes = PLANAR_AXES if graph.dimension == 2 else np.arange(6)
+    covariance = covariances(graph.information[:, axes[:, None], axes])
+    rows = np.flatnonzero(~backbone & (graph.edges[:, 0] != graph.edges[:, 1]))
+    step, step_covariance = np.tile(np.eye(4), (len(order), 1, 1)), np.zeros((len(order), len(axes), len(axes)))
+    at = np.flatnonzero(step_edge >= 0)
+    step[at], step_covariance[at] = _directed(
+        graph.i_from_j[step_edge[at]], covariance[step_edge[at]], place[graph.edges[step_edge[at], 0]] == at, axes
+    )
+    ends = place[graph.edges[rows]]
+    motion, loop_covariance = _directed(graph.i_from_j[rows], covariance[rows], ends[:, 0] > ends[:, 1], axes)
+    return Chain(
+        order, path, step, step_covariance, step_edge, rows, np.sort(ends, axis=1), motion, loop_covariance, axes
+    )
+
+
+def _directed(motion: Floats, covariance: Floats, reverse: Bools, axes: Ints) -> tuple[Floats, Floats]:
+    """Motions and covariances, of some the inverse: `Z⁻¹` has the covariance `Ad(Z) Σ Ad(Z)ᵀ`."""
+    motion, covariance = motion.copy(), covariance.copy()
+    turned = se3.adjoint(motion[reverse])[:, axes[:, None], axes]
+    covariance[reverse] = turned @ covariance[reverse] @ np.swapaxes(turned, 1, 2)
+    motion[reverse] = se3.inverse(motion[reverse])
+    return motion, covariance
+
+
+def covariances(information: Floats) -> Floats:
+    """Inverses (E, p, p) of information matrices, their eigenvalues clipped: never infinite, never negative."""
+    if not len(information):
+        return information
+    p = information.shape[-1]
+    split = 1 if p == 3 else 3
+    precision = np.einsum("eii->ei", information)
+    unit = np.ones(p)
+    for part in (slice(0, split), slice(split, p)):
+        positive = precision[:, part][precision[:, part] > 0]
+        unit[part] = 1 / np.sqrt(np.median(positive)) if len(positive) else 1.0
+    scale = np.outer(unit, unit)
+    values, vectors = np.linalg.eigh(0.5 * (information + np.swapaxes(information, 1, 2)) * scale)
+    values = np.clip(values, LEAST_PRECISION, MOST_PRECISION)
+    return np.asarray((vectors / values[:, None]) @ np.swapaxes(vectors, 1, 2) * scale)
+
+
+def _walk(edges: Ints, count: int, rows: Ints) -> tuple[Ints, Ints, Ints]:
+    """Vertices (V,) path by path, the edge that leads to each (−1 at a beginning), and its path."""
+    near: list[list[tuple[int, int]]] = [[] for _ in range(count)]
+    for row, (i, j) in zip(rows.tolist(), edges[rows].tolist(), strict=True):
+        near[i].append((j, row))
+        near[j].append((i, row))
+    seen = [False] * count
+    order, via, path, number = [], [], [], 0
+    for start in range(count):
+        if seen[start] or len(near[start]) > 1:
+            continue
+        vertex, edge = start, -1
+        while vertex >= 0:
+            seen[vertex] = True
+            order.append(vertex)
+            via.append(edge)
+            path.append(number)
+            following = [(other, row) for other, row in near[vertex] if not seen[other]]
+            vertex, edge = following[0] if following else (-1, -1)
+        number += 1
+    return np.array(order, np.int64), np.array(via, np.int64), np.array(path, np.int64)

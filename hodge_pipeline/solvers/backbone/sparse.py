@@ -1,0 +1,151 @@
+"""Sparse normal equations of relative motions: solves, and the covariance across each edge by selected inversion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csc_matrix
+
+from hodge_pipeline.complex.components import connected_components, first_of_component
+from hodge_pipeline.solvers.elimination import (
+    BlockFactor,
+    Elimination,
+    Group,
+    Ordering,
+    eliminate_blocks,
+    plan_elimination,
+)
+from hodge_pipeline.types import Floats, Ints
+
+MOST_NEIGHBOURS, FEWEST_IN_ROUND = 24, 6
+"""Of a vertex that is eliminated in a round, and vertices of a round: what is left is inverted densely."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """Vertices joined by edges (E, 2), one of each `component (N,)` held still.
+
+    - `place (N,)`: of each vertex in the plan's order, those held still from `plan.size` on; `slot (E,)`: of each
+      edge's block above the diagonal, −1 where an end is held still.
+    """
+
+    edges: Ints
+    component: Ints
+    place: Ints
+    slot: Ints
+    plan: Elimination
+
+    @classmethod
+    def of(cls, edges: Ints, count: int) -> Network:
+        """The network of these edges, none from a vertex to itself."""
+        component = connected_components(edges, count)
+        held = first_of_component(component)
+        free = np.flatnonzero(~held)
+        place = np.empty(count, np.int64)
+        place[free], place[held] = np.arange(len(free)), np.arange(len(free), count)
+        tail, head = place[edges].T
+        plan = plan_elimination(tail, head, len(free), _as_they_are, MOST_NEIGHBOURS, FEWEST_IN_ROUND)
+        place[free[plan.order]] = np.arange(len(free))
+        low, high = np.sort(place[edges], axis=1).T
+        slot = np.where(high < len(free), np.searchsorted(plan.keys, low * len(free) + high), -1)
+        return cls(edges, component, place, slot, plan)
+
+    @property
+    def core_size(self) -> int:
+        """How many vertices are inverted densely."""
+        return self.plan.size - self.plan.core
+
+    def factor(self, precision: Floats, carry: Floats) -> Factored:
+        """The normal equations' factor; `precision (E, p, p)` of each edge's `x_j − A x_i`, `carry (E, p, p)` is A."""
+        size, p = self.plan.size, precision.shape[-1]
+        diagonal, rows = np.zeros((size + 1, p, p)), np.zeros((len(self.plan.slot_rows), p, p))
+        tail, head = np.minimum(self.place[self.edges], size).T
+        pulled = np.swapaxes(carry, 1, 2) @ precision
+        np.add.at(diagonal, head, precision)
+        np.add.at(diagonal, tail, pulled @ carry)
+        inside = self.slot >= 0
+        off = np.where((tail < head)[:, None, None], pulled, np.swapaxes(pulled, 1, 2))
+        np.add.at(rows, self.slot[inside], -off[inside])
+        core: list[Floats] = [np.zeros((0, 0))]
+
+        def invert(matrix: csc_matrix) -> object:
+            core[0] = np.linalg.inv(matrix.toarray())
+            return lambda rhs: core[0] @ rhs
+
+        factor = eliminate_blocks(self.plan, diagonal[:size], rows, invert)  # type: ignore[arg-type]
+        return Factored(self, carry, factor, core[0])
+
+
+def _as_they_are(pattern: csc_matrix) -> Ordering:
+    return Ordering(np.arange(pattern.shape[0]), 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Factored:
+    """A factorised network: `core` is the inverse of what the rounds leave."""
+
+    network: Network
+    carry: Floats
+    blocks: BlockFactor
+    core: Floats
+
+    def solve(self, force: Floats) -> Floats:
+        """The x (N, p, c) of forces (N, p, c); 0 where held still."""
+        network = self.network
+        size = network.plan.size
+        out, rhs = np.zeros_like(force), np.empty((size, *force.shape[1:]))
+        free = np.flatnonzero(network.place < size)
+        rhs[network.place[free]] = force[free]
+        flat = rhs.reshape(size * force.shape[1], -1)
+        out[free] = self.blocks.solve(flat).reshape(rhs.shape)[network.place[free]] if size else 0.0
+        return out
+
+    def across(self) -> Floats:
+        """The covariance (E, p, p) of `x_j − A x_i` of each edge: only those entries of the inverse that the factor has
+        are computed (Takahashi et al. 1973).
+        """
+        network = self.network
+        diagonal, rows = self._inverse()
+        i, j = np.minimum(network.place[network.edges], network.plan.size).T
+        off = np.where((network.slot >= 0)[:, None, None], rows[network.slot], 0.0)
+        off = self.carry @ np.where((i < j)[:, None, None], off, np.swapaxes(off, 1, 2))
+        own = diagonal[j] + self.carry @ diagonal[i] @ np.swapaxes(self.carry, 1, 2)
+        return np.asarray(own - off - np.swapaxes(off, 1, 2))
+
+    def _inverse(self) -> tuple[Floats, Floats]:
+        plan, p = self.network.plan, self.blocks.pivots.shape[-1] if len(self.blocks.pivots) else self._width()
+        diagonal, rows = np.zeros((plan.size + 1, p, p)), np.zeros((len(plan.slot_rows) + 1, p, p))
+        begin = plan.core
+        if begin < plan.size:
+            dense = self.core.reshape(plan.size - begin, p, plan.size - begin, p)
+            diagonal[begin : plan.size] = np.einsum("iajb->ijab", dense)[(np.arange(plan.size - begin),) * 2]
+            first = plan.groups[-1].slots.stop if plan.groups else 0
+            a, b = plan.slot_rows[first:] - begin, plan.slot_columns[first:] - begin
+            rows[first:-1] = dense[a, :, b, :]
+        for group in reversed(plan.groups):
+            self._of_group(group, diagonal, rows)
+        return diagonal, rows
+
+    def _width(self) -> int:
+        left = self.network.plan.size - self.network.plan.core
+        return self.core.shape[0] // left if left else 1
+
+    def _of_group(self, group: Group, diagonal: Floats, rows: Floats) -> None:
+        plan, (count, k) = self.network.plan, group.neighbours.shape
+        pivots = self.blocks.pivots[group.begin : group.end]
+        diagonal[group.begin : group.end] = pivots
+        if not k:
+            return
+        p = pivots.shape[-1]
+        divided = self.blocks.rows[group.slots].reshape(count, k, p, p)
+        between = np.empty((count, k, k, p, p))
+        for a in range(k):
+            between[:, a, a] = diagonal[group.neighbours[:, a]]
+            for b in range(a + 1, k):
+                block = rows[np.searchsorted(plan.keys, group.neighbours[:, a] * plan.size + group.neighbours[:, b])]
+                between[:, a, b], between[:, b, a] = block, np.swapaxes(block, 1, 2)
+        wide = divided.transpose(0, 2, 1, 3).reshape(count, p, k * p)
+        across = -wide @ between.transpose(0, 1, 3, 2, 4).reshape(count, k * p, k * p)
+        diagonal[group.begin : group.end] -= across @ np.swapaxes(wide, 1, 2)
+        rows[group.slots] = across.reshape(count, p, k, p).transpose(0, 2, 1, 3).reshape(count * k, p, p)

@@ -1,0 +1,139 @@
+"""Whether a graph has a backbone that can be trusted, and the loops judged on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.backbone.chain import Chain, linear_forest, make_chain, sequential_edges
+from hodge_pipeline.solvers.backbone.inference import Inferred, infer
+from hodge_pipeline.solvers.backbone.tested import tested_by_pairs, tested_steps
+from hodge_pipeline.types import Bools, Floats, ViewGraph
+
+AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
+FEWEST_STEPS = 100
+"""Of a backbone that is looked for: shorter sequences are fragments of rooms, whose edges test each other."""
+COVERED = 0.9
+"""Of the vertices that consecutive edges must join, so that a sequence is a backbone."""
+TESTED = 0.3
+"""Of the steps in short cycles that close: from there on every edge is judged, none trusted. On graphs of rooms .77 to
+.98 are, on those of places visited again 0 to .1.
+"""
+LOOPS_AT_A_STEP, AGREEING = 0.5, 0.05
+"""From so many loops to a step on, of which no backbone confirms any, so large a share of the steps between loops that
+agree with each other says that the backbone is wrong. Fewer loops may be groups that take one place for another; among
+random ones hardly any agree.
+"""
+MOST_UNKNOWNS = 1500
+"""In a dense matrix: a lattice of loops, in which no edge needs to be trusted, has more."""
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """The edges that are trusted and what they say of the others.
+
+    - `steps`, `used (E,)`: edges of the backbone, and all that count; `right (E,)`: the probability of each loop, NaN
+      for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
+    - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
+    """
+
+    chain: Chain
+    found: Inferred
+    steps: Bools
+    used: Bools
+    right: Floats
+    chi2: Floats
+    world_from_cam: Floats
+
+    def placed(self, start: Floats | None) -> Floats:
+        """The poses (V, 4, 4), the first vertex of each component where it starts."""
+        poses = self.world_from_cam
+        if start is None:
+            return poses
+        ends = self.chain.order[self.chain.ends[self.found.used]]
+        steps = np.flatnonzero(self.chain.step_edge >= 0)
+        joined = np.concatenate([np.stack([self.chain.order[steps - 1], self.chain.order[steps]], axis=1), ends])
+        component = connected_components(joined, len(poses))
+        first = np.unique(component, return_index=True)[1]
+        return np.asarray((start[first] @ se3.inverse(poses[first]))[component] @ poses)
+
+    def weighted(self, graph: ViewGraph) -> ViewGraph:
+        """The graph of the edges that count, with the information that their errors were found to have."""
+        step, loop = self.found.scales.units(self.chain)
+        width = np.ones((graph.edge_count, len(self.chain.axes)))
+        width[self.chain.step_edge[self.chain.step_edge >= 0]] = step * self.found.step_width
+        width[self.chain.loop_edge] = loop * self.found.loop_width[:, None]
+        whole = np.ones((graph.edge_count, 6))
+        whole[:, self.chain.axes] = width
+        information = graph.information / (whole[:, :, None] * whole[:, None, :])
+        return replace(graph, information=information).select(np.flatnonzero(self.used))
+
+    @property
+    def note(self) -> str:
+        """What was trusted and what that led to."""
+        loops, used = len(self.chain.loop_edge), int(self.found.used.sum())
+        trusted = f"{int(self.steps.sum())} consecutive edges are trusted as a backbone"
+        if not self.found.confirmed:
+            return f"{trusted}, {loops} loops that nothing confirms: the poses are the backbone's"
+        return f"{trusted}, {used} of {loops} loops confirmed"
+
+
+def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
+    """The backbone of a graph, None where it has none that should be trusted.
+
+    `trust`: `auto` learns from the graph whether its consecutive edges are one; `sequential` trusts them, `none` no
+    edge; any other word those edges whose `source` it is. Raises `GraphError` where no edge is meant.
+    """
+    if trust == NONE or not graph.edge_count:
+        return None
+    chosen = sequential_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
+    if trust == AUTO and (graph.priors is not None or chosen.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count)):
+        return None
+    if not chosen.any():
+        raise GraphError("no edge joins consecutive vertices, so that there is no sequence to trust: use --trust none")
+    steps = linear_forest(graph.edges, graph.vertex_count, chosen)
+    chain = make_chain(graph, steps)
+    if not len(chain.loop_edge):
+        return None
+    if trust == AUTO and (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
+        return None
+    if trust == AUTO and tested_steps(chain, chain.poses()).sum() > TESTED * steps.sum():
+        return None
+    always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
+    found = infer(chain, always, MOST_UNKNOWNS if trust == AUTO else None)
+    if found is None or (trust == AUTO and not found.confirmed and _loops_agree(chain, steps)):
+        return None
+    return _backbone(graph, chain, found, steps)
+
+
+def _loops_agree(chain: Chain, steps: Bools) -> bool:
+    """Whether many loops agree with each other, though none with the backbone: it is what is wrong then."""
+    many = len(chain.loop_edge) > LOOPS_AT_A_STEP * steps.sum()
+    return many and bool(tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum())
+
+
+def _of_source(graph: ViewGraph, source: str) -> Bools:
+    chosen = np.array([source in word.split("+") for word in graph.source.tolist()], bool)
+    if not chosen.any():
+        known = ", ".join(sorted(set(graph.source.tolist())))
+        raise GraphError(f"--trust {source}: no edge comes from it; the edges come from {known}")
+    return chosen
+
+
+def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools) -> Backbone:
+    used, right, chi2 = steps.copy(), np.full(graph.edge_count, np.nan), np.full(graph.edge_count, np.nan)
+    used[chain.loop_edge] = found.used
+    probability = 1 / (1 + np.exp(-np.clip(found.judged.log_odds, -500, 500)))
+    right[chain.loop_edge] = np.where(found.used, probability, np.minimum(probability, UNUSED))
+    chi2[chain.loop_edge] = found.judged.chi2
+    poses = np.empty((graph.vertex_count, 4, 4))
+    poses[chain.order] = found.poses
+    return Backbone(chain, found, steps, used, right, chi2, poses)
+
+
+UNUSED = 0.49
+"""The most probable that a loop which does not count is: too little speaks for it."""

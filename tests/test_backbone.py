@@ -1,0 +1,153 @@
+"""A right odometry and loops of which many are wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.solver import DiagnosedSolver
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
+from hodge_pipeline.solvers.backbone.fit import Reduced, linearise, settled
+from hodge_pipeline.solvers.backbone.inference import left_out, uncertainty
+from hodge_pipeline.solvers.backbone.sparse import Network
+from hodge_pipeline.solvers.backbone.trust import find_backbone
+from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.solvers.robust import solve_robust
+from tests.backbone_graphs import drive
+
+NEVER_WORSE = 1.02
+
+
+def chain_of(graph):
+    return make_chain(graph, linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph)))
+
+
+def test_selected_inversion_is_the_dense_inverse() -> None:
+    rng = np.random.default_rng(0)
+    count = 60
+    edges = np.array([(k, k + 1) for k in range(count - 1)] + [(k, (7 * k + 13) % count) for k in range(0, count, 3)])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    root = rng.normal(size=(len(edges), 3, 3))
+    precision = root @ np.swapaxes(root, 1, 2) + np.eye(3)
+    carry = np.eye(3) + 0.3 * np.tril(rng.normal(size=(len(edges), 3, 3)), -1)
+    whole = np.zeros((count, 3, count, 3))
+    for (i, j), weight, moved in zip(edges, precision, carry, strict=True):
+        whole[j, :, j] += weight
+        whole[i, :, i] += moved.T @ weight @ moved
+        whole[i, :, j] -= moved.T @ weight
+        whole[j, :, i] -= weight @ moved
+    network = Network.of(edges, count)
+    free = np.flatnonzero(network.place < network.plan.size)
+    inverse = np.zeros_like(whole)
+    rows = np.ix_(free, range(3), free, range(3))
+    inverse[rows] = np.linalg.inv(whole[rows].reshape(3 * len(free), -1)).reshape(len(free), 3, len(free), 3)
+    expected = [
+        inverse[j, :, j] + moved @ inverse[i, :, i] @ moved.T - moved @ inverse[i, :, j] - inverse[j, :, i] @ moved.T
+        for (i, j), moved in zip(edges, carry, strict=True)
+    ]
+    factored = network.factor(precision, carry)
+    np.testing.assert_allclose(factored.across(), expected, atol=1e-11)
+    force = rng.normal(size=(count, 3, 2))
+    np.testing.assert_allclose(factored.solve(force), np.einsum("iajb,jbc->iac", inverse, force), atol=1e-10)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_reduced_chain_ends_at_the_minimum_over_all_poses(dimension: int) -> None:
+    graph = drive(dimension=dimension, wrong=0.0, loops=30).graph
+    chain = chain_of(graph)
+    everything = Reduced.of(chain, np.arange(len(chain.loop_edge)))
+    found = settled(chain, everything, chain.poses(), 30, 1e-12)
+    assert everything.cost(found) < everything.cost(linearise(chain, chain.poses())) / 10
+    exact = solve(graph)
+    again = solve(graph, start=found.poses[np.argsort(chain.order)], initial="given")
+    assert again.metrics["objective_at_start"] == pytest.approx(exact.metrics["chi2"], rel=1e-3)
+
+
+def test_left_out_residuals_are_those_of_a_solve_without_the_loop() -> None:
+    chain = chain_of(drive(wrong=0.0, loops=12).graph)
+    everything = Reduced.of(chain, np.arange(12))
+    found = settled(chain, everything, chain.poses(), 30, 1e-12)
+    without = left_out(found, everything, found.loop_residual, uncertainty(chain, found, everything))
+    for row in (0, 5, 11):
+        others = Reduced.of(chain, np.delete(np.arange(12), row))
+        actual = settled(chain, others, found.poses, 30, 1e-12).loop_residual[row]
+        np.testing.assert_allclose(without[row], actual, atol=0.03 * np.abs(actual).max() + 2e-3)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("wrong", "in_groups"), [(0.0, False), (0.5, False), (0.9, False), (0.6, True)])
+def test_right_loops_are_used_and_wrong_ones_are_not(dimension: int, wrong: float, in_groups: bool) -> None:
+    made = drive(dimension=dimension, wrong=wrong, in_groups=in_groups)
+    found = diagnose(made.graph)
+    assert not (found.kept & ~made.right).any()
+    assert (found.kept & made.right).sum() >= made.right.sum() - 2
+    assert (found.verdict[made.right] == "wrong").sum() == 0
+    assert made.error_m(found.world_from_cam) < made.error_m(made.odometry()) / 2
+
+
+@pytest.mark.parametrize("misstated", [(0.1, 1.0), (10.0, 1.0), (1.0, 0.2), (1.0, 10.0)])
+def test_stated_errors_are_believed_up_to_a_scale(misstated: tuple[float, float]) -> None:
+    made = drive(misstated=misstated)
+    found = diagnose(made.graph)
+    assert not (found.kept & ~made.right).any()
+    assert (found.kept & made.right).sum() >= made.right.sum() - 3
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("in_groups", [False, True])
+def test_where_all_loops_are_wrong_the_backbone_comes_back(dimension: int, in_groups: bool) -> None:
+    for seed in range(3):
+        made = drive(seed=seed, dimension=dimension, wrong=1.0, in_groups=in_groups)
+        found = diagnose(made.graph)
+        assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+        assert any("100 loops that nothing confirms" in note for note in found.notes)
+        assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
+
+
+def test_edges_written_the_other_way_round_change_nothing() -> None:
+    one, other = (diagnose(drive(turned=turned).graph) for turned in (False, True))
+    np.testing.assert_array_equal(one.verdict, other.verdict)
+    np.testing.assert_allclose(one.world_from_cam, other.world_from_cam, atol=1e-6)
+
+
+def test_solvers_and_the_diagnosis_agree() -> None:
+    made = drive()
+    found = diagnose(made.graph)
+    start = np.tile(np.eye(4), (made.graph.vertex_count, 1, 1))
+    for solution in (solve_robust(made.graph), DiagnosedSolver().solve(made.graph, start)):
+        np.testing.assert_array_equal(solution.weights > 0, found.kept)
+        assert solution.confirmed
+        assert made.error_m(solution.world_from_cam) < 1.1 * made.error_m(found.world_from_cam)
+        np.testing.assert_allclose(solution.world_from_cam[0], np.eye(4), atol=1e-9)
+
+
+def test_trust_is_what_the_options_say() -> None:
+    graph = replace(drive().graph, source=np.repeat(["odometry", "places"], [399, 100]))
+    assert find_backbone(graph, "none") is None
+    by_source, by_order = find_backbone(graph, "odometry"), find_backbone(graph, "sequential")
+    assert by_source is not None and by_order is not None
+    np.testing.assert_array_equal(by_source.used, by_order.used)
+    with pytest.raises(GraphError, match="--trust gps: no edge comes from it; the edges come from odometry, places"):
+        find_backbone(graph, "gps")
+    with pytest.raises(ValueError, match="trust"):
+        DiagnosisOptions(trust="")
+
+
+def test_vertices_that_are_no_sequence_have_no_backbone() -> None:
+    graph = drive().graph
+    shuffled = np.random.default_rng(0).permutation(graph.vertex_count)
+    mixed = replace(graph, edges=shuffled[graph.edges])
+    assert find_backbone(mixed) is None
+    none = replace(mixed.select(np.zeros(1, np.int64)), edges=np.array([[0, 5]]))
+    with pytest.raises(GraphError, match="no edge joins consecutive vertices"):
+        find_backbone(none, "sequential")
+
+
+def test_ids_give_the_sequence_not_rows() -> None:
+    made = drive()
+    shuffled = np.random.default_rng(0).permutation(made.graph.vertex_count)
+    mixed = replace(made.graph, edges=shuffled[made.graph.edges], vertex_ids=np.argsort(shuffled) * 10)
+    np.testing.assert_array_equal(diagnose(mixed).kept, diagnose(made.graph).kept)
