@@ -14,7 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.odometry import Odometry, OdometryOptions, chained
+from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame, velocities
 from hodge_pipeline.scene import KeyFrames, Scene, key_source, sequence_numbers, sequences_of, stamps_of
@@ -188,7 +188,9 @@ def register_steps(
     lost = [f"between {i} and {j}" for i, j in pairs[~held].tolist()]
     if lost:
         step.note(Note("path broken", len(lost), str(len(lost))))
-    poses = chained(len(world_from_key), sequences, edges.select(held))
+    motions = np.where(held[:, None, None], edges.i_from_j, guesses)
+    space_m = REACHES_APART * clouds.reach_m
+    poses = chained(len(world_from_key), sequences, replace(edges, i_from_j=motions), space_m)
     return Odometry(poses, edges.select(held), ())
 
 
