@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass as plain_dataclass
+from pathlib import Path
 
 import numpy as np
 import open3d as o3d
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.demo.street import CAR, Road, build_street
+from hodge_pipeline.stages import Advance
 from hodge_pipeline.types import Floats, Floats32
 
 REVOLUTION_S = 0.1
 LOWEST_DEG, HIGHEST_DEG = -24.0, 6.0
 NEAREST_M, FARTHEST_M = 2.0, 80.0
 RANGE_NOISE_M, LOST_SHARE = 0.02, 0.03
+TRUTH_FILE = "truth.tum"
 MOVING_CARS, ONCOMING_M_S, LANE_M = 5, 7.0, 3.0
 
 
-@dataclass(frozen=True)
+@plain_dataclass(frozen=True)
 class Sweep:
     """One revolution: `points (N, 3)` in the scanner's axes at the time of each, `times_s (N,)` after the first."""
 
@@ -90,3 +95,36 @@ def _to_box(rays: Floats, size: Floats) -> Floats:
         a, b = (low - rays[..., :3]) / rays[..., 3:], (high - rays[..., :3]) / rays[..., 3:]
     enter, leave = np.fmin(a, b).max(axis=-1), np.fmax(a, b).min(axis=-1)
     return np.where((enter <= leave) & (enter > 0), enter, np.inf)
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class StreetOptions:
+    """What is scanned: 500 m round at 7 m/s, ten revolutions a second, and 46 m more."""
+
+    frames: int = Field(default=780, ge=2, description="revolutions, 0.7 m apart")
+    beams: int = Field(default=16, ge=4, le=128, description="of the scanner, over 30 degrees")
+    columns: int = Field(default=720, ge=36, description="directions a beam is fired in during a revolution")
+    seed: int = Field(default=0, ge=0, description="of the houses and of the noise")
+    noise: float = Field(default=1.0, ge=0, description="scale of every error of the scanner; 0 gives exact points")
+    speed_m_s: float = Field(default=7.0, gt=0, description="of the car")
+
+    def write(self, draft: Path, advance: Advance) -> None:
+        """One PCD a revolution (x, y, z, t: seconds after its first point) and `truth.tum`, poses by its number."""
+        road = Road(self.speed_m_s)
+        scanner = SpinningScanner(road, self.seed, self.beams, self.columns, self.noise)
+        poses = road.world_from_car(np.asarray(np.arange(self.frames) * REVOLUTION_S, float))
+        rows = np.concatenate([poses[:, :3, 3], se3.to_quat_xyzw(poses)], axis=1)
+        lines = [f"{number} " + " ".join(f"{value:.7f}" for value in row) for number, row in enumerate(rows)]
+        (draft / TRUTH_FILE).write_text("\n".join(["# number tx ty tz qx qy qz qw", *lines]) + "\n")
+        for number in range(self.frames):
+            _write_pcd(draft / f"{number:06d}.pcd", scanner.sweep(number))
+            advance(1)
+
+
+def _write_pcd(path: Path, sweep: Sweep) -> None:
+    columns = np.concatenate([sweep.points, sweep.times_s[:, None]], axis=1).astype("<f4")
+    header = (
+        "VERSION 0.7\nFIELDS x y z t\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+        f"WIDTH {len(columns)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(columns)}\nDATA binary\n"
+    )
+    path.write_bytes(header.encode() + columns.tobytes())
