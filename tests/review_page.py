@@ -104,8 +104,14 @@ class Page:
         script = "return document.querySelector('#table tr.selected')?.dataset.name ?? ''"
         return str(self.browser.execute_script(script))
 
+    def sort(self, by: str) -> None:
+        """Click a heading of the table, and wait until it is sorted by it."""
+        self.click(f"th[data-sort={by}]")
+        self.until(lambda: "sorted" in self.find(f"th[data-sort={by}]").get_attribute("class"))
+
     def choose(self, name: str) -> None:
-        """Click the row of an edge, and wait until it is selected."""
+        """Click the row of an edge, once the table shows the latest state, and wait until it is selected."""
+        self.until(lambda: self.data("listed") == self.data("version"))
         self.click(f"#table tr[data-name='{name}']")
         self.until(lambda: self.selected() == name)
 

@@ -15,14 +15,13 @@ import hodge_pipeline
 from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_adapters.g2o import write_g2o
 from hodge_pipeline import se3
-from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError
+from hodge_pipeline.errors import GraphError, WorkspaceError
 from hodge_pipeline.pairs.edits import Edit, History, read_history_file, write_history_file
 from hodge_pipeline.review.adding import Candidate, guess_from_points
 from hodge_pipeline.review.decisions import LockedError, StaleError
 from hodge_pipeline.review.front import Front
 from hodge_pipeline.review.keeping import save_graph
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
-from hodge_pipeline.review.opening import Review
 from hodge_pipeline.review.picking import nearest_point, nearest_segment
 from hodge_pipeline.review.routes import site
 from hodge_pipeline.review.session import Session
@@ -165,6 +164,15 @@ def test_the_table_is_filtered_and_sorted(session: Session) -> None:
     assert [edge["row"] for edge in some] == [edge["row"] for edge in everything["edges"][10:15]]
 
 
+def test_the_whole_scene_is_seen_from_above_when_it_is_asked_for_again(session: Session) -> None:
+    session.show(mode="edge")
+    session.show(mode="all")
+    session.select(3)
+    assert (session.look.home, session.look.mode, session.look.selected) == (0, "all", 3)
+    session.show(mode="all")
+    assert session.look.home == 1
+
+
 def test_a_graph_is_saved_beside_the_old_one_and_nothing_is_written_over(session: Session) -> None:
     before = session.subject.path.read_bytes()
     session.disable_wrong(revision(session))
@@ -215,20 +223,6 @@ def test_an_edge_that_is_right_counts_though_the_solver_had_left_it_out(session:
     forced = with_right(graph, solution, right)
     assert forced.weights[PLANTED[0]] == 1 and (forced.weights[np.setdiff1d(out, PLANTED[:1])] == 0).all()
     assert with_right(graph, solution, ~right & (solution.weights > 0)) is solution
-
-
-def test_a_second_review_of_the_same_graph_is_refused(graph_file: Path) -> None:
-    with Review(graph_file, scene=False), pytest.raises(WorkspaceError, match="being reviewed already"):
-        Review(graph_file, scene=False)
-    Review(graph_file, scene=False).close()
-
-
-def test_a_path_without_edges_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
-    with pytest.raises(HodgeError, match="no graph of measured edges"):
-        open_for_review(tmp_path / "poses.tum")
-    with pytest.raises(WorkspaceError, match="cannot be read"):
-        Review(tmp_path / "nothing.g2o", scene=False)
 
 
 def test_a_port_in_use_is_one_line(session: Session) -> None:

@@ -80,8 +80,8 @@ def test_three_wrong_edges_taken_out_by_mouse_and_the_run_solved(
     session, before_m = review.session, error_of(run_folder)
     page = Page(browser, review)
     assert set(page.rows()) == PLANTED
-    page.click("th[data-sort=gap]")
-    page.click("th[data-sort=score]")
+    page.sort("gap")
+    page.sort("score")
     for name in sorted(PLANTED):
         page.choose(name)
         page.decided(lambda: page.click("#disable"))
@@ -114,6 +114,11 @@ def test_the_same_by_keyboard(browser: Any, review: Review, run_folder: Path) ->
     assert review.session.settled.error_m is not None and review.session.settled.error_m < 0.05
     page.press("2")
     page.until(lambda: review.session.look.mode == "edge")
+    page.press("1")
+    page.until(lambda: review.session.look.mode == "all")
+    page.press("1")
+    middle = np.median(review.session.settled.world_from_cam[:, :3, 3], axis=0)
+    page.until(lambda: np.allclose(page.scene.camera.look_at, middle, atol=1e-3))
 
 
 def test_a_line_clicked_in_the_scene_is_selected(browser: Any, review: Review) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -26,6 +27,8 @@ from hodge_adapters.colmap_files import (
     find_database,
     find_folder,
     find_model,
+    find_models,
+    largest_model,
     load_model,
     no_model,
     parent_of,
@@ -92,10 +95,31 @@ class ColmapReader:
         Frames have a pinhole camera; depth and colour of a distorting one are undistorted when read.
         """
         path = Path(path)
-        folder = find_model(path)
-        if folder is None:
+        folders = find_models(path)
+        if not folders:
             raise no_model(path)
-        model = load_model(folder, self.tracks)
+        folder, several = largest_model(folders)
+        source = self.source_of(path, folder, self._load(folder))
+        told = (
+            (f"{several}: {folder.name} is taken, which has most; `hodge refine colmap` joins them",) if several else ()
+        )
+        return replace(source, notes=(*told, *source.notes))
+
+    def _load(self, folder: Path) -> Model:
+        """The model; where its tracks alone are broken the error says how to do without."""
+        try:
+            return load_model(folder, self.tracks)
+        except SourceError as error:
+            if not self.tracks:
+                raise
+            try:
+                load_model(folder, False)
+            except SourceError:
+                raise error from None
+            raise SourceError(f"{error}, or set tracks=false to take its poses alone") from error
+
+    def source_of(self, path: Path, folder: Path, model: Model) -> Source:
+        """The source that a model of this folder is, with what lies beside it; `path` is what the user gave."""
         notes = list(model.notes)
         colour_folder = find_folder(folder, self.images, IMAGE_FOLDERS)
         depths = self._depths(folder, colour_folder, model)

@@ -119,5 +119,20 @@ def find_models(path: Path) -> list[Path]:
     return [single] if single else []
 
 
+def largest_model(folders: Sequence[Path]) -> tuple[Path, str]:
+    """The model with most images, and a line that names all of them, empty for one alone. Raises `SourceError`."""
+    if len(folders) == 1:
+        return folders[0], ""
+    counts = [_image_count(folder) for folder in folders]
+    named = ", ".join(f"{folder.name} ({count} images)" for folder, count in zip(folders, counts, strict=True))
+    return folders[counts.index(max(counts))], f"{len(folders)} models in {folders[0].parent}: {named}"
+
+
+def _image_count(folder: Path) -> int:
+    ending = model_ending(folder)
+    read = colmap_text if ending == ".txt" else colmap_binary
+    return len(read.read_images(folder / f"images{ending}", False))
+
+
 def _folders(path: Path) -> list[Path]:
     return [entry for entry in path.iterdir() if entry.is_dir()] if path.is_dir() else []

@@ -14,7 +14,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Ints
 
 NO_POINT = -1
-REMEDY = "write the model again with `colmap model_converter`, or set tracks=false to take its poses alone"
+REMEDY = "write the model again with `colmap model_converter`"
 
 CAMERA_MODELS: Mapping[str, tuple[int, int]] = {
     "SIMPLE_PINHOLE": (0, 3),

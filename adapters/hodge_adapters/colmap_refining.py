@@ -15,7 +15,7 @@ from hodge_adapters import images
 from hodge_adapters.colmap import ColmapReader
 from hodge_adapters.colmap_database import database_names, has_verified_pairs
 from hodge_adapters.colmap_depth import sensor_depth
-from hodge_adapters.colmap_files import find_database, find_models, model_ending, no_model
+from hodge_adapters.colmap_files import find_database, find_models, largest_model, load_model, model_ending, no_model
 from hodge_adapters.colmap_scale import other_camera_note
 from hodge_adapters.colmap_ties import similarity, tie_points
 from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, read_reconstruction
@@ -55,7 +55,13 @@ class ColmapModels:
         folders = find_models(Path(source))
         if not folders:
             raise no_model(Path(source))
-        return [self._open(folder) for folder in folders]
+        largest, several = largest_model(folders)
+        told = (f"{several}: those that tie are joined, the report shows the largest result",) if several else ()
+        models = [self._open(folder) for folder in folders]
+        return [
+            replace(model, notes=(*told, *model.notes)) if folder == largest else model
+            for folder, model in zip(folders, models, strict=True)
+        ]
 
     def _of_memory(self, number: int, model: pycolmap.Reconstruction) -> ColmapModel:
         with tempfile.TemporaryDirectory() as folder:
@@ -88,7 +94,7 @@ class ColmapModels:
         depth_of = "none" if sensor is None else str(sensor.absolute())
         source = replace(
             plain, images=self.images, depth=depth_of, depth_scale=self.depth_scale, no_depth=self.no_depth
-        ).open(folder)
+        ).source_of(folder, folder, load_model(folder, True))
         reconstruction = read_reconstruction(folder)
         notes = [*source.notes, *_unposed(reconstruction)]
         frames = {str(frame.frame_id): frame for frame in source.frames}

@@ -34,6 +34,10 @@ LEAST_LEFT = 3
 """Entries of a track: two would meet in a point wherever the images are."""
 
 
+FEW_BEHIND = 0.01
+"""Of the observations: where more are behind their cameras, these are wrong and not the points."""
+
+
 @dataclass(frozen=True)
 class DepthOptions:
     """Depth beside the images: the file of each image by its name, and how to read it."""
@@ -194,7 +198,18 @@ class ColmapModel:
         return replace(self, reconstruction=copy, files=(), notes=notes, tracks=None)
 
     def adjusted(self, priors: PositionPriors | None = None) -> ColmapModel:
-        """Bundle adjustment with cameras and rigs held; see `colmap_bundle`."""
+        """Bundle adjustment with cameras and rigs held; see `colmap_bundle`.
+
+        Where it leaves a few points behind their cameras, those are placed anew and all is adjusted once more.
+        """
+        first = self._adjusted(priors)
+        behind = len(first._behind())
+        if not 0 < behind <= FEW_BEHIND * len(first.quality.errors_px):
+            return first
+        placed = first.moved(first.world_from_body)
+        return placed._adjusted(priors) if len(placed._behind()) < behind else first
+
+    def _adjusted(self, priors: PositionPriors | None) -> ColmapModel:
         copy = self._copy()
         loose = adjust(copy, self._behind(), self.bodies, priors)
         if loose:

@@ -26,6 +26,7 @@ from hodge_pipeline.types import Floats
 NO_OBSERVATION = (
     "the model has no point that two images saw: nothing tells good poses from bad: triangulate points first"
 )
+ONE_IMAGE = "the model has one image with a pose: nothing tells whether it is right: give a model of two or more"
 JOIN_LOSS = 0.25
 """Of the cost: so much more of it is the price of one model in place of several that each fitted its own images."""
 NO_BASELINE = 1e-9
@@ -68,8 +69,10 @@ def refine_models(
 ) -> tuple[RefinedModel, ...]:
     """Every model refined, those that measurements tie together as one. Nothing is written but the steps.
 
-    `key` stands for the models and the options that open them. Raises `SourceError` for a model without observations.
+    `key` stands for the models and the options that open them. One of several that cannot be refined is a note. Raises
+    `SourceError` where none can.
     """
+    models, left_out = refinable(models)
     scales = [metric_scale(model.depth_ratios()) for model in models]
     metric = [in_metres(model, scale) for model, scale in zip(models, scales, strict=True)]
     out = []
@@ -79,7 +82,26 @@ def refine_models(
             steps.remember(joined, f"{key}-{number}")
             given = tuple(models[row] for row in parts), tuple(scales[row] for row in parts)
             out.append(_refine(joined, *given, options, steps, workers, force))
-    return tuple(out)
+    return (replace(out[0], notes=(*left_out, *out[0].notes)), *out[1:])
+
+
+def refinable(models: Sequence[TrackedModel]) -> tuple[Sequence[TrackedModel], tuple[str, ...]]:
+    """The models with observations that tell good poses from bad, and a line on each other one.
+
+    Raises `SourceError` where there is none.
+    """
+    reasons = [_unfit(model) for model in models]
+    told = tuple(f"{model.name}: {reason}" for model, reason in zip(models, reasons, strict=True) if reason)
+    fit = [model for model, reason in zip(models, reasons, strict=True) if not reason]
+    if not fit:
+        raise SourceError("; ".join(told))
+    return fit, tuple(f"left out: {line}" for line in told)
+
+
+def _unfit(model: TrackedModel) -> str:
+    if model.quality.images < 2:
+        return ONE_IMAGE
+    return "" if (model.quality.track_lengths > 1).any() else NO_OBSERVATION
 
 
 def in_metres(model: TrackedModel, scale: Scale) -> TrackedModel:
@@ -96,8 +118,6 @@ def _refine(
     workers: Workers,
     force: bool,
 ) -> RefinedModel:
-    if not (start.quality.track_lengths > 1).any():
-        raise SourceError(f"{start.name}: {NO_OBSERVATION}")
     is_metric = all(scale.is_observable for scale in scales)
     found = weigh(inputs, start, options, steps, workers, is_metric)
     distances_m = held_out_distances(found.depth, _image_poses([one.model for one in found.candidates]), workers)

@@ -27,6 +27,8 @@ MARKERS = "osD^vP"
 HISTOGRAM_BINS = 40
 WIDE = 5
 """Values that differ by less than this factor are legible on a linear axis."""
+LEAST_DOT_M = 1e-3
+"""Edges that fit better all have the first colour."""
 SMALLEST_RESIDUAL = 1e-3
 """Where a logarithmic histogram begins, in centimetres and degrees: nothing below it is of interest."""
 
@@ -112,19 +114,25 @@ def _score_histogram(figure: Figure, report: Report) -> None:
 
 
 def _residuals(figure: Figure, report: Report) -> None:
-    for axes, unit, columns in zip(
+    unit, factor = _small_unit(report)
+    for axes, name, columns in zip(
         figure.subplots(2, 1),
-        ("residual translation, cm", "residual rotation, °"),
+        (f"residual translation, {unit}", "residual rotation, °"),
         (
-            [(r.name, r.translation_m * 100) for r in report.pictures.residuals],
+            [(r.name, r.translation_m * factor) for r in report.pictures.residuals],
             [(r.name, np.rad2deg(r.angle_rad)) for r in report.pictures.residuals],
         ),
         strict=True,
     ):
         _log_histogram(axes, report, columns)
-        axes.set_xlabel(unit)
+        axes.set_xlabel(name)
         axes.set_ylabel("edges")
         axes.legend(frameon=False, fontsize=8)
+
+
+def _small_unit(report: Report) -> tuple[str, float]:
+    """The unit of residuals, and how many of them a metre has."""
+    return ("cm", 100.0) if report.has_metres else ("the source's unit", 1.0)
 
 
 def _log_histogram(axes: Any, report: Report, columns: list[tuple[str, Floats]]) -> None:
@@ -168,12 +176,14 @@ def _residual_dots(figure: Figure, axes: Any, report: Report, low: Ints, high: I
     if not after:
         return
     order = np.argsort(after[0].translation_m)
-    centimetres = np.maximum(after[0].translation_m[order] * 100, 0.1)
-    top = max(float(np.nanmax(centimetres, initial=1.0)), 1.0)
+    unit, factor = _small_unit(report)
+    least = LEAST_DOT_M * factor
+    sizes = np.maximum(after[0].translation_m[order] * factor, least)
+    top = float(np.nanmax(sizes, initial=10 * least))
     dots = axes.scatter(
-        low[order], high[order], s=size, c=centimetres, cmap="cividis_r", norm=LogNorm(0.1, top), linewidths=0
+        low[order], high[order], s=size, c=sizes, cmap="cividis_r", norm=LogNorm(least, top), linewidths=0
     )
-    figure.colorbar(dots, ax=axes, label="residual, cm", shrink=0.8)
+    figure.colorbar(dots, ax=axes, label=f"residual, {unit}", shrink=0.8)
 
 
 def _convergence(figure: Figure, report: Report) -> None:

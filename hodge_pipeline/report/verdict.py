@@ -236,11 +236,12 @@ def _edge_suspicions(report: Report) -> Iterator[Note]:
         if edge.weight > 0 and (edge.residual_m > _large_m(report) or edge.residual_deg > LARGE_RESIDUAL_DEG)
     ]
     if large:
-        yield Note("edges far off", len(large), f"{length(_large_m(report))} or {LARGE_RESIDUAL_DEG:g}°")
+        far = f"{length(_large_m(report))} or " if report.has_metres else ""
+        yield Note("edges far off", len(large), f"{far}{LARGE_RESIDUAL_DEG:g}°")
 
 
 def _large_m(report: Report) -> float:
-    return LARGE_RESIDUAL_M * report.scale
+    return LARGE_RESIDUAL_M * report.scale if report.has_metres else float("inf")
 
 
 def _unmatched(report: Report) -> Iterator[Note]:

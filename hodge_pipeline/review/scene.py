@@ -58,19 +58,11 @@ class Scene:
     def _begin(self) -> None:
         """The scene of a subject that was just opened."""
         scene, poses = self._server.scene, self._session.settled.world_from_cam
-        known = poses[np.isfinite(poses).all(axis=(1, 2))]
-        centre = np.median(known[:, :3, 3], axis=0) if len(known) else np.zeros(3)
-        spread = np.linalg.norm(known[:, :3, 3] - centre, axis=1) if len(known) else np.ones(1)
-        self._size = max(float(np.percentile(spread, 90)), 0.5)
-        up = -known[:, :3, 1].mean(axis=0) if len(known) and self._subject.clouds is not None else np.array([0, 0, 1.0])
-        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0, 0, 1.0])
-        side = np.cross(up, [1.0, 0.3, 0.2])
-        side /= np.linalg.norm(side)
-        scene.set_up_direction(tuple(up))
-        self._server.initial_camera.up = tuple(up)
-        self._server.initial_camera.position = tuple(centre + self._size * (2.2 * up + 1.6 * side))
+        position, centre = self._overview(poses)
+        scene.set_up_direction(tuple(self._up))
+        self._server.initial_camera.up = tuple(self._up)
+        self._server.initial_camera.position = tuple(position)
         self._server.initial_camera.look_at = tuple(centre)
-        self._up = up
         self._clouds = {}
         scene.add_frame("/clouds", show_axes=False)
         scene.add_frame("/pair", show_axes=False)
@@ -102,6 +94,18 @@ class Scene:
             if not self._closed.is_set():
                 self.draw(flip)
 
+    def _overview(self, poses: Floats) -> tuple[Floats, Floats]:
+        """Where the whole scene is seen from at these poses, and its middle; up and its size follow from them too."""
+        known = poses[np.isfinite(poses).all(axis=(1, 2))]
+        centre = np.median(known[:, :3, 3], axis=0) if len(known) else np.zeros(3)
+        spread = np.linalg.norm(known[:, :3, 3] - centre, axis=1) if len(known) else np.ones(1)
+        self._size = max(float(np.percentile(spread, 90)), 0.5)
+        up = -known[:, :3, 1].mean(axis=0) if len(known) and self._subject.clouds is not None else np.array([0, 0, 1.0])
+        self._up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0, 0, 1.0])
+        side = np.cross(self._up, [1.0, 0.3, 0.2])
+        side /= np.linalg.norm(side)
+        return centre + self._size * (2.2 * self._up + 1.6 * side), centre
+
     def draw(self, flip: bool = False) -> None:
         """Bring the scene up to date with the session; what has not changed is not sent again."""
         with self._session.changed:
@@ -128,6 +132,7 @@ class Scene:
                 around = [_around(along) for good, _, _, along in cycles if good == closes]
                 self._lines(f"/cycles/{name}", settled.world_from_cam, _joined(around), colour, 3.5)
             self._pair(pair)
+        self._turn_to(pair, look.home)
 
     def _move(self, poses: Floats) -> None:
         """The clouds at new poses, and a line where the cameras were before."""
@@ -168,7 +173,6 @@ class Scene:
         """The two clouds that are looked at, the others hidden meanwhile; nothing where none are."""
         clouds = self._subject.clouds
         self._server.scene.add_frame("/clouds", show_axes=False, visible=pair is None)
-        self._turn_to(pair)
         if pair is None or clouds is None:
             for name in ("first", "second", "picks"):
                 self._remove(f"/pair/{name}")
@@ -194,9 +198,9 @@ class Scene:
                     precision="float32",
                 )  # fmt: skip
 
-    def _turn_to(self, pair: Shown | None) -> None:
-        """Let every page look at the pair, and when it is left where it looked before."""
-        if self._same("eye", np.array([-1, -1, 0] if pair is None else [pair.i, pair.j, pair.wants_points])):
+    def _turn_to(self, pair: Shown | None, home: int) -> None:
+        """Let every page look at the pair; at what it saw before when that is left; at all when `home` grew."""
+        if self._same("eye", np.array([-1, -1, home] if pair is None else [pair.i, pair.j, pair.wants_points])):
             return
         for number, client in self._server.get_clients().items():
             if pair is not None:
@@ -207,6 +211,9 @@ class Scene:
                 client.camera.look_at = pair.middle
             elif number in self._looked:
                 client.camera.position, client.camera.look_at = self._looked.pop(number)
+            else:
+                position, centre = self._overview(self._session.settled.world_from_cam)
+                client.camera.up_direction, client.camera.position, client.camera.look_at = self._up, position, centre
 
     def _same(self, name: str, *drawn: Any) -> bool:
         """Whether this was drawn with the same numbers before; else they are remembered."""

@@ -39,7 +39,7 @@ class Look:
     """What the scene shows: the edge selected (a row, −1: none); everything, or the two clouds of that edge or of the
     candidate alone, by which motion (`MODES`; between: a `share` of the way from the edge's to the solution's; apart:
     side by side, to click points); a cut through them (at this share of their size above their middle; None: whole);
-    the frames picked to be joined, and the verdicts whose edges are drawn.
+    the frames picked to be joined, the verdicts whose edges are drawn; how often all was asked for again.
     """
 
     selected: int = -1
@@ -48,6 +48,7 @@ class Look:
     cut: float | None = None
     picked: tuple[int, ...] = ()
     verdicts: tuple[str, ...] = (WRONG, SUSPECT)
+    home: int = 0
 
 
 class Session:
@@ -228,8 +229,10 @@ class Session:
         self.quick.put("solving", self._solve)
 
     def show(self, **changes: Any) -> None:
-        """Change what the scene shows."""
+        """Change what the scene shows; the whole scene, asked for while it is shown, is seen from above again."""
         with self.changed:
+            if changes.get("mode") == self.look.mode == "all":
+                changes["home"] = self.look.home + 1
             self.look = replace(self.look, **changes)
             self.bump()
 
@@ -239,7 +242,8 @@ class Session:
             raise GraphError(f"there is no edge {row}: rows go from 0 to {len(self.table) - 1}")
         with self.changed:
             self.candidate = None
-            self.show(selected=row, mode=self.look.mode if self.look.mode in MODES[:5] else "edge", picked=())
+            self.look = replace(self.look, mode=self.look.mode if self.look.mode in MODES[:5] else "edge")
+            self.show(selected=row, picked=())
 
     def pick(self, frames: Sequence[int]) -> None:
         """Pick frames to be joined, by their rows: two of them are the candidate, its guess that of the poses."""

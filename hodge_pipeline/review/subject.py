@@ -8,17 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline.errors import HodgeError
+from hodge_pipeline.errors import HodgeError, SourceError
 from hodge_pipeline.pairs.edits import FILE
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.sources.inspect import guess_reader, guesses
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
+from hodge_pipeline.types.text import command
 
 SIDE_FILE, SIDE_LOG = ".edits.json", ".decisions.csv"
 LOG = "decisions.csv"
@@ -119,6 +120,12 @@ def _frames(run: Run, recipe: Recipe) -> tuple[Sequence[Frame], tuple[str, ...]]
 
 
 def _of_graph(path: Path) -> Subject:
+    if [guess.name for guess in guesses(path)[:1]] == ["colmap"]:
+        diagnose, convert = command("hodge", "diagnose", path), command("hodge", "convert", path, "graph.json")
+        raise SourceError(
+            f"{path}: is a COLMAP model, whose points and images a review does not show: '{diagnose}' names its wrong "
+            f"pairs, '{convert}' writes their graph, which can be reviewed"
+        )
     source = read_graph(path)
     assert source.graph is not None
     graph = source.graph

@@ -35,13 +35,15 @@ COLUMNS = {
     "why": "why",
 }
 """The columns after `i` and `j`, and the field of `Edges` that each shows."""
+UNITS = {name: name.removesuffix("_m") + "_units" for name in COLUMNS if name.endswith("_m")}
+"""What the columns of lengths are called where no scale is known."""
 LEAST = ("i", "j", "source", "status")
 
 
-def write_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic]) -> None:
+def write_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic], *, has_metres: bool = True) -> None:
     """One row a pair by vertex ids, the edges before those that are none; empty where nothing is known.
 
-    Raises `WorkspaceError` where the file cannot be written.
+    Without `has_metres` columns in `_m` are called `_units`. Raises `WorkspaceError` where the file cannot be written.
     """
     edges = edges.select(np.argsort(~edges.in_graph, kind="stable"))
     columns = [_cells(name, getattr(edges, field)) for name, field in COLUMNS.items()]
@@ -49,7 +51,7 @@ def write_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic]) -> No
     # A lone \r ends a line for those who read the table, and the writer does not quote for it.
     everywhere = any("\r" in str(name) for name in vertex_ids)
     table = csv.writer(text, csv.unix_dialect) if everywhere else csv.writer(text, lineterminator="\n")
-    table.writerow(("i", "j", *COLUMNS))
+    table.writerow(("i", "j", *(COLUMNS if has_metres else [UNITS.get(name, name) for name in COLUMNS])))
     names = [cell(str(name)) if isinstance(name, str) else name for name in vertex_ids.tolist()]
     ends = [[names[vertex] for vertex in side] for side in edges.pairs.T.tolist()]
     table.writerows(zip(*ends, *columns, strict=True))
@@ -83,7 +85,10 @@ def read_edges(path: Path) -> tuple[Edges, Words]:
         np.array([(cell_text(row["i"]), cell_text(row["j"])) for row in rows], np.str_), return_inverse=True
     )
     edges = Edges.of(ends.reshape(-1, 2))
-    columns = {field: [row[name] or "" for row in rows] for name, field in COLUMNS.items() if name in header}
+    called = {name: UNITS[name] if UNITS.get(name) in header else name for name in COLUMNS}
+    columns = {
+        field: [row[called[name]] or "" for row in rows] for name, field in COLUMNS.items() if called[name] in header
+    }
     edges = replace(edges, **{field: _column(getattr(edges, field), cells) for field, cells in columns.items()})
     return replace(edges, residual_rad=np.deg2rad(edges.residual_rad)), names
 

@@ -100,4 +100,5 @@ def _write_tables(out: Path, results: Sequence[RefinedModel]) -> None:
         registry.load("writers", "tum")().write(out / f"poses{suffix}.tum", source)
         if result.solved is not None:
             edges = result.solved.edges(result.model.world_from_body)
-            write_edges(out / f"edges{suffix}.csv", edges, result.solved.graph.vertex_ids)
+            has_metres = result.final_scale.is_observable
+            write_edges(out / f"edges{suffix}.csv", edges, result.solved.graph.vertex_ids, has_metres=has_metres)

@@ -57,6 +57,7 @@ function show(found) {
   document.body.dataset.doing = state.doing;
   document.body.dataset.revision = state.revision;
   document.body.dataset.settled = state.settled_revision;
+  document.body.dataset.version = state.version;
   $("locked").textContent = state.locked;
   $("locked").hidden = !state.locked;
   if (state.message) tell(state.message);
@@ -88,7 +89,7 @@ function showFilters() {
 
 async function list(always) {
   const query = new URLSearchParams({ verdicts: [...shown].join(","), frame: $("frame").value, min_gap: $("gap").value, min_residual_m: $("residual").value, sort, descending, first, count: COUNT });
-  const key = `${query} ${state.version}`;
+  const version = state.version, key = `${query} ${version}`;
   if (!shown.size || (key === listed && !always)) return;
   listed = key;
   try {
@@ -99,6 +100,7 @@ async function list(always) {
     $("place").textContent = `${total ? first + 1 : 0}–${first + rows.length} of ${total}`;
     $("before").disabled = first === 0; $("after").disabled = first + rows.length >= total;
     for (const head of $("table").tHead.rows[0].cells) head.classList.toggle("sorted", head.dataset.sort === sort);
+    document.body.dataset.listed = version;
   } catch (error) {
     tell(error.message);
   }

@@ -1,0 +1,130 @@
+"""What `hodge refine colmap` and the reader say to several models, to models too small, and to files that disagree."""
+
+from __future__ import annotations
+
+import csv
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from matplotlib.axis import Axis
+from typer.testing import CliRunner
+
+import hodge_pipeline
+from hodge_adapters.colmap import ColmapReader
+from hodge_adapters.colmap_refining import ColmapModels
+from hodge_pipeline.cli.main import app
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.store.edge_table import read_edges
+from test_readers_colmap import synthetic
+from test_refine_colmap import FREE, disturbed, noisy
+
+NO_TRACKS = "set tracks=false"
+
+
+def cut(model: Path, out: Path, frames: int) -> int:
+    """The model with its first frames alone; how many images have a pose."""
+    part = pycolmap.Reconstruction(model)
+    for frame_id in sorted(part.reg_frame_ids())[frames:]:
+        part.deregister_frame(frame_id)
+    out.mkdir(parents=True)
+    part.write(out)
+    return int(part.num_reg_images())
+
+
+@pytest.fixture
+def sparse(tmp_path: Path) -> Path:
+    """A scene's `sparse` with `0` of one image and `1` of all eight frames of one camera."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 8, 150
+    pycolmap.set_random_seed(0)
+    whole = tmp_path / "scene/sparse/1"
+    whole.mkdir(parents=True)
+    pycolmap.synthesize_dataset(options).write(whole)
+    assert cut(whole, tmp_path / "scene/sparse/0", 1) == 1
+    return whole.parent
+
+
+def test_several_models_are_all_named_with_their_images_and_the_largest_is_taken(sparse: Path) -> None:
+    named = f"2 models in {sparse}: 0 (1 images), 1 (8 images)"
+    source = ColmapReader(edges="none").open(sparse.parent)
+    assert len(source.frames) == 8 and source.notes[0].startswith(f"{named}: 1 is taken")
+    found = ColmapModels().open_models(sparse.parent)
+    assert [any(line.startswith(named) for line in one.notes) for one in found] == [False, True]
+
+
+def test_one_image_is_refused_alone_and_left_out_beside_others(sparse: Path) -> None:
+    with pytest.raises(SourceError, match="0: the model has one image with a pose") as refused:
+        hodge_pipeline.refine_colmap(sparse / "0", overrides=FREE)
+    assert "\n" not in str(refused.value)
+    (result,) = hodge_pipeline.refine_colmap(sparse, overrides=FREE).results
+    assert result.start.name == str(sparse / "1")
+    assert [note for note in result.notes if note.startswith(f"left out: {sparse / '0'}: the model has one image")]
+
+
+def test_models_without_an_observation_are_refused_in_one_line(sparse: Path) -> None:
+    empty = pycolmap.Reconstruction(sparse / "1")
+    for key in list(empty.points3D):
+        empty.delete_point3D(key)
+    empty.write(sparse / "1")
+    with pytest.raises(SourceError) as refused:
+        hodge_pipeline.refine_colmap(sparse, overrides=FREE)
+    told = str(refused.value)
+    assert f"{sparse / '0'}: the model has one image" in told and f"{sparse / '1'}: the model has no point" in told
+    assert "\n" not in told
+
+
+def contradict(model: Path) -> None:
+    """Let the first entry of the first track name another observation of its image."""
+    path = model / "points3D.bin"
+    data = bytearray(path.read_bytes())
+    at = 8 + 8 + 24 + 3 + 8 + 8  # count; id, xyz, colour, error, length of the track
+    image, column = struct.unpack_from("<II", data, at)
+    struct.pack_into("<II", data, at, image, column + 1)
+    path.write_bytes(data)
+
+
+def test_images_that_contradict_points_are_named_with_options_that_the_command_has(tmp_path: Path) -> None:
+    synthetic(tmp_path)
+    model = tmp_path / "binary"
+    contradict(model)
+    found = CliRunner().invoke(app, ["refine", "colmap", str(model), "--out", str(tmp_path / "out")])
+    assert isinstance(found.exception, SourceError) and found.exception.exit_code == 1
+    told = str(found.exception)
+    assert "the track of point" in told and "model_converter" in told
+    assert "tracks=false" not in told and "\n" not in told
+    with pytest.raises(SourceError, match=NO_TRACKS):
+        ColmapReader().open(model)
+    assert len(ColmapReader(tracks=False).open(model).frames) == 8
+
+
+def test_tracks_are_not_blamed_for_poses_that_cannot_be_read(tmp_path: Path) -> None:
+    synthetic(tmp_path)
+    path = tmp_path / "binary/images.bin"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(SourceError, match="images.bin") as refused:
+        ColmapReader().open(tmp_path / "binary")
+    assert NO_TRACKS not in str(refused.value)
+
+
+def test_without_a_scale_nothing_is_in_metres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the consistent solve, so that there are edges: on the page, in plots, in the table, at the terminal."""
+    start, out, labels = disturbed(noisy(tmp_path), tmp_path / "start", 8.0, 0.15), tmp_path / "out", list[str]()
+    monkeypatch.setattr("hodge_pipeline.refine.candidates._Weighing.is_settled", False)
+    set_label = Axis.set_label_text
+    monkeypatch.setattr(Axis, "set_label_text", lambda *a, **k: (labels.append(a[1]), set_label(*a, **k))[1])
+    sets = [text for option in FREE for text in ("--set", option)]
+    found = CliRunner().invoke(app, ["refine", "colmap", str(start), "--out", str(out), *sets])
+    assert found.exit_code == 0, found.output
+    page = re.sub(r"<[^>]*>", " ", (out / "report.html").read_text("utf-8"))
+    for text in (found.output, page, *labels):
+        assert not re.search(r"[\d,] ?(mm|cm|m)\b", text), text[:2000]
+    assert "units" in found.output and any("residual" in label and "unit" in label for label in labels)
+    with open(out / "edges.csv", newline="") as table:
+        names = next(csv.reader(table))
+    assert "residual_units" in names and not [name for name in names if name.endswith("_m")]
+    edges, _ = read_edges(out / "edges.csv")
+    assert len(edges.residual_m) and np.isfinite(edges.residual_m[edges.in_graph]).all()
