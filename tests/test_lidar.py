@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from functools import partial
 from itertools import permutations
 from pathlib import Path
@@ -12,10 +14,13 @@ import pytest
 from hodge_adapters.pcd_points import read_pcd
 from hodge_adapters.point_columns import seconds_after_first
 from hodge_pipeline import se3
+from hodge_pipeline.demo.sequence import make_sequence
 from hodge_pipeline.demo.street import HOUSES_M, Road, build_street
-from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, SpinningScanner, Sweep
+from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, TRUTH_FILE, SpinningScanner, StreetOptions, Sweep
+from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.pipeline import run
 from hodge_pipeline.recipe.scale import measured_scale
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.sweeps import deskewed, velocities
 from hodge_pipeline.types import Floats, Frame, PointCloud, Source
 
@@ -128,3 +133,28 @@ def test_five_scans_of_a_street_in_any_order(
             error = se3.inverse(se3.inverse(found[a]) @ found[b]) @ truth
             assert np.linalg.norm(error[:3, 3]) < 0.07
             assert np.degrees(np.linalg.norm(se3.so3_log(error[:3, :3]))) < 0.6
+
+
+def test_a_street_is_followed_and_deskewed(tmp_path: Path) -> None:
+    pytest.importorskip("kiss_icp", reason="the extra lidar is not installed")
+    options = StreetOptions(frames=25, beams=16, columns=360)
+    folder = make_sequence(tmp_path / "street", options)
+    recipe = load_recipe(
+        "lidar",
+        [f"evaluation.truth={json.dumps(str(folder / TRUTH_FILE))}", "recording.level=off", "fusion=[]"],
+        folder,
+    )
+    done = run(recipe, tmp_path / "run")
+    exact = Road(options.speed_m_s).world_from_car(np.arange(25) * REVOLUTION_S)
+    moved = se3.inverse(done.poses[0]) @ done.poses[-1]
+    error = se3.inverse(moved) @ se3.inverse(exact[0]) @ exact[-1]
+    assert 16 < np.linalg.norm(moved[:3, 3]) < 18 and np.linalg.norm(error[:3, 3]) < 0.3
+    assert len(done.key_frames.rows) < 20
+    assert done.source.frames[0].true_world_from_cam is not None
+
+
+def test_the_package_that_kiss_icp_needs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
+    folder = make_sequence(tmp_path / "street", StreetOptions(frames=2, beams=4, columns=72))
+    with pytest.raises(RecipeError, match=r"kiss-icp: pip install hodge-pipeline\[lidar\]"):
+        run(load_recipe("lidar", [], folder), tmp_path / "run")
