@@ -15,13 +15,7 @@ MUTANTS = {
         "hodge_pipeline/store/store.py",
         "        if file_facts(path / name) != known:",
         "        if False:",
-        "damage/zeroed/stages/clouds-1/clouds/points.npy",
-    ),
-    "a blocking open": (
-        "hodge_pipeline/types/input_files.py",
-        "    if not stat.S_ISREG(mode):",
-        "    if stat.S_ISDIR(mode):",
-        "reading/tum_poses/0/0/400",
+        "damage/zeroed/stages/solve_edges-1/value.npz",
     ),
     "an unquoted path": (
         "hodge_pipeline/types/text.py",
@@ -45,18 +39,18 @@ MUTANTS = {
         "hodge_pipeline/store/workspace.py",
         "            _remove_drafts(folder)",
         "            pass",
-        "crash/run/0004",
+        "crash/run/0026",
     ),
     "links followed": (
         "hodge_pipeline/store/workspace.py",
-        "            if stat.S_ISLNK(mode):",
-        "            if False:",
+        "    for parent, folders, files in os.walk(folder):\n        for name in (*folders, *files):\n            mode",
+        "    for parent, folders, files in ():\n        for name in (*folders, *files):\n            mode",
         "strangers/run/link at log.txt",
     ),
-    "notes after the commit": (
+    "notes of computed steps alone": (
         "hodge_pipeline/store/store.py",
-        '"notes": [vars(note) for note in notes]}',
-        '"notes": []}',
+        "        self.note(*(Note(**note) for note in _unsealed",
+        "            self.note(*(Note(**note) for note in _unsealed",
         "crash/run/0100",
     ),
     "lost lines without a note": (
