@@ -22,10 +22,10 @@ import dataclasses, sys
 from pathlib import Path
 import hodge_pipeline
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.sources.opening import open_source
+from hodge_pipeline.sources.opening import open_with_reader
 name, path, out, count, *overrides = sys.argv[1:]
 recipe = load_recipe(name, overrides, Path(path))
-whole, _ = open_source(Path(path), recipe.source.reader)
+whole, _ = open_with_reader(Path(path), recipe.source.reader)
 hodge_pipeline.run(recipe, out, source=dataclasses.replace(whole, frames=whole.frames[: int(count)]))
 """
 

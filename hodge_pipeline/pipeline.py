@@ -31,7 +31,7 @@ from hodge_pipeline.rounds.suggested import suggested_rounds
 from hodge_pipeline.run_folder import Run, begin, check_layout, end, opening_of
 from hodge_pipeline.scene import Round, Scene
 from hodge_pipeline.sources.measured_edges import measured_edges
-from hodge_pipeline.sources.opening import Fingerprints, changed_since, fingerprints, open_source, remembered
+from hodge_pipeline.sources.opening import Fingerprints, changed_since, fingerprints, open_with_reader, remembered
 from hodge_pipeline.start.truth import with_truth
 from hodge_pipeline.store.log import logging_to
 from hodge_pipeline.store.progress import Watcher
@@ -132,7 +132,7 @@ class _Job:
         if path is None:
             raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
         source, reader = (
-            (self.opened, None) if self.opened else open_source(path, self.recipe.source.reader, recipe_names())
+            (self.opened, None) if self.opened else open_with_reader(path, self.recipe.source.reader, recipe_names())
         )
         if not source.frames:
             raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")

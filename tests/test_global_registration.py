@@ -16,6 +16,7 @@ from hodge_pipeline.registration.global_evidence import depth_view, free_directi
 from hodge_pipeline.registration.global_features import describe, mutual_matches
 from hodge_pipeline.registration.global_registrars import FpfhConsensus, FpfhFgr, FpfhRansac, KissMatcher
 from hodge_pipeline.stages import GlobalRegistrar
+from hodge_pipeline.start.unordered.hypotheses import LEAD_SIGMAS
 from hodge_pipeline.start.unordered.options import HypothesisLimits
 from hodge_pipeline.types import Camera, Floats, PointCloud
 
@@ -66,6 +67,17 @@ def test_consensus_finds_the_motion_among_wrong_matches(seed: int, angle: float,
 def test_consensus_of_too_few_matches_says_nothing() -> None:
     found = rigid_consensus(np.zeros((3, 3)), np.zeros((3, 3)), 0.1)
     assert found.count == 0 and np.array_equal(found.i_from_j, np.eye(4)) and found.inlier.shape == (3,)
+
+
+@pytest.mark.parametrize(("second", "is_rival"), [(60, True), (20, False)])
+def test_a_second_motion_among_the_matches_is_counted(second: int, is_rival: bool) -> None:
+    rng = np.random.default_rng(3)
+    here, there = np.eye(4), se3.exp(np.array([0, 0, 1.0, 2.0, 0, 0]))
+    source = rng.uniform(-2, 2, (70 + second, 3))
+    target = np.concatenate([se3.transform(here, source[:70]), se3.transform(there, source[70:])])
+    found = rigid_consensus(target, source, 0.05)
+    assert found.count == 70 and second <= found.rival_count <= second + 3
+    assert (found.count - found.rival_count < LEAD_SIGMAS * np.sqrt(found.rival_count)) == is_rival
 
 
 def test_random_matches_hardly_agree() -> None:

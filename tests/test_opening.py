@@ -10,7 +10,7 @@ from hodge_adapters.tum import TumReader
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.recipe_file import recipe_names
-from hodge_pipeline.sources.opening import open_source
+from hodge_pipeline.sources.opening import open_with_reader
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +32,11 @@ def numbered(folder: Path, tum_folder: Path) -> Path:
 
 def test_a_folder_of_another_format_is_refused_with_its_recipe(tum_folder: Path) -> None:
     with pytest.raises(SourceError, match=r"no frame-000000.*looks like tum \(.*\): try the recipe tum"):
-        open_source(tum_folder, SevenScenesReader(), recipe_names())
+        open_with_reader(tum_folder, SevenScenesReader(), recipe_names())
 
 
 def test_what_can_be_read_all_the_same_is_noted(tum_folder: Path) -> None:
-    source, _ = open_source(tum_folder, IclNuimReader(), recipe_names())
+    source, _ = open_with_reader(tum_folder, IclNuimReader(), recipe_names())
     assert any("read as icl_nuim, but it looks like tum" in note for note in source.notes)
 
 
@@ -54,23 +54,23 @@ def test_what_can_be_read_all_the_same_is_noted(tum_folder: Path) -> None:
 def test_what_has_no_frames_is_sent_elsewhere(tmp_path: Path, text: str, remedy: str) -> None:
     (tmp_path / "file.txt").write_text(text)
     with pytest.raises(SourceError, match=remedy):
-        open_source(tmp_path / "file.txt", TumReader(), recipe_names())
+        open_with_reader(tmp_path / "file.txt", TumReader(), recipe_names())
 
 
 def test_the_right_reader_says_nothing(tum_folder: Path, tmp_path: Path) -> None:
     for reader in (TumReader(), None):
-        source, _ = open_source(tum_folder, reader, recipe_names())
+        source, _ = open_with_reader(tum_folder, reader, recipe_names())
         assert len(source.frames) == 3
         assert not any("looks like" in note for note in source.notes)
-    source, _ = open_source(numbered(tmp_path, tum_folder), IclNuimReader(), recipe_names())
+    source, _ = open_with_reader(numbered(tmp_path, tum_folder), IclNuimReader(), recipe_names())
     assert len(source.frames) == 3
     assert not any("looks like" in note for note in source.notes)
 
 
 def test_a_path_that_is_nothing_keeps_its_own_error(tmp_path: Path) -> None:
     with pytest.raises(SourceError) as refused:
-        open_source(tmp_path / "absent", TumReader(), recipe_names())
+        open_with_reader(tmp_path / "absent", TumReader(), recipe_names())
     assert "looks like" not in str(refused.value)
     with pytest.raises(SourceError, match="no depth.txt") as refused:
-        open_source(tmp_path, TumReader(), recipe_names())
+        open_with_reader(tmp_path, TumReader(), recipe_names())
     assert "looks like" not in str(refused.value)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hodge_adapters.mcap_fields import Message, Payload, part, parts, pose_values, text, whole
 from hodge_adapters.mcap_records import Malformed
+from hodge_adapters.point_columns import TIMES, seconds_after_first
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bytes, Floats, Floats32, PointCloud
 
@@ -67,6 +68,7 @@ def read_points(payload: Payload, layout: CloudLayout) -> PointCloud:
     good = np.isfinite(points).all(axis=1)
     normals = _normals(columns)
     colours = _colours(columns)
+    time = next((name for name in TIMES if name in (columns.dtype.names or ())), None)
     if layout.cloud_from_points is not None:
         motion = np.array(layout.cloud_from_points).reshape(4, 4)
         points = se3.transform(motion, points.astype(np.float64)).astype(np.float32)
@@ -75,6 +77,7 @@ def read_points(payload: Payload, layout: CloudLayout) -> PointCloud:
         points[good],
         None if normals is None else normals[good],
         None if colours is None else colours[good],
+        times_s=None if time is None else seconds_after_first(np.asarray(columns[time][good], float)),
     )
 
 
@@ -91,16 +94,22 @@ def _checked(
         raise Malformed("a cloud of more points than 64 million, or of points without a size")
     if width * height and (not width * step <= row_step <= length or row_step * (height - 1) + width * step > length):
         raise Malformed("a cloud with fewer bytes than its size needs")
-    wanted = tuple(field for field in fields if field[0] in _READ_FIELDS)
+    wanted = tuple(field for field in fields if field[0] in _READ_FIELDS or (field[0] in TIMES and _fits(field, step)))
     if {"x", "y", "z"} - {name for name, _, _ in wanted}:
         raise Malformed("a cloud without the fields x, y and z")
     if len({name for name, _, _ in wanted}) < len(wanted):
         raise Malformed("a cloud with two fields of one name")
     for name, kind, offset in wanted:
-        if len(kind) < 3 or offset < 0 or offset + np.dtype(kind).itemsize > step:
+        if not _fits((name, kind, offset), step):
             raise Malformed(f"a cloud whose field {name} does not lie in its points")
     flat = None if pose is None else tuple(pose.reshape(-1).tolist())
     return CloudLayout(width, height, step, row_step, wanted, flat)
+
+
+def _fits(field: tuple[str, str, int], step: int) -> bool:
+    """Whether a field (name, type, offset) has a known type and lies in a point of `step` bytes."""
+    _, kind, offset = field
+    return len(kind) >= 3 and 0 <= offset <= step - np.dtype(kind).itemsize
 
 
 def _pose(message: Message) -> Floats | None:

@@ -15,6 +15,10 @@ from hodge_pipeline.types import Bools, Bytes, Floats, Floats32, PointCloud
 
 NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 COLOURS = ("red", "green", "blue")
+TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time")
+"""When a point was measured: Ouster, Velodyne, Hesai and Livox name it differently, and count in their own units."""
+REVOLUTION_S = (0.01, 2.0)
+"""A spinning scanner's: it tells seconds from milli-, micro- and nanoseconds."""
 MAX_METRES = 1e9
 ROWS_IN_PART, LINES_IN_PART = 1 << 20, 1 << 17
 Columns: TypeAlias = Mapping[str, Any]
@@ -30,6 +34,7 @@ def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
     points: list[Floats32] = []
     normals: list[Floats32] = []
     colours: list[NDArray[Any]] = []
+    times: list[Floats] = []
     for columns in parts:
         if not all(name in columns for name in "xyz"):
             raise SourceError(f"{path}: no x, y and z among {', '.join(columns) or 'nothing'}: give a file of points")
@@ -42,9 +47,28 @@ def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
             normals.append(_unit(_stack(columns, names)[finite]))
         if all(name in columns for name in COLOURS):
             colours.append(_raw_colours(columns, finite))
+        time = next((name for name in TIMES if name in columns), None)
+        if time:
+            times.append(np.asarray(columns[time][finite], float))
     return PointCloud(
-        _joined(points), _joined(normals) if normals else None, _eight_bits(_joined(colours)) if colours else None
+        _joined(points),
+        _joined(normals) if normals else None,
+        _eight_bits(_joined(colours)) if colours else None,
+        times_s=seconds_after_first(_joined(times)) if times else None,
     )
+
+
+def seconds_after_first(times: Floats) -> Floats32 | None:
+    """When each point (N,) was measured, seconds after the first, whatever unit a revolution is counted in; None where
+    no unit gives a revolution.
+    """
+    if not len(times) or not np.isfinite(times).all():
+        return None
+    after = times - times.min()
+    for unit in (1.0, 1e-3, 1e-6, 1e-9):
+        if REVOLUTION_S[0] <= after.max() * unit <= REVOLUTION_S[1]:
+            return np.asarray(after * unit, np.float32)
+    return None
 
 
 def number_rows(path: Path, lines: Iterable[bytes], count: int, width: int) -> Iterator[Floats]:

@@ -111,16 +111,19 @@ def run(
 @app.command()
 def demo(
     out: Out,
+    lidar: Annotated[
+        bool, typer.Option("--lidar", help="A street scanned by a spinning LiDAR in place of the room.")
+    ] = False,
     overrides: Overrides = None,
     overwrite: Overwrite = False,
     dask: Dask = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a furnished room with Kinect-like noise and run the recipe `demo` on it."""
+    """Make a furnished room with Kinect-like noise and run the recipe `demo` on it (or a street: --lidar)."""
     from hodge_pipeline.cli import run as running
 
-    running.demo(out, overrides or [], overwrite=overwrite, quiet=quiet, dask=dask, verbose=verbose)
+    running.demo(out, overrides or [], lidar=lidar, overwrite=overwrite, quiet=quiet, dask=dask, verbose=verbose)
 
 
 @app.command()

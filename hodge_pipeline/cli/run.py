@@ -101,14 +101,29 @@ def resumable(out: Path) -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def demo(out: Path, overrides: Sequence[str], *, overwrite: bool, quiet: bool, dask: str | None, verbose: bool) -> None:
-    """Make the demo sequence, or find it in the cache, and run the recipe `demo` on it."""
-    from hodge_pipeline.demo.sequence import DemoOptions, demo_source
+def demo(
+    out: Path,
+    overrides: Sequence[str],
+    *,
+    lidar: bool,
+    overwrite: bool,
+    quiet: bool,
+    dask: str | None,
+    verbose: bool,
+) -> None:
+    """Make the demo's room, or street, or find it in the cache, and run the recipe `demo`, or `lidar`, on it."""
+    from hodge_pipeline.demo.sequence import DemoOptions, World, demo_source
+    from hodge_pipeline.demo.sweeps import TRUTH_FILE, StreetOptions
 
-    options = DemoOptions()
-    with Terminal(quiet, verbose) as terminal, terminal.stage("render the demo room", options.frames) as advance:
+    options: World = StreetOptions() if lidar else DemoOptions()
+    title = "scan the demo street" if lidar else "render the demo room"
+    with Terminal(quiet, verbose) as terminal, terminal.stage(title, options.frames) as advance:
         folder = demo_source(options=options, advance=advance)
-    run("demo", folder, out, overrides, overwrite=overwrite, quiet=quiet, as_json=False, dask=dask, verbose=verbose)
+    truth = named_truth(str(folder / TRUTH_FILE)) if lidar else []
+    run(
+        "lidar" if lidar else "demo", folder, out, [*truth, *overrides], overwrite=overwrite, quiet=quiet,
+        as_json=False, dask=dask, verbose=verbose,
+    )  # fmt: skip
 
 
 def _print_summary(result: Run, *, verbose: bool) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -75,19 +76,31 @@ class DemoOptions:
         reach = self.frames * STEP_DEG / 360
         return FULL_LOOP if reach >= FULL_LOOP else min(reach, 1.0) / 2
 
+    def write(self, draft: Path, advance: Advance) -> None:
+        """The sequence in the TUM layout: `rgb/*.jpg`, `depth/*.png` (16 bit, 5000 a metre), `rgb.txt`, `depth.txt`,
+        `groundtruth.txt` (poses at 100 Hz) and `intrinsics.txt` (`fx fy cx cy width height`).
+        """
+        _write(draft, self, advance)
+
+
+class World(Protocol):
+    """Options of a modelled world that can be written as a sequence of `frames`."""
+
     @property
-    def key(self) -> str:
-        """A short name of these options and this version of the generator."""
-        return hashlib.sha256(_stamp(self).encode()).hexdigest()[:12]
+    def frames(self) -> int:
+        """How many there are."""
+        ...
+
+    def write(self, draft: Path, advance: Advance) -> None:
+        """Everything into an empty folder; `advance(1)` after each frame."""
+        ...
 
 
-def make_sequence(folder: Path | str, options: DemoOptions | None = None, advance: Advance = no_progress) -> Path:
-    """The folder, holding a TUM RGB-D sequence of these options; one that holds it already is left as it is.
+def make_sequence(folder: Path | str, options: World | None = None, advance: Advance = no_progress) -> Path:
+    """The folder, holding what these options write; one that holds it already is left as it is.
 
-    `rgb/*.jpg`, `depth/*.png` (16 bit, 5000 a metre), `rgb.txt`, `depth.txt`, `groundtruth.txt` (poses at 100 Hz)
-    and `intrinsics.txt` (`fx fy cx cy width height`). It is made beside the folder and renamed when complete, so that
-    a killed run leaves no half of it. `advance(1)` is called after each frame. `SourceError` where the folder holds
-    anything else.
+    It is made beside the folder and renamed when complete, so that a killed run leaves no half of it. `advance(1)` is
+    called after each frame. `SourceError` where the folder holds anything else.
     """
     folder, options = Path(folder), options or DemoOptions()
     if _is_made(folder, options):
@@ -101,7 +114,8 @@ def make_sequence(folder: Path | str, options: DemoOptions | None = None, advanc
         folder.parent.mkdir(parents=True, exist_ok=True)
         draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", suffix=".partial", dir=folder.parent))
         try:
-            _write(draft, options, advance)
+            options.write(draft, advance)
+            (draft / STAMP_FILE).write_text(_stamp(options))
             _publish(draft, folder, options)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
@@ -112,9 +126,7 @@ def make_sequence(folder: Path | str, options: DemoOptions | None = None, advanc
     return folder
 
 
-def demo_source(
-    cache_dir: Path | None = None, options: DemoOptions | None = None, advance: Advance = no_progress
-) -> Path:
+def demo_source(cache_dir: Path | None = None, options: World | None = None, advance: Advance = no_progress) -> Path:
     """The folder of the demo sequence in the user's cache, made at the first call.
 
     The cache is `$XDG_CACHE_HOME/hodge-pipeline`, else `~/.cache/hodge-pipeline`; it keeps the last few sequences used.
@@ -122,7 +134,8 @@ def demo_source(
     options = options or DemoOptions()
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     cache = cache_dir or base / "hodge-pipeline"
-    folder = make_sequence(cache / f"demo-{options.key}", options, advance)
+    key = hashlib.sha256(_stamp(options).encode()).hexdigest()[:12]
+    folder = make_sequence(cache / f"demo-{key}", options, advance)
     os.utime(folder)
     _forget_oldest(cache, folder)
     return folder
@@ -139,16 +152,17 @@ def _forget_oldest(cache: Path, keep: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _stamp(options: DemoOptions) -> str:
-    return json.dumps({"version": VERSION, "options": asdict(options)}, indent=1, sort_keys=True) + "\n"
+def _stamp(options: World) -> str:
+    told = {"version": VERSION, "world": type(options).__name__, "options": asdict(options)}  # type: ignore[call-overload]
+    return json.dumps(told, indent=1, sort_keys=True) + "\n"
 
 
-def _is_made(folder: Path, options: DemoOptions) -> bool:
+def _is_made(folder: Path, options: World) -> bool:
     stamp = folder / STAMP_FILE
     return stamp.is_file() and read_input_text(stamp, errors="replace") == _stamp(options)
 
 
-def _publish(draft: Path, folder: Path, options: DemoOptions) -> None:
+def _publish(draft: Path, folder: Path, options: World) -> None:
     """Rename the draft; where another process was first, its sequence is the same and stays."""
     draft.chmod(0o755)
     try:
@@ -177,7 +191,6 @@ def _write(draft: Path, options: DemoOptions, advance: Advance) -> None:
     _write_list(draft / "depth.txt", "depth images", [depth for _, depth in names])
     _write_truth(draft / "groundtruth.txt", path)
     _write_intrinsics(draft / "intrinsics.txt", options.camera)
-    (draft / STAMP_FILE).write_text(_stamp(options))
 
 
 class _Recorder:

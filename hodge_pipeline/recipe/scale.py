@@ -33,6 +33,8 @@ POINTS_LOOKED_AT = 1_000_000
 MOST_STEPS = 40
 FULL = 0.5
 """Voxels over points, from which smaller voxels show nothing more."""
+POINTS_IN_VOXEL = 3
+"""Wanted of a scan of few points: a voxel with one of them knows nothing of a surface."""
 
 
 def with_scale(recipe: Recipe, source: Source, steps: Steps) -> Recipe:
@@ -103,17 +105,20 @@ def _factor(points: Floats, voxel_m: float) -> float:
     if len(points) < FEWEST_VOXELS:
         return float("nan")
     factor, count = 1.0, _occupied(points, voxel_m)
-    # Where each point has a voxel of its own, as in a scan of few beams, voxels say nothing of the surfaces.
-    most = WANTED_VOXELS if count > FULL * len(points) else MOST_VOXELS
+    # Where each point has a voxel of its own, as in a scan of few beams, voxels say nothing of the surfaces; in a cloud
+    # that was thinned before, twice the voxel holds several.
+    is_sparse = _occupied(points, 2 * voxel_m) > FULL * len(points)
+    wanted = min(WANTED_VOXELS, len(points) // POINTS_IN_VOXEL) if is_sparse else WANTED_VOXELS
+    most = wanted if is_sparse else MOST_VOXELS
     if FEWEST_VOXELS <= count <= most:
         return 1.0
     step = 2.0 if count > most else 0.5
     for _ in range(MOST_STEPS):
         before, factor = count, factor * step
         count = _occupied(points, voxel_m * factor)
-        if (count <= WANTED_VOXELS) == (step > 1) or (step < 1 and count > FULL * len(points)):
+        if (count <= wanted) == (step > 1) or (step < 1 and count > FULL * len(points)):
             slope = (np.log(count) - np.log(before)) / np.log(step)
-            return float(np.exp(np.log(factor) + (np.log(WANTED_VOXELS) - np.log(count)) / slope)) if slope else factor
+            return float(np.exp(np.log(factor) + (np.log(wanted) - np.log(count)) / slope)) if slope else factor
     return float("nan")  # a single place: no scale shows more
 
 

@@ -6,7 +6,7 @@ likely right. Nothing is drawn at random, so the answer is the same every time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,10 +23,13 @@ REFINEMENTS = 8
 
 @dataclass(frozen=True)
 class Consensus:
-    """The motion `i_from_j` (4, 4) and the matches (M,) that it explains."""
+    """The motion `i_from_j` (4, 4), the matches (M,) that it explains, and the count that its best rival explains of
+    the matches left over: where places look alike, or surfaces slide on each other, that is nearly as many.
+    """
 
     i_from_j: Floats
     inlier: Bools
+    rival_count: int = 0
 
     @property
     def count(self) -> int:
@@ -39,17 +42,19 @@ def rigid_consensus(points_in_i: Floats, points_in_j: Floats, tolerance_m: float
 
     The identity with no inlier where there are fewer than four matches.
     """
-    total = len(points_in_i)
-    target, source = np.asarray(points_in_i, float)[:MOST_MATCHES], np.asarray(points_in_j, float)[:MOST_MATCHES]
+    all_target, all_source = np.asarray(points_in_i, float), np.asarray(points_in_j, float)
+    target, source = all_target[:MOST_MATCHES], all_source[:MOST_MATCHES]
     if len(target) < FEWEST_MATCHES:
-        return Consensus(np.eye(4), np.zeros(total, bool))
+        return Consensus(np.eye(4), np.zeros(len(all_target), bool))
     groups, weights = _compatible_groups(target, source, tolerance_m)
     motions = fitted_motions(target[groups], source[groups], weights)
     moved = np.einsum("sij,mj->smi", motions[:, :3, :3], source) + motions[:, None, :3, 3]
     squared = ((moved - target) ** 2).sum(axis=2) / tolerance_m**2
-    support = np.maximum(0.0, 1 - squared).sum(axis=1)
-    motion = motions[int(support.argmax())]
-    return _refined(np.asarray(points_in_i, float), np.asarray(points_in_j, float), motion, tolerance_m)
+    support = np.maximum(0.0, 1 - squared)
+    best = _refined(all_target, all_source, motions[int(support.sum(axis=1).argmax())], tolerance_m)
+    left = ~best.inlier
+    rival = motions[int(support[:, left[:MOST_MATCHES]].sum(axis=1).argmax())]
+    return replace(best, rival_count=_refined(all_target[left], all_source[left], rival, tolerance_m).count)
 
 
 def _compatible_groups(target: Floats, source: Floats, tolerance_m: float) -> tuple[Ints, Floats]:

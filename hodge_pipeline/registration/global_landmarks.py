@@ -47,4 +47,4 @@ class LandmarkConsensus:
         rows = match(target.descriptors, source.descriptors, self.ratio)
         points = target.points_in_cam[rows[:, 0]].astype(float), source.points_in_cam[rows[:, 1]].astype(float)
         found = rigid_consensus(*points, self.tolerance_m)
-        return Match(found.i_from_j, found.count, len(rows))
+        return Match(found.i_from_j, found.count, len(rows), found.rival_count)

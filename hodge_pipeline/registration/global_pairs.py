@@ -31,6 +31,7 @@ class Matches:
     i_from_j: Floats
     inliers: Ints
     matches: Ints
+    rivals: Ints
 
     @classmethod
     def of(cls, pairs: Ints, found: Sequence[Match]) -> Matches:
@@ -40,6 +41,7 @@ class Matches:
             np.array([one.i_from_j for one in found], float).reshape(-1, 4, 4),
             np.array([one.inliers for one in found], np.int64),
             np.array([one.matches for one in found], np.int64),
+            np.array([one.rivals for one in found], np.int64),
         )
 
     @classmethod

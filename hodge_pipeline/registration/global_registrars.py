@@ -40,7 +40,7 @@ class FpfhConsensus:
         """Where the source lies in the target."""
         rows = _mutual_matches(target, source)
         found = rigid_consensus(target.points[rows[:, 0]], source.points[rows[:, 1]], TOLERANCE_VOXELS * self.voxel_m)
-        return Match(found.i_from_j, found.count, len(rows))
+        return Match(found.i_from_j, found.count, len(rows), found.rival_count)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

@@ -103,9 +103,8 @@ def _without_guess(
     matches = match_pairs(scratch, matcher, pairs, workers)
     views = Views.make([source.frames[row] for row in rows], scratch / "views", workers)
     found = weigh(
-        clouds, matches, lambda row: views(int(np.searchsorted(rows, row))), registrar, options.limits, not by_image,
-        workers,
-    )  # fmt: skip
+        clouds, matches, lambda row: views(int(np.searchsorted(rows, row))), registrar, options.limits, workers
+    )
     shutil.rmtree(scratch, ignore_errors=True)
     if not found.counts.all():
         refused = ", ".join(f"{count} {reason}" for reason, count in found.rejected_counts.items())

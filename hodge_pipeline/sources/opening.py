@@ -1,4 +1,4 @@
-"""A path opened by the reader that the recipe names; where it looks like another format, that is said."""
+"""Open a source with the recipe's reader; warn if another reader fits much better."""
 
 from __future__ import annotations
 
@@ -59,7 +59,9 @@ def _fingerprint(path: Path, strict: bool) -> tuple[Any, ...]:
         return ()
 
 
-def open_source(path: Path, reader: FrameReader | None, recipes: Collection[str] = ()) -> tuple[Source, FrameReader]:
+def open_with_reader(
+    path: Path, reader: FrameReader | None, recipes: Collection[str] = ()
+) -> tuple[Source, FrameReader]:
     """The source at a path and the reader that opened it; without a reader, the surest.
 
     Where another reader is much surer of the path than this one, the error (`SourceError`), or else a note, names it

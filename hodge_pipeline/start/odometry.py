@@ -63,14 +63,12 @@ class OdometryStart(OdometryOptions):
         keys = key_source(source, key_frames.rows)
         steps.remember(keys, steps.key([source, key_frames.rows]))
         part = connected_components(found.steps.pairs, len(found.world_from_cam))
-        drift, first = (
-            None if self.max_drift is None else Drift(found.world_from_cam, part, self.max_drift),
-            Round(found.steps, vertex_ids(keys), found.world_from_cam),
-        )
+        drift = Drift(found.world_from_cam, part, np.inf if self.max_drift is None else self.max_drift)
+        first = Round(found.steps, vertex_ids(keys), found.world_from_cam)
         several = int((np.bincount(part) > 1).sum()) > 1
         if self.relocalise is True or (self.relocalise == "auto" and several):
-            first = join_parts(keys, clouds, first, self.unordered, steps, workers)
-        return Scene(source, keys, key_frames, clouds, first, drift)
+            first = join_parts(keys, clouds, first, drift, self.unordered, steps, workers)
+        return Scene(source, keys, key_frames, clouds, first, None if self.max_drift is None else drift)
 
 
 def chain(

@@ -88,13 +88,15 @@ class Landmarks:
 class PointCloud:
     """Points of one frame, in its camera's axes: `points_in_cam (N, 3)` metres, unit normals, 8-bit RGB.
 
-    `landmarks` are other points, of the frame's image; None where nobody asked for them.
+    `landmarks` are other points, of the frame's image; None where nobody asked for them. `times_s (N,)` is when each
+    point was measured, seconds after the first, by a scanner that turns while it moves; None where nobody says.
     """
 
     points_in_cam: Floats32
     normals_in_cam: Floats32 | None = None
     colours: Bytes | None = None
     landmarks: Landmarks | None = None
+    times_s: Floats32 | None = None
 
     def __len__(self) -> int:
         return len(self.points_in_cam)
@@ -178,12 +180,14 @@ class Source:
 class Match:
     """Where cloud j lies in cloud i, found with no guess: `inliers` of the `matches` between them agree with it.
 
-    The identity with no inlier where nothing was found.
+    The identity with no inlier where nothing was found. `rivals` of the other matches agree with another motion; 0
+    where nobody has looked for one.
     """
 
     i_from_j: Floats
     inliers: int
     matches: int
+    rivals: int = 0
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
     ),
+    "sweeps untimed": (
+        Rank.FACT,
+        "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an instant",
+    ),
     "misfits": (
         Rank.LOOK,
         "{count} frames fit nothing that their key frame saw ({detail}): their poses follow from its own",

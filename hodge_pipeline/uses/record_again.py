@@ -13,7 +13,7 @@ from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.run import FILE, Recording
 from hodge_pipeline.run_folder import Run, check_layout
 from hodge_pipeline.scene import key_source
-from hodge_pipeline.sources.opening import fingerprints, open_source, remembered
+from hodge_pipeline.sources.opening import fingerprints, open_with_reader, remembered
 from hodge_pipeline.store.log import log, logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
@@ -53,7 +53,7 @@ def _with_images(run: Run, recipe: Recipe, store: Store) -> Source:
     source = run.source
     if recipe.source.path is not None:
         try:
-            opened, reader = open_source(recipe.source.path, recipe.source.reader)
+            opened, reader = open_with_reader(recipe.source.path, recipe.source.reader)
             if [frame.frame_id for frame in opened.frames] == [frame.frame_id for frame in source.frames]:
                 source = remembered(opened, reader, store, fingerprints(opened.files))
             else:

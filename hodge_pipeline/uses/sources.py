@@ -24,4 +24,4 @@ def open_source(path: Path | str, reader: str | FrameReader | None = None, **opt
     if reader is None and options:
         reader = registry.name_of(guess_reader(path))
     chosen = None if reader is None else stage_of("readers", reader, options, "open_source")
-    return opening.open_source(path, chosen)[0]
+    return opening.open_with_reader(path, chosen)[0]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
-from hodge_pipeline.registration.global_evidence import DepthView, free_directions_of, violation
+from hodge_pipeline.registration.global_evidence import DepthView, violation
 from hodge_pipeline.registration.global_pairs import Matches
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
@@ -18,6 +18,8 @@ from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import REJECTED, USED
 
 POINTS_PROJECTED = 1500
+LEAD_SIGMAS = 2.0
+"""Of the Poisson noise of a count: how far a motion's matches must exceed those of the best other motion."""
 USUAL_VIOLATIONS = 8.0
 USUAL_HUE_CONFLICTS = 12.0
 ViewOf = Callable[[int], DepthView | None]
@@ -29,7 +31,6 @@ def weigh(
     view_of: ViewOf,
     refine: Registrar,
     limits: HypothesisLimits,
-    needs_all_directions: bool,
     workers: Workers,
     advance: Advance = no_progress,
 ) -> Edges:
@@ -37,12 +38,15 @@ def weigh(
 
     `folder` holds the clouds. `overlap` is the share of the smaller cloud near the other.
 
-    `needs_all_directions`: whether a pair whose common surfaces leave a motion open is refused, as it must be where
-    nothing but the surfaces joined it.
+    A motion that hardly more matches explain than the best other one is refused: places look alike there, or what the
+    clouds share lets them slide.
     """
     clouds = CloudSet.open(folder)
     edges = Edges.of(matches.pairs).put(slice(None), status=REJECTED, why="too few matches agree")
-    worth = np.flatnonzero(matches.inliers >= limits.min_inliers)
+    enough = matches.inliers >= limits.min_inliers
+    leads = matches.inliers - matches.rivals >= LEAD_SIGMAS * np.sqrt(matches.rivals)
+    edges = edges.put(enough & ~leads, why="another motion explains as many matches")
+    worth = np.flatnonzero(enough & leads)
     advance(len(edges) - len(worth))
     chosen = Edges.of(matches.pairs[worth])
     registered = register_pairs(folder, refine, chosen, matches.i_from_j[worth], workers, advance)
@@ -50,17 +54,7 @@ def weigh(
     smaller = np.minimum(sizes[chosen.pairs[:, 0]], sizes[chosen.pairs[:, 1]])
     overlap = np.minimum(1.0, registered.fitness * sizes[chosen.pairs[:, 1]] / np.maximum(smaller, 1))
     seen_through = violations(clouds, chosen.pairs, registered.i_from_j, view_of, limits.room_m)
-    frames = {row: _frame_of(clouds, row) for row in np.unique(chosen.pairs[:, 1]).tolist()}
-    free = np.array(
-        [
-            "; ".join(free_directions_of(information, *frames[int(j)]))
-            for information, j in zip(registered.information, chosen.pairs[:, 1], strict=True)
-        ],
-        dtype=np.str_,
-    )
     reason = np.full(len(chosen), "", "U64")
-    if needs_all_directions:
-        reason[free != ""] = "what they share leaves a motion open"
     hue = hue_conflicts(clouds, chosen.pairs, registered.i_from_j)
     reason[hue > allowed_hue_conflict(hue, limits)] = "their colours differ"
     reason[seen_through > allowed_violation(seen_through, limits)] = "one camera saw through the other's surface"
@@ -82,13 +76,6 @@ def allowed_hue_conflict(conflicts: Floats, limits: HypothesisLimits) -> float:
     known = conflicts[np.isfinite(conflicts)]
     good = float(np.quantile(known, 0.25)) if len(known) else 0.0
     return max(USUAL_HUE_CONFLICTS * good, limits.hue_floor)
-
-
-def _frame_of(clouds: CloudSet, row: int) -> tuple[Floats, float]:
-    """Centroid and RMS radius of a cloud."""
-    points = np.asarray(clouds[row].points_in_cam, float)
-    middle = points.mean(axis=0)
-    return middle, float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean()))
 
 
 def violations(clouds: CloudSet, pairs: Ints, i_from_j: Floats, view_of: ViewOf, scale: float = 1.0) -> Floats:

@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.gaps import has_gap
-from hodge_pipeline.scene import START, KeyFrames, Round, Scene, sequences_of, vertex_ids
+from hodge_pipeline.scene import START, Drift, KeyFrames, Round, Scene, sequences_of, vertex_ids
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import landmarks_for, make_clouds
 from hodge_pipeline.start.unordered.options import GlobalStart
@@ -28,25 +28,34 @@ class UnorderedStart(GlobalStart):
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """Every frame of the source with its cloud and the pose that the evidence joins it at."""
         made = make_clouds(source, landmarks_for(clouds, self), steps, workers)
-        first = _round(source, made, None, self, steps, workers)
+        first = _round(source, made, None, None, self, steps, workers)
         key_frames = KeyFrames.all_of(source, first.world_from_cam)
         return Scene(source, source, key_frames, made, first, in_order=False)
 
 
 def join_parts(
-    source: Source, clouds: CloudSet, first: Round, options: GlobalStart, steps: Steps, workers: Workers
+    source: Source, clouds: CloudSet, first: Round, drift: Drift, options: GlobalStart, steps: Steps, workers: Workers
 ) -> Round:
-    """The parts of the first round, those of its edges, joined without a guess where the evidence allows."""
-    return _round(source, clouds, first, options, steps, workers)
+    """The parts of the first round, those of its edges, joined without a guess where the evidence allows.
+
+    Within a part a match counts only as far as odometry may have drifted.
+    """
+    return _round(source, clouds, first, drift, options, steps, workers)
 
 
 def _round(
-    source: Source, clouds: CloudSet, known: Round | None, options: GlobalStart, steps: Steps, workers: Workers
+    source: Source,
+    clouds: CloudSet,
+    known: Round | None,
+    drift: Drift | None,
+    options: GlobalStart,
+    steps: Steps,
+    workers: Workers,
 ) -> Round:
-    edges, poses = (None, None) if known is None else (known.edges, known.world_from_cam)
+    edges = None if known is None else known.edges
     total = 2 * len(source.frames)
     found = steps.step(
-        start_without_guess, source, clouds, edges, poses, options,
+        start_without_guess, source, clouds, edges, drift, options,
         title="start without a guess", total=total, workers=workers,
     )  # fmt: skip
     return Round(found.edges, vertex_ids(source), found.world_from_cam, name=START)
@@ -56,28 +65,30 @@ def start_without_guess(
     source: Source,
     clouds: CloudSet,
     edges: Edges | None,
-    world_from_cam: np.ndarray | None,
+    drift: Drift | None,
     options: GlobalStart,
     *,
     workers: Workers,
     step: Step,
 ) -> Start:
-    """Step: the start that the evidence of matches allows; the `edges` and poses of odometry are kept where given."""
+    """Step: the start that the evidence of matches allows; `edges` and `drift` of odometry are kept where given."""
     assert clouds.folder is not None
-    frames = Frames(source.frames, clouds.folder, vertex_ids(source), edges, world_from_cam)
+    frames = Frames(source.frames, clouds.folder, vertex_ids(source), edges, drift)
     scratch = step.folder / "scratch"
     found = find_start(frames, options, scratch, workers, step.advance)
     shutil.rmtree(scratch, ignore_errors=True)
     step.note(*notes_of("start", found.notes))
-    if edges is not None and world_from_cam is not None and _stays(source, edges, found):
+    if edges is not None and drift is not None and _stays(source, edges, found):
         step.note(Note("left apart"))
-        return replace(found, edges=edges, world_from_cam=world_from_cam)
+        return replace(found, edges=edges, world_from_cam=drift.world_from_cam)
     return found
 
 
 def _stays(source: Source, edges: Edges, found: Start) -> bool:
-    """Whether no two parts were joined, and none lies behind a hole, over which no motion can be guessed."""
+    """Whether of several parts no two were joined, and none lies behind a hole, over which no motion can be guessed."""
     parts = connected_components(edges.pairs, len(source.frames))
+    if len(np.unique(parts)) == 1:
+        return False
     stamps_s = np.array([frame.stamp_s for frame in source.frames])
     holes = has_gap(list(sequences_of(source).values()), stamps_s)
     return not holes and len(np.unique(found.piece)) >= len(np.unique(parts))

@@ -67,7 +67,10 @@ class GlobalStart:
         default=30, ge=0, description="frames: up to so many every pair is tried, beyond it the most similar ones"
     )
     similar_per_frame: int = Field(
-        default=12, ge=1, description="the most similar frames, by global descriptors, that each frame is matched with"
+        default=12,
+        ge=0,
+        description="the most similar frames, by global descriptors, that each frame is matched with; 0: none, after "
+        "odometry that drifts little, which leaves out whatever looks alike elsewhere",
     )
     reach: int = Field(
         default=5,

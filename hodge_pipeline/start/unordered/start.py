@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.registration.acceptance import strays
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
+from hodge_pipeline.scene import Drift
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
 from hodge_pipeline.start.unordered.hypotheses import weigh
@@ -21,6 +23,7 @@ from hodge_pipeline.start.unordered.scan_checks import check_scans
 from hodge_pipeline.start.unordered.similarity import LocalDescriptors, all_pairs, similar_pairs
 from hodge_pipeline.start.unordered.views import Views
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, ViewGraph
+from hodge_pipeline.types.edges import REJECTED
 
 DESCRIBED, VIEWS = "described", "views"
 
@@ -37,15 +40,15 @@ class Start:
 
 @dataclass(frozen=True)
 class Frames:
-    """What is to be joined: frames, their clouds (a folder), and edges and poses (N, 4, 4) that are known already, from
-    odometry, or none.
+    """What is to be joined: frames, their clouds (a folder), and edges and poses that are known already, from odometry,
+    or none.
     """
 
     frames: Sequence[Frame]
     clouds: Path
     vertex_ids: NDArray[np.generic]
     given: Edges | None = None
-    drifted: Floats | None = None
+    drift: Drift | None = None
 
 
 def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance) -> Start:
@@ -58,11 +61,15 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     by_image = uses_images(clouds, options)
     registrar: GlobalRegistrar = options.images if by_image else options.registrar
     describe_clouds(scene.clouds, registrar, rows, scratch / DESCRIBED, workers, advance)
-    notes = [] if by_image else [*check_scans(clouds, scene.vertex_ids)]
+    notes = [] if by_image or scene.given is not None else [*check_scans(clouds, scene.vertex_ids)]
     pairs = propose(scene, clouds, rows, scratch / DESCRIBED, options)
     matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
     views = Views.make(scene.frames, scratch / VIEWS, workers)
-    hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, not by_image, workers)
+    hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
+    if scene.drift is not None:
+        counted = np.flatnonzero(hypotheses.counts)
+        far = counted[strays(hypotheses.select(counted), scene.drift)]
+        hypotheses = hypotheses.put(far, status=REJECTED, why="farther off than odometry drifts")
     notes.append(_tried(len(rows), pairs, hypotheses))
     labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
     measured = labelled.select(labelled.counts).as_graph(scene.vertex_ids)
@@ -91,11 +98,13 @@ def propose(scene: Frames, clouds: CloudSet, rows: Ints, described: Path, option
     """The pairs (P, 2) to match: all of a few frames, else each with those most similar, or near by drifted poses."""
     if len(rows) <= options.all_pairs_up_to:
         return all_pairs(rows)
-    local = LocalDescriptors(described, clouds, options.similarity_voxel_m)
-    pairs = similar_pairs(local, rows, options, scene.given is not None)
-    if options.drift is None or scene.drifted is None:
+    pairs = np.zeros((0, 2), np.int64)
+    if options.similar_per_frame:
+        local = LocalDescriptors(described, clouds, options.similarity_voxel_m)
+        pairs = similar_pairs(local, rows, options, scene.given is not None)
+    if options.drift is None or scene.drift is None:
         return pairs
-    near = options.drift.propose(scene.frames, clouds, scene.drifted).pairs
+    near = options.drift.propose(scene.frames, clouds, scene.drift.world_from_cam).pairs
     return np.unique(np.concatenate([pairs, near]), axis=0)
 
 

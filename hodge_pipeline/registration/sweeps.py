@@ -1,0 +1,48 @@
+"""Sweeps of a scanner that turns while it moves, as if it had stood still: constant velocity within one revolution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.types import Floats, Frame, PointCloud
+
+STEPS_A_SWEEP = 64
+"""Motions that a revolution is cut into: 1.6 cm each at 10 m/s and 10 revolutions a second."""
+
+
+def deskewed(cloud: PointCloud, velocity: Floats) -> PointCloud:
+    """The points where they were when the first was measured, for a scanner that moves at `velocity (6,)`, a twist a
+    second in its own axes. As it is where the times of points are unknown.
+    """
+    if cloud.times_s is None or not len(cloud):
+        return cloud
+    last_s = max(float(cloud.times_s.max()), 1e-9)
+    step = np.minimum(cloud.times_s / last_s * STEPS_A_SWEEP, STEPS_A_SWEEP - 1).astype(np.int64)
+    middle_s = (np.arange(STEPS_A_SWEEP) + 0.5) / STEPS_A_SWEEP * last_s
+    motions = se3.exp(middle_s[:, None] * velocity).astype(np.float32)
+    points = np.einsum("nij,nj->ni", motions[step, :3, :3], cloud.points_in_cam) + motions[step, :3, 3]
+    return replace(cloud, points_in_cam=points, normals_in_cam=None, times_s=None)
+
+
+def deskewed_frame(frame: Frame, velocity: Floats) -> Frame:
+    """The frame, its points deskewed whenever they are read."""
+    if frame.read_points is None:
+        return frame
+    return replace(frame, read_points=partial(_read_deskewed, frame.read_points, tuple(velocity.tolist())))
+
+
+def _read_deskewed(read: Callable[[], PointCloud], velocity: tuple[float, ...]) -> PointCloud:
+    return deskewed(read(), np.array(velocity))
+
+
+def velocities(poses: Floats, times_s: Floats) -> Floats:
+    """The twist a second (N, 6) of each of N poses (N, 4, 4), in its own axes, to the next one; the last goes on."""
+    if len(poses) < 2:
+        return np.zeros((len(poses), 6))
+    steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / np.diff(times_s)[:, None]
+    return np.concatenate([steps, steps[-1:]])

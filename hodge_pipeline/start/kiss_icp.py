@@ -1,0 +1,210 @@
+"""First poses of a spinning LiDAR by KISS-ICP, sweeps deskewed; key frames are registered, all others follow them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
+from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame, velocities
+from hodge_pipeline.scene import KeyFrames, Scene, key_source, sequence_numbers, sequences_of, stamps_of
+from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.start.choose_key_frames import choose_key_frames
+from hodge_pipeline.start.clouds import make_clouds
+from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, Source
+from hodge_pipeline.types.notes import Note, notes_of
+
+VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
+"""KISS-ICP's own default, and 2 m for a scanner that sees 80 m: neighbours share nearly all they see."""
+REACH_QUANTILE = 0.99
+LONGEST_PAUSE = 20.0
+"""Revolutions between two sweeps of one clock; stamps that say more, or less than half of one, count something else."""
+
+
+@plain_dataclass(frozen=True)
+class Sweeps:
+    """Poses (N, 4, 4) of all sweeps at their first points, their velocities (N, 6), and which (N,) were read.
+
+    `reach_m` is how far the scanner sees: 99 % of the first sweep's points are nearer.
+    """
+
+    world_from_scan: Floats
+    velocity: Floats
+    found: Bools
+    reach_m: float
+
+
+@dataclass(frozen=True, config=OPTIONS)
+class KissIcpStart(OdometryStart):
+    """Follows a spinning LiDAR by KISS-ICP (Vizzo et al., RA-L 2023); needs `pip install hodge-pipeline[lidar]`."""
+
+    voxel_m: float | None = Field(
+        default=None, gt=0, description="metres: voxels of the local map; none: a hundredth of the scanner's reach"
+    )
+    distance_m: float | None = Field(
+        default=None, ge=0, description="metres from one key frame to the next; none: a fortieth of the scanner's reach"
+    )
+    angle_deg: float = Field(default=15.0, ge=0, description="degrees, likewise")
+
+    def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
+        """The key frames of a sequence of sweeps, with deskewed clouds and poses."""
+        sequences = tuple(sequences_of(source).values())
+        limits_m = clouds.min_range_m, clouds.max_range_m
+        found = steps.step(
+            follow, source, sequences, limits_m, self.voxel_m, title="KISS-ICP", total=len(source.frames)
+        )
+        frames = tuple(map(deskewed_frame, source.frames, found.velocity))
+        whole = replace(source, frames=frames)
+        steps.remember(whole, steps.key([source, found]) + "deskewed")
+        apart_m = found.reach_m / KEY_FRAMES_IN_REACH if self.distance_m is None else self.distance_m
+        rows = choose_key_frames(found.world_from_scan, sequences, apart_m, self.angle_deg, 0)
+        rows = rows[found.found[rows]]
+        keys = key_source(whole, rows)
+        steps.remember(keys, steps.key([whole, rows]))
+        steps.note(Note("key frames", len(rows), str(len(frames))))
+        made = make_clouds(keys, clouds, steps, workers)
+        steps_of = tuple(np.flatnonzero(np.isin(rows, part)) for part in sequences)
+        joined = steps.step(
+            register_steps, made, steps_of, found.world_from_scan[rows], self.odometry,
+            title="odometry", total=max(1, len(rows) - len(sequences)), workers=workers,
+        )  # fmt: skip
+        key_frames = _followers(whole, rows, found, joined, sequences)
+        return self.joined(whole, made, joined, key_frames, steps, workers)
+
+
+def follow(
+    source: Source, sequences: tuple[Ints, ...], limits_m: tuple[float, float], voxel_m: float | None, *, step: Step
+) -> Sweeps:
+    """Step: the poses of all sweeps, each sequence by itself."""
+    count = len(source.frames)
+    poses, velocity = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6))
+    found, timed = np.zeros(count, bool), np.zeros(count, bool)
+    stamps = stamps_of(source)
+    reach_m = _reach_m(source, limits_m)
+    notes: list[str] = []
+    for rows in sequences:
+        tracker = _Tracker(limits_m, voxel_m or reach_m / VOXELS_IN_REACH)
+        times = np.zeros(len(rows))
+        for place, row in enumerate(rows.tolist()):
+            since = stamps[row] - stamps[rows[place - 1]] if place else 0.0
+            duration, problem = tracker.follow(source.frames[row], since)
+            times[place] = times[place - 1] + duration if place else 0.0
+            poses[row], found[row], timed[row] = tracker.pose, not problem, tracker.timed
+            notes += [f"frame {source.frames[row].frame_id}: {problem}"] if problem else []
+            step.advance(1)
+        velocity[rows] = velocities(poses[rows], times)
+    step.note(*notes_of("clouds", notes))
+    if not timed.any():
+        step.note(Note("sweeps untimed"))
+    return Sweeps(poses, velocity, found, reach_m)
+
+
+def _reach_m(source: Source, limits_m: tuple[float, float]) -> float:
+    """How far the scanner sees in the first sweep that can be read. Raises `SourceError` where none can."""
+    problem: object = "the source has no points"
+    for frame in source.frames:
+        try:
+            points = frame.read_points().points_in_cam if frame.read_points else np.zeros((0, 3))
+        except (SourceError, OSError) as error:
+            problem = error
+            continue
+        ranges = np.linalg.norm(points, axis=1)
+        ranges = ranges[(ranges >= limits_m[0]) & (ranges <= limits_m[1])]
+        if len(ranges):
+            return float(np.quantile(ranges, REACH_QUANTILE))
+    raise SourceError(f"{source.path}: none of the {len(source.frames)} sweeps gave points in range: {problem}")
+
+
+class _Tracker:
+    """KISS-ICP on one sequence; sweeps are deskewed here, so that poses are those of their first points."""
+
+    def __init__(self, limits_m: tuple[float, float], voxel_m: float) -> None:
+        self._kiss, self._velocity, self.pose, self.timed = _kiss_icp(limits_m, voxel_m), np.zeros(6), np.eye(4), False
+
+    def follow(self, frame: Frame, since_s: float) -> tuple[float, str]:
+        """The seconds since the last sweep, and what kept this one from being read."""
+        try:
+            cloud = frame.read_points() if frame.read_points else None
+        except (SourceError, OSError) as error:
+            return max(since_s, 1e-6), str(error)
+        if cloud is None or not len(cloud):
+            return max(since_s, 1e-6), "it has no points"
+        self.timed = cloud.times_s is not None
+        turn_s = float(cloud.times_s.max()) if cloud.times_s is not None else since_s
+        known = 0.5 * turn_s <= since_s <= LONGEST_PAUSE * turn_s
+        duration = max(since_s if known else turn_s, 1e-6)
+        points = deskewed(cloud, self._velocity).points_in_cam.astype(np.float64)
+        before = self.pose
+        self._kiss.register_frame(points[np.isfinite(points).all(axis=1)], np.zeros(0))
+        self.pose = np.array(self._kiss.last_pose)
+        self._velocity = se3.log(se3.inverse(before) @ self.pose) / duration
+        return duration, ""
+
+
+def _kiss_icp(limits_m: tuple[float, float], voxel_m: float) -> Any:
+    try:
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+    except ImportError as error:
+        raise RecipeError(
+            "start kiss_icp needs the package kiss-icp: pip install hodge-pipeline[lidar], or take start.stage=odometry"
+        ) from error
+    config = KISSConfig()
+    config.data.min_range, config.data.max_range = limits_m
+    config.data.deskew = False
+    config.mapping.voxel_size = voxel_m
+    config.registration.max_num_threads = 1
+    return KissICP(config)
+
+
+def register_steps(
+    clouds: CloudSet,
+    sequences: tuple[Ints, ...],
+    world_from_key: Floats,
+    options: OdometryOptions,
+    *,
+    workers: Workers,
+    step: Step,
+) -> Odometry:
+    """Step: each key frame registered to the one before it, from the motion that KISS-ICP found."""
+    assert clouds.folder is not None
+    pairs = np.concatenate([np.stack([rows[:-1], rows[1:]], axis=1) for rows in sequences]).astype(np.int64)
+    guesses = se3.inverse(world_from_key[pairs[:, 0]]) @ world_from_key[pairs[:, 1]]
+    edges = register_pairs(
+        clouds.folder, options.registration, Edges.of(pairs, "sequential"), guesses, workers, step.advance
+    )
+    held = edges.fitness >= options.min_fitness
+    lost = [f"between {i} and {j}" for i, j in pairs[~held].tolist()]
+    if lost:
+        step.note(Note("path broken", len(lost), str(len(lost))))
+    motions = np.where(held[:, None, None], edges.i_from_j, guesses)
+    space_m = REACHES_APART * clouds.reach_m
+    poses = chained(len(world_from_key), sequences, replace(edges, i_from_j=motions), space_m)
+    return Odometry(poses, edges.select(held), ())
+
+
+def _followers(source: Source, rows: Ints, found: Sweeps, joined: Odometry, sequences: tuple[Ints, ...]) -> KeyFrames:
+    """How all sweeps of the source move with the key frames, each with the last one before it."""
+    number = sequence_numbers(source)
+    anchor = np.clip(np.searchsorted(rows, np.arange(len(source.frames)), side="right") - 1, 0, len(rows) - 1)
+    first_of = np.array([np.searchsorted(rows, part[0]) for part in sequences])
+    anchor = np.maximum(anchor, np.minimum(first_of[number], len(rows) - 1))
+    key_from_frame = se3.inverse(found.world_from_scan[rows[anchor]]) @ found.world_from_scan
+    poses = joined.world_from_cam
+    part = connected_components(joined.steps.pairs, len(rows))
+    return KeyFrames(
+        rows=rows, first=poses[anchor] @ key_from_frame, world_from_key=poses, part=part[anchor],
+        times=np.arange(len(source.frames), dtype=float), found=found.found, stamps_s=stamps_of(source),
+        sequence=number, key_of_frame=anchor,
+    )  # fmt: skip

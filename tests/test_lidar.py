@@ -1,0 +1,160 @@
+"""Spinning scanners: times of points, deskewing, the street that is modelled, scans out of doors in no order."""
+
+from __future__ import annotations
+
+import json
+import sys
+from functools import partial
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_adapters.pcd_points import read_pcd
+from hodge_adapters.point_columns import seconds_after_first
+from hodge_pipeline import se3
+from hodge_pipeline.demo.sequence import make_sequence
+from hodge_pipeline.demo.street import HOUSES_M, Road, build_street
+from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, TRUTH_FILE, SpinningScanner, StreetOptions, Sweep
+from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.pipeline import run
+from hodge_pipeline.recipe.scale import measured_scale
+from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.registration.sweeps import deskewed, velocities
+from hodge_pipeline.types import Floats, Frame, PointCloud, Source
+
+
+def test_a_revolution_tells_the_unit_of_its_times() -> None:
+    seconds = np.linspace(0, 0.1, 50)
+    for unit, first in ((1.0, 0.0), (1e-3, 7.0), (1e-6, 1e6), (1e-9, 1.7e18)):
+        found = seconds_after_first(first + seconds / unit)
+        assert found is not None and found == pytest.approx(seconds, abs=1e-6 if unit > 1e-9 else 3e-7)
+    assert seconds_after_first(np.zeros(5)) is None  # an organised cloud without a clock
+    assert seconds_after_first(np.array([0.0, np.nan])) is None
+
+
+def test_times_come_with_the_points_of_a_pcd(tmp_path: Path) -> None:
+    points = np.array([[1, 2, 3, 0.0], [np.nan, 0, 0, 0.05], [4, 5, 6, 0.1]], "<f4")
+    header = (
+        "VERSION 0.7\nFIELDS x y z time\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\n"
+        "DATA binary\n"
+    )
+    (tmp_path / "0.pcd").write_bytes(header.encode() + points.tobytes())
+    cloud = read_pcd(tmp_path / "0.pcd")
+    assert cloud.times_s == pytest.approx([0.0, 0.1]) and len(cloud) == 2
+
+
+def scanner(noise: float = 0.0) -> SpinningScanner:
+    return SpinningScanner(Road(10.0), 0, beams=12, columns=360, noise=noise)
+
+
+def cloud_of(sweep: Sweep) -> PointCloud:
+    return PointCloud(sweep.points, times_s=sweep.times_s)
+
+
+def test_a_deskewed_sweep_is_what_a_scanner_at_rest_would_see() -> None:
+    sweep = scanner().sweep(20)
+    at = scanner().road.world_from_car(2.0 + np.array([0.0, REVOLUTION_S]))
+    velocity = velocities(at, np.array([0.0, REVOLUTION_S]))[0]
+    exact = scanner().road.world_from_car(2.0 + sweep.times_s.astype(float))
+    world = np.einsum("nij,nj->ni", exact[:, :3, :3], sweep.points) + exact[:, :3, 3]
+    still = se3.transform(se3.inverse(at[0]), world)
+    before = np.linalg.norm(sweep.points - still, axis=1)
+    after = np.linalg.norm(deskewed(cloud_of(sweep), velocity).points_in_cam - still, axis=1)
+    assert before.max() > 0.9 and after.max() < 0.03
+
+
+def test_without_times_nothing_is_deskewed() -> None:
+    cloud = PointCloud(np.ones((3, 3), np.float32))
+    assert deskewed(cloud, np.ones(6)) is cloud
+
+
+def test_the_road_is_closed_smooth_and_clear() -> None:
+    road = Road(10.0)
+    poses = road.world_from_car(np.arange(0, road.length_m / 10.0, 0.05))
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert 480 < road.length_m < 520 and steps == pytest.approx(0.5, abs=0.05)
+    first, last = road.world_from_car(np.array([0.0, road.length_m / 10.0]))
+    assert np.linalg.norm(first[:2, 3] - last[:2, 3]) < 0.1
+    vertices, _ = build_street(0)
+    low = vertices[(vertices[:, 2] > 0.05) & (vertices[:, 2] < 3.0)]
+    gaps = np.linalg.norm(low[:, None, :2] - poses[None, ::10, :2, 3], axis=2).min()
+    assert gaps > 0.3 * HOUSES_M / 2
+
+
+def test_north_and_south_are_alike() -> None:
+    road = Road(10.0)
+    half = road.length_m / 2 / 10.0
+    here, there = road.world_from_car(np.array([3.0, 3.0 + half]))
+    assert np.linalg.norm(here[:2, 3] + there[:2, 3]) < 0.2
+    vertices, _ = build_street(0)
+    middle = vertices[(np.abs(vertices[:, 0]) < 50) & (np.abs(np.abs(vertices[:, 1]) - 52) < 12)]
+    turned = middle * np.array([-1, -1, 1])
+    far = [np.linalg.norm(middle - corner, axis=1).min() for corner in turned[:200]]
+    assert max(far) < 1e-6
+
+
+def test_a_sweep_is_the_same_every_time_and_in_range() -> None:
+    first, again = scanner(1.0).sweep(7), scanner(1.0).sweep(7)
+    assert np.array_equal(first.points, again.points)
+    ranges = np.linalg.norm(first.points, axis=1)
+    assert ranges.max() < FARTHEST_M + 0.5 and first.times_s.min() >= 0 and first.times_s.max() < REVOLUTION_S
+
+
+def test_a_scan_of_few_beams_wants_several_points_a_voxel() -> None:
+    sweep = cloud_of(scanner().sweep(3))
+    assert measured_scale([Frame(0, 0.0, read_points=lambda: sweep)], 0.04) > 5
+
+
+@pytest.fixture
+def kitti(data_dir: Path) -> tuple[list[Floats], list[Floats]]:
+    """Points (N, 3) and poses of five scans over 28 m of road."""
+    folder = data_dir / "scans" / "kitti_07_5scans"
+    points = [np.fromfile(file, "<f4").reshape(-1, 3).astype(np.float32) for file in sorted(folder.glob("*.bin"))]
+    rows = [line.split() for line in (folder / "graph.txt").read_text().splitlines() if line.startswith("v")]
+    values = np.array([row[1:8] for row in rows], float)
+    return points, list(se3.from_quat_xyzw(values[:, :3], values[:, 3:]))
+
+
+@pytest.mark.parametrize("order", list(permutations(range(5)))[::53])
+def test_five_scans_of_a_street_in_any_order(
+    kitti: tuple[list[Floats], list[Floats]], order: tuple[int, ...], tmp_path: Path
+) -> None:
+    points, poses = kitti
+    frames = tuple(
+        Frame(name, float(name), read_points=partial(PointCloud, points[row])) for name, row in enumerate(order)
+    )
+    recipe = "scans"
+    found = run(recipe, tmp_path / "run", source=Source("street", tmp_path, frames)).poses
+    for a in range(5):
+        for b in range(a):
+            truth = se3.inverse(poses[order[a]]) @ poses[order[b]]
+            error = se3.inverse(se3.inverse(found[a]) @ found[b]) @ truth
+            assert np.linalg.norm(error[:3, 3]) < 0.07
+            assert np.degrees(np.linalg.norm(se3.so3_log(error[:3, :3]))) < 0.6
+
+
+def test_a_street_is_followed_and_deskewed(tmp_path: Path) -> None:
+    pytest.importorskip("kiss_icp", reason="the extra lidar is not installed")
+    options = StreetOptions(frames=25, beams=16, columns=360)
+    folder = make_sequence(tmp_path / "street", options)
+    recipe = load_recipe(
+        "lidar",
+        [f"evaluation.truth={json.dumps(str(folder / TRUTH_FILE))}", "recording.level=off", "fusion=[]"],
+        folder,
+    )
+    done = run(recipe, tmp_path / "run")
+    exact = Road(options.speed_m_s).world_from_car(np.arange(25) * REVOLUTION_S)
+    moved = se3.inverse(done.poses[0]) @ done.poses[-1]
+    error = se3.inverse(moved) @ se3.inverse(exact[0]) @ exact[-1]
+    assert 16 < np.linalg.norm(moved[:3, 3]) < 18 and np.linalg.norm(error[:3, 3]) < 0.3
+    assert len(done.key_frames.rows) < 20
+    assert done.source.frames[0].true_world_from_cam is not None
+
+
+def test_the_package_that_kiss_icp_needs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
+    folder = make_sequence(tmp_path / "street", StreetOptions(frames=2, beams=4, columns=72))
+    with pytest.raises(RecipeError, match=r"kiss-icp: pip install hodge-pipeline\[lidar\]"):
+        run(load_recipe("lidar", [], folder), tmp_path / "run")
