@@ -15,6 +15,7 @@ from hodge_pipeline.fusion.fuse import fuse
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report.contents import Report
+from hodge_pipeline.rounds.all_frames import pose_frames
 from hodge_pipeline.rounds.one_round import judge_edges, solve_edges
 from hodge_pipeline.scene import KeyFrames, Round, Scene, given_poses, true_poses
 from hodge_pipeline.stages import Step
@@ -126,14 +127,15 @@ class Run:
         rounds = [opening[-1].first, *stored(steps, solve_edges)]
         rounds = [*rounds[:-1], *judged] if judged else rounds
         key_frames = opening[-1].key_frames
-        scores = stored(steps, evaluate)
+        scores, posed = stored(steps, evaluate), stored(steps, pose_frames)
+        expanded = posed[-1] if posed else key_frames.expand(rounds[-1].world_from_cam)
         return cls(
             folder=folder,
             source=opening[-1].frames.source(),
             key_frames=key_frames,
             clouds=clouds[-1],
             rounds=tuple(rounds),
-            poses=ended[-1].world_from_cam if ended else key_frames.expand(rounds[-1].world_from_cam),
+            poses=ended[-1].world_from_cam if ended else expanded,
             models={path.stem: path for path in stored(steps, fuse)},
             scores=scores[-1] if scores else None,
             ending=ended[-1] if ended else None,

@@ -17,7 +17,6 @@ LACKS = {
     "maximum_likelihood": {"wrong copy of an edge"},  # least squares: every edge counts
     "paper": {"wrong copy of an edge", "zero information"},  # every edge counts, and each as much as the others
     "poisson": {"zero information", "units x 1000"},  # unit weights by default; a lever arm of 1 m
-    "robust": {"reversed edges"},  # its gate's weight of a rotation is the block's, which a lever arm makes larger
 }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -51,6 +53,8 @@ def convert(
     writer: Writer = registry.load("writers", name)()
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise not_written(out, NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))) from error
     except OSError as error:
         raise not_written(out, error) from error
     what, *lost = writer.write(out, opened) or ("",)

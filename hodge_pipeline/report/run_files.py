@@ -136,7 +136,7 @@ def make_report(
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(recipe)),
         last_shift_m=_last_shift(rounds, component),
-        wrong_edges=store.step(weigh_wrong, last, recipe.solver, title="diagnosis"),
+        wrong_edges=store.step(weigh_wrong, last, recipe.solver, title="edges judged wrong"),
         unmeasured=_unmeasured(recipe, scores, last),
         pictures=dataclasses.replace(
             _pictures(source, rounds, sets),

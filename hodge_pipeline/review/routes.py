@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
-from importlib.resources import files
+from importlib.resources import as_file, files
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.pictures import Pictures
 from hodge_pipeline.review.session import MODES, Session
 from hodge_pipeline.stages import Advance
+from hodge_pipeline.types.input_files import read_input
 from hodge_pipeline.types.notes import Note
 
 FILES = {
@@ -47,7 +48,8 @@ def site(session: Session, viewer: Any = None) -> Site:
 
 
 def _file(name: str, content_type: str) -> Route:
-    body = files("hodge_pipeline.review").joinpath("page", name).read_bytes()
+    with as_file(files("hodge_pipeline.review").joinpath("page", name)) as page:
+        body = read_input(page)
     return lambda _: Answer(body, content_type)
 
 
@@ -75,7 +77,7 @@ def _shown(session: Session) -> Mapping[str, Route]:
         return Answer(image, "image/jpeg" if image.startswith(JPEG) else "image/png")
 
     def log(_: Asked) -> Answer:
-        body = session.subject.log.read_bytes() if session.subject.log.exists() else b""
+        body = read_input(session.subject.log) if session.subject.log.exists() else b""
         return Answer(body, "text/csv; charset=utf-8", session.subject.log.name)
 
     return {

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import RecipeError, SourceError
-from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame, velocities
@@ -22,7 +22,7 @@ from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
-from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, Source
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, PointCloud, Source
 from hodge_pipeline.types.notes import Note, notes_of
 
 VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
@@ -60,10 +60,7 @@ class KissIcpStart(OdometryStart):
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """The key frames of a sequence of sweeps, with deskewed clouds and poses."""
         sequences = tuple(sequences_of(source).values())
-        limits_m = clouds.min_range_m, clouds.max_range_m
-        found = steps.step(
-            follow, source, sequences, limits_m, self.voxel_m, title="KISS-ICP", total=len(source.frames)
-        )
+        found = steps.step(follow, source, sequences, clouds, self.voxel_m, title="KISS-ICP", total=len(source.frames))
         frames = tuple(map(deskewed_frame, source.frames, found.velocity))
         whole = replace(source, frames=frames)
         steps.remember(whole, steps.key([source, found]) + "deskewed")
@@ -84,17 +81,17 @@ class KissIcpStart(OdometryStart):
 
 
 def follow(
-    source: Source, sequences: tuple[Ints, ...], limits_m: tuple[float, float], voxel_m: float | None, *, step: Step
+    source: Source, sequences: tuple[Ints, ...], clouds: CloudOptions, voxel_m: float | None, *, step: Step
 ) -> Sweeps:
     """Step: the poses of all sweeps, each sequence by itself."""
     count = len(source.frames)
     poses, velocity = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6))
     found, timed = np.zeros(count, bool), np.zeros(count, bool)
     stamps = stamps_of(source)
-    reach_m = _reach_m(source, limits_m)
+    reach_m = _reach_m(source, clouds)
     notes: list[str] = []
     for rows in sequences:
-        tracker = _Tracker(limits_m, voxel_m or reach_m / VOXELS_IN_REACH)
+        tracker = _Tracker(clouds, voxel_m or reach_m / VOXELS_IN_REACH)
         times = np.zeros(len(rows))
         for place, row in enumerate(rows.tolist()):
             since = stamps[row] - stamps[rows[place - 1]] if place else 0.0
@@ -110,35 +107,41 @@ def follow(
     return Sweeps(poses, velocity, found, reach_m)
 
 
-def _reach_m(source: Source, limits_m: tuple[float, float]) -> float:
+def _reach_m(source: Source, clouds: CloudOptions) -> float:
     """How far the scanner sees in the first sweep that can be read. Raises `SourceError` where none can."""
     problem: object = "the source has no points"
     for frame in source.frames:
         try:
-            points = frame.read_points().points_in_cam if frame.read_points else np.zeros((0, 3))
+            points = _sweep(frame, clouds).points_in_cam
         except (SourceError, OSError) as error:
             problem = error
             continue
         ranges = np.linalg.norm(points, axis=1)
-        ranges = ranges[(ranges >= limits_m[0]) & (ranges <= limits_m[1])]
+        ranges = ranges[(ranges >= clouds.min_range_m) & (ranges <= clouds.max_range_m)]
         if len(ranges):
             return float(np.quantile(ranges, REACH_QUANTILE))
     raise SourceError(f"{source.path}: none of the {len(source.frames)} sweeps gave points in range: {problem}")
 
 
+def _sweep(frame: Frame, clouds: CloudOptions) -> PointCloud:
+    """The points of a sweep as measured; the cloud of a frame that has a depth image in their place."""
+    return make_cloud(frame, clouds)[0] if frame.read_points is None else frame.read_points()
+
+
 class _Tracker:
     """KISS-ICP on one sequence; sweeps are deskewed here, so that poses are those of their first points."""
 
-    def __init__(self, limits_m: tuple[float, float], voxel_m: float) -> None:
-        self._kiss, self._velocity, self.pose, self.timed = _kiss_icp(limits_m, voxel_m), np.zeros(6), np.eye(4), False
+    def __init__(self, clouds: CloudOptions, voxel_m: float) -> None:
+        self._clouds = clouds
+        self._kiss, self._velocity, self.pose, self.timed = _kiss_icp(clouds, voxel_m), np.zeros(6), np.eye(4), False
 
     def follow(self, frame: Frame, since_s: float) -> tuple[float, str]:
         """The seconds since the last sweep, and what kept this one from being read."""
         try:
-            cloud = frame.read_points() if frame.read_points else None
+            cloud = _sweep(frame, self._clouds)
         except (SourceError, OSError) as error:
             return max(since_s, 1e-6), str(error)
-        if cloud is None or not len(cloud):
+        if not len(cloud):
             return max(since_s, 1e-6), "it has no points"
         self.timed = cloud.times_s is not None
         turn_s = float(cloud.times_s.max()) if cloud.times_s is not None else since_s
@@ -152,7 +155,7 @@ class _Tracker:
         return duration, ""
 
 
-def _kiss_icp(limits_m: tuple[float, float], voxel_m: float) -> Any:
+def _kiss_icp(clouds: CloudOptions, voxel_m: float) -> Any:
     try:
         from kiss_icp.config import KISSConfig
         from kiss_icp.kiss_icp import KissICP
@@ -161,7 +164,7 @@ def _kiss_icp(limits_m: tuple[float, float], voxel_m: float) -> Any:
             "start kiss_icp needs the package kiss-icp: pip install hodge-pipeline[lidar], or take start.stage=odometry"
         ) from error
     config = KISSConfig()
-    config.data.min_range, config.data.max_range = limits_m
+    config.data.min_range, config.data.max_range = clouds.min_range_m, clouds.max_range_m
     config.data.deskew = False
     config.mapping.voxel_size = voxel_m
     config.registration.max_num_threads = 1
