@@ -12,6 +12,7 @@ from pathlib import Path
 from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError, not_written
 from hodge_pipeline.pairs.edits import VERBS, Edit, History, read_history_file, write_history_file
 from hodge_pipeline.store.workspace import holding
+from hodge_pipeline.types.input_files import read_input_text
 
 COLUMNS = ("time", "who", "decision", "pairs", "verdict", "score", "residual_m", "residual_deg", "note")
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -106,8 +107,7 @@ class Decisions:
         """The log, oldest first."""
         if not self._log.exists():
             return []
-        with self._log.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
+        return list(csv.DictReader(io.StringIO(read_input_text(self._log), newline="")))
 
     @contextmanager
     def _changing(self, revision: int) -> Iterator[None]:
