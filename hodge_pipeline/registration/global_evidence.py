@@ -92,20 +92,9 @@ def free_directions(points: Floats, normals: Floats) -> tuple[str, ...]:
         return ("everything",)
     centred = points - points.mean(axis=0)
     rows = np.hstack([np.cross(centred, normals), normals])
-    return _slippable(rows.T @ rows, float(np.sqrt((centred**2).sum(axis=1).mean())))
-
-
-def free_directions_of(information: Floats, centroid: Floats, radius_m: float) -> tuple[str, ...]:
-    """The same for what two clouds share, from the information (6, 6) of their registration in the axes of cloud j.
-
-    `centroid (3,)` and RMS `radius_m` are those of cloud j.
-    """
-    shift = se3.adjoint(se3.from_parts(np.eye(3), centroid))
-    return _slippable(shift.T @ information @ shift, radius_m)
-
-
-def _slippable(matrix: Floats, radius_m: float) -> tuple[str, ...]:
+    radius_m = float(np.sqrt((centred**2).sum(axis=1).mean()))
     scale = np.repeat([1 / max(radius_m, 1e-12), 1.0], 3)
+    matrix = rows.T @ rows
     total = float(np.trace(matrix[3:, 3:]))
     if not total > 0:
         return ("everything",)

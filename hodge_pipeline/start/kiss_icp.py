@@ -28,6 +28,8 @@ from hodge_pipeline.types.notes import Note, notes_of
 VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
 """KISS-ICP's own default, and 2 m for a scanner that sees 80 m: neighbours share nearly all they see."""
 REACH_QUANTILE = 0.99
+WARM_UP = 10
+"""Sweeps, a second, that a tracker sees twice: KISS-ICP begins at rest, and a moving car is six sweeps ahead of it."""
 LONGEST_PAUSE = 20.0
 """Revolutions between two sweeps of one clock; stamps that say more, or less than half of one, count something else."""
 
@@ -91,7 +93,8 @@ def follow(
     reach_m = _reach_m(source, clouds)
     notes: list[str] = []
     for rows in sequences:
-        tracker = _Tracker(clouds, voxel_m or reach_m / VOXELS_IN_REACH)
+        voxel = voxel_m or reach_m / VOXELS_IN_REACH
+        tracker = _moving(_Tracker(clouds, voxel), [source.frames[row] for row in rows[:WARM_UP]], stamps[rows])
         times = np.zeros(len(rows))
         for place, row in enumerate(rows.tolist()):
             since = stamps[row] - stamps[rows[place - 1]] if place else 0.0
@@ -135,6 +138,12 @@ class _Tracker:
         self._clouds = clouds
         self._kiss, self._velocity, self.pose, self.timed = _kiss_icp(clouds, voxel_m), np.zeros(6), np.eye(4), False
 
+    def again(self) -> _Tracker:
+        """A new one with this one's velocity."""
+        new = _Tracker(self._clouds, self._kiss.config.mapping.voxel_size)
+        new._velocity, new._kiss.last_delta = self._velocity, self._kiss.last_delta
+        return new
+
     def follow(self, frame: Frame, since_s: float) -> tuple[float, str]:
         """The seconds since the last sweep, and what kept this one from being read."""
         try:
@@ -153,6 +162,13 @@ class _Tracker:
         self.pose = np.array(self._kiss.last_pose)
         self._velocity = se3.log(se3.inverse(before) @ self.pose) / duration
         return duration, ""
+
+
+def _moving(tracker: _Tracker, frames: list[Frame], stamps_s: Floats) -> _Tracker:
+    """A tracker that begins with the velocity that this one, which begins at rest, has after these frames."""
+    for place, frame in enumerate(frames):
+        tracker.follow(frame, stamps_s[place] - stamps_s[place - 1] if place else 0.0)
+    return tracker.again()
 
 
 def _kiss_icp(clouds: CloudOptions, voxel_m: float) -> Any:
@@ -188,9 +204,9 @@ def register_steps(
         clouds.folder, options.registration, Edges.of(pairs, "sequential"), guesses, workers, step.advance
     )
     held = edges.fitness >= options.min_fitness
-    lost = [f"between {i} and {j}" for i, j in pairs[~held].tolist()]
-    if lost:
-        step.note(Note("path broken", len(lost), str(len(lost))))
+    if not held.all():
+        breaks = int((~held).sum())
+        step.note(Note("path broken", breaks, str(breaks)))
     motions = np.where(held[:, None, None], edges.i_from_j, guesses)
     space_m = REACHES_APART * clouds.reach_m
     poses = chained(len(world_from_key), sequences, replace(edges, i_from_j=motions), space_m)
