@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 from hodge_pipeline import se3
 from hodge_pipeline.complex.parts import Energies
 from hodge_pipeline.se3 import spread_correction
-from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, Solution, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
 
 START = "start"
 """The name of given poses, and of first poses that are not odometry's."""
 FIRST = "first poses"
 """Their name where they are not the given ones."""
+UNIX_STAMP_S = 1e8
+"""Stamps above this (1973) are seconds since 1970, smaller ones count from a start of their own."""
 
 
 @dataclass(frozen=True)
@@ -184,6 +186,14 @@ def stamps_of(source: Source) -> Floats:
         if not (np.diff(stamps[rows]) > 0).all():
             stamps[rows] = np.arange(len(rows))
     return stamps
+
+
+def has_real_stamps(frames: Sequence[Frame]) -> bool:
+    """Whether the stamps are a clock's: finite, not all one value, and not merely numbers of frames or of rows."""
+    stamps = np.array([frame.stamp_s for frame in frames])
+    if not len(stamps) or not np.isfinite(stamps).all() or not np.ptp(stamps) > 0:
+        return False
+    return bool(stamps.min() > UNIX_STAMP_S or (np.mod(stamps, 1) != 0).any())
 
 
 def sequence_numbers(source: Source) -> Ints:

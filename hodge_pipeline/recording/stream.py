@@ -14,13 +14,12 @@ import rerun as rr
 
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import layout
+from hodge_pipeline.scene import UNIX_STAMP_S, has_real_stamps
 from hodge_pipeline.types import Floats, Frame, Ints
 
 TURN_S, STALLED_S = 2.0, 60.0
 """How long Rerun is waited for at a time, and after how long without a byte its writer counts as dead."""
 LEAST_FREE_BYTES = 1 << 16
-UNIX_STAMP_S = 1e8
-"""Stamps above this (1973) are seconds since 1970, smaller ones count from a start of their own."""
 
 
 def open_stream(application_id: str, recording_id: str) -> rr.RecordingStream:
@@ -106,14 +105,6 @@ def frame_columns(frames: Sequence[Frame], count: int, rows: Ints) -> list[rr.Ti
             rr.TimeColumn(layout.TIME, timestamp=stamps) if since_1970 else rr.TimeColumn(layout.TIME, duration=stamps)
         )
     return columns
-
-
-def has_real_stamps(frames: Sequence[Frame]) -> bool:
-    """Whether the stamps are a clock's: finite, not all one value, and not merely numbers of frames or of rows."""
-    stamps = np.array([frame.stamp_s for frame in frames])
-    if not len(stamps) or not np.isfinite(stamps).all() or not np.ptp(stamps) > 0:
-        return False
-    return bool(stamps.min() > UNIX_STAMP_S or (np.mod(stamps, 1) != 0).any())
 
 
 def log_notes(stream: rr.RecordingStream, slot: int, notes: Iterable[str], level: str = "INFO") -> None:

@@ -15,16 +15,16 @@ STEPS_A_SWEEP = 64
 """Motions that a revolution is cut into: 1.6 cm each at 10 m/s and 10 revolutions a second."""
 
 
-def deskewed(cloud: PointCloud, velocity: Floats) -> PointCloud:
-    """The points where they were when the first was measured, for a scanner that moves at `velocity (6,)`, a twist a
-    second in its own axes. As it is where the times of points are unknown.
+def deskewed(cloud: PointCloud, velocity: Floats, after_s: float = 0.0) -> PointCloud:
+    """The points as seen from where the scanner was `after_s` seconds after the first, for one that moves at
+    `velocity (6,)`, a twist a second in its own axes. As it is where the times of points are unknown.
     """
     if cloud.times_s is None or not len(cloud):
         return cloud
     last_s = max(float(cloud.times_s.max()), 1e-9)
     step = np.minimum(cloud.times_s / last_s * STEPS_A_SWEEP, STEPS_A_SWEEP - 1).astype(np.int64)
     middle_s = (np.arange(STEPS_A_SWEEP) + 0.5) / STEPS_A_SWEEP * last_s
-    motions = se3.exp(middle_s[:, None] * velocity).astype(np.float32)
+    motions = se3.exp((middle_s - after_s)[:, None] * velocity).astype(np.float32)
     points = np.einsum("nij,nj->ni", motions[step, :3, :3], cloud.points_in_cam) + motions[step, :3, 3]
     return replace(cloud, points_in_cam=points, normals_in_cam=None, times_s=None)
 
@@ -41,8 +41,10 @@ def _read_deskewed(read: Callable[[], PointCloud], velocity: tuple[float, ...]) 
 
 
 def velocities(poses: Floats, times_s: Floats) -> Floats:
-    """The twist a second (N, 6) of each of N poses (N, 4, 4), in its own axes, to the next one; the last goes on."""
+    """The twist a second (N, 6) of each of N poses (N, 4, 4), in its own axes, from the one before to the one after."""
     if len(poses) < 2:
         return np.zeros((len(poses), 6))
-    steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / np.diff(times_s)[:, None]
-    return np.concatenate([steps, steps[-1:]])
+    here = np.arange(len(poses))
+    before, behind = np.maximum(here - 1, 0), np.minimum(here + 1, len(poses) - 1)
+    moved = se3.log(se3.inverse(poses[before]) @ poses[behind])
+    return np.asarray(moved / (times_s[behind] - times_s[before])[:, None])

@@ -17,7 +17,15 @@ from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame, velocities
-from hodge_pipeline.scene import KeyFrames, Scene, key_source, sequence_numbers, sequences_of, stamps_of
+from hodge_pipeline.scene import (
+    KeyFrames,
+    Scene,
+    has_real_stamps,
+    key_source,
+    sequence_numbers,
+    sequences_of,
+    stamps_of,
+)
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
@@ -29,9 +37,9 @@ VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
 """KISS-ICP's own default, and 2 m for a scanner that sees 80 m: neighbours share nearly all they see."""
 REACH_QUANTILE = 0.99
 WARM_UP = 10
-"""Sweeps, a second, that a tracker sees twice: KISS-ICP begins at rest, and a moving car is six sweeps ahead of it."""
-LONGEST_PAUSE = 20.0
-"""Revolutions between two sweeps of one clock; stamps that say more, or less than half of one, count something else."""
+"""Sweeps, a second, until a tracker knows its way: it begins at rest, and rings on the ground look the same ahead."""
+NO_CLOCK_S = 1.0
+"""Between two sweeps that neither stamps nor times of points tell apart: velocities are then a sweep's."""
 
 
 @plain_dataclass(frozen=True)
@@ -88,24 +96,31 @@ def follow(
     """Step: the poses of all sweeps, each sequence by itself."""
     count = len(source.frames)
     poses, velocity = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6))
-    found, timed = np.zeros(count, bool), np.zeros(count, bool)
-    stamps = stamps_of(source)
+    found, turn_s = np.zeros(count, bool), np.zeros(count)
+    stamps, is_clock = stamps_of(source), has_real_stamps(source.frames)
     reach_m = _reach_m(source, clouds)
     notes: list[str] = []
     for rows in sequences:
         voxel = voxel_m or reach_m / VOXELS_IN_REACH
-        tracker = _moving(_Tracker(clouds, voxel), [source.frames[row] for row in rows[:WARM_UP]], stamps[rows])
+        since = np.diff(stamps[rows], prepend=stamps[rows[0]]) if is_clock else np.zeros(len(rows))
+        tracker = _Tracker(clouds, voxel)
         times = np.zeros(len(rows))
         for place, row in enumerate(rows.tolist()):
-            since = stamps[row] - stamps[rows[place - 1]] if place else 0.0
-            duration, problem = tracker.follow(source.frames[row], since)
+            duration, problem = tracker.follow(source.frames[row], since[place])
             times[place] = times[place - 1] + duration if place else 0.0
-            poses[row], found[row], timed[row] = tracker.pose, not problem, tracker.timed
+            poses[row], found[row], turn_s[row] = tracker.pose, not problem, tracker.turn_s
             notes += [f"frame {source.frames[row].frame_id}: {problem}"] if problem else []
             step.advance(1)
+        first = rows[: 2 * WARM_UP]
+        behind = _from_behind(_Tracker(clouds, voxel, backwards=True), [source.frames[row] for row in first], since)
+        anew, join = first[: len(first) // 2], len(first) // 2
+        poses[anew] = poses[first[join]] @ se3.inverse(behind[join]) @ behind[:join]
         velocity[rows] = velocities(poses[rows], times)
+        poses[rows] = poses[rows] @ se3.exp(
+            -turn_s[rows, None] / 2 * velocity[rows]
+        )  # from the middle to the first point
     step.note(*notes_of("clouds", notes))
-    if not timed.any():
+    if not turn_s.any():
         step.note(Note("sweeps untimed"))
     return Sweeps(poses, velocity, found, reach_m)
 
@@ -132,31 +147,29 @@ def _sweep(frame: Frame, clouds: CloudOptions) -> PointCloud:
 
 
 class _Tracker:
-    """KISS-ICP on one sequence; sweeps are deskewed here, so that poses are those of their first points."""
+    """KISS-ICP on one sequence: `pose` is that at the middle of the last sweep, `turn_s` how long that took, if known.
 
-    def __init__(self, clouds: CloudOptions, voxel_m: float) -> None:
-        self._clouds = clouds
-        self._kiss, self._velocity, self.pose, self.timed = _kiss_icp(clouds, voxel_m), np.zeros(6), np.eye(4), False
+    Sweeps are deskewed to their middle, where a wrong velocity moves them as little forwards as back. To their first
+    points it would move the next pose the other way by half, which swings for ever.
+    """
 
-    def again(self) -> _Tracker:
-        """A new one with this one's velocity."""
-        new = _Tracker(self._clouds, self._kiss.config.mapping.voxel_size)
-        new._velocity, new._kiss.last_delta = self._velocity, self._kiss.last_delta
-        return new
+    def __init__(self, clouds: CloudOptions, voxel_m: float, *, backwards: bool = False) -> None:
+        self._clouds, self._sense = clouds, -1.0 if backwards else 1.0
+        self._kiss, self._velocity, self.pose, self.turn_s = _kiss_icp(clouds, voxel_m), np.zeros(6), np.eye(4), 0.0
 
     def follow(self, frame: Frame, since_s: float) -> tuple[float, str]:
-        """The seconds since the last sweep, and what kept this one from being read."""
+        """The seconds since the last sweep, a revolution where no clock says (`since_s` 0), and what kept this one from
+        being read.
+        """
         try:
             cloud = _sweep(frame, self._clouds)
         except (SourceError, OSError) as error:
-            return max(since_s, 1e-6), str(error)
+            return since_s or self.turn_s or NO_CLOCK_S, str(error)
         if not len(cloud):
-            return max(since_s, 1e-6), "it has no points"
-        self.timed = cloud.times_s is not None
-        turn_s = float(cloud.times_s.max()) if cloud.times_s is not None else since_s
-        known = 0.5 * turn_s <= since_s <= LONGEST_PAUSE * turn_s
-        duration = max(since_s if known else turn_s, 1e-6)
-        points = deskewed(cloud, self._velocity).points_in_cam.astype(np.float64)
+            return since_s or self.turn_s or NO_CLOCK_S, "it has no points"
+        self.turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
+        duration = since_s or self.turn_s or NO_CLOCK_S
+        points = deskewed(cloud, self._sense * self._velocity, self.turn_s / 2).points_in_cam.astype(np.float64)
         before = self.pose
         self._kiss.register_frame(points[np.isfinite(points).all(axis=1)], np.zeros(0))
         self.pose = np.array(self._kiss.last_pose)
@@ -164,11 +177,15 @@ class _Tracker:
         return duration, ""
 
 
-def _moving(tracker: _Tracker, frames: list[Frame], stamps_s: Floats) -> _Tracker:
-    """A tracker that begins with the velocity that this one, which begins at rest, has after these frames."""
-    for place, frame in enumerate(frames):
-        tracker.follow(frame, stamps_s[place] - stamps_s[place - 1] if place else 0.0)
-    return tracker.again()
+def _from_behind(tracker: _Tracker, frames: list[Frame], since_s: Floats) -> Floats:
+    """Poses (n, 4, 4) of the first frames of a sequence, each at the middle of its sweep, followed from the last one
+    back to the first by a new tracker: by then its map is full.
+    """
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    for place in reversed(range(len(frames))):
+        tracker.follow(frames[place], since_s[place + 1] if place + 1 < len(frames) else 0.0)
+        poses[place] = tracker.pose
+    return poses
 
 
 def _kiss_icp(clouds: CloudOptions, voxel_m: float) -> Any:
