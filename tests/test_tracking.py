@@ -31,7 +31,7 @@ from hodge_pipeline.sources.opening import fingerprints, remembered
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start import key_frames as tracked
 from hodge_pipeline.start import odometry as odometry_start
-from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, followers
+from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, followers, is_video
 from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.start.unordered.join import _stays
 from hodge_pipeline.start.unordered.start import Start
@@ -290,3 +290,11 @@ def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(sequ
     assert found.found.all()
     poses, expected = (all_poses(source, one, one.world_from_key) for one in (found, whole))
     assert np.abs(poses - expected).max() < 0.06
+
+
+@pytest.mark.parametrize(
+    ("step_s", "first_s", "is_tracked"), [(1 / 30, 0.5, True), (0.7, 0.5, False), (1.0, 0.0, False)]
+)
+def test_stills_and_frames_without_a_clock_are_no_video(step_s: float, first_s: float, is_tracked: bool) -> None:
+    frames = tuple(Frame(row, first_s + row * step_s) for row in range(60))
+    assert is_video(Source("s", Path("s"), frames)) == is_tracked

@@ -6,7 +6,7 @@ from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -19,13 +19,25 @@ from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chaine
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
-from hodge_pipeline.scene import KeyFrames, Scene, sequence_numbers, sequences_of, stamps_of, vertex_ids
+from hodge_pipeline.scene import (
+    KeyFrames,
+    Scene,
+    has_real_stamps,
+    sequence_numbers,
+    sequences_of,
+    stamps_of,
+    vertex_ids,
+)
 from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of
 
 NOTES_SHOWN = 5
+WHOLE_VIDEO, WHOLE_STILLS = 50, 300
+"""Frames that are registered whole: tracking by optical flow is more exact at the rate of a video, and glues stills."""
+VIDEO_STEP_S = 0.2
+"""Between two frames: fr1/rpy's every third frame, 0.1 s, is tracked well; key frames 0.7 s apart are not."""
 
 
 @plain_dataclass(frozen=True)
@@ -52,11 +64,11 @@ class Tracked:
 class KeyFrameStart(OdometryStart):
     """Tracks a long sequence from key frame to key frame and registers these alone; registers a short one whole."""
 
-    whole_up_to: int = Field(
+    whole_up_to: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
         default=300,
-        ge=1,
         description="frames: a source of so many is registered whole; a longer one is tracked from key frame to key "
-        "frame, which are chosen by how far the camera moved and by what it still sees",
+        "frame, which are chosen by how far the camera moved and by what it still sees. auto: 50 where a clock says "
+        "that frames are at most 0.2 s apart, else 300",
     )
     distance_m: float = Field(
         default=0.1,
@@ -74,7 +86,7 @@ class KeyFrameStart(OdometryStart):
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """The key frames of a long source, every frame of a short one, with their clouds and poses by odometry."""
         can_be_tracked = any(frame.read_depth or frame.read_points for frame in source.frames)
-        if len(source.frames) <= self.whole_up_to or self.distance_m == 0 or not can_be_tracked:
+        if len(source.frames) <= self._whole_up_to(source) or self.distance_m == 0 or not can_be_tracked:
             return super().begin(source, clouds, steps, workers)
         options = self._tracking(clouds)
         found = steps.step(track, source, options, title="tracking", total=len(source.frames), workers=workers)
@@ -84,6 +96,11 @@ class KeyFrameStart(OdometryStart):
         steps.remember(found.sightings, steps.key(found) + "sightings")
         return replace(scene, sightings=found.sightings if self.repose else None)
 
+    def _whole_up_to(self, source: Source) -> int:
+        if self.whole_up_to != "auto":
+            return self.whole_up_to
+        return WHOLE_VIDEO if is_video(source) else WHOLE_STILLS
+
     def _tracking(self, clouds: CloudOptions) -> TrackingOptions:
         """How frames are followed."""
         return TrackingOptions(
@@ -92,6 +109,12 @@ class KeyFrameStart(OdometryStart):
             distance_m=self.distance_m,
             angle_rad=float(np.deg2rad(self.angle_deg)),
         )
+
+
+def is_video(source: Source) -> bool:
+    """Whether a clock says that most frames follow each other at the rate of a video."""
+    stamps = np.array([frame.stamp_s for frame in source.frames])
+    return len(stamps) > 1 and has_real_stamps(source.frames) and float(np.median(np.diff(stamps))) <= VIDEO_STEP_S
 
 
 def followers(source: Source, tracked: Tracked) -> KeyFrames:
