@@ -19,7 +19,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import demo_source
 from hodge_pipeline.diagnosis.result import WRONG
 from hodge_pipeline.pairs.edits import Edit, History, write_history
-from hodge_pipeline.pipeline import solve_again
+from hodge_pipeline.uses.recipe_run import solve_again
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_plots import draw
