@@ -23,6 +23,7 @@ from hodge_pipeline.recording.run import Recording
 from hodge_pipeline.refine import verdict
 from hodge_pipeline.refine.poses import refine_poses
 from hodge_pipeline.refine.verdict import Refined
+from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.report import run_files
 from hodge_pipeline.rounds.all_frames import pose_all_frames
 from hodge_pipeline.rounds.by_hand import edited_rounds
@@ -41,6 +42,7 @@ from hodge_pipeline.types import Floats, Source, ViewGraph
 from hodge_pipeline.types.notes import Note, notes_of
 
 
+@plugin_errors()
 def run(
     recipe: Recipe | str,
     out: Path | str,
@@ -74,6 +76,7 @@ def run(
         return _Job(recipe, workspace, Store(workspace.steps, watcher), live, dask, opened, strict=strict).run()
 
 
+@plugin_errors()
 def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str | None = None) -> Run:
     """Solve and fuse a finished run once more, with the edits in its folder, and bring all that it left up to date.
 
