@@ -142,21 +142,26 @@ OURS = "hodge-pipeline "
 
 @contextmanager
 def plugin_errors() -> Iterator[None]:
-    """Turn what a stage of another package raises, unless it is a `HodgeError`, into a `StageError` of one line.
-
-    A decorator, too: of tasks, since a worker's error comes back without its frames.
+    """Raise `plugin_error` in the place of the error that it names. A decorator of tasks, too: a worker's error comes
+    back without its frames.
     """
     try:
         yield
-    except HodgeError:
-        raise
     except Exception as error:
-        stage = _plugin_in(error)
-        if stage is None:
+        named = plugin_error(error)
+        if named is None:
             raise
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        raised = " ".join(f"{type(error).__name__}: {error}".split())
-        raise StageError(f"stage {stage} raised {raised}, at {Path(where.filename).name}:{where.lineno}") from error
+        raise named from error
+
+
+def plugin_error(error: Exception) -> StageError | None:
+    """The error of one line that stands for what a stage of another package raised; None for any other error."""
+    stage = None if isinstance(error, (HodgeError, MemoryError)) else _plugin_in(error)
+    if stage is None:
+        return None
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    raised = " ".join(f"{type(error).__name__}: {error}".split())
+    return StageError(f"stage {stage} raised {raised}, at {Path(where.filename).name}:{where.lineno}")
 
 
 def _plugin_in(error: Exception) -> str | None:
