@@ -34,6 +34,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from hodge_pipeline.cli.console import ProgressBars
     from hodge_pipeline.diagnosis.diagnosis import diagnose
     from hodge_pipeline.diagnosis.result import Diagnosis
     from hodge_pipeline.errors import HodgeError
@@ -64,14 +65,15 @@ if TYPE_CHECKING:
     from hodge_pipeline.uses.trajectory import frames_from_images, refine_trajectory
 
 __all__ = [
-    "Camera", "Diagnosis", "Edges", "Frame", "GraphEditor", "HodgeError", "PointCloud", "Priors", "Recipe",
-    "Registration", "Run", "Solution", "Source", "Trajectory", "ViewGraph", "diagnose", "frames_from_images",
+    "Camera", "Diagnosis", "Edges", "Frame", "GraphEditor", "HodgeError", "PointCloud", "Priors", "ProgressBars",
+    "Recipe", "Registration", "Run", "Solution", "Source", "Trajectory", "ViewGraph", "diagnose", "frames_from_images",
     "load_recipe", "marginal_covariances", "open_review", "open_source", "refine_colmap", "refine_trajectory",
     "register", "register_clouds", "relative_covariances", "run", "solve", "solve_again", "solve_pose_graph",
     "solve_robust",
 ]  # fmt: skip
 
 _NAMES_IN = {
+    "cli.console": ("ProgressBars",),
     "diagnosis.diagnosis": ("diagnose",),
     "diagnosis.result": ("Diagnosis",),
     "errors": ("HodgeError",),

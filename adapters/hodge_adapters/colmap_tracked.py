@@ -27,7 +27,17 @@ from hodge_adapters.colmap_ties import held_apart, merge_matched_points
 from hodge_adapters.colmap_uncertainty import standard_errors
 from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline import se3
-from hodge_pipeline.types import Bools, Floats, Frame, Ints, ModelQuality, PositionPriors, ViewGraph
+from hodge_pipeline.types import (
+    Bools,
+    CloudSet,
+    Floats,
+    Frame,
+    Ints,
+    ModelQuality,
+    PointCloud,
+    PositionPriors,
+    ViewGraph,
+)
 
 LEAST_LEFT = 3
 """Entries of a track: two would meet in a point wherever the images are."""
@@ -144,6 +154,18 @@ class ColmapModel:
             row: depth.files[image.name] for row, image in enumerate(self.records.images) if image.name in depth.files
         }
         return depth_ratios(self.records, files, depth.units_per_metre, depth.no_depth, depth.camera)
+
+    def seen_points(self) -> CloudSet:
+        """The tracked points that each body's images see, in its axes; a point counts once for each body."""
+        points, known = self.records.points, self.reconstruction.points3D
+        colours = np.array([known[key].color for key in points.ids.tolist()], np.uint8).reshape(-1, 3)
+        body = self.bodies.body_of_image[self.records.image_rows]
+        seen = np.unique(np.stack([body, points.owners], axis=1), axis=0)
+        clouds = []
+        for row, pose in enumerate(se3.inverse(self.world_from_body)):
+            own = seen[seen[:, 0] == row, 1]
+            clouds.append(PointCloud(se3.transform(pose, points.xyz[own]).astype(np.float32), colours=colours[own]))
+        return CloudSet.from_clouds(clouds)
 
     def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
         """Edges of the database where there is one, else of covisible images."""
