@@ -38,7 +38,7 @@ def run(
     loaded = load_recipe(recipe, overrides, source)
     if loaded.source.path is None:
         raise RecipeError(f"recipe '{recipe}' names no source: add --source PATH")
-    from hodge_pipeline.pipeline import run as run_pipeline
+    from hodge_pipeline.uses.recipe_run import run as run_pipeline
 
     with resumable(out), ProgressBars(quiet or as_json, verbose) as terminal, _viewer(live, terminal) as address:
         result = run_pipeline(
