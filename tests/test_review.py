@@ -204,6 +204,14 @@ def test_three_points_give_the_motion_and_a_line_does_not() -> None:
     assert np.allclose(candidate.guess, motion)
 
 
+def test_a_cloud_put_at_a_place_makes_the_guess(session: Session) -> None:
+    session.pick([3, 9])
+    there = session.settled.world_from_cam[3] @ se3.exp(np.array([0.1, 0.2, -0.3, 1.0, 2.0, 3.0]))
+    session.place(there)
+    assert session.candidate is not None and session.candidate.guess_by == "the place it was put at"
+    assert np.allclose(se3.log(session.candidate.guess), [0.1, 0.2, -0.3, 1.0, 2.0, 3.0])
+
+
 def test_the_nearest_line_in_front_is_picked() -> None:
     segments = np.array([[[-1.0, 0.05, 10], [1, 0.05, 10]], [[-1, 0, -5], [1, 0, -5]], [[-1, 3, 4], [1, 3, 4]]])
     origin, ahead = np.zeros(3), np.array([0.0, 0, 2])
