@@ -15,7 +15,7 @@ import numpy as np
 
 from hodge_adapters.colmap_bodies import Bodies, bodies_of, body_graph
 from hodge_adapters.colmap_bundle import adjust
-from hodge_adapters.colmap_content import content_of, refreshed
+from hodge_adapters.colmap_content import content_of, read_reconstruction, refreshed
 from hodge_adapters.colmap_database import database_pairs
 from hodge_adapters.colmap_edges import covisible_pairs, measured_graph
 from hodge_adapters.colmap_points import parallaxes, points_of_rays
@@ -27,7 +27,6 @@ from hodge_adapters.colmap_ties import held_apart, merge_matched_points
 from hodge_adapters.colmap_uncertainty import standard_errors
 from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import (
     Bools,
     CloudSet,
@@ -284,12 +283,3 @@ class ColmapModel:
 def rigid3d(b_from_a: Floats) -> pycolmap.Rigid3d:
     """A motion as pycolmap has it."""
     return pycolmap.Rigid3d(np.ascontiguousarray(b_from_a[:3]))
-
-
-def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
-    """The model of a folder by pycolmap. Raises `SourceError` where it refuses."""
-    try:
-        return pycolmap.Reconstruction(folder)
-    except Exception as error:  # pycolmap raises what its C++ checks raise: RuntimeError, ValueError, IndexError
-        reason = str(error).strip().splitlines()[-1][:200] if str(error).strip() else type(error).__name__
-        raise SourceError(f"{folder}: COLMAP itself cannot read this model ({reason}): write it again") from error
