@@ -349,7 +349,7 @@ def test_an_edge_added_counts_until_it_is_undone(session: Session) -> None:
     count = len(session.table)
     motion = se3.inverse(poses_on_a_ring(VIEWS)[0]) @ poses_on_a_ring(VIEWS)[12]
     registration = hodge_pipeline.Registration(motion, np.eye(6) * 1e4, 0.8, 0.01, 500, 9, True)
-    session.candidate = Candidate(0, 12, motion, registration)
+    session.candidate = Candidate(0, 12, motion, found=registration)
     session.accept(revision(session), "seen by eye")
     session.wait()
     assert len(session.table) == count + 1 and session.settled.weights[count] == 1
