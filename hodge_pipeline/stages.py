@@ -300,6 +300,10 @@ class TrackedModel(Protocol):
         """
         ...
 
+    def seen_points(self) -> CloudSet:
+        """For each body the points that its images track, in its axes and the model's unit, with their colours."""
+        ...
+
     def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
         """Relative poses of the bodies, estimated anew from what their images share, and what was left out."""
         ...

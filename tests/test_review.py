@@ -20,7 +20,7 @@ from hodge_pipeline.pairs.edits import Edit, History, read_history_file, write_h
 from hodge_pipeline.review.adding import Candidate, guess_from_points
 from hodge_pipeline.review.decisions import LockedError, StaleError
 from hodge_pipeline.review.front import Front
-from hodge_pipeline.review.keeping import save_graph
+from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.picking import nearest_point, nearest_segment
 from hodge_pipeline.review.routes import site
@@ -177,7 +177,7 @@ def test_a_graph_is_saved_beside_the_old_one_and_nothing_is_written_over(session
     before = session.subject.path.read_bytes()
     session.disable_wrong(revision(session))
     session.wait()
-    first, second = save_graph(session), save_graph(session)
+    (first, _), (second, _) = save(session), save(session)
     assert [first.name, second.name] == ["ring.reviewed.g2o", "ring.reviewed-2.g2o"]
     assert session.subject.path.read_bytes() == before
     assert read_history_file(first.with_name(first.name + ".edits.json")) == session.decisions.history
@@ -302,7 +302,6 @@ def test_two_pages_and_a_stale_write_through_the_front(client: Client) -> None:
         ("POST", "pick", {"frames": ["nobody"]}),
         ("POST", "register", {}),
         ("POST", "accept", {"revision": 0}),
-        ("POST", "solve", {}),
         ("GET", "edges?sort=taste", None),
         ("GET", "edges?min_gap=wide", None),
         ("GET", "edges?colour=red", None),

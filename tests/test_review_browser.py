@@ -96,7 +96,7 @@ def test_three_wrong_edges_taken_out_by_mouse_and_the_run_solved(
     assert set(read_history(run_folder).disabled) == PLANTED
     assert session.decisions.lines()[-1]["note"] == "one desk taken for the other"
 
-    page.click("#solve")
+    page.click("#finish")
     page.until(lambda: "solved and fused" in page.text("message"))
     assert error_of(run_folder) < 0.05
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hodge_adapters.colmap_bodies import Bodies, bodies_of, body_graph
 from hodge_adapters.colmap_bundle import adjust
-from hodge_adapters.colmap_content import content_of, refreshed
+from hodge_adapters.colmap_content import content_of, read_reconstruction, refreshed
 from hodge_adapters.colmap_database import database_pairs
 from hodge_adapters.colmap_edges import covisible_pairs, measured_graph
 from hodge_adapters.colmap_points import parallaxes, points_of_rays
@@ -27,8 +27,17 @@ from hodge_adapters.colmap_ties import held_apart, merge_matched_points
 from hodge_adapters.colmap_uncertainty import standard_errors
 from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Bools, Floats, Frame, Ints, ModelQuality, PositionPriors, ViewGraph
+from hodge_pipeline.types import (
+    Bools,
+    CloudSet,
+    Floats,
+    Frame,
+    Ints,
+    ModelQuality,
+    PointCloud,
+    PositionPriors,
+    ViewGraph,
+)
 
 LEAST_LEFT = 3
 """Entries of a track: two would meet in a point wherever the images are."""
@@ -146,6 +155,18 @@ class ColmapModel:
         }
         return depth_ratios(self.records, files, depth.units_per_metre, depth.no_depth, depth.camera)
 
+    def seen_points(self) -> CloudSet:
+        """The tracked points that each body's images see, in its axes; a point counts once for each body."""
+        points, known = self.records.points, self.reconstruction.points3D
+        colours = np.array([known[key].color for key in points.ids.tolist()], np.uint8).reshape(-1, 3)
+        body = self.bodies.body_of_image[self.records.image_rows]
+        seen = np.unique(np.stack([body, points.owners], axis=1), axis=0)
+        clouds = []
+        for row, pose in enumerate(se3.inverse(self.world_from_body)):
+            own = seen[seen[:, 0] == row, 1]
+            clouds.append(PointCloud(se3.transform(pose, points.xyz[own]).astype(np.float32), colours=colours[own]))
+        return CloudSet.from_clouds(clouds)
+
     def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
         """Edges of the database where there is one, else of covisible images."""
         notes: list[str] = []
@@ -262,12 +283,3 @@ class ColmapModel:
 def rigid3d(b_from_a: Floats) -> pycolmap.Rigid3d:
     """A motion as pycolmap has it."""
     return pycolmap.Rigid3d(np.ascontiguousarray(b_from_a[:3]))
-
-
-def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
-    """The model of a folder by pycolmap. Raises `SourceError` where it refuses."""
-    try:
-        return pycolmap.Reconstruction(folder)
-    except Exception as error:  # pycolmap raises what its C++ checks raise: RuntimeError, ValueError, IndexError
-        reason = str(error).strip().splitlines()[-1][:200] if str(error).strip() else type(error).__name__
-        raise SourceError(f"{folder}: COLMAP itself cannot read this model ({reason}): write it again") from error

@@ -64,13 +64,11 @@ def guess_from_points(points_in_i: Floats, points_in_j: Floats) -> Floats:
     first, second = np.asarray(points_in_i, float), np.asarray(points_in_j, float)
     if len(first) != len(second) or len(first) < LEAST_POINTS:
         raise GraphError(f"{len(first)} and {len(second)} points clicked: click three pairs or more, in both clouds")
-    here, there = first - first.mean(axis=0), second - second.mean(axis=0)
-    for name, points in (("first", here), ("second", there)):
-        sizes = np.linalg.svd(points, compute_uv=False)
+    for name, points in (("first", first), ("second", second)):
+        sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if sizes[1] <= LEAST_SPREAD * max(sizes[0], 1e-12):
             raise GraphError(f"the points clicked in the {name} cloud lie on a line: click one beside it")
-    rotation = se3.project_to_so3(here.T @ there)
-    return np.asarray(se3.from_parts(rotation, first.mean(axis=0) - rotation @ second.mean(axis=0)))
+    return se3.fit_rigid(first, second)
 
 
 def register_candidate(recipe: Recipe, clouds: CloudSet, wanted: Candidate) -> Registration:

@@ -179,6 +179,8 @@ def state(session: Session) -> dict[str, Any]:
             "message": session.message,
             "doing": session.quick.doing or session.slow.doing,
             "is_run": session.subject.is_run,
+            "finish": session.subject.finish,
+            "unit": session.subject.unit,
             "has_clouds": session.subject.clouds is not None,
             "notes": list(session.subject.notes),
             "verdicts": dict(zip(words.tolist(), counts.tolist(), strict=True)),

@@ -273,7 +273,7 @@ class Session:
         if wanted is None:
             raise GraphError("pick two frames first")
         if recipe is None or clouds is None:
-            raise GraphError(f"{subject.path}: has no clouds to register: add the edge to the graph's file")
+            raise GraphError(f"{subject.path}: is no run whose clouds could be registered: add it where it was made")
         chosen_recipe, chosen_clouds, chosen = recipe, clouds, wanted
 
         def job() -> None:
