@@ -34,10 +34,9 @@ class Mesh:
 
     def with_triangles(self, chosen: Bools) -> Mesh:
         """The chosen triangles (T,) alone, with the vertices that they have."""
-        triangles = self.triangles[chosen]
-        used, corners = np.unique(triangles, return_inverse=True)
-        corners = np.asarray(corners.reshape(-1, 3), np.int32)
-        return Mesh(self.points[used], self.normals[used], self.colours[used], corners)
+        used, corners = np.unique(self.triangles[chosen], return_inverse=True)
+        triangles = np.asarray(corners.reshape(-1, 3), np.int32)
+        return Mesh(self.points[used], self.normals[used], self.colours[used], triangles)
 
     @classmethod
     def joined(cls, parts: Sequence[Mesh]) -> Mesh:
