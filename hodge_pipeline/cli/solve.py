@@ -108,7 +108,7 @@ def _writer(out: Path, source: Source) -> str:
 
 def _solve_run(folder: Path, *, quiet: bool, as_json: bool, dask: str | None, verbose: bool) -> None:
     from hodge_pipeline.cli.run import print_result
-    from hodge_pipeline.pipeline import solve_again
+    from hodge_pipeline.uses.recipe_run import solve_again
 
     with ProgressBars(quiet or as_json, verbose) as terminal:
         result = solve_again(folder, watcher=terminal, dask=dask)

@@ -13,7 +13,6 @@ import numpy as np
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import pair_names
-from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.report.document import JPEG
 from hodge_pipeline.review.front import Answer, Route, Site
 from hodge_pipeline.review.keeping import save
@@ -23,6 +22,7 @@ from hodge_pipeline.review.session import MODES, Session
 from hodge_pipeline.stages import Advance
 from hodge_pipeline.types.input_files import read_input
 from hodge_pipeline.types.notes import Note
+from hodge_pipeline.uses.recipe_run import solve_again
 
 FILES = {
     "": ("index.html", "text/html; charset=utf-8"),
