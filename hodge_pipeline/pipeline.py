@@ -194,7 +194,7 @@ class _Job:
         """
         scene = work.scene
         poses = (
-            pose_all_frames(scene, last.world_from_cam, self.store, work.workers)
+            pose_all_frames(scene, last.world_from_cam, self.store, work.workers, work.scale)
             if refined is None
             else refined.world_from_cam
         )

@@ -12,7 +12,7 @@ from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.evaluate import evaluate
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.fusion.fuse import fuse
-from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.recipe.schema import Recipe, recipe_of_run
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.rounds.all_frames import pose_frames
@@ -167,8 +167,13 @@ class Run:
 
     @property
     def recipe(self) -> Recipe:
-        """The recipe in the folder."""
-        return load_recipe(str(self.folder / RECIPE_FILE))
+        """The recipe in the folder, without the options of another version (`options_left_out`)."""
+        return recipe_of_run(self.folder / RECIPE_FILE)[0]
+
+    @property
+    def options_left_out(self) -> tuple[str, ...]:
+        """What is in the folder's recipe and unknown here, one line each: only running it again needs it."""
+        return recipe_of_run(self.folder / RECIPE_FILE)[1]
 
     def __repr__(self) -> str:
         graph = self.result.graph
