@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -164,6 +165,19 @@ class Run:
     def edges(self) -> Edges:
         """Every pair of the last round, between the key frames."""
         return self.result.edges
+
+    def posed_source(self) -> Source:
+        """All frames with their final poses, the key frames with their clouds, the edges between these."""
+        row_of = {int(row): number for number, row in enumerate(self.key_frames.rows)}
+        frames = tuple(
+            replace(
+                frame,
+                world_from_cam=_known(pose),
+                read_points=partial(self.clouds.__getitem__, row_of[row]) if row in row_of else None,
+            )
+            for row, (frame, pose) in enumerate(zip(self.source.frames, self.poses, strict=True))
+        )
+        return replace(self.source, frames=frames, path=self.folder, graph=self.result.graph)
 
     @property
     def recipe(self) -> Recipe:
