@@ -46,6 +46,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
     ),
+    "clock": (
+        Rank.LOOK,
+        "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
+    ),
     "path broken": (
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
