@@ -30,8 +30,10 @@ from hodge_pipeline.rounds.one_round import Registered, Work
 from hodge_pipeline.rounds.suggested import suggested_rounds
 from hodge_pipeline.run_folder import Run, begin, check_layout, end, opening_of
 from hodge_pipeline.scene import Round, Scene
+from hodge_pipeline.solvers.positions import Fixes
 from hodge_pipeline.sources.measured_edges import measured_edges
 from hodge_pipeline.sources.opening import Fingerprints, changed_since, fingerprints, open_with_reader, remembered
+from hodge_pipeline.start.known_positions import fixes_of, known_positions
 from hodge_pipeline.start.truth import with_truth
 from hodge_pipeline.store.log import logging_to
 from hodge_pipeline.store.progress import Watcher
@@ -115,7 +117,7 @@ class _Job:
                 scene = job.recipe.start.begin(source, job.recipe.clouds, job.store, workers)
                 job.store.step(begin, *opening_of(scene), title="frames")
                 recording.begin(scene.source, scene.clouds, scene.first)
-                work = Work(job.recipe, job.store, scene, job.measured(scene), workers)
+                work = Work(job.recipe, job.store, scene, job.measured(scene), workers, job.fixes(scene))
                 rounds, scores = job.compute(work, recording)
                 refined = verdict.finish(work, job.workspace.folder, rounds) if scene.is_given else None
                 poses = job.refine(work, rounds[-1], refined)
@@ -149,13 +151,19 @@ class _Job:
         self.store.note(*notes_of("measured", notes))
         return graph
 
+    def fixes(self, scene: Scene) -> Fixes | None:
+        """Known positions of points of the key frames, None where there are none."""
+        options = self.recipe.positions
+        found = known_positions(scene.whole, options, self.store)
+        return None if found is None else fixes_of(found, options, scene, self.store)
+
     def compute(self, work: Work, recording: Recording) -> tuple[list[Round], ScoreTable | None]:
         """The rounds and their scores: the paper's algorithm."""
-        rounds = [work.scene.first]
+        rounds, before = [work.scene.first], work.placed_first()
         for number in range(1, self.recipe.outer_iterations + 1):
-            proposed = work.propose(number, rounds[-1])
-            registered = work.register(number, proposed, rounds[-1])
-            rounds.append(self.consistent(work, registered))
+            proposed = work.propose(number, before)
+            registered = work.register(number, proposed, before)
+            rounds.append(before := self.consistent(work, registered))
             recording.round(number, rounds[-1])
         for more in chain(suggested_rounds(work, rounds), edited_rounds(work, self.workspace.folder, rounds)):
             rounds.append(self.consistent(work, more))
