@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from hodge_pipeline.fusion.fuse import fuse
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report.contents import Report
+from hodge_pipeline.report.notebook import as_html
 from hodge_pipeline.rounds.all_frames import pose_frames
 from hodge_pipeline.rounds.one_round import judge_edges, solve_edges
 from hodge_pipeline.scene import KeyFrames, Round, Scene, given_poses, true_poses
@@ -169,6 +171,19 @@ class Run:
     def recipe(self) -> Recipe:
         """The recipe in the folder."""
         return load_recipe(str(self.folder / RECIPE_FILE))
+
+    def show(self, width: int = 960, height: int = 540) -> Any:
+        """The recording in a Rerun viewer in a notebook's cell, in pixels (extra `notebook`); elsewhere `hodge view`.
+
+        Raises `WorkspaceError` where the run has no recording.
+        """
+        from hodge_pipeline.recording.notebook import viewer  # Rerun takes half a second
+
+        return viewer(self.folder, width, height)
+
+    def _repr_html_(self) -> str | None:
+        """The verdict, a picture and the errors, for a notebook; None of a run that has not ended."""
+        return None if self.ending is None else as_html(self.ending.report)
 
     def __repr__(self) -> str:
         graph = self.result.graph

@@ -18,11 +18,11 @@ from hodge_pipeline.demo.sequence import make_sequence
 from hodge_pipeline.demo.street import HOUSES_M, Road, build_street
 from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, TRUTH_FILE, SpinningScanner, StreetOptions, Sweep
 from hodge_pipeline.errors import RecipeError
-from hodge_pipeline.pipeline import run
 from hodge_pipeline.recipe.scale import measured_scale
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.sweeps import deskewed, velocities
 from hodge_pipeline.types import Floats, Frame, PointCloud, Source
+from hodge_pipeline.uses.recipe_run import run
 
 
 def test_a_revolution_tells_the_unit_of_its_times() -> None:

@@ -20,7 +20,7 @@ from hodge_pipeline.pairs.edits import Edit, History, read_history_file, write_h
 from hodge_pipeline.review.adding import Candidate, guess_from_points
 from hodge_pipeline.review.decisions import LockedError, StaleError
 from hodge_pipeline.review.front import Front
-from hodge_pipeline.review.keeping import save_graph
+from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.picking import nearest_point, nearest_segment
 from hodge_pipeline.review.routes import site
@@ -177,7 +177,7 @@ def test_a_graph_is_saved_beside_the_old_one_and_nothing_is_written_over(session
     before = session.subject.path.read_bytes()
     session.disable_wrong(revision(session))
     session.wait()
-    first, second = save_graph(session), save_graph(session)
+    (first, _), (second, _) = save(session), save(session)
     assert [first.name, second.name] == ["ring.reviewed.g2o", "ring.reviewed-2.g2o"]
     assert session.subject.path.read_bytes() == before
     assert read_history_file(first.with_name(first.name + ".edits.json")) == session.decisions.history
@@ -202,6 +202,14 @@ def test_three_points_give_the_motion_and_a_line_does_not() -> None:
     for here, there in zip(se3.transform(motion, points).tolist(), points.tolist(), strict=True):
         candidate = candidate.clicked(tuple(here)).clicked(tuple(there))
     assert np.allclose(candidate.guess, motion)
+
+
+def test_a_cloud_put_at_a_place_makes_the_guess(session: Session) -> None:
+    session.pick([3, 9])
+    there = session.settled.world_from_cam[3] @ se3.exp(np.array([0.1, 0.2, -0.3, 1.0, 2.0, 3.0]))
+    session.place(there)
+    assert session.candidate is not None and session.candidate.guess_by == "the place it was put at"
+    assert np.allclose(se3.log(session.candidate.guess), [0.1, 0.2, -0.3, 1.0, 2.0, 3.0])
 
 
 def test_the_nearest_line_in_front_is_picked() -> None:
@@ -302,7 +310,6 @@ def test_two_pages_and_a_stale_write_through_the_front(client: Client) -> None:
         ("POST", "pick", {"frames": ["nobody"]}),
         ("POST", "register", {}),
         ("POST", "accept", {"revision": 0}),
-        ("POST", "solve", {}),
         ("GET", "edges?sort=taste", None),
         ("GET", "edges?min_gap=wide", None),
         ("GET", "edges?colour=red", None),
@@ -342,7 +349,7 @@ def test_an_edge_added_counts_until_it_is_undone(session: Session) -> None:
     count = len(session.table)
     motion = se3.inverse(poses_on_a_ring(VIEWS)[0]) @ poses_on_a_ring(VIEWS)[12]
     registration = hodge_pipeline.Registration(motion, np.eye(6) * 1e4, 0.8, 0.01, 500, 9, True)
-    session.candidate = Candidate(0, 12, motion, registration)
+    session.candidate = Candidate(0, 12, motion, found=registration)
     session.accept(revision(session), "seen by eye")
     session.wait()
     assert len(session.table) == count + 1 and session.settled.weights[count] == 1

@@ -16,9 +16,9 @@ from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.report.write import as_json
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.artifacts import json_text
 from hodge_pipeline.types import Trajectory

@@ -20,7 +20,6 @@ from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.fusion.cloud import CloudFuser
 from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import Edit, History, write_history
-from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.odometry import Odometry
@@ -38,6 +37,7 @@ from hodge_pipeline.start.unordered.start import Start
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Source, ViewGraph
 from hodge_pipeline.types.notes import Note
+from hodge_pipeline.uses.recipe_run import solve_again
 
 FRAMES, BLOCK = 64, 48
 SMALL = (

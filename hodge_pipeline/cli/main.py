@@ -114,6 +114,9 @@ def demo(
     lidar: Annotated[
         bool, typer.Option("--lidar", help="A street scanned by a spinning LiDAR in place of the room.")
     ] = False,
+    rooms: Annotated[
+        int, typer.Option("--rooms", min=1, help="A walk through so many rooms and back, about 450 frames a room.")
+    ] = 1,
     overrides: Overrides = None,
     overwrite: Overwrite = False,
     dask: Dask = None,
@@ -123,7 +126,10 @@ def demo(
     """Make a furnished room with Kinect-like noise and run the recipe `demo` on it (or a street: --lidar)."""
     from hodge_pipeline.cli import run as running
 
-    running.demo(out, overrides or [], lidar=lidar, overwrite=overwrite, quiet=quiet, dask=dask, verbose=verbose)
+    if lidar and rooms > 1:
+        raise typer.BadParameter("--rooms and --lidar are two demos: give one of them")
+    shown = {"quiet": quiet, "verbose": verbose}
+    running.demo(out, overrides or [], lidar=lidar, rooms=rooms, overwrite=overwrite, dask=dask, **shown)
 
 
 @app.command()

@@ -170,7 +170,7 @@ def relative_error(
     true_motion = se3.inverse(reference[chosen]) @ reference[chosen + delta_frames]
     error = se3.inverse(true_motion) @ motion
     translation_m = np.linalg.norm(error[:, :3, 3], axis=-1)
-    rotation_deg = np.rad2deg(np.linalg.norm(se3.so3_log(error[:, :3, :3]), axis=-1))
+    rotation_deg = np.rad2deg(se3.rotation_angle(error))
     return RelativeError(
         delta_frames,
         _rms(translation_m),

@@ -45,9 +45,9 @@ class OdometryOptions:
     max_drift: float | None = Field(
         default=0.3,
         gt=0,
-        description="share of the way between two frames (metres, and radians at 1 m) that odometry may err by; where "
-        "it was not lost between them a pair that contradicts it by more is no edge. Of right pairs on three real "
-        "sequences 99 % stay below 0.27. null: odometry rejects no pair",
+        description="share of the path between two frames (metres, and radians at 1 m) that odometry may be off by; "
+        "where it was not lost between them a pair that contradicts it by more is no edge. Of right pairs on three "
+        "real sequences 99 % stay below 0.27. null: odometry rejects no pair",
     )
 
 

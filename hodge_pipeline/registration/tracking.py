@@ -302,7 +302,7 @@ class _Tracker:
 
     def _has_moved(self, key_from_view: Floats) -> bool:
         moved = float(np.linalg.norm(key_from_view[:3, 3]))
-        turned = float(np.linalg.norm(se3.so3_log(key_from_view[:3, :3])))
+        turned = float(se3.rotation_angle(key_from_view))
         return moved >= self._options.distance_m or turned >= self._options.angle_rad
 
     def _sees_little(self, view: _View) -> bool:

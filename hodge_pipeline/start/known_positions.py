@@ -57,6 +57,12 @@ def known_positions(source: Source, options: PositionOptions, steps: Steps) -> P
     return opened.positions
 
 
+def known_fixes(scene: Scene, options: PositionOptions, steps: Steps) -> Fixes | None:
+    """The known positions of a scene's frames as points of its key frames, None where the options name none."""
+    found = known_positions(scene.whole, options, steps)
+    return None if found is None else fixes_of(found, options, scene, steps)
+
+
 def fixes_of(positions: Positions, options: PositionOptions, scene: Scene, steps: Steps) -> Fixes:
     """Each position as a point of the key frame that its frame belongs to; at most one for each frame.
 

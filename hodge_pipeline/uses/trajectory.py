@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from hodge_pipeline import pipeline
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.refine.guard import Decision
@@ -21,6 +20,7 @@ from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.start.match_poses import RECIPE, recipe_for
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source
+from hodge_pipeline.uses.recipe_run import run as recipe_run
 
 Array = TypeVar("Array")
 
@@ -92,7 +92,7 @@ def refine_trajectory(
     loaded = load_recipe(chosen, [*ours, *overrides])
     with tempfile.TemporaryDirectory(prefix="hodge-refine-") as scratch:
         folder = Path(scratch) / "run" if out is None else Path(out)
-        run = pipeline.run(loaded, folder, source=source, watcher=watcher, dask=dask)
+        run = recipe_run(loaded, folder, source=source, watcher=watcher, dask=dask)
     assert run.refined is not None
     decision = run.refined.decision
     if decision.keeps_input:
