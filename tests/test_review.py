@@ -204,6 +204,14 @@ def test_three_points_give_the_motion_and_a_line_does_not() -> None:
     assert np.allclose(candidate.guess, motion)
 
 
+def test_a_cloud_put_at_a_place_makes_the_guess(session: Session) -> None:
+    session.pick([3, 9])
+    there = session.settled.world_from_cam[3] @ se3.exp(np.array([0.1, 0.2, -0.3, 1.0, 2.0, 3.0]))
+    session.place(there)
+    assert session.candidate is not None and session.candidate.guess_by == "the place it was put at"
+    assert np.allclose(se3.log(session.candidate.guess), [0.1, 0.2, -0.3, 1.0, 2.0, 3.0])
+
+
 def test_the_nearest_line_in_front_is_picked() -> None:
     segments = np.array([[[-1.0, 0.05, 10], [1, 0.05, 10]], [[-1, 0, -5], [1, 0, -5]], [[-1, 3, 4], [1, 3, 4]]])
     origin, ahead = np.zeros(3), np.array([0.0, 0, 2])
@@ -341,7 +349,7 @@ def test_an_edge_added_counts_until_it_is_undone(session: Session) -> None:
     count = len(session.table)
     motion = se3.inverse(poses_on_a_ring(VIEWS)[0]) @ poses_on_a_ring(VIEWS)[12]
     registration = hodge_pipeline.Registration(motion, np.eye(6) * 1e4, 0.8, 0.01, 500, 9, True)
-    session.candidate = Candidate(0, 12, motion, registration)
+    session.candidate = Candidate(0, 12, motion, found=registration)
     session.accept(revision(session), "seen by eye")
     session.wait()
     assert len(session.table) == count + 1 and session.settled.weights[count] == 1

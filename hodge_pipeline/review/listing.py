@@ -212,6 +212,7 @@ def _candidate(session: Session, candidate: Any) -> dict[str, Any]:
     return {
         "pair": f"{_name(session, candidate.i)}-{_name(session, candidate.j)}",
         "registered": found is not None,
+        "guess_by": candidate.guess_by,
         "fitness": None if found is None else _number(found.fitness),
         "rmse_m": None if found is None else _number(found.rmse_m),
         "rejected": candidate.rejected,

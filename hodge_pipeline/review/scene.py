@@ -11,6 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG
 from hodge_pipeline.report.diagnosis_plots import COLOURS as REPORTED
+from hodge_pipeline.review.closeup import Closeup, placed, quat_wxyz
 from hodge_pipeline.review.listing import witnesses
 from hodge_pipeline.review.looking import Shown, shown_pair
 from hodge_pipeline.review.picking import nearest_point, nearest_segment
@@ -18,15 +19,10 @@ from hodge_pipeline.review.session import Session
 from hodge_pipeline.types import CloudSet, Floats, Floats32, Ints
 
 COLOURS = {verdict: tuple(bytes.fromhex(colour[1:])) for verdict, colour in REPORTED.items()}
-FIRST, SECOND = (0, 114, 178), (230, 120, 0)
 SELECTED, BEFORE = (190, 0, 190), (170, 170, 200)
 MOST_POINTS = 3_000_000
 """Of the overview: 9 bytes each, 27 MB for a page to receive."""
-MOST_PAIR_POINTS = 200_000
-"""Of each of the two clouds that are looked at closely."""
 BLINK_S = 0.6
-CUT_SHARE = 0.04
-"""Thickness of a cut, of the size of what is cut."""
 BARELY = 1e-7
 """A pose that changed by less stays where it is drawn."""
 
@@ -65,7 +61,7 @@ class Scene:
         self._server.initial_camera.look_at = tuple(centre)
         self._clouds = {}
         scene.add_frame("/clouds", show_axes=False)
-        scene.add_frame("/pair", show_axes=False)
+        self._closeup = Closeup(self._session, self._server)
         if self._subject.clouds is not None:
             self._add_clouds(self._subject.clouds, poses)
         self._poses = poses.copy()
@@ -76,7 +72,7 @@ class Scene:
         for row in range(len(clouds)):
             points, colours = thinned(clouds, row, step)
             if len(points) and np.isfinite(poses[row]).all():
-                wxyz, position = _placed(poses[row])
+                wxyz, position = placed(poses[row])
                 self._clouds[row] = self._server.scene.add_point_cloud(
                     f"/clouds/{row}", points, colours, point_size=size, point_shading="flat", wxyz=wxyz,
                     position=position,
@@ -131,7 +127,9 @@ class Scene:
             for closes, name, colour in ((True, "closing", COLOURS[CONSISTENT]), (False, "failing", COLOURS[WRONG])):
                 around = [_around(along) for good, _, _, along in cycles if good == closes]
                 self._lines(f"/cycles/{name}", settled.world_from_cam, _joined(around), colour, 3.5)
-            self._pair(pair)
+            scene = self._server.scene
+            scene.add_frame("/clouds", show_axes=False, visible=pair is None)
+            self._closeup.draw(pair, self._subject.clouds, self._up, self._size)
         self._turn_to(pair, look.home)
 
     def _move(self, poses: Floats) -> None:
@@ -142,7 +140,7 @@ class Scene:
         ways = np.stack([self._poses[:, :3, 3], poses[:, :3, 3]], axis=1)[moved]
         for row in moved.tolist():
             if row in self._clouds:
-                self._clouds[row].wxyz, self._clouds[row].position = _placed(poses[row])
+                self._clouds[row].wxyz, self._clouds[row].position = placed(poses[row])
         self._poses = poses.copy()
         self._draw_lines("/before", ways, BEFORE, 1.0)
 
@@ -152,7 +150,7 @@ class Scene:
         known = poses[np.isfinite(poses).all(axis=(1, 2))]
         length = 0.04 * self._size
         self._server.scene.add_batched_axes(
-            "/cameras", _wxyz(known), known[:, :3, 3], axes_length=length,
+            "/cameras", quat_wxyz(known), known[:, :3, 3], axes_length=length,
             axes_radius=length / 12,
         )  # fmt: skip
 
@@ -168,35 +166,6 @@ class Scene:
         self._server.scene.add_line_segments(
             name, segments.astype(np.float32), colour, thickness=width_px, thickness_units="screen"
         )
-
-    def _pair(self, pair: Shown | None) -> None:
-        """The two clouds that are looked at, the others hidden meanwhile; nothing where none are."""
-        clouds = self._subject.clouds
-        self._server.scene.add_frame("/clouds", show_axes=False, visible=pair is None)
-        if pair is None or clouds is None:
-            for name in ("first", "second", "picks"):
-                self._remove(f"/pair/{name}")
-            return
-        for name, row, colour, pose in (
-            ("first", pair.i, FIRST, pair.world_from_i), ("second", pair.j, SECOND, pair.world_from_j),
-        ):  # fmt: skip
-            if self._same(f"/pair/{name}", pose, np.array([row, pair.cut is None, pair.cut or 0.0])):
-                continue
-            points, _ = thinned(clouds, row, thinning(np.diff(clouds.offsets)[[row]].cumsum(), MOST_PAIR_POINTS))
-            points = points[pair.kept(points, pose, self._up, CUT_SHARE)]
-            wxyz, position = _placed(pose)
-            self._server.scene.add_point_cloud(
-                f"/pair/{name}", points, colour, point_size=max(0.003 * self._size, 0.006), precision="float32",
-                wxyz=wxyz, position=position,
-            )  # fmt: skip
-        picks = pair.picks()
-        if not self._same("/pair/picks", picks):
-            self._remove("/pair/picks", forget=False)
-            if len(picks):
-                self._server.scene.add_point_cloud(
-                    "/pair/picks", picks, SELECTED, point_size=0.02 * self._size, point_shape="circle",
-                    precision="float32",
-                )  # fmt: skip
 
     def _turn_to(self, pair: Shown | None, home: int) -> None:
         """Let every page look at the pair; at what it saw before when that is left; at all when `home` grew."""
@@ -223,9 +192,8 @@ class Scene:
         self._shown[name] = tuple(np.array(one) for one in drawn)
         return False
 
-    def _remove(self, name: str, *, forget: bool = True) -> None:
-        if forget:
-            self._shown.pop(name, None)
+    def _remove(self, name: str) -> None:
+        self._shown.pop(name, None)
         if self._server.scene.get_handle_by_name(name) is not None:
             self._server.scene.remove_by_name(name)
 
@@ -270,15 +238,6 @@ def thinned(clouds: CloudSet, row: int, step: int) -> tuple[Floats32, np.ndarray
     entry = slice(int(clouds.offsets[row]), int(clouds.offsets[row + 1]), step)
     points, colours = np.asarray(clouds.points[entry]), np.asarray(clouds.colours[entry])
     return points, colours if colours.any() else np.full_like(colours, 150)
-
-
-def _placed(pose: Floats) -> tuple[Floats, Floats]:
-    """A pose as viser takes it: quaternion (w first) and position."""
-    return _wxyz(pose), pose[:3, 3]
-
-
-def _wxyz(poses: Floats) -> Floats:
-    return np.asarray(se3.to_quat_xyzw(poses)[..., [3, 0, 1, 2]])
 
 
 def _around(along: Ints) -> Ints:
