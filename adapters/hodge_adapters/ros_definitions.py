@@ -18,6 +18,9 @@ TYPES = {
     "sensor_msgs/RegionOfInterest": "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n",
     "sensor_msgs/CameraInfo": f"{_STAMPED}uint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\n"
     "float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n",
+    "sensor_msgs/NavSatStatus": "int8 status\nuint16 service\n",
+    "sensor_msgs/NavSatFix": f"{_STAMPED}sensor_msgs/NavSatStatus status\nfloat64 latitude\nfloat64 longitude\n"
+    "float64 altitude\nfloat64[9] position_covariance\nuint8 position_covariance_type\n",
     "geometry_msgs/Point": _XYZ,
     "geometry_msgs/Vector3": _XYZ,
     "geometry_msgs/Quaternion": f"{_XYZ}float64 w\n",
