@@ -25,7 +25,7 @@ from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.picking import nearest_point, nearest_segment
 from hodge_pipeline.review.routes import site
 from hodge_pipeline.review.session import Session
-from hodge_pipeline.review.settle import Settler
+from hodge_pipeline.review.settle import Settler, moved_m
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.rounds.one_round import with_right
 from hodge_pipeline.solvers.editing import GraphEditor
@@ -98,10 +98,12 @@ def test_poses_are_shown_before_they_are_checked_and_converge(graph_file: Path) 
     history = History((Edit(disable=tuple(pair_names(np.arange(VIEWS), settler.table.graph.edges[list(PLANTED)]))),))
     settler._solution = replace(settler._solution, world_from_cam=np.tile(np.eye(4), (VIEWS, 1, 1)))
     settler._editor = GraphEditor(settler.table.graph, settler._solution)
+    settler.settled = replace(settler.settled, world_from_cam=settler._solution.world_from_cam)
     first, then = settler.solve(history, 1), settler.checked(history, 1)
     assert not first.converged and then is not None and then.converged
     assert then.residual_m[then.weights > 0].max() < first.residual_m[first.weights > 0].max()
     assert settler.checked(history, 1) is None
+    assert then.moved_m == pytest.approx(moved_m(np.tile(np.eye(4), (VIEWS, 1, 1)), then.world_from_cam))
 
 
 def test_nothing_is_lost_when_the_program_ends(session: Session, graph_file: Path) -> None:

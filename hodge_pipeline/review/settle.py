@@ -33,8 +33,8 @@ LOWER = 1e-6
 class Settled:
     """Poses (V, 4, 4) at a revision of the decisions, what each edge (E,) leaves of them, and what that took.
 
-    `moved_m` is the farthest that a pose moved since the last, `error_m` the trajectory's error where the truth is
-    known.
+    `moved_m` is the farthest that a pose moved by the latest decision, `error_m` the trajectory's error where the truth
+    is known.
     """
 
     revision: int
@@ -127,6 +127,7 @@ class Settler:
     def __init__(self, subject: Subject) -> None:
         self._truth = subject.truth
         self._solution = subject.solution
+        self._before = 0, subject.solution.world_from_cam
         self.table = Table.of(subject)
         self._editor = _editor(subject.graph, replace(subject.solution, weights=self.table.base))
         self.settled = self._settled(0, subject.solution, 0.0)
@@ -179,7 +180,8 @@ class Settler:
 
     def _settled(self, revision: int, solution: Solution, seconds: float) -> Settled:
         residual_m, residual_rad = edge_residuals(self.table.graph, solution.world_from_cam)
-        before = self.settled.world_from_cam if revision else solution.world_from_cam
+        if revision != self._before[0]:
+            self._before = revision, self.settled.world_from_cam
         return Settled(
             revision=revision,
             world_from_cam=solution.world_from_cam,
@@ -188,7 +190,7 @@ class Settler:
             residual_m=residual_m,
             residual_rad=residual_rad,
             seconds=seconds,
-            moved_m=moved_m(before, solution.world_from_cam),
+            moved_m=moved_m(self._before[1], solution.world_from_cam),
             error_m=error_m(solution.world_from_cam, self._truth),
             converged=solution.converged is not False,
         )
