@@ -31,6 +31,10 @@ class WorkerError(HodgeError):
     """A worker process or cluster was lost more often than its edges may be retried."""
 
 
+class StageError(HodgeError):
+    """A stage of another package raised something else than a `HodgeError`: names stage, package, error and line."""
+
+
 class CheckError(HodgeError):
     """A result failed its own checks. `exit_code` is 3."""
 

@@ -330,7 +330,12 @@ class TrackedModel(Protocol):
         ...
 
     def adjusted(self, priors: PositionPriors | None = None) -> TrackedModel:
-        """Bundle adjustment of poses and points, cameras held. Raises `SourceError` where it fails."""
+        """Bundle adjustment of poses and points. Raises `SourceError` where it fails."""
+        ...
+
+    @property
+    def moves_intrinsics(self) -> bool:
+        """Whether that adjusts the cameras' intrinsics too."""
         ...
 
     def standard_errors(self) -> Floats:

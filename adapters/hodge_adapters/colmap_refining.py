@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters import images
 from hodge_adapters.colmap import ColmapReader
+from hodge_adapters.colmap_bundle import Intrinsics
 from hodge_adapters.colmap_content import checked_content, read_model
 from hodge_adapters.colmap_database import database_names, has_verified_pairs
 from hodge_adapters.colmap_depth import sensor_depth
@@ -25,6 +26,7 @@ from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Frame
 
+HELD = "intrinsics are held: --refine focal or all adjusts them too"
 COVISIBILITY = "edges come from the points that images share"
 
 
@@ -45,6 +47,9 @@ class ColmapModels:
     min_shared: int = Field(30, ge=8, description="points or matches that a pair must share to become an edge")
     max_edges_per_image: int = Field(
         20, ge=1, description="pairs for an image where there is no database, those with most shared points first"
+    )
+    refine: Intrinsics = Field(
+        "none", description="intrinsics that bundle adjustment refines: focal lengths, all with the distortion, or none"
     )
     seed: int = Field(0, ge=0, description="of RANSAC")
 
@@ -95,7 +100,11 @@ class ColmapModels:
         source = replace(
             plain, images=self.images, depth=depth_of, depth_scale=self.depth_scale, no_depth=self.no_depth
         ).source_of(folder, folder, content)
-        notes = [*source.notes, *_unposed(reconstruction)]
+        notes = [
+            *source.notes,
+            *_unposed(reconstruction),
+            HELD if self.refine == "none" else f"intrinsics are refined: {self.refine}",
+        ]
         frames = {str(frame.frame_id): frame for frame in source.frames}
         depth = self._depth(sensor, frames)
         database = self._database(folder, frames, notes)
@@ -107,6 +116,7 @@ class ColmapModels:
             edges=EdgeOptions(database, self.min_shared, self.max_edges_per_image, self.seed),
             text=model_ending(folder) == ".txt",
             files=content.files,
+            refine=self.refine,
             tracks=content,
             notes=tuple(notes),
         )

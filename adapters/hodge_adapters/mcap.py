@@ -20,6 +20,7 @@ from hodge_adapters.association import nearest_pairs
 from hodge_adapters.camera_files import Intrinsics, checked
 from hodge_adapters.mcap_clouds import read_points
 from hodge_adapters.mcap_files import find_files, sniff_recording
+from hodge_adapters.mcap_fixes import positions_of
 from hodge_adapters.mcap_images import ImageLayout, encoded_image, read_colour, read_depth
 from hodge_adapters.mcap_poses import PoseOptions, find_poses
 from hodge_adapters.mcap_recording import A_MESSAGE_WITH, NO_PINHOLE, Recording, Seen
@@ -95,7 +96,8 @@ class McapReader:
         stamps_s = np.array([frame.stamp_s for frame in frames], float)
         options = PoseOptions(self.pose_topic, self.pose_child, self.world_frame, self.max_gap_s)
         poses = find_poses(recording, camera_frame, stamps_s, options, notes)
-        if not frames and poses.trajectory is None:
+        positions = positions_of(recording.fixes, notes)
+        if not frames and poses.trajectory is None and positions is None:
             raise _nothing(path, recording, notes)
         return Source(
             name=path.stem if path.is_file() else path.resolve().name,
@@ -105,6 +107,7 @@ class McapReader:
             notes=tuple(notes),
             files=listing.all,
             contents=recording.contents(),
+            positions=positions,
         )
 
     def _frames(self, path: Path, recording: Recording, notes: list[str]) -> tuple[list[Frame], str]:

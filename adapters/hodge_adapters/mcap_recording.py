@@ -1,4 +1,4 @@
-"""What a recording holds, by topic: where its images and clouds lie, its calibrations, poses and transforms."""
+"""What a recording holds, by topic: where its images and clouds lie, its calibrations, poses, fixes and transforms."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from hodge_adapters.mcap_fields import (
     text,
     whole,
 )
+from hodge_adapters.mcap_fixes import Fix, fix_of
 from hodge_adapters.mcap_images import ImageLayout, compressed_layout, raw_layout
 from hodge_adapters.mcap_log import LogFile, Logged, Tally
 from hodge_adapters.mcap_records import Malformed
@@ -83,6 +84,7 @@ class Recording:
     calibrations: dict[str, Calibration] = field(default_factory=dict)
     poses: dict[str, PoseTopic] = field(default_factory=dict)
     topics: dict[str, str] = field(default_factory=dict)
+    fixes: dict[str, list[Fix]] = field(default_factory=dict)
     tallies: dict[str, Tally] = field(default_factory=dict)
     clock_differences_s: array[float] = field(default_factory=lambda: array("d"))
     _decoders: dict[tuple[str, str], Decoder | None] = field(default_factory=dict)
@@ -208,6 +210,11 @@ def _add_pose(recording: Recording, message: Message, path: Path, logged: Logged
     topic.poses.add(recording.stamp(message, logged), values)
 
 
+def _add_fix(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
+    found = fix_of(message, recording.stamp(message, logged))
+    recording.fixes.setdefault(logged.channel.topic, []).append(found)
+
+
 def _add_transforms(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
     is_static = logged.channel.topic.endswith("tf_static")
     for transform in parts(message, "transforms") if "transforms" in message else [message]:
@@ -232,6 +239,8 @@ _KINDS: dict[tuple[str, str], Add] = {
     ("foxglove", "PointCloud"): _add_foxglove_cloud,
     ("sensor", "CameraInfo"): _add_calibration,
     ("foxglove", "CameraCalibration"): _add_calibration,
+    ("sensor", "NavSatFix"): _add_fix,
+    ("foxglove", "LocationFix"): _add_fix,
     ("nav", "Odometry"): _add_pose,
     ("geometry", "PoseStamped"): _add_pose,
     ("geometry", "PoseWithCovarianceStamped"): _add_pose,

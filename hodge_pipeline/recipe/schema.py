@@ -31,6 +31,7 @@ from hodge_pipeline.stages import (
     Start,
 )
 from hodge_pipeline.start.key_frames import KeyFrameStart
+from hodge_pipeline.start.known_positions import PositionOptions
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
@@ -88,6 +89,7 @@ class Recipe:
     guard: GuardOptions = GuardOptions()
     acceptance: Acceptance = Acceptance()
     measured: MeasuredOptions = MeasuredOptions()
+    positions: PositionOptions = PositionOptions()
     outer_iterations: int = Field(
         default=2,
         ge=1,

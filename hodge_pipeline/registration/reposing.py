@@ -61,7 +61,9 @@ def repose(block: PosedBlock) -> Reposed:
 
 
 def _groups(labels: Ints) -> list[tuple[int, Ints]]:
-    """The rows of each label, labels ascending."""
+    """The rows of each label, labels ascending; none of a block that saw nothing, as in the dark."""
+    if not len(labels):
+        return []
     order = np.argsort(labels, kind="stable")
     values, begin = np.unique(labels[order], return_index=True)
     return list(zip(values.tolist(), np.split(order, begin[1:]), strict=True))

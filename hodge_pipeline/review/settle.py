@@ -19,7 +19,8 @@ from hodge_pipeline.rounds.by_hand import BY_HAND
 from hodge_pipeline.solvers.editing import GraphEditor
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, Registration, Solution, ViewGraph
-from hodge_pipeline.types.edges import DISABLED, REJECTED, USED, Words
+from hodge_pipeline.types.arrays import Words
+from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
 
 MOST_CHECKED = 20_000
 """Edges up to which a solve is checked by one from the edges alone: that takes about 0.05 CPU seconds for each 1000."""
