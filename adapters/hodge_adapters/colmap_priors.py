@@ -13,13 +13,12 @@ import numpy as np
 
 from hodge_adapters.colmap_bodies import Bodies
 from hodge_adapters.colmap_database import prior_rows
+from hodge_adapters.positions import read_positions
 from hodge_adapters.pycolmap_import import pycolmap
-from hodge_adapters.text_rows import read_text, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, PositionPriors
 
-AXES = (("e", "n", "u"), ("lat", "lon", "alt"))
 FEWEST = 3
 TRIALS, REFITS = 300, 5
 """Of three positions each: with half of them wrong, one of 8 has three right ones."""
@@ -59,28 +58,14 @@ def database_priors(path: Path) -> dict[str, Known]:
 
 
 def table_priors(path: Path, notes: list[str]) -> dict[str, Known]:
-    """The positions of a table (CSV) by the image's name: columns name, then e,n,u (metres) or lat,lon,alt (degrees,
-    metres), then sigma (metres) if known. Raises `SourceError` with `file:line`.
-    """
-    lines = [line for line in enumerate(read_text(path).splitlines(), 1) if line[1].strip()]
-    head = [word.strip().lower() for word in lines[0][1].split(",")] if lines else []
-    axes = next((axes for axes in AXES if set(axes) <= set(head)), None)
-    if axes is None or "name" not in head:
-        raise SourceError(f"{path}:1: names no columns of positions: it should name name,e,n,u or name,lat,lon,alt")
-    wanted = [*axes, *(["sigma"] if "sigma" in head else [])]
-    names, numbers = [], []
-    for line, text in lines[1:]:
-        cells = dict(zip(head, (cell.strip() for cell in text.split(",")), strict=False))
-        found = to_floats([cells.get(axis, "") for axis in wanted])
-        if found is None or not np.isfinite(found).all() or not all(sigma > 0 for sigma in found[3:]):
-            raise SourceError(f"{path}:{line}: `{text[:60]}`: expected a name and the numbers {', '.join(wanted)}")
-        names.append(cells["name"])
-        numbers.append([*found, *([np.nan] * (4 - len(found)))])
-    table = np.array(numbers).reshape(-1, 4)
-    if axes == AXES[1] and len(table):
-        table[:, :3] = pycolmap.GPSTransform().ellipsoid_to_enu(table[:, :3], *table[0, :3])
-    notes.append(f"{path.name}: {len(names)} known positions")
-    return {name: Known(row[:3], row[3] ** 2 * np.eye(3), NONE) for name, row in zip(names, table, strict=True)}
+    """The positions of a table by the image's name; see `PositionsReader`. Raises `SourceError`."""
+    found = read_positions(path, notes)
+    rows = zip(found.names.tolist(), found.points, found.covariances, strict=True)
+    named = {name: Known(point, covariance, NONE) for name, point, covariance in rows if name}
+    if not named:
+        raise SourceError(f"{path}: has no column of names: images of a model have no stamps to find positions by")
+    notes.append(f"{path.name}: {len(named)} known positions; zero is {found.origin}")
+    return named
 
 
 @dataclass(frozen=True)

@@ -295,6 +295,20 @@ def recipes(
     listing.recipes(name, schema=schema)
 
 
+@app.command("new-plugin")
+def new_plugin(
+    name: Annotated[str, typer.Argument(help="Of the stage, such as my_icp.")],
+    kind: Annotated[str, typer.Option(help="registration: a registrar that wraps Open3D's ICP; readers: a format.")] = (
+        "registration"
+    ),
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder of the package; default: its name.")] = None,
+) -> None:
+    """Write a package with a stage of your own: its entry point, its test by the contract checks, a README."""
+    from hodge_pipeline.cli import new_plugin as making
+
+    making.new_plugin(name, kind, out or Path(f"hodge-{name.replace('_', '-')}"))
+
+
 @app.command()
 def view(
     run_folder: Path,
@@ -348,11 +362,13 @@ def main() -> None:
         sys.exit(1)
     except Exception as error:
         from hodge_pipeline.errors import HodgeError
+        from hodge_pipeline.registry import plugin_error
 
-        if not isinstance(error, HodgeError):
+        known = plugin_error(error) or error
+        if not isinstance(known, HodgeError):
             raise
-        print(f"error: {shown(str(error))}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        print(f"error: {shown(str(known))}", file=sys.stderr)
+        sys.exit(known.exit_code)
 
 
 if __name__ == "__main__":
