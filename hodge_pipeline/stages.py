@@ -300,6 +300,10 @@ class TrackedModel(Protocol):
         """
         ...
 
+    def seen_points(self) -> CloudSet:
+        """For each body the points that its images track, in its axes and the model's unit, with their colours."""
+        ...
+
     def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
         """Relative poses of the bodies, estimated anew from what their images share, and what was left out."""
         ...
@@ -326,7 +330,12 @@ class TrackedModel(Protocol):
         ...
 
     def adjusted(self, priors: PositionPriors | None = None) -> TrackedModel:
-        """Bundle adjustment of poses and points, cameras held. Raises `SourceError` where it fails."""
+        """Bundle adjustment of poses and points. Raises `SourceError` where it fails."""
+        ...
+
+    @property
+    def moves_intrinsics(self) -> bool:
+        """Whether that adjusts the cameras' intrinsics too."""
         ...
 
     def standard_errors(self) -> Floats:

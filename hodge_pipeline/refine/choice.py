@@ -105,7 +105,7 @@ def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
     moved = absolute_error(model.world_from_body, start.world_from_body, with_scale=True).rmse_m
     extent = float(np.linalg.norm(np.ptp(start.world_from_body[:, :3, 3], axis=0)))
     share = moved / extent if extent > 0 else 0.0
-    if share > LEAST_MOVE and gain < GAIN_TO_MOVE:
+    if share > LEAST_MOVE and gain < GAIN_TO_MOVE and not start.moves_intrinsics:
         return f"the best candidate gains {gain:.1%} of the mean error and moves cameras by {share:.2%} of their extent"
     errors = steps.step(held_out_errors, start, model, seed, title="observations held out").errors_px
     if not errors.size:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats
 
@@ -98,6 +99,7 @@ def register_pairs(
     return in_blocks.select(np.argsort(order))
 
 
+@plugin_errors()
 def _register_block(folder: Path, registrar: Registrar, block: tuple[Edges, Floats]) -> Edges:
     edges, guesses = block
     prepared = prepared_clouds(folder, registrar)

@@ -179,6 +179,8 @@ def state(session: Session) -> dict[str, Any]:
             "message": session.message,
             "doing": session.quick.doing or session.slow.doing,
             "is_run": session.subject.is_run,
+            "finish": session.subject.finish,
+            "unit": session.subject.unit,
             "has_clouds": session.subject.clouds is not None,
             "notes": list(session.subject.notes),
             "verdicts": dict(zip(words.tolist(), counts.tolist(), strict=True)),
@@ -210,6 +212,7 @@ def _candidate(session: Session, candidate: Any) -> dict[str, Any]:
     return {
         "pair": f"{_name(session, candidate.i)}-{_name(session, candidate.j)}",
         "registered": found is not None,
+        "guess_by": candidate.guess_by,
         "fitness": None if found is None else _number(found.fitness),
         "rmse_m": None if found is None else _number(found.rmse_m),
         "rejected": candidate.rejected,

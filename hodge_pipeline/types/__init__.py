@@ -14,10 +14,12 @@ from hodge_pipeline.types.arrays import Bytes as Bytes
 from hodge_pipeline.types.arrays import Floats as Floats
 from hodge_pipeline.types.arrays import Floats32 as Floats32
 from hodge_pipeline.types.arrays import Ints as Ints
+from hodge_pipeline.types.arrays import Words as Words
 from hodge_pipeline.types.edges import Edges as Edges
 from hodge_pipeline.types.edges import Priors as Priors
 from hodge_pipeline.types.edges import Registration as Registration
 from hodge_pipeline.types.edges import ViewGraph as ViewGraph
+from hodge_pipeline.types.positions import Positions as Positions
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,7 @@ class Source:
 
     - `trajectory` is the whole trajectory that the frames' poses come from, on its own stamps, where there is one.
     - `notes` say what was skipped or repaired, with counts: one line each.
+    - `positions` of its frames that are known from elsewhere, such as satellite fixes; None where it has none.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
     - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
     """
@@ -168,11 +171,13 @@ class Source:
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
     contents: tuple[str, ...] = ()
+    positions: Positions | None = None
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]
         parts += [] if self.trajectory is None else [f"a trajectory of {len(self.trajectory)} poses"]
         parts += [] if self.graph is None else [repr(self.graph)]
+        parts += [] if self.positions is None else [f"{len(self.positions)} known positions"]
         return f"Source({self.name!r}: {', '.join(parts)})"
 
 
