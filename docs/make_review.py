@@ -98,13 +98,14 @@ def look(browser: Any, path: Path, name: str) -> None:
         dismiss(page)
         print(page.text("name"), page.text("facts"))
         picture(page, f"review-{name}.jpg")
-        if rows := page.rows():
+        if (rows := page.rows()) and review.session.subject.clouds is not None:
             page.choose(rows[0])
             page.press("2")
             page.until(lambda: page.browser.execute_script("return document.querySelector('#pictures img') !== null"))
             page.browser.execute_script("document.getElementById('edge').scrollIntoView()")
             picture(page, f"review-{name}-edge.jpg")
             page.press("1")
+        if rows:
             page.decided(lambda: page.press("w"))
             page.press("1")
             page.browser.execute_script("document.getElementById('name').scrollIntoView()")
