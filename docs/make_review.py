@@ -77,6 +77,7 @@ def join(page: Page) -> None:
     page.find("#first").send_keys(str(i))
     page.find("#second").send_keys(str(j))
     page.click("#pick")
+    page.until(lambda: page.find("#candidate").is_displayed())
     page.click("#apart")
     page.until(lambda: session.look.mode == "apart")
     page.until(lambda: page.place(shown_pair(session, False).middle))  # type: ignore[union-attr]
