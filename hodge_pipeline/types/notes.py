@@ -35,6 +35,7 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
     ),
+    "option unknown": (Rank.LOOK, "{detail}; made by another version: it is left out of what is shown"),
     "scale": (Rank.LOOK, "{detail}"),
     "given poses": (Rank.FACT, "{count} of {detail} poses given"),
     "given file": (Rank.FACT, "{detail}"),
