@@ -15,6 +15,7 @@ from hodge_adapters.colmap_bodies import Bodies
 from hodge_adapters.colmap_database import prior_rows
 from hodge_adapters.positions import read_positions
 from hodge_adapters.pycolmap_import import pycolmap
+from hodge_adapters.text_rows import counted
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, PositionPriors
@@ -89,7 +90,7 @@ def placing(images: Sequence[str], world_from_cam: Floats, known: Mapping[str, K
     down = np.array([known[images[row]].gravity for row in rows]).reshape(-1, 3)
     felt = np.isfinite(down).all(axis=1)
     if not felt.any():
-        return f"{int(with_position.sum())} images of the model have a known position: {FEWEST} are needed"
+        return f"{counted(int(with_position.sum()), 'known position')} of the model's images: {FEWEST} are needed"
     return _by_gravity(np.einsum("nij,nj->ni", world_from_cam[rows][felt, :3, :3], down[felt]))
 
 
@@ -150,4 +151,4 @@ def _by_gravity(down: Floats) -> Placing:
     sine, cosine = np.linalg.norm(axis), float(-middle[2] / np.linalg.norm(middle))
     axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
     turn = pycolmap.Rotation3d(se3.so3_exp(float(np.arctan2(sine, cosine)) * axis))
-    return Placing(pycolmap.Sim3d(1.0, turn, np.zeros(3)), f"upright by gravity of {len(down)} images")
+    return Placing(pycolmap.Sim3d(1.0, turn, np.zeros(3)), f"upright by gravity of {counted(len(down), 'image')}")

@@ -24,6 +24,7 @@ from hodge_adapters.colmap_ties import similarity, tie_points
 from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, PriorOptions
 from hodge_adapters.colmap_union import united
 from hodge_adapters.pycolmap_import import pycolmap
+from hodge_adapters.text_rows import counted
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Frame
 
@@ -176,7 +177,9 @@ class ColmapModels:
         if self.positions == "none":
             count = len(database_priors(database)) if database else 0
             if count:
-                notes.append(f"the database has pose priors of {count} images: --positions database places the model")
+                notes.append(
+                    f"the database has pose priors of {counted(count, 'image')}: --positions database places the model"
+                )
             return PriorOptions()
         if self.positions == "database":
             if database is None:
@@ -195,7 +198,7 @@ class ColmapModels:
 
 def _unposed(reconstruction: pycolmap.Reconstruction) -> list[str]:
     unposed = reconstruction.num_images() - reconstruction.num_reg_images()
-    return [f"{unposed} images of the model have no pose: they stay without"] if unposed else []
+    return [f"{counted(unposed, 'image')} of the model without a pose: left without"] if unposed else []
 
 
 def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
