@@ -15,7 +15,7 @@ from hodge_pipeline.diagnosis.robust_poses import GATE, LARGE, TWICE, Fit, fit, 
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Floats, ViewGraph
 
-PRIOR_SHARE = 0.2
+PRIOR_SHARE = 0.25
 """Of the prior's log odds. The probability, its root of 1 - chi2 / gate among it, was chosen for calibration: of right
 edges of 90 simulated rings, corridors and streets and 16 rooms, and of nine graphs of real fragments.
 """
