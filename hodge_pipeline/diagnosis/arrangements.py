@@ -14,7 +14,6 @@ import numpy as np
 
 from hodge_pipeline.diagnosis.arrangement_evidence import arrangement_log_evidence
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.pieces import Alignment, align
 from hodge_pipeline.diagnosis.rearrange import rearranged
 from hodge_pipeline.diagnosis.robust_poses import ONCE, TWICE, Fit, fit
@@ -50,13 +49,12 @@ def _in_order(
 ) -> Fit:
     """The views chained by edges between consecutive ones, and then all edges that agree with that."""
     rows = np.flatnonzero(np.abs(evidence.edges[:, 1] - evidence.edges[:, 0]) == 1)
-    noise = Noise(evidence.noise.rotation_rad[rows], evidence.noise.translation_m[rows])
     chain = replace(
         evidence,
         edges=evidence.edges[rows],
         i_from_j=evidence.i_from_j[rows],
         prior=evidence.prior[rows],
-        noise=noise,
+        noise=evidence.noise.select(rows),
         support=evidence.support[rows],
         in_no_listed_cycle=evidence.in_no_listed_cycle[rows],
     )
