@@ -86,7 +86,8 @@ def _best_move(criteria: PlacementCriteria, found: Fit) -> _Move | None:
     in_order = (np.abs(j - i) == 1) & (criteria.usual > 0)
     urgent = 2.0 * np.log1p(np.asarray(proposals.alike.sum(axis=1)).ravel())
     urgent += np.where(in_order, sure, 0.0)[proposals.edge]
-    moves, left = [], np.ones(len(proposals.mover), bool)
+    moves: list[_Move] = []
+    left = np.ones(len(proposals.mover), bool)
     while left.any() and len(moves) < TRIED:
         moves.append(_moved(criteria, now, proposals, proposals.next(left, urgent)))
     return max((move for move in moves if move.inside.any()), key=lambda move: move.gain, default=None)

@@ -54,7 +54,7 @@ class Upright:
         return 1 - (1 - self.share) / np.exp(self._log_density(self._cosine(rotations, up)))
 
     def _cosine(self, rotations: Floats, up: Floats) -> Floats:
-        return np.einsum("nij,ni,j->n", rotations, up, self.up)
+        return np.asarray(np.einsum("nij,ni,j->n", rotations, up, self.up))
 
     def _log_density(self, cosine: Floats) -> Floats:
         """The logarithm of the density against the uniform one."""
