@@ -7,7 +7,7 @@ export OMP_NUM_THREADS ?= 1
 PYTEST_ARGS ?= -n 2 --dist loadfile
 BASELINE ?= ../hodge-baseline
 
-.PHONY: help setup demo paper test faults faults-full faults-mutants baseline compare-baseline docs lint format clean
+.PHONY: help setup demo paper test faults faults-full faults-mutants baseline compare-baseline docs site dist lint format clean
 help:
 	@echo "make setup   system libraries, $(VENV) and everything in it: 3 GB"
 	@echo "make demo    make a room, reconstruct it: runs/demo"
@@ -18,6 +18,8 @@ help:
 	@echo "make baseline          what real data gives now, kept in $(BASELINE)"
 	@echo "make compare-baseline  what has changed since"
 	@echo "make docs    docs/recipes.md from the code"
+	@echo "make site    docs/ as a site: build/site/index.html"
+	@echo "make dist    sdist and wheel: dist"
 	@echo "make lint    ruff, mypy, import directions"
 
 $(STAMP): pyproject.toml constraints.txt tools/system-libraries.sh
@@ -57,6 +59,14 @@ compare-baseline: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/python tools/recipe_reference.py
 
+site: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "open build/site/index.html"
+
+dist: $(STAMP)
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation
+
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -68,4 +78,4 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) runs dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) runs dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis

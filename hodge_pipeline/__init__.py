@@ -34,10 +34,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from hodge_pipeline.cli.console import ProgressBars
     from hodge_pipeline.diagnosis.diagnosis import diagnose
     from hodge_pipeline.diagnosis.result import Diagnosis
     from hodge_pipeline.errors import HodgeError
-    from hodge_pipeline.pipeline import run, solve_again
     from hodge_pipeline.recipe.schema import Recipe, load_recipe
     from hodge_pipeline.refine.open3d_objects import solve_pose_graph
     from hodge_pipeline.review.opening import open_review
@@ -59,23 +59,24 @@ if TYPE_CHECKING:
         ViewGraph,
     )
     from hodge_pipeline.uses.colmap import refine_colmap
+    from hodge_pipeline.uses.recipe_run import run, solve_again
     from hodge_pipeline.uses.registration import register, register_clouds
     from hodge_pipeline.uses.sources import open_source
     from hodge_pipeline.uses.trajectory import frames_from_images, refine_trajectory
 
 __all__ = [
-    "Camera", "Diagnosis", "Edges", "Frame", "GraphEditor", "HodgeError", "PointCloud", "Priors", "Recipe",
-    "Registration", "Run", "Solution", "Source", "Trajectory", "ViewGraph", "diagnose", "frames_from_images",
+    "Camera", "Diagnosis", "Edges", "Frame", "GraphEditor", "HodgeError", "PointCloud", "Priors", "ProgressBars",
+    "Recipe", "Registration", "Run", "Solution", "Source", "Trajectory", "ViewGraph", "diagnose", "frames_from_images",
     "load_recipe", "marginal_covariances", "open_review", "open_source", "refine_colmap", "refine_trajectory",
     "register", "register_clouds", "relative_covariances", "run", "solve", "solve_again", "solve_pose_graph",
     "solve_robust",
 ]  # fmt: skip
 
 _NAMES_IN = {
+    "cli.console": ("ProgressBars",),
     "diagnosis.diagnosis": ("diagnose",),
     "diagnosis.result": ("Diagnosis",),
     "errors": ("HodgeError",),
-    "pipeline": ("run", "solve_again"),
     "recipe.schema": ("Recipe", "load_recipe"),
     "uses.colmap": ("refine_colmap",),
     "refine.open3d_objects": ("solve_pose_graph",),
@@ -87,6 +88,7 @@ _NAMES_IN = {
     "solvers.editing": ("GraphEditor",),
     "solvers.maximum_likelihood": ("solve",),
     "solvers.robust": ("solve_robust",),
+    "uses.recipe_run": ("run", "solve_again"),
     "uses.sources": ("open_source",),
     "types": (
         "Camera", "Edges", "Frame", "PointCloud", "Priors", "Registration", "Solution", "Source", "Trajectory",

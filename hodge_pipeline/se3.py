@@ -49,6 +49,19 @@ def _series(angle: Floats) -> tuple[Floats, Floats]:
     return a, b
 
 
+def rescaled(motions: Floats, factor: float) -> Floats:
+    """Motions (..., 4, 4) with every length times the factor."""
+    out = np.array(motions, float)
+    out[..., :3, 3] *= factor
+    return out
+
+
+def rescaled_information(information: Floats, factor: float) -> Floats:
+    """Information (..., 6, 6) over (rotation, translation) of motions whose lengths are taken times the factor."""
+    unit = np.repeat([1.0, 1 / factor], 3)
+    return np.asarray(unit[:, None] * information * unit)
+
+
 def left_jacobian(phi: Floats) -> Floats:
     """V(φ) (..., 3, 3), the left Jacobian of SO(3): the translation of exp(φ, ρ) is V(φ) ρ."""
     phi = np.asarray(phi, float)
@@ -142,6 +155,23 @@ def project_to_so3(matrix: Floats) -> Floats:
     u, _, vt = np.linalg.svd(matrix)
     u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return np.asarray(u @ vt)
+
+
+def rotation_angle(b_from_a: Floats) -> Floats:
+    """Angles (...,) of the rotations of motions (..., 4, 4), radians in [0, π]."""
+    return np.asarray(np.linalg.norm(so3_log(b_from_a[..., :3, :3]), axis=-1))
+
+
+def fit_rigid(points_in_b: Floats, points_in_a: Floats, weights: Floats | None = None) -> Floats:
+    """The motions `b_from_a (..., 4, 4)` of least squares between matched points (..., N, 3), weighted (..., N).
+
+    Arun, Huang and Blostein 1987; points on a line leave the rotation about it open.
+    """
+    weights = np.ones(points_in_b.shape[:-1]) if weights is None else weights
+    share = (weights / np.maximum(weights.sum(axis=-1, keepdims=True), 1e-12))[..., None]
+    centre_b, centre_a = ((share * points).sum(axis=-2, keepdims=True) for points in (points_in_b, points_in_a))
+    rotation = project_to_so3(np.swapaxes(share * (points_in_b - centre_b), -1, -2) @ (points_in_a - centre_a))
+    return from_parts(rotation, (centre_b - centre_a @ np.swapaxes(rotation, -1, -2))[..., 0, :])
 
 
 def interpolate(world_from_a: Floats, world_from_b: Floats, share: Floats) -> Floats:

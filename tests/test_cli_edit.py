@@ -14,12 +14,13 @@ from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError
 from hodge_pipeline.pairs.edits import Edit, History, read_history, write_history
-from hodge_pipeline.pipeline import Run, solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.rounds.more import Placed
 from hodge_pipeline.rounds.one_round import solve_edges
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.types import ViewGraph
+from hodge_pipeline.uses.recipe_run import solve_again
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (

@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.progress import Task
 
 from hodge_pipeline.cli import console
-from hodge_pipeline.cli.console import RateColumn, Terminal
+from hodge_pipeline.cli.console import ProgressBars, RateColumn
 from hodge_pipeline.types.notes import Note
 
 
-def work(terminal: Terminal) -> None:
+def work(terminal: ProgressBars) -> None:
     with terminal:
         for title, total in (("recording", 1), ("clouds", 50), ("recording", 1)):
             with terminal.stage(title, total) as advance:
@@ -23,7 +23,7 @@ def work(terminal: Terminal) -> None:
 
 
 def test_plain_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    work(Terminal(quiet=False, verbose=True))
+    work(ProgressBars(quiet=False, verbose=True))
     out, err = capsys.readouterr()
     lines = err.splitlines()
     assert out == ""
@@ -38,7 +38,7 @@ def test_what_nobody_waited_for_is_no_line_and_facts_wait_for_the_report(
 ) -> None:
     clock = iter([0.0, 0.4, 1.0, 3.0, 4.0, 4.1])
     monkeypatch.setattr(console.time, "perf_counter", lambda: next(clock))
-    terminal = Terminal(quiet=False)
+    terminal = ProgressBars(quiet=False)
     work(terminal)
     terminal.note(Note("solver", detail="a fact"))
     terminal.note(Note("parts", 2))
@@ -48,13 +48,13 @@ def test_what_nobody_waited_for_is_no_line_and_facts_wait_for_the_report(
 
 
 def test_a_stage_that_fails_prints_no_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(ValueError), Terminal(quiet=False) as terminal, terminal.stage("clouds", 3):
+    with pytest.raises(ValueError), ProgressBars(quiet=False) as terminal, terminal.stage("clouds", 3):
         raise ValueError
     assert capsys.readouterr().err == ""
 
 
 def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    work(Terminal(quiet=True))
+    work(ProgressBars(quiet=True))
     assert capsys.readouterr() == ("", "")
 
 
@@ -63,7 +63,7 @@ def test_bars_with_rates_in_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: 
         return Console(**{**options, "force_terminal": True, "width": 120})
 
     monkeypatch.setattr(console, "Console", terminal)
-    work(Terminal(quiet=False))
+    work(ProgressBars(quiet=False))
     shown = capsys.readouterr().err
     assert "50/50" in shown
     assert "2/2" in shown  # the two parts of the recording share a bar

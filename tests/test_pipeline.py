@@ -18,8 +18,8 @@ import pytest
 import hodge_pipeline
 from hodge_adapters.poses_text import parse_tum
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError, WorkspaceError
-from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.types.notes import Note
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 

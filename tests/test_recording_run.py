@@ -17,9 +17,9 @@ from rerun.chunk import RrdReader
 import hodge_pipeline
 from hodge_pipeline import se3
 from hodge_pipeline.errors import HodgeError, SourceError, WorkspaceError
-from hodge_pipeline.pipeline import Run
 from hodge_pipeline.recording import binary, layout, shapes
 from hodge_pipeline.registration.register import register_edges
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.start.odometry import chain
 from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.store import stored

@@ -294,3 +294,22 @@ def test_sub_models_are_found(tmp_path: Path) -> None:
             (tmp_path / "scene/sparse" / number / file.name).write_bytes(file.read_bytes())
     found = ColmapModels().open_models(tmp_path / "scene")
     assert [Path(one.name).name for one in found] == ["2", "10"]
+
+
+@pytest.mark.parametrize("refine", ["none", "focal", "all"])
+def test_intrinsics_are_held_unless_they_are_to_be_refined(tmp_path: Path, refine: str) -> None:
+    good = pycolmap.Reconstruction(noisy(tmp_path))
+    long = pycolmap.Reconstruction(good)
+    for camera in long.cameras.values():
+        camera.params = camera.params * np.array([1.02, 1, 1, 1])
+    options = (*FREE, f"model.refine={refine}", "model.database=none")
+    (result,) = hodge_pipeline.refine_colmap(long, overrides=options).results
+    assert result.decision.outcome == "refined"
+    for key, camera in result.model.native.cameras.items():
+        params, before = camera.params, long.cameras[key].params
+        focal = good.cameras[key].params[0]
+        assert abs(params[0] / focal - 1) < 5e-3 if refine != "none" else params[0] == before[0]
+        assert (params[1] == before[1]) == (refine != "all") and (params[3] == before[3]) == (refine != "all")
+    notes = " ".join(result.notes)
+    assert ("intrinsics are held: --refine" in notes) == (refine == "none")
+    assert ("focal lengths of 2 cameras changed by" in notes) == (refine != "none")

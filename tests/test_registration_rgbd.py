@@ -11,7 +11,7 @@ from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.guided import guided_match
 from hodge_pipeline.registration.landmarks import back_projected, find_landmarks
 from hodge_pipeline.registration.rgbd import Rgbd
-from hodge_pipeline.registration.visual import rigid_motions, visual_motion
+from hodge_pipeline.registration.visual import visual_motion
 from hodge_pipeline.types import Camera, CloudSet, Floats, Frame, Landmarks, PointCloud
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -58,7 +58,7 @@ def test_landmarks_that_agree_on_nothing_give_no_motion_that_counts():
 def test_three_points_give_their_rigid_motion():
     points_j = points_before(3, np.random.default_rng(0))
     np.testing.assert_allclose(
-        rigid_motions(se3.transform(I_FROM_J, points_j)[None], points_j[None])[0], I_FROM_J, atol=1e-9
+        se3.fit_rigid(se3.transform(I_FROM_J, points_j)[None], points_j[None])[0], I_FROM_J, atol=1e-9
     )
 
 

@@ -7,11 +7,11 @@ import pytest
 
 import hodge_pipeline
 from hodge_pipeline import registry
-from hodge_pipeline.errors import HodgeError, SourceError, WorkspaceError
+from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.pairs.edits import read_history_file
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.review.decisions import LockedError
-from hodge_pipeline.review.keeping import save_graph
+from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.opening import Review
 from hodge_pipeline.review.subject import open_for_review
@@ -19,7 +19,6 @@ from hodge_pipeline.types import Source
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_cli_edit import small_recipe
 from test_pipeline import Log
-from test_readers_colmap_rigs import write_model
 from test_review import PLANTED, graph_file  # noqa: F401 - a fixture
 
 
@@ -35,15 +34,6 @@ def test_a_path_without_edges_is_refused(tmp_path: Path) -> None:
         open_for_review(tmp_path / "poses.tum")
     with pytest.raises(WorkspaceError, match="cannot be read"):
         Review(tmp_path / "nothing.g2o", scene=False)
-
-
-def test_a_colmap_model_is_refused_in_one_line(tmp_path: Path) -> None:
-    model = write_model(tmp_path / "model")
-    before = sorted(model.iterdir())
-    with pytest.raises(SourceError, match="is a COLMAP model") as refused:
-        Review(model, scene=False)
-    assert f"'hodge convert {model} graph.json' writes their graph" in str(refused.value)
-    assert "\n" not in str(refused.value) and sorted(model.iterdir()) == before
 
 
 @pytest.mark.parametrize(("writer", "name"), [("pairs", "ring.log"), ("open3d_pose_graph", "ring.json")])
@@ -68,7 +58,7 @@ def test_graphs_of_other_formats_are_decided_about_beside_them(
         assert (
             session.settled.weights[PLANTED[0]] == 0 and (session.settled.weights > 0).sum() == len(session.table) - 1
         )
-        saved = save_graph(session)
+        saved, _ = save(session)
     assert read_history_file(tmp_path / f"{name}.edits.json").disabled == (pair,)
     assert (tmp_path / f"{name}.decisions.csv").exists() and saved.name == "ring.reviewed.g2o"
     assert path.read_bytes() == before

@@ -17,14 +17,15 @@ import hodge_pipeline
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import RecipeError, WorkerError, WorkspaceError
 from hodge_pipeline.executors.local import LocalExecutor
-from hodge_pipeline.pipeline import Run, solve_again
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.refine.model_options import load_model_refinement
 from hodge_pipeline.registration.global_pairs import describe_clouds
 from hodge_pipeline.registration.global_registrars import FpfhConsensus
 from hodge_pipeline.report.run_files import write_poses
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.store import yaml_file
 from hodge_pipeline.types import Frame, Source
+from hodge_pipeline.uses.recipe_run import solve_again
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (

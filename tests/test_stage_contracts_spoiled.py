@@ -435,6 +435,9 @@ class Model:
         graph, notes = self._inner.measured()
         return (replace(graph, i_from_j=1.1 * graph.i_from_j), notes) if self._how == "sheared" else (graph, notes)
 
+    def seen_points(self) -> Any:
+        return list(self._inner.seen_points())[1:] if self._how == "one cloud less" else self._inner.seen_points()
+
     def read_back(self, folder: Path, notes: tuple[str, ...]) -> Any:
         return self._inner.read_back(folder, () if self._how == "no notes" else notes)
 
@@ -563,6 +566,7 @@ def test_a_rewriter_that_breaks_its_contract_is_noticed(rewriter: Any, what: str
         (Models("takes anything"), "no such path", "must raise SourceError"),
         (Models("carried"), "bodies and frames", "where their bodies carry them"),
         (Models("sheared"), "measured", "an edge is not a rigid motion"),
+        (Models("one cloud less"), "seen points", "points of"),
         (Models("one scale"), "another unit", "does not double the positions"),
         (Models("stays"), "moved", "not at the poses that were given"),
         (Models("no notes"), "read back", "the notes are lost"),

@@ -11,8 +11,9 @@ from typer.testing import CliRunner
 import hodge_pipeline
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import GraphError, WorkspaceError
-from hodge_pipeline.pipeline import Run, solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.run_folder import Run
+from hodge_pipeline.uses.recipe_run import solve_again
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 CHAIN = (

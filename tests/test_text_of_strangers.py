@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_pipeline.cli.console import Terminal, print_table
+from hodge_pipeline.cli.console import ProgressBars, print_table
 from hodge_pipeline.cli.guard import guard_streams
 from hodge_pipeline.report.run_files import write_poses
 from hodge_pipeline.store.edge_table import read_edges, write_edges
@@ -51,7 +51,7 @@ def test_nothing_reaches_the_terminal_or_the_log(
     monkeypatch.setattr(sys, "stderr", sys.stderr)
     guard_streams()
     print(f"note {name}")
-    Terminal(quiet=False).say(f"note {name}")
+    ProgressBars(quiet=False).say(f"note {name}")
     print_table(name, ("a", "b"), [(name, name)])
     with logging_to(tmp_path / "log.txt"):
         log.warning("note %s", name)

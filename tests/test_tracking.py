@@ -20,7 +20,6 @@ from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.fusion.cloud import CloudFuser
 from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import Edit, History, write_history
-from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.odometry import Odometry
@@ -38,6 +37,7 @@ from hodge_pipeline.start.unordered.start import Start
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Source, ViewGraph
 from hodge_pipeline.types.notes import Note
+from hodge_pipeline.uses.recipe_run import solve_again
 
 FRAMES, BLOCK = 64, 48
 SMALL = (
@@ -288,6 +288,17 @@ def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(sequ
     whole, _ = track(source, tmp_path / "whole")
     found, _ = track(replace(source, frames=tuple(frames)), tmp_path / "stopped")
     assert found.found.all()
+    poses, expected = (all_poses(source, one, one.world_from_key) for one in (found, whole))
+    assert np.abs(poses - expected).max() < 0.06
+
+
+def test_a_clock_that_goes_back_is_said_and_costs_no_frame(sequence: Path, tmp_path: Path) -> None:
+    source = TumReader().open(sequence)
+    frames = [replace(frame, stamp_s=frame.stamp_s - 5.0 * (row >= 30)) for row, frame in enumerate(source.frames)]
+    whole, _ = track(source, tmp_path / "whole")
+    found, notes = track(replace(source, frames=tuple(frames)), tmp_path / "back")
+    assert found.found.all()
+    assert any("the clock goes back at 1 frames (30)" in note for note in notes)
     poses, expected = (all_poses(source, one, one.world_from_key) for one in (found, whole))
     assert np.abs(poses - expected).max() < 0.06
 

@@ -17,12 +17,12 @@ from hodge_pipeline.cli.console import Terminal
 from hodge_pipeline.cli.options import Dask
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphKind, score_table
-from hodge_pipeline.pipeline import run as run_pipeline
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import has_truth, true_poses
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats
+from hodge_pipeline.uses.recipe_run import run as run_pipeline
 
 HEADING = "The paper's tables"
 OUTER_ITERATIONS = 3

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from importlib.util import find_spec
 
 from rich import box
 from rich.console import Console
@@ -32,17 +33,21 @@ WAITED_FOR_S = 1.0
 """A stage that is over sooner is not worth a line."""
 
 
-class Terminal:
-    """A watcher that draws one bar for each stage on stderr; where that is not a terminal, a plain line for each stage
-    that took long enough to be waited for. `verbose`: for every stage, and every note.
+class ProgressBars:
+    """A watcher that draws one bar for each stage, on stderr or in a notebook's cell; where neither can be drawn in, a
+    plain line for each stage that took long enough to be waited for. `verbose`: for every stage, and every note.
+
+    From Python: `with ProgressBars() as bars: hodge_pipeline.run(…, watcher=bars)`.
     """
 
-    def __init__(self, quiet: bool, verbose: bool = False) -> None:
+    def __init__(self, quiet: bool = False, verbose: bool = False) -> None:
         self._verbose = verbose
-        self._console = Console(file=unguarded(sys.stderr), quiet=quiet, highlight=False, soft_wrap=True)
+        in_notebook = None if find_spec("ipywidgets") else False  # without it rich draws no bars there
+        stream = unguarded(sys.stderr)
+        self._console = Console(file=stream, quiet=quiet, highlight=False, soft_wrap=True, force_jupyter=in_notebook)
         self._tasks: dict[str, TaskID] = {}
         self._totals: dict[str, int] = {}
-        self._draws = self._console.is_terminal and not quiet
+        self._draws = (self._console.is_terminal or self._console.is_jupyter) and not quiet
         self._progress = Progress(
             TextColumn("{task.description:<24}"),
             BarColumn(),
@@ -54,7 +59,7 @@ class Terminal:
             disable=not self._draws,
         )
 
-    def __enter__(self) -> Terminal:
+    def __enter__(self) -> ProgressBars:
         self._progress.start()
         return self
 

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.cli.console import ProgressBars
 
 if TYPE_CHECKING:
     from hodge_pipeline.diagnosis.energy import EnergyRow
@@ -22,7 +22,7 @@ def diagnose(path: Path, out: Path | None, *, top: int | None, trust: str | None
     """Judge every edge, print the worst, and leave the rest in a folder where one is given."""
     from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
 
-    with Terminal(quiet or as_json) as terminal:
+    with ProgressBars(quiet or as_json) as terminal:
         with terminal.stage("diagnosis", 1):
             found = diagnose_subject(open_subject(path, trust))
         if out is not None:

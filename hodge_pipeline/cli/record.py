@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
-from hodge_pipeline.cli.console import Terminal, print_table
+from hodge_pipeline.cli.console import ProgressBars, print_table
 from hodge_pipeline.errors import RecipeError, WorkspaceError
 from hodge_pipeline.recipe.recording_options import Level
 
@@ -22,7 +22,7 @@ def record(run_folder: Path, level: str | None, max_megabytes: float | None, *, 
     from hodge_pipeline.uses.record_again import record_again
 
     given: dict[str, Any] = {"level": level, "max_megabytes": max_megabytes}
-    with Terminal(quiet) as terminal:
+    with ProgressBars(quiet) as terminal:
         path, is_whole = record_again(
             run_folder, {name: value for name, value in given.items() if value is not None}, terminal
         )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hodge_pipeline.cli.console import Terminal, print_table
+from hodge_pipeline.cli.console import ProgressBars, print_table
 from hodge_pipeline.cli.run import resumable
 from hodge_pipeline.errors import CheckError
 from hodge_pipeline.refine.model_options import RECIPE, load_model_refinement
@@ -32,7 +32,7 @@ def refine(
     from hodge_pipeline.types.input_files import read_input_text
     from hodge_pipeline.uses.colmap import run_refinement
 
-    with resumable(out), Terminal(quiet or as_json) as terminal:
+    with resumable(out), ProgressBars(quiet or as_json) as terminal:
         done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal, dask=dask)
     if as_json:
         print(read_input_text(out / "report.json"), end="")

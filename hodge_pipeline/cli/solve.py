@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
-from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.cli.console import ProgressBars
 from hodge_pipeline.cli.convert import writer_name
 from hodge_pipeline.cli.paths import check_result, keep_source
 from hodge_pipeline.errors import CheckError, RecipeError
@@ -78,7 +78,7 @@ def solve(
     if out is not None:
         check_result(out)
         keep_source(path, out)
-    with Terminal(quiet or as_json) as terminal, terminal.stage("solve", 1):
+    with ProgressBars(quiet or as_json) as terminal, terminal.stage("solve", 1):
         solved = solve_file(path, options)
     if out is not None:
         write_solved(out, solved, _writer(out, solved.source))
@@ -108,9 +108,9 @@ def _writer(out: Path, source: Source) -> str:
 
 def _solve_run(folder: Path, *, quiet: bool, as_json: bool, dask: str | None, verbose: bool) -> None:
     from hodge_pipeline.cli.run import print_result
-    from hodge_pipeline.pipeline import solve_again
+    from hodge_pipeline.uses.recipe_run import solve_again
 
-    with Terminal(quiet or as_json, verbose) as terminal:
+    with ProgressBars(quiet or as_json, verbose) as terminal:
         result = solve_again(folder, watcher=terminal, dask=dask)
     print_result(result, quiet=quiet, as_json=as_json, verbose=verbose)
 

@@ -19,7 +19,7 @@ def edge_residuals(graph: ViewGraph, world_from_cam: Floats) -> tuple[Floats, Fl
     known = np.asarray(np.isfinite(left_over).all(axis=(-1, -2)))
     translation_m, angle_rad = np.full(len(known), np.nan), np.full(len(known), np.nan)
     translation_m[known] = np.linalg.norm(left_over[known, :3, 3], axis=-1)
-    angle_rad[known] = np.linalg.norm(se3.so3_log(left_over[known, :3, :3]), axis=-1)
+    angle_rad[known] = se3.rotation_angle(left_over[known])
     return translation_m, angle_rad
 
 

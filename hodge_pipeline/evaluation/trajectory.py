@@ -34,9 +34,7 @@ class Alignment:
 
     def apply(self, world_from_cam: Floats) -> Floats:
         """Poses (..., 4, 4) of the estimate, in the reference's world."""
-        scaled = np.array(world_from_cam, float)
-        scaled[..., :3, 3] *= self.scale
-        return np.asarray(self.reference_from_estimate @ scaled)
+        return np.asarray(self.reference_from_estimate @ se3.rescaled(world_from_cam, self.scale))
 
 
 def align(estimate: Floats, reference: Floats, with_scale: bool = False) -> Alignment:
@@ -170,7 +168,7 @@ def relative_error(
     true_motion = se3.inverse(reference[chosen]) @ reference[chosen + delta_frames]
     error = se3.inverse(true_motion) @ motion
     translation_m = np.linalg.norm(error[:, :3, 3], axis=-1)
-    rotation_deg = np.rad2deg(np.linalg.norm(se3.so3_log(error[:, :3, :3]), axis=-1))
+    rotation_deg = np.rad2deg(se3.rotation_angle(error))
     return RelativeError(
         delta_frames,
         _rms(translation_m),

@@ -1,4 +1,4 @@
-"""Pairs that may see the same space although the poses have drifted: overlap with a tolerance that grows on the way."""
+"""Loop candidates of drifted poses: overlap, with a tolerance that grows with the path between two frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hodge_pipeline.pairs.overlap import pairwise_iou
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
 
 OCTAVES = 8
-FRAMES_LOOKED_AT = 50
+SAMPLED_FRAMES = 50
 NOTHING = np.zeros((0, 2), np.int64)
 
 
@@ -22,16 +22,16 @@ NOTHING = np.zeros((0, 2), np.int64)
 class DriftEdges:
     """Pairs the frames whose clouds may share space, however far odometry has drifted between them.
 
-    Two frames are compared in voxels that are as wide as the poses may have drifted on the way from one to the other:
-    small ones after a short way, large ones after a long way.
+    Two frames are compared in voxels as wide as the drift to expect between them: small ones after a short path, large
+    ones after a long path.
     """
 
     drift_share: float = Field(
         default=0.05,
         gt=0,
         lt=1,
-        description="drift over the length of the way, where a turn counts as the way that the scene moves before the "
-        "camera; odometry of RGB-D frames drifts by 1 to 5 %, of lidar by less",
+        description="drift over the length of the path, where a turn counts as the distance by which the scene "
+        "moves; odometry of RGB-D frames drifts by 1 to 5 %, of lidar by less",
     )
     min_iou: float = Field(
         default=0.2, ge=0, lt=1, description="share in [0, 1): a pair's IoU in such voxels exceeds it"
@@ -66,7 +66,7 @@ class DriftEdges:
         if len(rows) < 2:
             return NOTHING, np.zeros(0)
         own, poses = [clouds[int(row)] for row in rows], world_from_cam[rows]
-        way_m = _way_m(poses, _usual_range_m(clouds, rows))
+        way_m = _path_length_m(poses, _median_range_m(clouds, rows))
         pairs, overlap = [NOTHING], [np.zeros(0)]
         for octave in range(OCTAVES):
             voxel_m = self.voxel_m * 2**octave
@@ -96,13 +96,13 @@ def best_of_each(pairs: Ints, scores: Floats, most: int, reach: int) -> Ints:
     return np.sort(np.array(kept, np.int64))
 
 
-def _way_m(world_from_cam: Floats, range_m: float) -> Floats:
-    """The length (N,) of the way to each pose: steps, and turns by what they move at the scene's distance."""
+def _path_length_m(world_from_cam: Floats, range_m: float) -> Floats:
+    """The path length (N,) up to each pose: steps, and turns as the arc at the scene's median distance."""
     motions = se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:]
-    turns = np.linalg.norm(se3.so3_log(motions[:, :3, :3]), axis=1)
+    turns = se3.rotation_angle(motions)
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(motions[:, :3, 3], axis=1) + range_m * turns)])
 
 
-def _usual_range_m(clouds: CloudSet, rows: Ints) -> float:
-    some = rows[:: max(1, len(rows) // FRAMES_LOOKED_AT)].tolist()
+def _median_range_m(clouds: CloudSet, rows: Ints) -> float:
+    some = rows[:: max(1, len(rows) // SAMPLED_FRAMES)].tolist()
     return float(np.median([np.median(np.linalg.norm(clouds[row].points_in_cam, axis=1)) for row in some]))

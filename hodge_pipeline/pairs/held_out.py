@@ -13,10 +13,12 @@ from hodge_pipeline.scene import Round
 from hodge_pipeline.types import Bools, Edges, Ints
 from hodge_pipeline.types.edges import HELD_OUT
 
-MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-
+HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+"""Odd constants of a multiplicative hash: the draw depends on a pair's frames and the seed alone."""
 FEWEST = 15
+"""Pairs, at least, where there are enough: one or two would judge nothing."""
 LARGEST_SHARE = 0.3
+"""Of the pairs: the solve needs the rest."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -42,11 +44,11 @@ class HeldOut:
     def of(self, candidates: Edges) -> Bools:
         """Where (P,) a pair is kept out: a share of those that no sequence needs, the same ones in every round.
 
-        Of few pairs a larger share is kept out, up to `LARGEST_SHARE`: one or two pairs would judge nothing.
+        Of few pairs a larger share is kept out, up to `LARGEST_SHARE`.
         """
-        mixed = candidates.pairs.astype(np.uint64) * MIXERS[:2]
-        key = (mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(7))) + np.uint64(self.seed) * MIXERS[2]
-        key = (key ^ (key >> np.uint64(29))) * MIXERS[2]
+        mixed = candidates.pairs.astype(np.uint64) * HASH_FACTORS[:2]
+        key = (mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(7))) + np.uint64(self.seed) * HASH_FACTORS[2]
+        key = (key ^ (key >> np.uint64(29))) * HASH_FACTORS[2]
         drawn = (key >> np.uint64(11)).astype(float) / float(1 << 53)
         needed = np.array(["sequential" in str(source).split("+") for source in candidates.proposed_by], bool)
         optional = ~needed.reshape(drawn.shape)

@@ -35,7 +35,7 @@ def triangle_curl_m(graph: ViewGraph, triangles: Ints) -> Floats:
     """
     ab, bc, ca = (_motions(graph, triangles[:, k], triangles[:, (k + 1) % 3]) for k in range(3))
     around = ab @ bc @ ca
-    angle_rad = np.linalg.norm(se3.so3_log(around[:, :3, :3]), axis=1)
+    angle_rad = se3.rotation_angle(around)
     return np.asarray(np.hypot(np.linalg.norm(around[:, :3, 3], axis=1), shapes.RESIDUAL_ARM_M * angle_rad))
 
 

@@ -34,7 +34,7 @@ def change(graph: ViewGraph, solution: Solution, before: Floats) -> Change:
     used = np.flatnonzero(solution.weights > LEAST_WEIGHT)
     moved = se3.inverse(before) @ solution.world_from_cam
     translation_m = _rms(np.linalg.norm(moved[:, :3, 3], axis=1))
-    rotation_deg = float(np.rad2deg(_rms(np.linalg.norm(se3.so3_log(moved[:, :3, :3]), axis=1))))
+    rotation_deg = float(np.rad2deg(_rms(se3.rotation_angle(moved))))
     rows = np.unique(np.linspace(0, graph.vertex_count - 1, MOST_SAMPLED).round().astype(np.int64))
     rotation, translation = _sigmas(graph, solution, used, rows)
     return Change(translation_m, rotation_deg, SIGMAS * translation, SIGMAS * float(np.rad2deg(rotation)))

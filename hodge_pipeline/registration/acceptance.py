@@ -1,4 +1,4 @@
-"""Which registered pairs of a run become edges: by themselves, and by what odometry says of the way between them."""
+"""Which registered pairs become edges: judged by themselves, and against the odometry between their frames."""
 
 from __future__ import annotations
 
@@ -12,38 +12,37 @@ from hodge_pipeline.types.edges import HELD_OUT, REJECTED, USED
 
 ARM_M = 1.0
 """A rotation counts as the displacement that it causes at this distance."""
-LEAST_WAY_M = 0.05
-"""Added to every way: frames of a camera at rest differ by what a registration errs."""
+MIN_PATH_M = 0.05
+"""Added to the length of every path: frames of a camera at rest differ by the error of a registration."""
 
 
 def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, scale: float = 1.0) -> Edges:
     """The table with `status` and `why` of every registered pair: used, or rejected; those held out stay so.
 
-    `drift`: what odometry says of the way between two frames, None where it says nothing. `scale` multiplies lengths.
+    `drift`: how far odometry may be off between two frames; None without odometry. `scale` multiplies lengths.
     """
     rows = np.flatnonzero(edges.status != HELD_OUT)
     registered = edges.select(rows)
     reasons = acceptance.reasons(registered)
     if drift is not None:
-        far = strays(registered, drift, scale)
+        far = contradicts_odometry(registered, drift, scale)
         reasons[(reasons == "") & far] = "farther off than odometry drifts"
     return edges.put(rows, status=np.where(reasons == "", USED, REJECTED), why=reasons)
 
 
-def strays(registered: Edges, drift: Drift, scale: float = 1.0) -> Bools:
-    """Where (P,) a pair contradicts odometry by more than the share of the way between its frames that this may err by.
+def contradicts_odometry(registered: Edges, drift: Drift, scale: float = 1.0) -> Bools:
+    """Where (P,) a pair is off odometry's motion by more than the allowed share of the path between its frames.
 
-    Odometry knows nothing of a pair across two parts that it left apart. Lengths are multiplied by `scale`.
+    Never for a pair across two parts that odometry left apart. Lengths are multiplied by `scale`.
     """
     world_from_cam, part = drift.world_from_cam, drift.part
     i, j = registered.pairs.T
-    steps = _lengths(se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:], ARM_M * scale)
-    gone = np.concatenate([[0.0], np.cumsum(steps)])
+    steps = _displacement_m(se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:], ARM_M * scale)
+    path_m = np.concatenate([[0.0], np.cumsum(steps)])
     moved = se3.inverse(se3.inverse(world_from_cam[i]) @ world_from_cam[j]) @ registered.i_from_j
-    allowed = drift.largest * (LEAST_WAY_M * scale + np.abs(gone[j] - gone[i]))
-    return np.asarray((part[i] == part[j]) & (_lengths(moved, ARM_M * scale) > allowed))
+    allowed = drift.largest * (MIN_PATH_M * scale + np.abs(path_m[j] - path_m[i]))
+    return np.asarray((part[i] == part[j]) & (_displacement_m(moved, ARM_M * scale) > allowed))
 
 
-def _lengths(motions: Floats, arm_m: float) -> Floats:
-    turned = np.linalg.norm(se3.so3_log(motions[:, :3, :3]), axis=1)
-    return np.asarray(np.linalg.norm(motions[:, :3, 3], axis=1) + arm_m * turned)
+def _displacement_m(motions: Floats, arm_m: float) -> Floats:
+    return np.asarray(np.linalg.norm(motions[:, :3, 3], axis=1) + arm_m * se3.rotation_angle(motions))

@@ -47,7 +47,7 @@ def rigid_consensus(points_in_i: Floats, points_in_j: Floats, tolerance_m: float
     if len(target) < FEWEST_MATCHES:
         return Consensus(np.eye(4), np.zeros(len(all_target), bool))
     groups, weights = _compatible_groups(target, source, tolerance_m)
-    motions = fitted_motions(target[groups], source[groups], weights)
+    motions = se3.fit_rigid(target[groups], source[groups], weights)
     moved = np.einsum("sij,mj->smi", motions[:, :3, :3], source) + motions[:, None, :3, 3]
     squared = ((moved - target) ** 2).sum(axis=2) / tolerance_m**2
     support = np.maximum(0.0, 1 - squared)
@@ -82,22 +82,12 @@ def _distances(points: Floats) -> Floats32:
     return np.asarray(np.sqrt(np.maximum(gram, 0.0)), np.float32)
 
 
-def fitted_motions(target: Floats, source: Floats, weights: Floats) -> Floats:
-    """The least-squares motions (S, 4, 4) that move source (S, K, 3) onto target, weighted (S, K) (Kabsch 1976)."""
-    total = np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
-    share = (weights / total)[:, :, None]
-    middle_target, middle_source = (share * target).sum(axis=1), (share * source).sum(axis=1)
-    covariance = np.einsum("ski,skj->sij", share * (target - middle_target[:, None]), source - middle_source[:, None])
-    rotation = se3.project_to_so3(covariance)
-    return se3.from_parts(rotation, middle_target - np.einsum("sij,sj->si", rotation, middle_source))
-
-
 def _refined(target: Floats, source: Floats, motion: Floats, tolerance_m: float) -> Consensus:
     inlier = _within(target, source, motion, tolerance_m)
     for _ in range(REFINEMENTS):
         if inlier.sum() < FEWEST_MATCHES:
             return Consensus(np.eye(4), np.zeros(len(target), bool))
-        (better,) = fitted_motions(target[inlier][None], source[inlier][None], np.ones((1, int(inlier.sum()))))
+        better = se3.fit_rigid(target[inlier], source[inlier])
         agreeing = _within(target, source, better, tolerance_m)
         if agreeing.sum() < inlier.sum():
             break

@@ -11,7 +11,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.free_directions import named_direction
 from hodge_pipeline.types import Camera, Floats, Floats32
 
-SLIPPABLE = 0.015
+SLIPPAGE = 0.015
 """Eigenvalue of the mean normal matrix: normals that differ by less than 7° are one plane."""
 FEWEST_SEEN = 30
 VIEW_WIDTH = 160
@@ -99,4 +99,4 @@ def free_directions(points: Floats, normals: Floats) -> tuple[str, ...]:
     if not total > 0:
         return ("everything",)
     values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale / total)
-    return tuple(named_direction(vector) for value, vector in zip(values, vectors.T, strict=True) if value < SLIPPABLE)
+    return tuple(named_direction(vector) for value, vector in zip(values, vectors.T, strict=True) if value < SLIPPAGE)

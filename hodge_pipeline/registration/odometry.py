@@ -15,6 +15,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.gaps import over_gap
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import prepared_clouds
+from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
@@ -45,9 +46,9 @@ class OdometryOptions:
     max_drift: float | None = Field(
         default=0.3,
         gt=0,
-        description="share of the way between two frames (metres, and radians at 1 m) that odometry may err by; where "
-        "it was not lost between them a pair that contradicts it by more is no edge. Of right pairs on three real "
-        "sequences 99 % stay below 0.27. null: odometry rejects no pair",
+        description="share of the path between two frames (metres, and radians at 1 m) that odometry may be off by; "
+        "where it was not lost between them a pair that contradicts it by more is no edge. Of right pairs on three "
+        "real sequences 99 % stay below 0.27. null: odometry rejects no pair",
     )
 
 
@@ -111,6 +112,7 @@ def _blocks(rows: Ints, stamps_s: Floats) -> list[_Block]:
     return out
 
 
+@plugin_errors()
 def _run_block(folder: Path, options: OdometryOptions, block: _Block) -> Edges:
     """The steps of one block, without its warm-up."""
     prepared = prepared_clouds(folder, options.registration)

@@ -13,7 +13,7 @@ from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import HELD_OUT, MEASURED, USED
 
-STANDING_M = 0.01
+REUSE_WITHIN_M = 0.01
 """Between a registration and where the poses now put its pair: nearer than any registrar's start must be."""
 ARM_M = 1.0
 """A rotation counts as the displacement that it causes at this distance."""
@@ -40,7 +40,7 @@ def register_edges(
     candidates = edges.select(~held_out)
     i, j = candidates.pairs.T
     guesses = se3.inverse(world_from_cam[i]) @ world_from_cam[j]
-    rows, known = _standing(candidates, guesses, earlier, scale)
+    rows, known = _reusable(candidates, guesses, earlier, scale)
     missing = np.setdiff1d(np.arange(len(candidates)), rows)
     step.advance(len(rows))
     blocks = BlockStore(step.folder / "blocks")
@@ -57,7 +57,7 @@ def register_edges(
     return Edges.joined([Edges.joined([found, kept]).select(order), edges.select(held_out)])
 
 
-def _standing(candidates: Edges, guesses: Floats, earlier: Edges | None, scale: float) -> tuple[Ints, Ints]:
+def _reusable(candidates: Edges, guesses: Floats, earlier: Edges | None, scale: float) -> tuple[Ints, Ints]:
     """Rows of the candidates whose earlier registration stands, and its rows in that table."""
     if earlier is None:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -68,5 +68,5 @@ def _standing(candidates: Edges, guesses: Floats, earlier: Edges | None, scale: 
     rows, known = np.array(both, np.int64).reshape(-1, 2).T
     apart = se3.log(se3.inverse(earlier.i_from_j[known]) @ guesses[rows])
     moved = np.linalg.norm(apart[:, 3:], axis=1) + ARM_M * scale * np.linalg.norm(apart[:, :3], axis=1)
-    near = moved < STANDING_M * scale
+    near = moved < REUSE_WITHIN_M * scale
     return rows[near], known[near]

@@ -59,7 +59,7 @@ def visual_motion(points_i: Floats, points_j: Floats, seed: int) -> VisualMotion
     errors_i, errors_j = (covariances(points, PIXEL_SIGMA_RAD, DEPTH_SIGMAS) for points in (points_i, points_j))
     gate_i, gate_j = (covariances(points, GATE_PIXEL_SIGMA_RAD, 1.0) for points in (points_i, points_j))
     rows = np.random.default_rng(seed).integers(0, count, (TRIPLES, 3))
-    guesses = rigid_motions(points_i[rows], points_j[rows])
+    guesses = se3.fit_rigid(points_i[rows], points_j[rows])
     spread = np.sqrt((np.trace(gate_i, axis1=1, axis2=2) + np.trace(gate_j, axis1=1, axis2=2)) / 3)
     apart = np.linalg.norm(se3.transform(guesses, points_j[None]) - points_i, axis=2) / spread
     scores = np.maximum(1 - (apart / (2 * GATE)) ** 2, 0).sum(axis=1)
@@ -76,14 +76,6 @@ def visual_motion(points_i: Floats, points_j: Floats, seed: int) -> VisualMotion
     if inlier.sum() < FEWEST_MATCHES:
         return None
     return VisualMotion(motion, information, int(inlier.sum()), count)
-
-
-def rigid_motions(points_i: Floats, points_j: Floats) -> Floats:
-    """The rigid motions (H, 4, 4) that move points j (H, n, 3) onto points i best (Arun, Huang and Blostein 1987)."""
-    centre_i, centre_j = points_i.mean(axis=1), points_j.mean(axis=1)
-    moment = np.swapaxes(points_i - centre_i[:, None], 1, 2) @ (points_j - centre_j[:, None])
-    rotation = se3.project_to_so3(moment)
-    return se3.from_parts(rotation, centre_i - np.einsum("hij,hj->hi", rotation, centre_j))
 
 
 def _whitened(

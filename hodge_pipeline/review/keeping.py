@@ -1,4 +1,4 @@
-"""What a review leaves beside its decisions: a pose graph in a new file, nothing written over."""
+"""What a review leaves beside its decisions: a pose graph or a COLMAP model in a new place, nothing written over."""
 
 from __future__ import annotations
 
@@ -8,42 +8,75 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import registry
-from hodge_pipeline.errors import GraphError, not_written
-from hodge_pipeline.pairs.edits import write_history_file
+from hodge_pipeline.errors import not_written
+from hodge_pipeline.pairs.edits import FILE, write_history_file
+from hodge_pipeline.refine.judge import SAME_COST, costs
 from hodge_pipeline.review.session import Session
-from hodge_pipeline.review.subject import SIDE_FILE
-from hodge_pipeline.types import Trajectory
+from hodge_pipeline.review.subject import SIDE_FILE, Subject
+from hodge_pipeline.stages import TrackedModel
+from hodge_pipeline.types import Floats, Trajectory, ViewGraph
+from hodge_pipeline.uses.model_folder import MODELS
+
+SAME_PX = 1e-3
+"""Less than keypoints are found to, and more than a bundle adjustment stops short by."""
 
 
-def save_graph(session: Session) -> Path:
-    """Write the edges that count, at their poses, as g2o beside the graph, and the decisions beside that; the new file.
+def save(session: Session) -> tuple[Path, str]:
+    """The new file or folder with the latest decisions solved, its decisions beside it, and what to know of it.
 
     Raises `WorkspaceError` where it cannot be written.
     """
+    session.quick.wait()
     with session.changed:
         table, settled, history = session.table, session.settled, session.decisions.history
-        current = settled.revision == session.decisions.revision or not session.quick.doing
-    if not current:
-        raise GraphError("the latest decision is being solved: save when that is done")
     subject = session.subject
-    path = _free(subject.path)
-    chosen = table.graph.select(np.flatnonzero(settled.weights > 0))
-    trajectory = Trajectory(np.arange(len(settled.world_from_cam), dtype=float), settled.world_from_cam)
-    source = replace(subject.source, graph=chosen, trajectory=trajectory)
+    path = _free(subject)
     try:
-        registry.load("writers", "g2o")().write(path, source)
-        write_history_file(path.with_name(path.name + SIDE_FILE), history)
+        if subject.model is not None:
+            told = _write_model(path, subject.model, settled.world_from_cam)
+            write_history_file(path / FILE, history)
+        else:
+            chosen = table.graph.select(np.flatnonzero(settled.weights > 0))
+            told = _write_graph(path, subject, chosen, settled.world_from_cam)
+            write_history_file(path.with_name(path.name + SIDE_FILE), history)
     except OSError as error:
         raise not_written(path, error) from error
-    return path
+    return path, told
 
 
-def _free(path: Path) -> Path:
-    """A name beside a graph that nothing has: `graph.reviewed.g2o`, `graph.reviewed-2.g2o`, …"""
-    folder, stem = (path, path.name) if path.is_dir() else (path.parent, path.stem)
+def _write_graph(path: Path, subject: Subject, graph: ViewGraph, world_from_cam: Floats) -> str:
+    """The edges that count, at their poses, as g2o."""
+    trajectory = Trajectory(np.arange(len(world_from_cam), dtype=float), world_from_cam)
+    source = replace(subject.source, graph=graph, trajectory=trajectory)
+    registry.load("writers", "g2o")().write(path, source)
+    return f"{graph.edge_count} edges"
+
+
+def _write_model(path: Path, model: TrackedModel, world_from_body: Floats) -> str:
+    """The model at these poses after bundle adjustment, where `hodge refine colmap` puts its own."""
+    done = model.moved(world_from_body).merged().adjusted()
+    before, after = costs([model.quality], [done.quality])
+    folder = path / MODELS / "0"
+    folder.mkdir(parents=True)
+    done.write(folder)
+    is_worse = after.px > (1 + SAME_COST) * before.px + SAME_PX
+    worse = "; that is worse: keep the model as it was" if is_worse else ""
+    return f"after bundle adjustment, mean reprojection error {before.px:.3g} -> {after.px:.3g} px{worse}"
+
+
+def _free(subject: Subject) -> Path:
+    """A name beside the subject that nothing has: `graph.reviewed.g2o`, `graph.reviewed-2.g2o`, …; of a model a folder
+    `model.reviewed`, …
+    """
+    path = subject.path.resolve()
+    folder, stem, ending = path.parent, path.name if path.is_dir() else path.stem, ".g2o"
+    if subject.model is not None:
+        ending = ""
+    elif path.is_dir():
+        folder = path
     number = 1
     while True:
-        named = folder / f"{stem}.reviewed{f'-{number}' if number > 1 else ''}.g2o"
+        named = folder / f"{stem}.reviewed{f'-{number}' if number > 1 else ''}{ending}"
         if not named.exists() and not named.with_name(named.name + SIDE_FILE).exists():
             return named
         number += 1

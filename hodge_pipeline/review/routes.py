@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields
 from importlib.resources import as_file, files
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import pair_names
-from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.report.document import JPEG
 from hodge_pipeline.review.front import Answer, Route, Site
-from hodge_pipeline.review.keeping import save_graph
+from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.pictures import Pictures
 from hodge_pipeline.review.session import MODES, Session
 from hodge_pipeline.stages import Advance
 from hodge_pipeline.types.input_files import read_input
 from hodge_pipeline.types.notes import Note
+from hodge_pipeline.uses.recipe_run import solve_again
 
 FILES = {
     "": ("index.html", "text/html; charset=utf-8"),
@@ -30,6 +30,7 @@ FILES = {
     "page.css": ("page.css", "text/css; charset=utf-8"),
 }
 SUGGESTED = 12
+QUERY = TypeAdapter(Query)
 Asked = dict[str, Any]
 
 
@@ -109,24 +110,25 @@ def _actions(session: Session) -> Mapping[str, Callable[[Asked], Any]]:
         "look": lambda asked: session.show(**_look(asked)),
         "pick": lambda asked: session.pick(_frames(session, asked)),
         "register": lambda _: session.register(),
-        "save": lambda _: f"written: {save_graph(session)}",
-        "solve": lambda _: solve_run(session),
+        "finish": lambda _: finish(session),
     }
 
 
-def solve_run(session: Session) -> None:
-    """Solve and fuse the run again with its decisions, while the pages go on; then show what came out."""
+def finish(session: Session) -> None:
+    """Solve and fuse a run again with its decisions, or write a graph or a model, while the pages go on."""
     subject = session.subject
-    if not subject.is_run:
-        raise GraphError(f"{subject.path}: is no run: save it as a pose graph")
 
-    def job() -> None:
+    def fuse() -> None:
         session.quick.wait()
         solve_again(subject.path, watcher=_Told(session))
         session.reopen(subject.path)
         session.say("solved and fused: this is the run as it is now")
 
-    session.slow.put("fusing", job)
+    def write() -> None:
+        path, told = save(session)
+        session.say(f"written: {path} ({told})")
+
+    session.slow.put("fusing" if subject.is_run else "writing", fuse if subject.is_run else write)
     session.bump()
 
 
@@ -177,22 +179,12 @@ def _note(asked: Asked) -> str:
 
 
 def _query(asked: Asked) -> Query:
-    known = {field.name for field in fields(Query)}
-    if strange := set(asked) - known:
-        raise GraphError(f"{', '.join(sorted(strange))}: expected {', '.join(sorted(known))}")
+    verdicts = tuple(word for word in str(asked.get("verdicts", "")).split(",") if word)
     try:
-        return Query(
-            verdicts=tuple(word for word in str(asked.get("verdicts", "")).split(",") if word),
-            min_gap=int(asked.get("min_gap") or 0),
-            min_residual_m=float(asked.get("min_residual_m") or 0),
-            frame=str(asked.get("frame", "")),
-            sort=asked.get("sort", "score"),
-            descending=asked.get("descending") == "true",
-            first=max(0, int(asked.get("first") or 0)),
-            count=max(1, int(asked.get("count") or 100)),
-        )
-    except ValueError as error:
-        raise GraphError(f"a filter is no number: {error}") from None
+        return QUERY.validate_python({key: value for key, value in asked.items() if value} | {"verdicts": verdicts})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise GraphError(f"{first['loc'][0]}: {first['msg']}") from None
 
 
 def _look(asked: Asked) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What is reviewed: the edges of a run or of a pose graph, their poses, and where decisions about them are kept."""
+"""What is reviewed: the edges of a run, model or pose graph, their poses, and where decisions about them are kept."""
 
 from __future__ import annotations
 
@@ -11,18 +11,25 @@ import numpy as np
 from hodge_pipeline.errors import HodgeError, SourceError
 from hodge_pipeline.pairs.edits import FILE
 from hodge_pipeline.recipe.schema import Recipe
+from hodge_pipeline.refine.candidates import NO_EDGE
+from hodge_pipeline.refine.model import refinable
+from hodge_pipeline.refine.model_options import load_model_refinement
+from hodge_pipeline.refine.model_solve import solve_bodies
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.sources.inspect import guess_reader, guesses
+from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
-from hodge_pipeline.types.text import command
+from hodge_pipeline.types.notes import Note
 
 SIDE_FILE, SIDE_LOG = ".edits.json", ".decisions.csv"
 LOG = "decisions.csv"
+
+UNITS = "the unit of length is the model's own, which reasons call metres"
 
 
 @dataclass(frozen=True)
@@ -31,8 +38,8 @@ class Subject:
 
     `edges` are those of the graph and the pairs that were rejected with a motion, row by row `graph`'s; `solution` is
     that of the graph with a weight for each of them. A run also has a recipe, clouds and, where its source is still
-    there, frames (its key frames'). `truth (V, 4, 4)` is NaN where unknown. Decisions are kept in `edits`, their log in
-    `log`; `locked` says why none can be taken.
+    there, frames (its key frames'); a `model` its points as clouds, in its own unit. `truth (V, 4, 4)` is NaN where
+    unknown. Decisions are kept in `edits`, their log in `log`; `locked` says why none can be taken.
     """
 
     path: Path
@@ -46,6 +53,7 @@ class Subject:
     source: Source
     recipe: Recipe | None = None
     clouds: CloudSet | None = None
+    model: TrackedModel | None = None
     frames: Sequence[Frame] = ()
     locked: str = ""
     notes: tuple[str, ...] = ()
@@ -55,10 +63,24 @@ class Subject:
         """Whether `hodge solve` fuses it again."""
         return self.recipe is not None
 
+    @property
+    def finish(self) -> str:
+        """What the last button does."""
+        if self.is_run:
+            return "solve and fuse"
+        return "save as g2o" if self.model is None else "adjust and save as COLMAP model"
+
+    @property
+    def unit(self) -> str:
+        """Of its lengths: those of a model without a scale are its own."""
+        return "m" if self.model is None else "units"
+
 
 def open_for_review(path: Path) -> Subject:
-    """What a path holds: a run, finished or not, or a pose graph. Raises `HodgeError` where it holds neither."""
-    return _of_run(path) if is_run_folder(path) else _of_graph(path)
+    """What a path holds: a run, finished or not, a COLMAP model, a pose graph. Raises `HodgeError` for others."""
+    if is_run_folder(path):
+        return _of_run(path)
+    return _of_model(path) if [guess.name for guess in guesses(path)[:1]] == ["colmap"] else _of_graph(path)
 
 
 def _of_run(path: Path) -> Subject:
@@ -67,6 +89,7 @@ def _of_run(path: Path) -> Subject:
     rows = np.flatnonzero(last.edges.in_graph | _rejected_with_motion(last.edges))
     edges = last.edges.select(rows)
     left = int((last.edges.status == REJECTED).sum() - (edges.status == REJECTED).sum())
+    unknown = tuple(str(Note("option unknown", detail=line)) for line in run.options_left_out)
     notes = (f"{left} rejected pairs have no motion and are not listed",) if left else ()
     frames, complaint = _frames(run, recipe)
     unfinished = "the run is not finished: run the same command again; until then it can only be looked at"
@@ -84,7 +107,7 @@ def _of_run(path: Path) -> Subject:
         clouds=run.clouds,
         frames=frames,
         locked="" if run.ending is not None else unfinished,
-        notes=(*notes, *complaint),
+        notes=(*unknown, *notes, *complaint),
     )
 
 
@@ -120,26 +143,45 @@ def _frames(run: Run, recipe: Recipe) -> tuple[Sequence[Frame], tuple[str, ...]]
 
 
 def _of_graph(path: Path) -> Subject:
-    if [guess.name for guess in guesses(path)[:1]] == ["colmap"]:
-        diagnose, convert = command("hodge", "diagnose", path), command("hodge", "convert", path, "graph.json")
-        raise SourceError(
-            f"{path}: is a COLMAP model, whose points and images a review does not show: '{diagnose}' names its wrong "
-            f"pairs, '{convert}' writes their graph, which can be reviewed"
-        )
     source = read_graph(path)
     assert source.graph is not None
     graph = source.graph
     start = None if source.trajectory is None else source.trajectory.world_from_cam
-    solution = solve(graph, start=start)
-    kept = path if path.is_dir() else None
+    return _beside(path, source, Edges.measured(graph), graph, solve(graph, start=start))
+
+
+def _of_model(path: Path) -> Subject:
+    """The largest model of a path, its bodies for vertices, at the poses that its measured edges agree with."""
+    options = load_model_refinement()
+    models, left_out = refinable(options.model.open_models(path))
+    model = max(models, key=lambda one: one.quality.images)
+    graph, notes = model.measured()
+    if not graph.edge_count:
+        raise SourceError(f"{path}: {NO_EDGE}")
+    solved = solve_bodies(graph, model.world_from_body, options.solver)
+    first = np.unique(model.body_of_frame, return_index=True)[1]
+    frames = tuple(model.frames[row] for row in first)
+    source = Source(path.resolve().name, path, frames, notes=(*left_out, *model.notes, *notes, UNITS))
+    return replace(
+        _beside(path, source, Edges.measured(solved.graph), solved.graph, solved.solution),
+        solution=replace(solved.solution, weights=np.where(solved.kept, solved.solution.weights, 0.0)),
+        clouds=model.seen_points(),
+        frames=frames if any(frame.read_colour is not None for frame in frames) else (),
+        model=model,
+    )
+
+
+def _beside(path: Path, source: Source, edges: Edges, graph: ViewGraph, solution: Solution) -> Subject:
+    """A subject that is no run: decisions are kept beside its file, or in its folder."""
+    is_folder = path.is_dir()
     return Subject(
         path=path,
         name=path.resolve().name,
-        edges=Edges.measured(graph),
+        edges=edges,
         graph=graph,
         solution=solution,
-        edits=kept / FILE if kept else path.with_name(path.name + SIDE_FILE),
-        log=kept / LOG if kept else path.with_name(path.name + SIDE_LOG),
+        edits=path / FILE if is_folder else path.with_name(path.name + SIDE_FILE),
+        log=path / LOG if is_folder else path.with_name(path.name + SIDE_LOG),
         truth=np.full((graph.vertex_count, 4, 4), np.nan),
         source=source,
         notes=source.notes,

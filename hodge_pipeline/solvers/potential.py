@@ -176,7 +176,7 @@ def residuals(edges: Ints, i_from_j: Floats, poses: Floats) -> tuple[Floats, Flo
     j_from_i = se3.inverse(i_from_j)
     at_i, at_j = poses_say @ j_from_i, j_from_i @ poses_say
     translation = np.sqrt(((at_i[:, :3, 3] ** 2).sum(axis=1) + (at_j[:, :3, 3] ** 2).sum(axis=1)) / 2)
-    return translation, np.linalg.norm(se3.so3_log(at_j[:, :3, :3]), axis=1)
+    return translation, se3.rotation_angle(at_j)
 
 
 def residual_metrics(edges: Ints, i_from_j: Floats, poses: Floats) -> Mapping[str, float]:

@@ -95,7 +95,7 @@ def pose_facts(world_from_cam: Floats, together: Bools, names: Sequence[str], od
         return {}
     relative = se3.inverse(world_from_cam[rows]) @ world_from_cam[rows + 1]
     moved_m = np.linalg.norm(relative[:, :3, 3], axis=1)
-    turned_deg = np.rad2deg(np.linalg.norm(se3.so3_log(relative[:, :3, :3]), axis=1))
+    turned_deg = np.rad2deg(se3.rotation_angle(relative))
     for size, least, unit in ((moved_m, LEAST_JUMP_M, "m"), (turned_deg, LEAST_JUMP_DEG, "°")):
         jumps = size > max(JUMP * float(np.median(size)), least)
         if jumps.any():

@@ -66,7 +66,7 @@ def _motion_facts(graph: ViewGraph, oddities: list[str]) -> dict[str, Any]:
     if not sound.any():
         return {}
     translation_m = np.linalg.norm(graph.i_from_j[sound, :3, 3], axis=1)
-    angle_deg = np.rad2deg(np.linalg.norm(se3.so3_log(graph.i_from_j[sound, :3, :3]), axis=1))
+    angle_deg = np.rad2deg(se3.rotation_angle(graph.i_from_j[sound]))
     return {
         "edge translation in metres, median largest": [float(np.median(translation_m)), float(translation_m.max())],
         "edge rotation in degrees, median largest": [float(np.median(angle_deg)), float(angle_deg.max())],

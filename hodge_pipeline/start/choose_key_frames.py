@@ -20,7 +20,7 @@ def choose_key_frames(
         chosen.append(last)
         for place, row in enumerate(map(int, rows[1:]), start=1):
             step = se3.inverse(world_from_cam[last]) @ world_from_cam[row]
-            turned_deg = np.rad2deg(np.linalg.norm(se3.so3_log(step[:3, :3])))
+            turned_deg = np.rad2deg(se3.rotation_angle(step))
             moved = np.linalg.norm(step[:3, 3]) >= distance_m or turned_deg >= angle_deg
             if moved or (every and place % every == 0):
                 chosen.append(row)

@@ -97,4 +97,4 @@ def without_points(clouds: CloudSet, rows: Sequence[int]) -> CloudSet:
 def off_by(motion: Floats, truth: Floats) -> tuple[float, float]:
     """Radians and metres by which a motion (4, 4) is off."""
     error = se3.inverse(truth) @ motion
-    return float(np.linalg.norm(se3.so3_log(error[:3, :3]))), float(np.linalg.norm(error[:3, 3]))
+    return float(se3.rotation_angle(error)), float(np.linalg.norm(error[:3, 3]))

@@ -74,6 +74,15 @@ def _measures(case: _Case) -> None:
     assert all(isinstance(note, str) for note in left_out), "what was left out is told in sentences"
 
 
+def _sees_points(case: _Case) -> None:
+    model = _model(case)
+    seen = model.seen_points()
+    assert len(seen) == len(model.body_names), f"{len(model.body_names)} bodies, points of {len(seen)}"
+    assert len(seen.points), "no body sees a point"
+    twice = np.asarray(model.scaled(2.0).seen_points().points, float)
+    _assert_near(twice, 2.0 * np.asarray(seen.points, float), "seen points are not in the model's unit")
+
+
 def _is_scaled(case: _Case) -> None:
     model = _model(case)
     before = model.world_from_body
@@ -112,6 +121,7 @@ MODEL_READER_PROPERTIES: dict[str, Callable[[_Case], None]] = {
     "no such path": _refuses_what_is_not_there,
     "bodies and frames": _fits_together,
     "measured": _measures,
+    "seen points": _sees_points,
     "another unit": _is_scaled,
     "moved": _is_moved,
     "read back": _is_read_back,

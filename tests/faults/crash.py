@@ -13,7 +13,7 @@ from pathlib import Path
 from small_run import Made, Outcome, edit, made, recipe
 
 import hodge_pipeline
-from hodge_pipeline.pipeline import solve_again
+from hodge_pipeline.uses.recipe_run import solve_again
 
 WRITES = frozenset(("os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.link", "os.truncate", "shutil.rmtree"))
 SEEDED = 60

@@ -12,9 +12,9 @@ import numpy as np
 import hodge_pipeline
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.pairs.edits import Edit, History, write_history
-from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.run_folder import Run
+from hodge_pipeline.uses.recipe_run import solve_again
 
 SMALL = (
     "clouds.voxel_m=0.1", "executor={stage: local, workers: 0}", "recording.level=off", "evaluation.tables=false",

@@ -16,9 +16,9 @@ from small_run import made, recipe
 import hodge_pipeline
 from hodge_adapters.tum import TumReader
 from hodge_pipeline.errors import HodgeError
-from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.store.workspace import holding
+from hodge_pipeline.uses.recipe_run import solve_again
 
 NAMES = (
     "<script>alert(1)</script>", "\"><img src=x onerror=alert(1)>", "=HYPERLINK(\"http://x\")", "\x1b[31mred", "a\nb",

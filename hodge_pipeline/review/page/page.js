@@ -2,7 +2,7 @@
 "use strict";
 const $ = (id) => document.getElementById(id);
 const VERDICTS = ["wrong", "suspect", "untestable", "consistent"];
-const SORTS = ["score", "residual", "gap"];
+const SORTS = [...$("table").tHead.querySelectorAll("[data-sort]")].map((head) => head.dataset.sort);
 const COUNT = 100;
 let state = { revision: -1, version: -1, look: { selected: -1, verdicts: [] } };
 let rows = [], total = 0, first = 0, sort = "score", descending = false, shown = new Set(["wrong", "suspect"]);
@@ -34,6 +34,7 @@ function tell(text) {
 
 function metres(value) {
   if (value === null || value === undefined) return "–";
+  if (state.unit !== "m") return value.toPrecision(3);
   return value < 0.1 ? `${(100 * value).toFixed(value < 0.01 ? 2 : 1)} cm` : `${value.toFixed(2)} m`;
 }
 
@@ -64,7 +65,7 @@ function show(found) {
   for (const name of ["disable", "enable", "right"]) $(name).disabled = Boolean(state.locked) || state.look.selected < 0;
   $("undo").disabled = !state.can_undo; $("undo").title = state.latest;
   $("redo").disabled = !state.can_redo;
-  $("solve").hidden = !state.is_run; $("save").hidden = state.is_run;
+  $("finishes").textContent = state.finish; $("unit").textContent = state.unit; $("adding").hidden = !state.is_run;
   $("view").hidden = !state.has_clouds;
   for (const button of $("view").querySelectorAll("button")) button.classList.toggle("on", button.dataset.mode === state.look.mode);
   showFilters();
@@ -159,7 +160,7 @@ function showCandidate() {
     return;
   }
   [$("first").value, $("second").value] = state.look.picked;
-  const result = found.registered ? `fitness ${found.fitness}, RMS ${metres(found.rmse_m)}, ${metres(found.residual_m)} and ${found.residual_deg}° from the poses; ${found.rejected ? `acceptance rejects it: ${found.rejected}; adding lets it in all the same` : "acceptance takes it"}` : `guess from ${found.points >= 3 ? `${found.points} point pairs` : "the poses"}${found.points && found.points < 3 ? `, ${found.points} point pairs clicked` : ""}: register it`;
+  const result = found.registered ? `fitness ${found.fitness}, RMS ${metres(found.rmse_m)}, ${metres(found.residual_m)} and ${found.residual_deg}° from the poses; ${found.rejected ? `acceptance rejects it: ${found.rejected}; adding lets it in all the same` : "acceptance takes it"}` : `guess from ${found.guess_by}${found.points && found.points < 3 ? `, ${found.points} point pairs clicked` : ""}: register it`;
   $("found").textContent = `${found.pair}: ${result}`;
   $("accept").disabled = !found.registered;
 }
@@ -199,10 +200,9 @@ function sortBy(key) {
   list();
 }
 
-const finish = () => act(state.is_run ? "solve" : "save");
 const KEYS = {
   j: () => step(1), k: () => step(-1), d: () => decide("disable"), e: () => decide("enable"), r: () => decide("right"),
-  u: () => act("undo"), y: () => act("redo"), w: () => act("wrong"), s: finish, n: () => $("note").focus(),
+  u: () => act("undo"), y: () => act("redo"), w: () => act("wrong"), s: () => act("finish"), n: () => $("note").focus(),
   o: () => { descending = false; sortBy(SORTS[(SORTS.indexOf(sort) + 1) % SORTS.length]); },
   1: () => act("look", { mode: "all" }), 2: () => act("look", { mode: "edge" }), 3: () => act("look", { mode: "solution" }), 4: () => act("look", { mode: "blink" }),
 };
@@ -220,7 +220,7 @@ function hasWebGl() {
 }
 
 for (const verb of ["disable", "enable", "right"]) $(verb).onclick = () => decide(verb);
-for (const name of ["undo", "redo", "wrong", "save", "solve", "register", "accept"]) $(name).onclick = () => act(name);
+for (const name of ["undo", "redo", "wrong", "finish", "register", "accept"]) $(name).onclick = () => act(name);
 for (const head of $("table").tHead.rows[0].cells) if (head.dataset.sort) head.onclick = () => sortBy(head.dataset.sort);
 for (const name of ["frame", "gap", "residual"]) $(name).onchange = () => { first = 0; list(); };
 for (const button of $("view").querySelectorAll("button")) button.onclick = () => act("look", { mode: button.dataset.mode });
@@ -232,6 +232,7 @@ $("cut").oninput = () => { $("cut-on").checked = true; cut(); };
 $("cut-on").onchange = cut;
 $("pick").onclick = () => act("pick", { frames: [$("first").value, $("second").value] });
 $("apart").onclick = () => act("look", { mode: "apart" });
+$("put").onclick = () => act("look", { mode: "place" });
 $("look").onclick = () => act("look", { mode: "edge" });
 $("adding").ontoggle = suggest;
 $("decided").ontoggle = log;

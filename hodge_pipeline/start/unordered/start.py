@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.registration.acceptance import strays
+from hodge_pipeline.registration.acceptance import contradicts_odometry
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
@@ -68,7 +68,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
     if scene.drift is not None:
         counted = np.flatnonzero(hypotheses.counts)
-        far = counted[strays(hypotheses.select(counted), scene.drift)]
+        far = counted[contradicts_odometry(hypotheses.select(counted), scene.drift)]
         hypotheses = hypotheses.put(far, status=REJECTED, why="farther off than odometry drifts")
     notes.append(_tried(len(rows), pairs, hypotheses))
     labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
