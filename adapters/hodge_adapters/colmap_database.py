@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,9 @@ MAX_KEYPOINT_COLUMNS = 16
 USABLE = (2, 3, 4, 5, 6)
 """Calibrated, uncalibrated, planar, panoramic, either of the last two: not degenerate, not a watermark."""
 MATRICES = ("F", "E", "H")
-TABLES = ("images", "keypoints", "two_view_geometries")
+TABLES = ("images", "keypoints", "two_view_geometries", "pose_priors")
+CAMERA, GEODETIC = 0, 0
+"""A type of sensor, and a coordinate system (WGS 84), as the database numbers them."""
 MAX_VALUE_BYTES = 1 << 26
 """The keypoints of an image, or the matches of a pair: 64 MiB are 2.8 million keypoints of six columns."""
 
@@ -62,6 +64,52 @@ def has_verified_pairs(path: Path) -> bool:
             return bool(database.execute(query).fetchone()[0])
     except (sqlite3.Error, OverflowError) as error:
         raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
+
+
+class PriorRow(NamedTuple):
+    """What COLMAP noted of an image beside its pixels: NaN where it noted nothing.
+
+    `position (3,)`: latitude, longitude (degrees) and height where it is geodetic; `gravity (3,)` in the camera's axes.
+    """
+
+    name: str
+    position: Floats
+    covariance: Floats
+    gravity: Floats
+    geodetic: bool
+
+
+def prior_rows(path: Path) -> Sequence[PriorRow]:
+    """The pose priors of a database, empty where it has none. Raises `SourceError` where it is none."""
+    try:
+        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
+            there = database.execute("SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'pose_priors'")
+            if not there.fetchone()[0]:
+                return ()
+            names = dict(database.execute("SELECT image_id, name FROM images"))
+            table = database.execute("SELECT * FROM pose_priors")
+            columns = [column for column, *_ in table.description]
+            rows = [dict(zip(columns, row, strict=True)) for row in table]
+            return [_prior(names[_image_of(row)], row) for row in rows if _image_of(row) in names]
+    except DAMAGED as error:
+        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
+
+
+def _image_of(row: Mapping[str, Any]) -> int | None:
+    """Of a prior: the image, None where it is of another sensor; databases of before COLMAP 4 name it otherwise."""
+    if row.get("corr_sensor_type", CAMERA) != CAMERA:
+        return None
+    return int(row.get("corr_data_id", row.get("image_id")))
+
+
+def _prior(name: str, row: Mapping[str, Any]) -> PriorRow:
+    cells = []
+    for column, count in (("position", 3), ("position_covariance", 9), ("gravity", 3)):
+        data = row.get(column)
+        whole = isinstance(data, bytes) and len(data) == 8 * count
+        cells.append(np.frombuffer(data, "<f8").copy() if whole and data is not None else np.full(count, np.nan))
+    position, covariance, gravity = cells
+    return PriorRow(name, position, covariance.reshape(3, 3), gravity, row.get("coordinate_system") == GEODETIC)
 
 
 def database_matches(path: Path, row_of_name: Mapping[str, int]) -> Iterator[tuple[int, int, Ints]]:

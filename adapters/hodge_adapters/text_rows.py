@@ -53,6 +53,11 @@ def listed(items: Sequence[object]) -> str:
     return ", ".join(str(item) for item in items[:SHOWN]) + more
 
 
+def counted(count: int, noun: str) -> str:
+    """A count with its noun: `1 image`, `2 images`."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 def inside(folder: Path, name: str) -> Path | None:
     """The path of a file named in a list, or None for one that leaves the folder by `..` or an absolute path.
 

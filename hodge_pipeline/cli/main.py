@@ -241,7 +241,9 @@ def edit(
 
 @app.command()
 def review(
-    path: Annotated[Path, typer.Argument(help="A run, or a pose graph (g2o, TORO, Open3D, pair .log).")],
+    path: Annotated[
+        Path, typer.Argument(help="A run, a COLMAP model, or a pose graph (g2o, TORO, Open3D, pair .log).")
+    ],
     port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: a free one.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
 ) -> None:
@@ -359,6 +361,13 @@ def main() -> None:
         sys.exit(1)
     except MemoryError:
         print("error: this needs more memory than there is: give less data, or free some", file=sys.stderr)
+        sys.exit(1)
+    except ImportError as error:
+        if (error.name or "").startswith("hodge"):
+            raise
+        from hodge_pipeline.registry import LIBRARIES
+
+        print(f"error: a library does not load ({shown(str(error))}): {LIBRARIES}", file=sys.stderr)
         sys.exit(1)
     except Exception as error:
         from hodge_pipeline.errors import HodgeError
