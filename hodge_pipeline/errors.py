@@ -12,7 +12,14 @@ class HodgeError(Exception):
 
 
 class RecipeError(HodgeError):
-    """A recipe, an override or a stage's option is wrong: names file, line, key and what was expected."""
+    """A recipe, an override or a stage's option is wrong: names file, line, key and what was expected.
+
+    `keys` is the path of the option, where one is to blame.
+    """
+
+    def __init__(self, message: str, keys: tuple[str | int, ...] = ()) -> None:
+        super().__init__(message)
+        self.keys = keys
 
 
 class SourceError(HodgeError):
@@ -29,6 +36,10 @@ class WorkspaceError(HodgeError):
 
 class WorkerError(HodgeError):
     """A worker process or cluster was lost more often than its edges may be retried."""
+
+
+class StageError(HodgeError):
+    """A stage of another package raised something else than a `HodgeError`: names stage, package, error and line."""
 
 
 class CheckError(HodgeError):

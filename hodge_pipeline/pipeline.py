@@ -25,6 +25,7 @@ from hodge_pipeline.rounds.suggested import suggested_rounds
 from hodge_pipeline.run_folder import begin, opening_of
 from hodge_pipeline.scene import Round, Scene
 from hodge_pipeline.sources.measured_edges import measured_edges
+from hodge_pipeline.start.known_positions import known_fixes
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.types import Floats, Source, ViewGraph
 from hodge_pipeline.types.notes import Note, notes_of
@@ -61,7 +62,8 @@ def compute(job: Job, recording: Recording) -> Computed:
         scene = recipe.start.begin(job.source, recipe.clouds, store, workers)
         store.step(begin, *opening_of(scene), title="frames")
         recording.begin(scene.source, scene.clouds, scene.first)
-        work = Work(recipe, store, scene, measured(job, scene), workers)
+        fixes = known_fixes(scene, recipe.positions, store)
+        work = Work(recipe, store, scene, measured(job, scene), workers, fixes)
         rounds = [scene.first]
         edited = edited_rounds(work, job.folder, rounds)
         for registered in chain(proposed_rounds(work, rounds), suggested_rounds(work, rounds), edited):
@@ -81,8 +83,9 @@ def compute(job: Job, recording: Recording) -> Computed:
 def proposed_rounds(work: Work, rounds: Sequence[Round]) -> Iterator[Registered]:
     """The outer iterations: pairs proposed and registered from the last of `rounds`, which the caller extends."""
     for number in range(1, work.recipe.outer_iterations + 1):
-        proposed = work.propose(number, rounds[-1])
-        yield work.register(number, proposed, rounds[-1])
+        before = rounds[-1] if number > 1 else work.placed_first()
+        proposed = work.propose(number, before)
+        yield work.register(number, proposed, before)
 
 
 def consistent(work: Work, registered: Registered) -> Round:
@@ -121,7 +124,7 @@ def refine(work: Work, last: Round, refined: Refined | None) -> Floats:
     """
     scene, refiner = work.scene, work.recipe.refiner
     if refined is None:
-        poses = pose_all_frames(scene, last.world_from_cam, work.steps, work.workers)
+        poses = pose_all_frames(scene, last.world_from_cam, work.steps, work.workers, work.scale)
     else:
         poses = refined.world_from_cam
     if refiner is None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any
 
 from hodge_pipeline import stages
-from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.errors import HodgeError, RecipeError, StageError
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,11 @@ def suggestion(given: str, known: list[str]) -> str:
     return f" (did you mean '{close[0]}'?)" if close else f" (known: {', '.join(known) or 'none'})"
 
 
+OURS = "hodge-pipeline "
+LIBRARIES = "on Debian or Ubuntu apt-get install libusb-1.0-0 libegl1 libgl1 libx11-6 libgomp1 has what open3d needs"
+"""As tools/system-libraries.sh installs them."""
+
+
 def load(kind: str, name: str) -> Any:
     """The class of a stage. Raises `RecipeError` for an unknown name, or for a plugin that does not import."""
     known = _entries(KINDS[kind].group)
@@ -104,8 +113,10 @@ def load(kind: str, name: str) -> Any:
     except Exception as error:  # a plugin can fail in any way
         _give_way_to_ctrl_c(error)
         reason = f"{type(error).__name__}: {error}"
+        ours = isinstance(error, ImportError) and origin(kind, name).startswith(OURS)
         raise RecipeError(
-            f"stage '{name}' of kind '{kind}' ({origin(kind, name)}) does not load: {reason}; repair or remove it"
+            f"stage '{name}' of kind '{kind}' ({origin(kind, name)}) does not load: {reason}; "
+            f"{LIBRARIES if ours else 'repair or remove it'}"
         ) from error
 
 
@@ -131,3 +142,44 @@ def name_of_class(cls: type) -> str:
             if entry.value == path:
                 return name
     return path
+
+
+@contextmanager
+def plugin_errors() -> Iterator[None]:
+    """Raise `plugin_error` in the place of the error that it names. A decorator of tasks, too: a worker's error comes
+    back without its frames.
+    """
+    try:
+        yield
+    except Exception as error:
+        named = plugin_error(error)
+        if named is None:
+            raise
+        raise named from error
+
+
+def plugin_error(error: Exception) -> StageError | None:
+    """The error of one line that stands for what a stage of another package raised; None for any other error."""
+    stage = None if isinstance(error, (HodgeError, MemoryError)) else _plugin_in(error)
+    if stage is None:
+        return None
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    raised = " ".join(f"{type(error).__name__}: {error}".split())
+    return StageError(f"stage {stage} raised {raised}, at {Path(where.filename).name}:{where.lineno}")
+
+
+def _plugin_in(error: Exception) -> str | None:
+    """The innermost stage of another package whose method the error passed through, as `name (package 1.2.3)`."""
+    found = None
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        found = _plugin_of(type(frame.f_locals.get("self"))) or found
+    return found
+
+
+def _plugin_of(cls: type) -> str | None:
+    path = f"{cls.__module__}:{cls.__qualname__}"
+    for kind in KINDS.values():
+        for name, entry in _entries(kind.group).items():
+            if entry.value == path and not origin(kind.name, name).startswith(OURS):
+                return f"{name} ({origin(kind.name, name)})"
+    return None

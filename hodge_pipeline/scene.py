@@ -15,6 +15,7 @@ from hodge_pipeline.complex.parts import Energies
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, Solution, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
+from hodge_pipeline.types.positions import PositionFit
 
 START = "start"
 """The name of given poses, and of first poses that are not odometry's."""
@@ -31,7 +32,8 @@ class Round:
 
     The pairs that any round so far registered come first in `edges`, then those that came measured. This round itself
     registered the rows `fresh (F,)` from the poses `before (N, 4, 4)`; `energies` are those of ω's parts at the poses
-    that the solve started from. It is `edited` where a person's edits made it.
+    that the solve started from. It is `edited` where a person's edits made it. `position_fit`: how known positions fit
+    it, None without any.
     """
 
     edges: Edges
@@ -43,6 +45,7 @@ class Round:
     energies: Energies | None = None
     edited: bool = False
     name: str = "odometry"
+    position_fit: PositionFit | None = None
 
     @cached_property
     def graph_edges(self) -> Edges:

@@ -22,6 +22,7 @@ from hodge_adapters.open3d_json import Open3dPoseGraphWriter, Open3dReader, Open
 from hodge_adapters.pair_log import PairLogReader
 from hodge_adapters.ply_points import write_ply
 from hodge_adapters.poses_text import KittiWriter, TumWriter
+from hodge_adapters.positions import PositionsReader
 from hodge_adapters.seven_scenes import SevenScenesReader
 from hodge_adapters.toro import ToroReader
 from hodge_adapters.trajectory_files import KittiPosesReader, TumPosesReader
@@ -169,6 +170,17 @@ def mcap_of(encoding: str) -> Callable[[Path], Path]:
     return make
 
 
+def bag_of(kind: str) -> Callable[[Path], Path]:
+    """Every kind of message, by the writers of another library."""
+
+    def make(folder: Path) -> Path:
+        from bag_data import WRITERS  # skips where that library is absent
+
+        return WRITERS[kind](everything(), folder)
+
+    return make
+
+
 def split_bag(folder: Path) -> Path:
     for row in range(2):
         write_depth_log(folder / f"bag_{row}.mcap", some_images(1))
@@ -244,6 +256,12 @@ def priors(folder: Path) -> Path:
     return path
 
 
+def fixes(folder: Path) -> Path:
+    path = folder / "fixes.csv"
+    path.write_text("name,lat,lon,alt,sigma,cov_ee\na,49,8,100,0.5,1\nb,49.1,8,100,0.5,1\n12,49,8.2,90,,\n")
+    return path
+
+
 def isam(folder: Path) -> Path:
     path = folder / "isam.txt"
     path.write_text("ODOMETRY 0 1 1 0 0.1 4 0 0 9 0 1\nLANDMARK 0 5 2 3 0.4 0 0.4\nODOMETRY 1 2 1 0 0.1 4 0 0 9 0 1\n")
@@ -280,6 +298,9 @@ TARGETS: dict[str, Target] = {
     "mcap_protobuf": Target(McapReader(depth_topic="/rvl"), mcap_of(PROTOBUF)),
     "mcap_json": Target(McapReader(depth_topic="/png"), mcap_of(JSON)),
     "mcap_clouds": Target(McapReader(frames="points"), mcap_of(CDR)),
+    "db3": Target(McapReader(), bag_of("db3 before Iron")),
+    "bag": Target(McapReader(), bag_of("bag")),
+    "bag_bz2": Target(McapReader(frames="points"), bag_of("bag bz2")),
     "mcap_split": Target(McapReader(), split_bag),
     "mcap": Target(McapReader(), lambda folder: write_depth_log(folder / "a.mcap", some_images(2))),
     "colmap_bin": Target(ColmapReader(edges="none"), colmap("bin")),
@@ -299,6 +320,7 @@ TARGETS: dict[str, Target] = {
     "euroc": Target(EurocReader(), written(EurocWriter(), "data.csv")),
     "log": Target(LogReader(), written(LogWriter(), "a.log")),
     "pair_log": Target(PairLogReader(), pairs),
+    "positions": Target(PositionsReader(), fixes),
     "pair_information": Target(PairLogReader(), pairs_with_information),
     "tum_poses": Target(TumPosesReader(), written(TumWriter(), "a.tum")),
     "kitti_poses": Target(KittiPosesReader(), written(KittiWriter(), "a.txt")),

@@ -32,7 +32,7 @@ def why_no_browser() -> str:
     return f"no {' and no '.join(missing)} here: apt-get install chromium chromium-driver" if missing else ""
 
 
-def start_browser(width: int = 1500, height: int = 1000) -> Any:
+def start_browser(width: int = 1500, height: int = 1000, *flags: str) -> Any:
     """A headless Chromium. Selenium looks nothing up: browser and driver are the ones that are installed."""
     from selenium import webdriver
     from selenium.webdriver.chrome.options import Options
@@ -40,7 +40,7 @@ def start_browser(width: int = 1500, height: int = 1000) -> Any:
 
     options = Options()
     options.binary_location = str(shutil.which("chromium"))
-    for flag in (*FLAGS, f"--window-size={width},{height}"):
+    for flag in (*FLAGS, *flags, f"--window-size={width},{height}"):
         options.add_argument(flag)
     browser = webdriver.Chrome(options=options, service=Service(str(shutil.which("chromedriver"))))
     browser.set_script_timeout(PATIENCE_S)
@@ -70,6 +70,10 @@ class Page:
         """viser's handle of this tab; None until its scene has begun."""
         clients = self.review.viewer.server.get_clients() if self.review.viewer else {}
         return clients[max(clients)] if clients else None
+
+    def handle(self, name: str) -> Any:
+        """What viser shows under a name; None while there is nothing."""
+        return self.review.viewer.server.scene.get_handle_by_name(name) if self.review.viewer else None
 
     def data(self, name: str) -> str | None:
         return self.browser.execute_script(f"return document.body.dataset.{name} ?? null")
@@ -137,15 +141,19 @@ class Page:
         inside = frame["x"] < x < frame["x"] + frame["width"] and 60 < y < frame["height"] - 90
         return (float(x), float(y)) if depth > 0 and inside else None
 
-    def click_scene(self, point: Floats) -> None:
-        """Click where a point of the world is seen."""
+    def click_scene(self, *points: Floats) -> None:
+        """Click where a point of the world is seen; of several press at the first, and drag along the others."""
         from selenium.webdriver import ActionChains
         from selenium.webdriver.common.actions.action_builder import ActionBuilder
 
-        place = self.place(point)
-        assert place is not None, f"{point} is out of sight"
+        places = [self.place(point) for point in points]
+        assert all(places), f"{points} are out of sight"
+        pixels = [(round(place[0]), round(place[1])) for place in places if place is not None]
         actions = ActionBuilder(self.browser)
-        actions.pointer_action.move_to_location(round(place[0]), round(place[1])).click()
+        actions.pointer_action.move_to_location(*pixels[0]).pointer_down()
+        for pixel in pixels[1:]:
+            actions.pointer_action.move_to_location(*pixel)
+        actions.pointer_action.pointer_up()
         actions.perform()
         ActionChains(self.browser).reset_actions()
 

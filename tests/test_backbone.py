@@ -16,7 +16,7 @@ from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.robust import solve_robust
-from tests.backbone_graphs import drive
+from tests.backbone_graphs import WORLDS, broken, drive, spanned
 
 NEVER_WORSE = 1.02
 
@@ -151,3 +151,60 @@ def test_ids_give_the_sequence_not_rows() -> None:
     shuffled = np.random.default_rng(0).permutation(made.graph.vertex_count)
     mixed = replace(made.graph, edges=shuffled[made.graph.edges], vertex_ids=np.argsort(shuffled) * 10)
     np.testing.assert_array_equal(diagnose(mixed).kept, diagnose(made.graph).kept)
+
+
+BROKEN = [
+    ("ring", 2, 400, 80, 0.4),
+    ("ring", 2, 400, 20, 0.4),
+    ("room", 3, 400, 80, 0.4),
+    ("corridor", 2, 1000, 200, 0.0),
+    ("town", 2, 1000, 200, 0.6),
+]
+
+
+@pytest.mark.parametrize(("world", "dimension", "count", "loops", "wrong"), BROKEN)
+def test_a_broken_step_is_named_and_no_other(world: str, dimension: int, count: int, loops: int, wrong: float) -> None:
+    made = drive(world=world, dimension=dimension, count=count, loops=loops, wrong=wrong)
+    step = int(np.random.default_rng(count + loops).choice(spanned(made)))
+    found = diagnose(broken(made, step))
+    assert np.flatnonzero(found.verdict[: count - 1] == "wrong").tolist() == [step]
+    assert "confirmed loops over it contradict" in found.reason[step]
+    assert made.error_m(found.world_from_cam) < 1.1 * made.error_m(diagnose(made.graph).world_from_cam)
+
+
+def test_two_broken_steps_are_named() -> None:
+    made = drive(loops=200)
+    once = broken(made, 90)
+    found = diagnose(broken(replace(made, graph=once), 310, seed=1))
+    assert np.flatnonzero(found.verdict[:399] == "wrong").tolist() == [90, 310]
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.5, 0.9, 1.0])
+def test_no_right_step_is_called_wrong(wrong: float) -> None:
+    for seed in range(4):
+        made = drive(seed=seed, world=WORLDS[seed], wrong=wrong, in_groups=bool(seed % 2), count=200, loops=60)
+        backbone = find_backbone(made.graph)
+        assert backbone is None or backbone.used[:199].all()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("wrong", [0.0, 0.5])
+def test_robots_in_one_file_are_joined_by_loops_that_agree(dimension: int, wrong: float) -> None:
+    made = drive(dimension=dimension, wrong=wrong, count=600)
+    step = np.flatnonzero((np.sort(made.graph.edges, axis=1) == [249, 250]).all(axis=1))
+    rows = np.setdiff1d(np.arange(made.graph.edge_count), step)
+    robots = (ord("a") << 56) + np.arange(250), (ord("b") << 56) + np.arange(350)
+    graph = replace(made.graph.select(rows), vertex_ids=np.concatenate(robots))
+    found = diagnose(graph)
+    assert any("598 consecutive edges are trusted as a backbone" in note for note in found.notes)
+    assert not (found.kept & ~made.right[rows]).any()
+    assert (found.kept & made.right[rows]).sum() >= made.right[rows].sum() - 2
+    assert made.error_m(found.world_from_cam) < made.error_m(made.odometry())
+
+
+def test_robots_whose_loops_are_all_wrong_stay_apart() -> None:
+    made = drive(wrong=1.0, count=600, loops=60)
+    step = np.flatnonzero((np.sort(made.graph.edges, axis=1) == [249, 250]).all(axis=1))
+    found = diagnose(made.graph.select(np.setdiff1d(np.arange(made.graph.edge_count), step)))
+    assert not found.kept[598:].any() and found.kept[:598].all()
+    assert len(np.unique(found.piece)) == 2

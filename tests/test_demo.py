@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import open3d as o3d
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,10 +15,10 @@ from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo import sequence
 from hodge_pipeline.demo.noise import RANGE_M, measured_depth, photographed
-from hodge_pipeline.demo.path import HandHeldLoop
+from hodge_pipeline.demo.path import HandHeldLoop, Walk
 from hodge_pipeline.demo.render import Renderer
-from hodge_pipeline.demo.room import Room, build_room
-from hodge_pipeline.demo.sequence import DemoOptions, demo_source, make_sequence
+from hodge_pipeline.demo.room import Room, build_building, build_room
+from hodge_pipeline.demo.sequence import BuildingOptions, DemoOptions, demo_source, make_sequence
 from hodge_pipeline.demo.shapes import Mesh, ball, box, curtain, cylinder, lathe
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Frame
@@ -266,3 +267,42 @@ def test_the_cache_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(("frames", "rounds"), [(24, 24 * 3.4 / 720), (115, 0.5), (120, 1.12), (500, 1.12)])
 def test_short_sequences_go_as_far_as_small_steps_reach(frames: int, rounds: float) -> None:
     assert DemoOptions(frames=frames).rounds == pytest.approx(rounds)
+
+
+def test_the_walk_goes_through_doors_and_back_at_a_walking_pace() -> None:
+    walk = Walk(seed=0, rooms=3)
+    times = np.arange(0, walk.duration_s, 1 / 30)
+    poses = walk.world_from_cam(times)
+    steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:])
+    assert np.linalg.norm(steps[:, 3:], axis=1).max() < 0.05
+    assert np.rad2deg(np.linalg.norm(steps[:, :3], axis=1)).max() < 3
+    places = poses[:, :3, 3].astype(np.float32)
+    assert np.linalg.norm(places[-1] - places[0]) < 0.5 and places[:, 1].max() > 9, "the third room and back"
+    building = build_building(3)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(building.vertices.astype(np.float32)),
+        o3d.core.Tensor.from_numpy(building.triangles.astype(np.uint32)),
+    )
+    near = scene.compute_distance(o3d.core.Tensor.from_numpy(places)).numpy()
+    crossed = scene.test_occlusions(
+        o3d.core.Tensor.from_numpy(np.concatenate([places[:-1], np.diff(places, axis=0)], axis=1)), tnear=0.0, tfar=1.0
+    ).numpy()
+    assert near.min() > 0.15 and not crossed.any()
+
+
+def test_rooms_of_a_building_are_lit_and_look_different() -> None:
+    building = build_building(2)
+    images = []
+    for lamp in np.unique(building.lamp, axis=0):
+        pose = se3.from_parts(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), lamp - [0.3, 1.8, 0.4])
+        images.append(Renderer(building, BuildingOptions(rooms=2, width=80, height=60).camera).colour(pose))
+    assert all(image.mean() > 0.2 for image in images)
+    assert np.abs(images[0] - images[1]).mean() > 0.01
+
+
+def test_a_building_is_read_whole(tmp_path: Path) -> None:
+    options = BuildingOptions(rooms=2, width=32, height=24, stride=60)
+    source = TumReader().open(make_sequence(tmp_path / "building", options))
+    assert len(source.frames) == options.frames > 10
+    assert all(frame.true_world_from_cam is not None for frame in source.frames)

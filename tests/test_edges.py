@@ -17,7 +17,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.candidates import merge
 from hodge_pipeline.pairs.centroid import CentroidEdges
 from hodge_pipeline.pairs.combined import CombinedEdges
-from hodge_pipeline.pairs.overlap import OverlapEdges, pairwise_iou
+from hodge_pipeline.pairs.overlap import FRAMES_OF_A_PLACE, OverlapEdges, pairwise_iou, some_of_each_place
 from hodge_pipeline.pairs.sequential import SequentialEdges
 from hodge_pipeline.stages import EdgeBuilder
 from hodge_pipeline.types import CloudSet, Edges, Frame, PointCloud
@@ -217,3 +217,33 @@ def sparse_points(frame: Frame) -> np.ndarray:
     x = (4 * u - frame.camera.cx) / frame.camera.fx * z
     y = (4 * v - frame.camera.cy) / frame.camera.fy * z
     return np.stack([x, y, z], axis=1).astype(np.float32)
+
+
+def test_pairs_grow_with_the_frames_however_often_a_camera_comes_back() -> None:
+    counts = {}
+    for laps in (4, 40, 80):
+        poses = poses_at(*[0.0, 1.0] * laps)
+        clouds = clouds_of(*[POINT] * len(poses))
+        pairs = OverlapEdges(min_iou=0.5).propose(frames_of(*[""] * len(poses)), clouds, poses).pairs
+        assert (pairs[:, 0] < pairs[:, 1]).all() and len(np.unique(pairs, axis=0)) == len(pairs)
+        assert ((pairs[:, 0] - pairs[:, 1]) % 2 == 0).all(), "of the same place"
+        assert len(np.unique(pairs)) == len(poses), "every frame has a partner"
+        counts[laps] = len(pairs)
+    assert counts[4] == 2 * 4 * 3 // 2, "all pairs, of few"
+    assert counts[80] - counts[40] == 2 * 40 * FRAMES_OF_A_PLACE
+
+
+@given(st.lists(st.integers(0, 3), max_size=80))
+def test_of_each_place_some_frames_are_taken_evenly(places: list[int]) -> None:
+    rows = some_of_each_place(poses_at(*map(float, places)), 0.2)
+    assert (np.diff(rows) > 0).all()
+    for place in set(places):
+        own = np.flatnonzero(np.array(places) == place)
+        taken = np.searchsorted(own, rows[np.isin(rows, own)])
+        assert len(taken) == min(len(own), FRAMES_OF_A_PLACE) and taken[0] == 0
+        assert np.ptp(np.diff(taken)) <= 1 if len(taken) > 1 else True
+
+
+def test_frames_that_look_elsewhere_are_of_another_place() -> None:
+    poses = se3.exp(np.array([[0, angle, 0, 0, 0, 0] for angle in np.linspace(0, 2 * np.pi, 64, endpoint=False)]))
+    assert len(some_of_each_place(poses, 0.2)) == 64

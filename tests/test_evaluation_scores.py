@@ -11,6 +11,7 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.evaluation import scores
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, REACH_M
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances, evaluation_pairs, evenly, score_table
@@ -110,6 +111,15 @@ def test_iou_counts_shared_voxels() -> None:
     # Ten by ten voxels of 0.1 m each; a shift by k columns shares 100 − 10k of 100 + 10k: above a half up to k = 3.
     clouds = CloudSet.from_clouds([square(0.05, shift) for shift in (0.0, 0.3, 0.4)])
     assert evaluation_pairs(clouds, identities(3), "iou").tolist() == [[0, 1], [1, 2]]
+
+
+@pytest.mark.parametrize("kind", ["distance", "iou"])
+def test_of_many_frames_the_pairs_of_some_are_scored(kind: scores.GraphKind, monkeypatch: pytest.MonkeyPatch) -> None:
+    clouds = CloudSet.from_clouds([square(0.0)] * 6)
+    assert len(evaluation_pairs(clouds, identities(6), kind)) == 15
+    monkeypatch.setattr(scores, "MOST_FRAMES", 2)
+    some = [[0, 1], [0, 2], [0, 3], [0, 4], [0, 5], [1, 3], [2, 3], [3, 4], [3, 5]]
+    assert evaluation_pairs(clouds, identities(6), kind).tolist() == some
 
 
 def test_of_many_pairs_some_are_taken_evenly() -> None:

@@ -139,13 +139,23 @@ def test_a_street_is_followed_and_deskewed(tmp_path: Path) -> None:
     pytest.importorskip("kiss_icp", reason="the extra lidar is not installed")
     options = StreetOptions(frames=25, beams=16, columns=360)
     folder = make_sequence(tmp_path / "street", options)
-    recipe = load_recipe(
-        "lidar",
-        [f"evaluation.truth={json.dumps(str(folder / TRUTH_FILE))}", "recording.level=off", "fusion=[]"],
-        folder,
-    )
-    done = run(recipe, tmp_path / "run")
     exact = Road(options.speed_m_s).world_from_car(np.arange(25) * REVOLUTION_S)
+    known = se3.exp(np.array([0, 0, 2.0, 300, -200, 40])) @ exact @ se3.from_parts(np.eye(3), np.array([0.5, 0, 1.0]))
+    known[9, 0, 3] += 50
+    rows = [f"{name:06d},{x:.3f},{y:.3f},{z:.3f},0.1" for name, (x, y, z) in enumerate(known[:, :3, 3])]
+    (tmp_path / "fixes.csv").write_text("\n".join(["name,e,n,u,sigma", *rows]))
+    changes = {
+        "evaluation.truth": str(folder / TRUTH_FILE), "recording.level": "off", "fusion": [],
+        "positions.path": str(tmp_path / "fixes.csv"), "positions.antenna_m": [0.5, 0, 1.0],
+    }  # fmt: skip
+    recipe = load_recipe("lidar", [f"{key}={json.dumps(value)}" for key, value in changes.items()], folder)
+    done = run(recipe, tmp_path / "run")
+    antenna = se3.transform(done.poses, np.tile([[[0.5, 0, 1.0]]], (25, 1, 1)))[:, 0]
+    right = np.arange(25) != 9
+    assert np.linalg.norm(antenna - known[:, :3, 3], axis=1)[right].max() < 0.5
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert [name.startswith("000009") for name in report["positions"]["rejected"]] == [True]
+    assert "rejected" in (tmp_path / "run" / "positions.csv").read_text()
     moved = se3.inverse(done.poses[0]) @ done.poses[-1]
     error = se3.inverse(moved) @ se3.inverse(exact[0]) @ exact[-1]
     assert 16 < np.linalg.norm(moved[:3, 3]) < 18 and np.linalg.norm(error[:3, 3]) < 0.3

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -355,6 +356,19 @@ def test_images_stay_in_their_share(megabytes: float, every: int) -> None:
     assert total <= SHARES["images"] * megabytes * 1e6
     assert len(np.unique(np.diff(picked))) <= 1
     assert bool(notes) == (len(picked) < len(range(0, 20, every)))
+
+
+def test_of_many_frames_few_images_are_read_to_know_their_size() -> None:
+    read: list[int] = []
+
+    def image(row: int) -> EncodedImage:
+        read.append(row)
+        return EncodedImage(bytes(1000 + row % 7 * 50), "image/png")
+
+    frames = [Frame(row, float(row), encoded_colour=partial(image, row)) for row in range(3000)]
+    picked, _ = image_rows(frames, RecordingOptions(max_megabytes=1.0))
+    assert len(read) <= 64
+    assert 0.7 * 0.85e6 < sum(1000 + row % 7 * 50 for row in picked.tolist()) <= 0.85e6
 
 
 def test_levels(tmp_path: Path) -> None:

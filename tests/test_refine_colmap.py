@@ -138,6 +138,20 @@ def test_a_candidate_that_is_worse_is_kept_out_unless_forced(tmp_path: Path, mon
     assert (out / "sparse/0/images.bin").read_bytes() != (model / "images.bin").read_bytes()
 
 
+def test_the_terminal_has_ten_lines_of_80_columns_and_verbose_has_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = noisy(tmp_path)
+    command = ["refine", "colmap", str(model), "--out", "out", "--set", FREE[0], "--overwrite"]
+    monkeypatch.chdir(tmp_path)
+    brief = CliRunner().invoke(app, command).stdout.splitlines()
+    whole = CliRunner().invoke(app, [*command, "--verbose"]).stdout
+    assert brief[0].startswith("verdict  ") and brief[-1] == "report   out/report.html"
+    assert len(brief) <= 10 and max(map(len, brief)) <= 80
+    assert any("mean reprojection error" in line for line in brief)
+    assert "candidate" in whole and "bundle adjustment" in whole and len(whole.splitlines()) > len(brief)
+
+
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     model = noisy(tmp_path)
     for option in ("database", "depth"):
@@ -294,3 +308,22 @@ def test_sub_models_are_found(tmp_path: Path) -> None:
             (tmp_path / "scene/sparse" / number / file.name).write_bytes(file.read_bytes())
     found = ColmapModels().open_models(tmp_path / "scene")
     assert [Path(one.name).name for one in found] == ["2", "10"]
+
+
+@pytest.mark.parametrize("refine", ["none", "focal", "all"])
+def test_intrinsics_are_held_unless_they_are_to_be_refined(tmp_path: Path, refine: str) -> None:
+    good = pycolmap.Reconstruction(noisy(tmp_path))
+    long = pycolmap.Reconstruction(good)
+    for camera in long.cameras.values():
+        camera.params = camera.params * np.array([1.02, 1, 1, 1])
+    options = (*FREE, f"model.refine={refine}", "model.database=none")
+    (result,) = hodge_pipeline.refine_colmap(long, overrides=options).results
+    assert result.decision.outcome == "refined"
+    for key, camera in result.model.native.cameras.items():
+        params, before = camera.params, long.cameras[key].params
+        focal = good.cameras[key].params[0]
+        assert abs(params[0] / focal - 1) < 5e-3 if refine != "none" else params[0] == before[0]
+        assert (params[1] == before[1]) == (refine != "all") and (params[3] == before[3]) == (refine != "all")
+    notes = " ".join(result.notes)
+    assert ("intrinsics are held: --refine" in notes) == (refine == "none")
+    assert ("focal lengths of 2 cameras changed by" in notes) == (refine != "none")

@@ -16,7 +16,7 @@ from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_adapters.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError, WorkspaceError
-from hodge_pipeline.pairs.edits import Edit, History, read_history_file, write_history_file
+from hodge_pipeline.pairs.edits import Edit, History, pair_names, read_history_file, write_history_file
 from hodge_pipeline.review.adding import Candidate, guess_from_points
 from hodge_pipeline.review.decisions import LockedError, StaleError
 from hodge_pipeline.review.front import Front
@@ -25,8 +25,10 @@ from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.picking import nearest_point, nearest_segment
 from hodge_pipeline.review.routes import site
 from hodge_pipeline.review.session import Session
+from hodge_pipeline.review.settle import Settler, moved_m
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.rounds.one_round import with_right
+from hodge_pipeline.solvers.editing import GraphEditor
 
 VIEWS, REACH, PLANTED = 24, 3, (5, 40)
 """A ring of views, each joined to the next three; two of these edges have another motion."""
@@ -88,6 +90,20 @@ def test_verdicts_follow_and_what_is_off_keeps_its_own(session: Session) -> None
     assert session.table.edges.verdict[PLANTED[0]] == "wrong"
     assert session.judged.row(PLANTED[1]) == PLANTED[1] - 1
     assert describe(session, PLANTED[1])["cycles"]
+
+
+def test_poses_are_shown_before_they_are_checked_and_converge(graph_file: Path) -> None:
+    settler = Settler(open_for_review(graph_file))
+    settler.table = replace(settler.table, base=np.ones(len(settler.table)))
+    history = History((Edit(disable=tuple(pair_names(np.arange(VIEWS), settler.table.graph.edges[list(PLANTED)]))),))
+    settler._solution = replace(settler._solution, world_from_cam=np.tile(np.eye(4), (VIEWS, 1, 1)))
+    settler._editor = GraphEditor(settler.table.graph, settler._solution)
+    settler.settled = replace(settler.settled, world_from_cam=settler._solution.world_from_cam)
+    first, then = settler.solve(history, 1), settler.checked(history, 1)
+    assert not first.converged and then is not None and then.converged
+    assert then.residual_m[then.weights > 0].max() < first.residual_m[first.weights > 0].max()
+    assert settler.checked(history, 1) is None
+    assert then.moved_m == pytest.approx(moved_m(np.tile(np.eye(4), (VIEWS, 1, 1)), then.world_from_cam))
 
 
 def test_nothing_is_lost_when_the_program_ends(session: Session, graph_file: Path) -> None:
@@ -202,6 +218,14 @@ def test_three_points_give_the_motion_and_a_line_does_not() -> None:
     for here, there in zip(se3.transform(motion, points).tolist(), points.tolist(), strict=True):
         candidate = candidate.clicked(tuple(here)).clicked(tuple(there))
     assert np.allclose(candidate.guess, motion)
+
+
+def test_a_cloud_put_at_a_place_makes_the_guess(session: Session) -> None:
+    session.pick([3, 9])
+    there = session.settled.world_from_cam[3] @ se3.exp(np.array([0.1, 0.2, -0.3, 1.0, 2.0, 3.0]))
+    session.place(there)
+    assert session.candidate is not None and session.candidate.guess_by == "the place it was put at"
+    assert np.allclose(se3.log(session.candidate.guess), [0.1, 0.2, -0.3, 1.0, 2.0, 3.0])
 
 
 def test_the_nearest_line_in_front_is_picked() -> None:
@@ -341,7 +365,7 @@ def test_an_edge_added_counts_until_it_is_undone(session: Session) -> None:
     count = len(session.table)
     motion = se3.inverse(poses_on_a_ring(VIEWS)[0]) @ poses_on_a_ring(VIEWS)[12]
     registration = hodge_pipeline.Registration(motion, np.eye(6) * 1e4, 0.8, 0.01, 500, 9, True)
-    session.candidate = Candidate(0, 12, motion, registration)
+    session.candidate = Candidate(0, 12, motion, found=registration)
     session.accept(revision(session), "seen by eye")
     session.wait()
     assert len(session.table) == count + 1 and session.settled.weights[count] == 1

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.pairs.edits import read_history
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.review.closeup import SLICES
 from hodge_pipeline.review.looking import shown_pair
 from hodge_pipeline.review.opening import Review
 from hodge_pipeline.review.picking import nearest_point
@@ -117,7 +119,7 @@ def test_the_same_by_keyboard(browser: Any, review: Review, run_folder: Path) ->
     page.press("1")
     page.until(lambda: review.session.look.mode == "all")
     page.press("1")
-    middle = np.median(review.session.settled.world_from_cam[:, :3, 3], axis=0)
+    _, middle = review.scene.overview(review.session.settled.world_from_cam)
     page.until(lambda: np.allclose(page.scene.camera.look_at, middle, atol=1e-3))
 
 
@@ -159,6 +161,44 @@ def test_an_edge_added_by_three_clicked_points(browser: Any, review: Review, run
     page.decided(lambda: page.click("#accept"))
     assert session.settled.weights[session.rows_of(f"{i}-{j}")[0]] == 1
     assert read_history(run_folder).registered == (f"{i}-{j}",)
+
+
+def test_a_first_guess_by_the_handles_of_the_second_cloud(browser: Any, review: Review) -> None:
+    page, session = Page(browser, review), review.session
+    page.browser.execute_script("document.getElementById('adding').open = true")
+    page.find("#first").send_keys("4")
+    page.find("#second").send_keys("8")
+    page.click("#pick")
+    page.until(lambda: page.find("#candidate").is_displayed())
+    before = session.candidate.guess  # type: ignore[union-attr]
+    page.click("#put")
+    page.until(lambda: session.look.mode == "place")
+    page.until(lambda: page.place(shown_pair(session, False).middle))  # type: ignore[union-attr]
+    handle = page.until(lambda: page.handle("/pair/second"))
+    ways = np.outer([0.5, 0.6, 0.7, 0.9], [handle.scale, 0, 0])  # along the arrow of x
+    pose = se3.from_quat_xyzw(np.array(handle.position), np.array(handle.wxyz)[[1, 2, 3, 0]])
+    time.sleep(2)  # the handles are drawn a few frames after the server has made them
+    page.click_scene(*se3.transform(pose, ways))
+    page.until(lambda: "the place it was put at" in page.text("found"))
+    moved = se3.log(se3.inverse(before) @ session.candidate.guess)  # type: ignore[union-attr]
+    assert moved[3] == pytest.approx(ways[-1, 0] - ways[0, 0], rel=0.2) and np.abs(np.delete(moved, 3)).max() < 1e-6
+
+
+def test_the_second_cloud_fades_from_the_edges_place_to_the_solutions(browser: Any, review: Review) -> None:
+    page, session = Page(browser, review), review.session
+    page.choose(sorted(PLANTED)[0])
+    sent = []
+    for mode, share in (("edge", 0), ("between", 3), ("solution", SLICES)):
+        session.show(mode=mode, share=0.3)
+        page.until(lambda: [len(seen(page, name)) for name in ("second", "solved")] == [SLICES - share, share])  # noqa: B023
+        sent.append(page.handle("/pair/second/9"))
+    assert sent[0] is sent[1] is sent[2]
+
+
+def seen(page: Page, name: str) -> list[Any]:
+    """The parts of a cloud that are shown."""
+    parts = [page.handle(f"/pair/{name}/{number}") for number in range(SLICES)]
+    return [part for part in parts if part is not None and part.visible]
 
 
 def clicks(session: Any) -> tuple[int, int]:
@@ -228,6 +268,21 @@ def test_a_server_that_is_killed_loses_no_decision(browser: Any, run_folder: Pat
             process.send_signal(signal.SIGKILL)
             process.wait()
     assert read_history(run_folder).disabled == (name,)
+
+
+def test_without_webgl_there_is_a_line_and_every_decision(review: Review, run_folder: Path) -> None:
+    bare = start_browser(1500, 1000, "--disable-3d-apis")
+    try:
+        bare.get(review.address)
+        page = Page.__new__(Page)
+        page.browser, page.review = bare, review
+        page.settled()
+        assert "has no WebGL" in page.find("#no-webgl").text and not bare.find_elements("css selector", "#scene")
+        page.choose(sorted(PLANTED)[0])
+        page.decided(lambda: page.press("d"))
+        assert read_history(run_folder).disabled == (sorted(PLANTED)[0],)
+    finally:
+        bare.quit()
 
 
 def test_another_origin_gets_no_socket(browser: Any, review: Review) -> None:

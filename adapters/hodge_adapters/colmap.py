@@ -20,6 +20,7 @@ from hodge_adapters.colmap_cameras import (
     read_sensor_depth,
     read_stereo_depth,
 )
+from hodge_adapters.colmap_content import read_model
 from hodge_adapters.colmap_database import database_pairs
 from hodge_adapters.colmap_depth import depth_map_size, sensor_depth, stereo_depth
 from hodge_adapters.colmap_edges import Pair, covisible_pairs, measured_graph
@@ -29,7 +30,6 @@ from hodge_adapters.colmap_files import (
     find_model,
     find_models,
     largest_model,
-    load_model,
     no_model,
     parent_of,
     part_of_model,
@@ -108,12 +108,12 @@ class ColmapReader:
     def _load(self, folder: Path) -> Model:
         """The model; where its tracks alone are broken the error says how to do without."""
         try:
-            return load_model(folder, self.tracks)
+            return read_model(folder, self.tracks)[1]
         except SourceError as error:
             if not self.tracks:
                 raise
             try:
-                load_model(folder, False)
+                read_model(folder, False)
             except SourceError:
                 raise error from None
             raise SourceError(f"{error}, or set tracks=false to take its poses alone") from error

@@ -1,8 +1,9 @@
-"""Bundle adjustment by pycolmap: poses and points, with cameras and rigs as they are."""
+"""Bundle adjustment by pycolmap: poses and points, intrinsics where that is asked for, with rigs as they are."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from hodge_adapters.colmap_bodies import Bodies
 from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PositionPriors
+
+Intrinsics: TypeAlias = Literal["none", "focal", "all"]
+"""What of each camera is adjusted: nothing; its focal lengths; these, its principal point and its distortion."""
 
 
 def adjust(
@@ -19,8 +23,9 @@ def adjust(
     priors: PositionPriors | None,
     *,
     move_bodies: bool = True,
+    refine: Intrinsics = "none",
 ) -> set[int]:
-    """Adjust it in place with COLMAP's own options, cameras held; the points alone where bodies are not to move.
+    """Adjust it in place with COLMAP's own options; the points alone where bodies are not to move.
 
     As in COLMAP, observations (image, keypoint) of points `behind` their camera take no part; gives the points whose
     place is therefore not adjusted to their whole track. Without priors the gauge is that of two images; with them the
@@ -37,18 +42,24 @@ def adjust(
             part.delete_observation(image_id, column)
     if not part.num_points3D():
         raise SourceError("no point was seen by two images: nothing ties the poses: triangulate points first")
-    _solve(_adjuster(part, bodies, priors, move_bodies))
+    _solve(_adjuster(part, bodies, priors, move_bodies, refine))
     for frame_id in bodies.frame_ids:
         reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
+    for camera_id, camera in part.cameras.items():
+        reconstruction.cameras[camera_id].params = camera.params
     for key, point in part.points3D.items():
         reconstruction.points3D[key].xyz = point.xyz
     return loose
 
 
 def _adjuster(
-    reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors | None, move_bodies: bool
+    reconstruction: pycolmap.Reconstruction,
+    bodies: Bodies,
+    priors: PositionPriors | None,
+    move_bodies: bool,
+    refine: Intrinsics,
 ) -> pycolmap.BundleAdjuster:
-    options, config = _options(), pycolmap.BundleAdjustmentConfig()
+    options, config = _options(refine), pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
         config.add_image(image_id)
     if not move_bodies:
@@ -64,10 +75,11 @@ def _adjuster(
     return pycolmap.create_pose_prior_bundle_adjuster(options, _prior_options(), config, known, reconstruction)
 
 
-def _options() -> pycolmap.BundleAdjustmentOptions:
+def _options(refine: Intrinsics) -> pycolmap.BundleAdjustmentOptions:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+    options.refine_focal_length = refine != "none"
+    options.refine_principal_point = options.refine_extra_params = refine == "all"
     options.refine_sensor_from_rig = False
     return options
 

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
-from hodge_adapters import colmap_binary, colmap_text
-from hodge_adapters.colmap_records import Model, check_model, no_points
-from hodge_adapters.colmap_rigs import posed_by_rigs, rig_files
+from hodge_adapters.colmap_check import image_count
+from hodge_adapters.text_rows import counted
 from hodge_pipeline.errors import SourceError
 
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
@@ -74,27 +73,6 @@ def find_database(model: Path) -> Path | None:
     return next((place / "database.db" for place in above if (place / "database.db").is_file()), None)
 
 
-def load_model(folder: Path, tracks: bool) -> Model:
-    """The model of a folder, checked; images in natural order of their names (2 before 10).
-
-    Without `tracks` observations and points are not read. Raises `SourceError` with file and record.
-    """
-    ending = model_ending(folder)
-    read = colmap_text if ending == ".txt" else colmap_binary
-    paths = [folder / f"{name}{ending}" for name in ("cameras", "images", "points3D")]
-    has_points = tracks and paths[2].is_file()
-    cameras = read.read_cameras(paths[0])
-    images = sorted(read.read_images(paths[1], has_points), key=lambda image: natural(image.name))
-    points = read.read_points(paths[2]) if has_points else no_points()
-    rigs, notes = rig_files(folder, ending or ".bin"), list[str]()
-    if rigs:
-        images = posed_by_rigs(images, rigs, notes)
-    files = (*(paths if has_points else paths[:2]), *rigs)
-    model = Model(cameras, images, points, files, tuple(notes))
-    check_model(model, folder)
-    return model
-
-
 def natural(name: str) -> tuple[tuple[int, int, str], ...]:
     """A sort key that takes digits for numbers."""
     parts = (part for part in _DIGITS.split(name) if part)
@@ -123,15 +101,11 @@ def largest_model(folders: Sequence[Path]) -> tuple[Path, str]:
     """The model with most images, and a line that names all of them, empty for one alone. Raises `SourceError`."""
     if len(folders) == 1:
         return folders[0], ""
-    counts = [_image_count(folder) for folder in folders]
-    named = ", ".join(f"{folder.name} ({count} images)" for folder, count in zip(folders, counts, strict=True))
+    counts = [image_count(folder / f"images{model_ending(folder)}") for folder in folders]
+    named = ", ".join(
+        f"{folder.name} ({counted(count, 'image')})" for folder, count in zip(folders, counts, strict=True)
+    )
     return folders[counts.index(max(counts))], f"{len(folders)} models in {folders[0].parent}: {named}"
-
-
-def _image_count(folder: Path) -> int:
-    ending = model_ending(folder)
-    read = colmap_text if ending == ".txt" else colmap_binary
-    return len(read.read_images(folder / f"images{ending}", False))
 
 
 def _folders(path: Path) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,19 +12,24 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters import images
 from hodge_adapters.colmap import ColmapReader
+from hodge_adapters.colmap_bundle import Intrinsics
+from hodge_adapters.colmap_content import checked_content, read_model
 from hodge_adapters.colmap_database import database_names, has_verified_pairs
 from hodge_adapters.colmap_depth import sensor_depth
-from hodge_adapters.colmap_files import find_database, find_models, largest_model, load_model, model_ending, no_model
+from hodge_adapters.colmap_files import find_database, find_models, largest_model, model_ending, no_model
+from hodge_adapters.colmap_priors import database_priors, table_priors
+from hodge_adapters.colmap_records import Model
 from hodge_adapters.colmap_scale import other_camera_note
 from hodge_adapters.colmap_ties import similarity, tie_points
-from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, read_reconstruction
+from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, PriorOptions
 from hodge_adapters.colmap_union import united
 from hodge_adapters.pycolmap_import import pycolmap
+from hodge_adapters.text_rows import counted
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Frame
 
+HELD = "intrinsics are held: --refine focal or all adjusts them too"
 COVISIBILITY = "edges come from the points that images share"
-MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -46,6 +50,15 @@ class ColmapModels:
     max_edges_per_image: int = Field(
         20, ge=1, description="pairs for an image where there is no database, those with most shared points first"
     )
+    refine: Intrinsics = Field(
+        "none", description="intrinsics that bundle adjustment refines: focal lengths, all with the distortion, or none"
+    )
+    positions: str = Field(
+        "none",
+        description="known positions of images, whose world the result is then in: database (its pose priors: GPS, "
+        "gravity), or a table of name and e,n,u or lat,lon,alt; none",
+    )
+    position_sigma_m: float = Field(1.0, gt=0, description="metres: sigma of positions that state none")
     seed: int = Field(0, ge=0, description="of RANSAC")
 
     def open_models(self, source: Path | Sequence[pycolmap.Reconstruction]) -> Sequence[ColmapModel]:
@@ -57,16 +70,18 @@ class ColmapModels:
             raise no_model(Path(source))
         largest, several = largest_model(folders)
         told = (f"{several}: those that tie are joined, the report shows the largest result",) if several else ()
-        models = [self._open(folder) for folder in folders]
+        models = [self._open(folder, *read_model(folder)) for folder in folders]
         return [
             replace(model, notes=(*told, *model.notes)) if folder == largest else model
             for folder, model in zip(folders, models, strict=True)
         ]
 
     def _of_memory(self, number: int, model: pycolmap.Reconstruction) -> ColmapModel:
-        with tempfile.TemporaryDirectory() as folder:
-            model.write_binary(folder)
-            return replace(self._open(Path(folder)), name=f"model {number}", files=())
+        """A copy of a model of pycolmap's, beside which nothing lies."""
+        nowhere = Path(f"model {number}")
+        images, database = ("none" if option == "auto" else option for option in (self.images, self.database))
+        alone = replace(self, images=images, database=database)
+        return alone._open(nowhere, pycolmap.Reconstruction(model), checked_content(model, nowhere))
 
     def join(self, models: Sequence[ColmapModel]) -> Sequence[ColmapModel]:
         """The largest model takes in, one by one, those that enough tied points place in it."""
@@ -86,29 +101,32 @@ class ColmapModels:
             out.append(whole)
         return out
 
-    def _open(self, folder: Path) -> ColmapModel:
-        ending = model_ending(folder)
-        assert ending is not None
+    def _open(self, folder: Path, reconstruction: pycolmap.Reconstruction, content: Model) -> ColmapModel:
         sensor = self._sensor(folder)
         plain = ColmapReader(edges="none", scale=1.0)  # type: ignore[call-arg] # the plugin reads Field(1, …) as required
         depth_of = "none" if sensor is None else str(sensor.absolute())
         source = replace(
             plain, images=self.images, depth=depth_of, depth_scale=self.depth_scale, no_depth=self.no_depth
-        ).source_of(folder, folder, load_model(folder, True))
-        reconstruction = read_reconstruction(folder)
-        notes = [*source.notes, *_unposed(reconstruction)]
+        ).source_of(folder, folder, content)
+        notes = [
+            *source.notes,
+            *_unposed(reconstruction),
+            HELD if self.refine == "none" else f"intrinsics are refined: {self.refine}",
+        ]
         frames = {str(frame.frame_id): frame for frame in source.frames}
         depth = self._depth(sensor, frames)
         database = self._database(folder, frames, notes)
-        files = (folder / f"{name}{ending}" for name in MODEL_FILES)
         model = ColmapModel(
             name=str(folder),
             reconstruction=reconstruction,
             all_frames={name: self._with_depth(frame, depth.files.get(name)) for name, frame in frames.items()},
             depth=depth,
             edges=EdgeOptions(database, self.min_shared, self.max_edges_per_image, self.seed),
-            text=ending == ".txt",
-            files=tuple(file for file in files if file.is_file()),
+            text=model_ending(folder) == ".txt",
+            files=content.files,
+            refine=self.refine,
+            known=self._known(database, notes),
+            tracks=content,
             notes=tuple(notes),
         )
         return self._with_camera_note(model)
@@ -154,6 +172,22 @@ class ColmapModels:
             return None
         return found
 
+    def _known(self, database: Path | None, notes: list[str]) -> PriorOptions:
+        """What is known of images beside their pixels."""
+        if self.positions == "none":
+            count = len(database_priors(database)) if database else 0
+            if count:
+                notes.append(
+                    f"the database has pose priors of {counted(count, 'image')}: --positions database places the model"
+                )
+            return PriorOptions()
+        if self.positions == "database":
+            if database is None:
+                raise SourceError("--positions database: there is no database: give --database, or a table")
+            return PriorOptions(database_priors(database), None, self.position_sigma_m)
+        path = Path(self.positions)
+        return PriorOptions(table_priors(path, notes), path, self.position_sigma_m)
+
     def _with_depth(self, frame: Frame, depth: Path | None) -> Frame:
         """The frame in the camera of its depth, where that is another one than the colour's."""
         if depth is None or self.depth_camera is None:
@@ -164,7 +198,7 @@ class ColmapModels:
 
 def _unposed(reconstruction: pycolmap.Reconstruction) -> list[str]:
     unposed = reconstruction.num_images() - reconstruction.num_reg_images()
-    return [f"{unposed} images of the model have no pose: they stay without"] if unposed else []
+    return [f"{counted(unposed, 'image')} of the model without a pose: left without"] if unposed else []
 
 
 def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
@@ -178,11 +212,13 @@ def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
     points = f"{agreeing} of {len(ties.ids)} points in both"
     note = f"{other.name} joined to {whole.name} by {points}, scale {whole_from_other.scale:.4g}"
     depth = replace(whole.depth, files={**other.depth.files, **whole.depth.files})
+    known = replace(whole.known, images={**other.known.images, **whole.known.images})
     return replace(
         whole,
         reconstruction=united(whole.reconstruction, moved),
         all_frames={**other.all_frames, **whole.all_frames},
         depth=depth,
+        known=known,
         files=(),
         notes=(*whole.notes, *(line for line in other.notes if line not in whole.notes), note),
         tracks=None,

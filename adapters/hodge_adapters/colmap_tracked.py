@@ -6,19 +6,20 @@ frames: all cameras of a rig at one moment, or a single image.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from hodge_adapters.colmap_bodies import Bodies, bodies_of, body_graph
-from hodge_adapters.colmap_bundle import adjust
-from hodge_adapters.colmap_content import content_of, refreshed
+from hodge_adapters.colmap_bundle import Intrinsics, adjust
+from hodge_adapters.colmap_content import content_of, read_reconstruction, refreshed
 from hodge_adapters.colmap_database import database_pairs
 from hodge_adapters.colmap_edges import covisible_pairs, measured_graph
 from hodge_adapters.colmap_points import parallaxes, points_of_rays
+from hodge_adapters.colmap_priors import Known, body_priors, placing
 from hodge_adapters.colmap_records import Model
 from hodge_adapters.colmap_reprojection import reprojection_errors, update_errors
 from hodge_adapters.colmap_resection import resected
@@ -27,7 +28,6 @@ from hodge_adapters.colmap_ties import held_apart, merge_matched_points
 from hodge_adapters.colmap_uncertainty import standard_errors
 from hodge_adapters.pycolmap_import import pycolmap
 from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import (
     Bools,
     CloudSet,
@@ -69,6 +69,15 @@ class EdgeOptions:
 
 
 @dataclass(frozen=True)
+class PriorOptions:
+    """What is known of images by name beside their pixels, the file it comes from, and sigma where none is stated."""
+
+    images: Mapping[str, Known] = field(default_factory=dict)
+    file: Path | None = None
+    sigma_m: float = 1.0
+
+
+@dataclass(frozen=True)
 class ColmapModel:
     """See `stages.TrackedModel`. The reconstruction is never changed in place."""
 
@@ -80,6 +89,10 @@ class ColmapModel:
     text: bool = False
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
+    refine: Intrinsics = "none"
+    known: PriorOptions = field(default_factory=PriorOptions)
+    placing: str = ""
+    """What gave the model its place in the world, empty where nothing did."""
     tracks: Model | None = None
     """The content of a model with the same tracks, from which this one differs by poses and positions alone."""
 
@@ -90,9 +103,9 @@ class ColmapModel:
 
     @property
     def measurements(self) -> tuple[Path, ...]:
-        """The database and the depth images."""
-        database = () if self.edges.database is None else (self.edges.database,)
-        return (*database, *self.depth.files.values())
+        """The database, known positions and the depth images."""
+        files = (self.edges.database, self.known.file, *self.depth.files.values())
+        return tuple(dict.fromkeys(file for file in files if file is not None))
 
     @cached_property
     def records(self) -> Model:
@@ -189,6 +202,25 @@ class ColmapModel:
         """Poses (B, 4, 4): those of these bodies (B,), all by default, by the points; see `colmap_resection`."""
         return resected(self.records, self.bodies, bodies)
 
+    @property
+    def known_positions(self) -> PositionPriors | None:
+        """Where bodies should be, of a model that was placed by known positions."""
+        names = [image.name for image in self.records.images]
+        return body_priors(names, self.bodies, self.known.images, self.known.sigma_m) if self.placing else None
+
+    def placed(self) -> ColmapModel:
+        """The model in the world of what is known of its images; as it is, with a note, where that does not tell."""
+        if not self.known.images:
+            return self
+        images = self.records.images
+        poses = np.array([image.world_from_cam for image in images])
+        found = placing([image.name for image in images], poses, self.known.images, self.known.sigma_m)
+        if isinstance(found, str):
+            return replace(self, notes=(*self.notes, found))
+        copy = self._copy()
+        copy.transform(found.world_from_model)
+        return replace(self, reconstruction=copy, files=(), tracks=self.records, placing=found.told)
+
     def scaled(self, factor: float) -> ColmapModel:
         """Positions times the factor."""
         copy = self._copy()
@@ -220,7 +252,7 @@ class ColmapModel:
         return replace(self, reconstruction=copy, files=(), notes=notes, tracks=None)
 
     def adjusted(self, priors: PositionPriors | None = None) -> ColmapModel:
-        """Bundle adjustment with cameras and rigs held; see `colmap_bundle`.
+        """Bundle adjustment with rigs held, and intrinsics unless they are to be refined; see `colmap_bundle`.
 
         Where it leaves a few points behind their cameras, those are placed anew and all is adjusted once more.
         """
@@ -233,7 +265,7 @@ class ColmapModel:
 
     def _adjusted(self, priors: PositionPriors | None) -> ColmapModel:
         copy = self._copy()
-        loose = adjust(copy, self._behind(), self.bodies, priors)
+        loose = adjust(copy, self._behind(), self.bodies, priors, refine=self.refine)
         if loose:
             after = refreshed(self.records, copy)
             poses = np.array([image.world_from_cam for image in after.images])
@@ -242,6 +274,11 @@ class ColmapModel:
                     copy.points3D[point_id].xyz = xyz
         update_errors(copy)
         return replace(self, reconstruction=copy, files=(), tracks=self.records)
+
+    @property
+    def moves_intrinsics(self) -> bool:
+        """Whether bundle adjustment changes more than poses and points."""
+        return self.refine != "none"
 
     def _behind(self) -> list[tuple[int, int]]:
         """Image and keypoint of each observation whose point lies behind the camera."""
@@ -275,7 +312,20 @@ class ColmapModel:
 
     def read_back(self, folder: Path, notes: tuple[str, ...]) -> ColmapModel:
         """The model of that folder with the frames, depth and database of this one."""
-        return replace(self, reconstruction=read_reconstruction(folder), files=(), notes=notes, tracks=None)
+        back = read_reconstruction(folder)
+        return replace(self, reconstruction=back, files=(), notes=(*notes, *self._refined_cameras(back)), tracks=None)
+
+    def _refined_cameras(self, after: pycolmap.Reconstruction) -> tuple[str, ...]:
+        """A line on how the adjustment to another model changed focal lengths."""
+        if not self.moves_intrinsics:
+            return ()
+        cameras = self.reconstruction.cameras
+        pairs = [(cameras[key].mean_focal_length(), new.mean_focal_length()) for key, new in after.cameras.items()]
+        ratios: Floats = np.array([new / old for old, new in pairs])
+        if len(ratios) == 1:
+            return (f"focal length {pairs[0][0]:.6g} -> {pairs[0][1]:.6g} px",)
+        low, middle, high = 100 * (np.percentile(ratios, [0, 50, 100]) - 1)
+        return (f"focal lengths of {len(ratios)} cameras changed by {middle:+.3g} % ({low:+.3g} to {high:+.3g} %)",)
 
     def _copy(self) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(self.reconstruction)
@@ -284,12 +334,3 @@ class ColmapModel:
 def rigid3d(b_from_a: Floats) -> pycolmap.Rigid3d:
     """A motion as pycolmap has it."""
     return pycolmap.Rigid3d(np.ascontiguousarray(b_from_a[:3]))
-
-
-def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
-    """The model of a folder by pycolmap. Raises `SourceError` where it refuses."""
-    try:
-        return pycolmap.Reconstruction(folder)
-    except Exception as error:  # pycolmap raises what its C++ checks raise: RuntimeError, ValueError, IndexError
-        reason = str(error).strip().splitlines()[-1][:200] if str(error).strip() else type(error).__name__
-        raise SourceError(f"{folder}: COLMAP itself cannot read this model ({reason}): write it again") from error

@@ -4,7 +4,6 @@ read from COLMAP's files stays whole, points and rigs included.
 
 from __future__ import annotations
 
-import struct
 import tempfile
 from pathlib import Path
 from typing import Literal
@@ -14,12 +13,12 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.colmap_cameras import HALF_PIXEL
-from hodge_adapters.colmap_files import find_model, load_model
-from hodge_adapters.colmap_records import CAMERA_MODELS, to_colmap
-from hodge_adapters.colmap_rigs import CAMERA
+from hodge_adapters.colmap_content import read_model
+from hodge_adapters.colmap_files import find_model
 from hodge_adapters.posed import written
 from hodge_adapters.pycolmap_import import pycolmap
-from hodge_adapters.text_rows import listed, write_bytes_atomically
+from hodge_adapters.text_rows import counted, listed, write_bytes_atomically
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.types import Frame, Source
 from hodge_pipeline.types.input_files import read_input
@@ -47,7 +46,6 @@ class ColmapWriter:
         frames = [frame for frame in source.frames if frame.camera is not None and frame.world_from_cam is not None]
         if not frames:
             raise SourceError(f"{source.path}: no frame with a camera and a pose: COLMAP needs both")
-        lenses = [_lens(frame) for frame in frames]
         if any(frame.camera.fy < 0 for frame in frames if frame.camera):
             raise SourceError(
                 f"{source.path}: fy is negative (y points up), which COLMAP has not: turn the images over"
@@ -55,21 +53,21 @@ class ColmapWriter:
         whole = _whole_model(source, frames)
         if whole is not None:
             _write_folder(Path(path), _files_of(whole, self.form))
-            count = f"{whole.num_reg_images()} images, {whole.num_cameras()} cameras, {whole.num_points3D()} points"
-            return written(count, source, {"cameras", "names", "images"})
-        cameras = list(dict.fromkeys(lenses))
+            points = counted(whole.num_points3D(), "point")
+            return written(f"{_sizes(whole)}, {points}", source, {"cameras", "names", "images"})
         names = _names(frames)
         blank = [name for name in names if len(name.split()) != 1]
         if blank and self.form == "txt":
             raise SourceError(
                 f"{source.path}: COLMAP's text cannot hold names with blanks ({listed(blank)}): write form=bin"
             )
-        write = _binary_files if self.form == "bin" else _text_files
-        numbers = [cameras.index(lens) + 1 for lens in lenses]
-        _write_folder(Path(path), write(cameras, numbers, names, _poses(frames)))
-        return written(
-            f"{len(frames)} images, {len(cameras)} cameras, no points", source, {"cameras", "names", "images"}
-        )
+        made = _made_model(frames, names)
+        _write_folder(Path(path), _files_of(made, self.form))
+        return written(f"{_sizes(made)}, no points", source, {"cameras", "names", "images"})
+
+
+def _sizes(model: pycolmap.Reconstruction) -> str:
+    return f"{counted(model.num_reg_images(), 'image')}, {counted(model.num_cameras(), 'camera')}"
 
 
 def _whole_model(source: Source, frames: list[Frame]) -> pycolmap.Reconstruction | None:
@@ -80,9 +78,8 @@ def _whole_model(source: Source, frames: list[Frame]) -> pycolmap.Reconstruction
     if folder is None:
         return None
     try:
-        load_model(folder, tracks=True)  # which checks what pycolmap would crash on
-        model = pycolmap.Reconstruction(str(folder))
-    except (SourceError, ValueError, RuntimeError):
+        model, _ = read_model(folder)
+    except SourceError:
         return None
     images = {
         image.name: image.cam_from_world().inverse().matrix() for image in model.images.values() if image.has_pose
@@ -99,6 +96,24 @@ def _whole_model(source: Source, frames: list[Frame]) -> pycolmap.Reconstruction
         return None
     if abs(scale - 1) > SAME:
         model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
+    return model
+
+
+def _made_model(frames: list[Frame], names: list[str]) -> pycolmap.Reconstruction:
+    """A model of these frames without points: a rig for each camera, a frame for each image."""
+    model, numbers = pycolmap.Reconstruction(), dict[Lens, int]()
+    for row, (frame, name) in enumerate(zip(frames, names, strict=True), 1):
+        lens = _lens(frame)
+        if lens not in numbers:
+            numbers[lens] = len(numbers) + 1
+            kind, width, height, params = lens
+            camera = pycolmap.Camera(
+                camera_id=numbers[lens], model=kind, width=width, height=height, params=np.array(params)
+            )
+            model.add_camera_with_trivial_rig(camera)
+        assert frame.world_from_cam is not None
+        image = pycolmap.Image(name, np.zeros((0, 2)), numbers[lens], row)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(se3.inverse(frame.world_from_cam)[:3]))
     return model
 
 
@@ -128,60 +143,6 @@ def _names(frames: list[Frame]) -> list[str]:
     if len(set(files)) < len(files) or not all(isinstance(frame.frame_id, int) and frame.image for frame in frames):
         return numbered
     return files
-
-
-def _poses(frames: list[Frame]) -> list[list[float]]:
-    poses = np.hstack(to_colmap(np.array([frame.world_from_cam for frame in frames])))
-    return [list(map(float, pose)) for pose in poses]
-
-
-def _text_files(
-    cameras: list[Lens], numbers: list[int], names: list[str], poses: list[list[float]]
-) -> dict[str, bytes]:
-    lines = [
-        f"{number} {lens} {width} {height} {' '.join(map(repr, params))}\n"
-        for number, (lens, width, height, params) in enumerate(cameras, 1)
-    ]
-    words = [" ".join(map(repr, pose)) for pose in poses]
-    numbered = list(enumerate(zip(words, numbers, names, strict=True), 1))
-    rows = [f"{number} {pose} {camera} {name}\n\n" for number, (pose, camera, name) in numbered]
-    rig_frames = [f"{number} {camera} {pose} 1 CAMERA {camera} {number}\n" for number, (pose, camera, _) in numbered]
-    return {
-        "cameras.txt": ("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n" + "".join(lines)).encode(),
-        "rigs.txt": (
-            "# RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID\n"
-            + "".join(f"{number} 1 CAMERA {number}\n" for number in range(1, len(cameras) + 1))
-        ).encode(),
-        "frames.txt": ("# FRAME_ID RIG_ID RIG_FROM_WORLD NUM_DATA_IDS DATA_IDS\n" + "".join(rig_frames)).encode(),
-        "images.txt": ("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points\n" + "".join(rows)).encode(),
-        "points3D.txt": b"# POINT3D_ID X Y Z R G B ERROR TRACK\n",
-    }
-
-
-def _binary_files(
-    cameras: list[Lens], numbers: list[int], names: list[str], poses: list[list[float]]
-) -> dict[str, bytes]:
-    records = [
-        struct.pack(f"<IiQQ{len(params)}d", number, CAMERA_MODELS[lens][0], width, height, *params)
-        for number, (lens, width, height, params) in enumerate(cameras, 1)
-    ]
-    numbered = list(enumerate(zip(poses, numbers, names, strict=True), 1))
-    rows = [
-        struct.pack("<I7dI", number, *pose, camera) + name.encode() + struct.pack("<xQ", 0)
-        for number, (pose, camera, name) in numbered
-    ]
-    rigs = [struct.pack("<IIiI", number, 1, CAMERA, number) for number in range(1, len(cameras) + 1)]
-    rig_frames = [
-        struct.pack("<II7dIiIQ", number, camera, *pose, 1, CAMERA, camera, number)
-        for number, (pose, camera, _) in numbered
-    ]
-    return {
-        "cameras.bin": struct.pack("<Q", len(records)) + b"".join(records),
-        "rigs.bin": struct.pack("<Q", len(rigs)) + b"".join(rigs),
-        "frames.bin": struct.pack("<Q", len(rig_frames)) + b"".join(rig_frames),
-        "images.bin": struct.pack("<Q", len(rows)) + b"".join(rows),
-        "points3D.bin": struct.pack("<Q", 0),
-    }
 
 
 def _write_folder(folder: Path, files: dict[str, bytes]) -> None:

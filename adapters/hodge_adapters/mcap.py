@@ -1,4 +1,4 @@
-"""MCAP recordings: ROS 2 bags (CDR) and Foxglove logs (protobuf, JSON) with depth images, point clouds and poses.
+"""Recordings: ROS 2 bags (MCAP, SQLite), ROS 1 bags, Foxglove logs with depth images, point clouds and poses.
 
 A recording is gone through once when opened, without decoding an image; frames know where their bytes lie.
 """
@@ -20,6 +20,7 @@ from hodge_adapters.association import nearest_pairs
 from hodge_adapters.camera_files import Intrinsics, checked
 from hodge_adapters.mcap_clouds import read_points
 from hodge_adapters.mcap_files import find_files, sniff_recording
+from hodge_adapters.mcap_fixes import positions_of
 from hodge_adapters.mcap_images import ImageLayout, encoded_image, read_colour, read_depth
 from hodge_adapters.mcap_poses import PoseOptions, find_poses
 from hodge_adapters.mcap_recording import A_MESSAGE_WITH, NO_PINHOLE, Recording, Seen
@@ -44,7 +45,7 @@ UNITS_PER_METRE = 1000.0
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class McapReader:
-    """Reads an MCAP file, or a folder with the files of a split recording."""
+    """Reads an MCAP file, a `.db3` or a `.bag`, or a folder with the files of a split recording."""
 
     frames: Literal["auto", "depth", "points", "colour"] = Field(
         "auto", description="what makes a frame; auto: depth images if there are any, else point clouds, else colour"
@@ -72,7 +73,7 @@ class McapReader:
     every: int = Field(1, ge=1, description="take every n-th frame")
 
     def sniff(self, path: Path) -> Sniff:
-        """Sure where the file starts as MCAP does, or the folder has such files beside `metadata.yaml`."""
+        """Sure where the file starts as a recording does, or the folder has some beside `metadata.yaml`."""
         return sniff_recording(Path(path))
 
     def open(self, path: Path) -> Source:
@@ -84,7 +85,7 @@ class McapReader:
         notes: list[str] = []
         listing = find_files(path, notes)
         recording = Recording(TransformTree(self.max_gap_s))
-        for file in listing.mcap:
+        for file in listing.logs:
             recording.read_file(file)
         notes += recording.complaints.notes()
         notes += filter(None, [recording.clock_note()])
@@ -95,7 +96,8 @@ class McapReader:
         stamps_s = np.array([frame.stamp_s for frame in frames], float)
         options = PoseOptions(self.pose_topic, self.pose_child, self.world_frame, self.max_gap_s)
         poses = find_poses(recording, camera_frame, stamps_s, options, notes)
-        if not frames and poses.trajectory is None:
+        positions = positions_of(recording.fixes, notes)
+        if not frames and poses.trajectory is None and positions is None:
             raise _nothing(path, recording, notes)
         return Source(
             name=path.stem if path.is_file() else path.resolve().name,
@@ -105,6 +107,7 @@ class McapReader:
             notes=tuple(notes),
             files=listing.all,
             contents=recording.contents(),
+            positions=positions,
         )
 
     def _frames(self, path: Path, recording: Recording, notes: list[str]) -> tuple[list[Frame], str]:

@@ -114,6 +114,9 @@ def demo(
     lidar: Annotated[
         bool, typer.Option("--lidar", help="A street scanned by a spinning LiDAR in place of the room.")
     ] = False,
+    rooms: Annotated[
+        int, typer.Option("--rooms", min=1, help="A walk through so many rooms and back, about 450 frames a room.")
+    ] = 1,
     overrides: Overrides = None,
     overwrite: Overwrite = False,
     dask: Dask = None,
@@ -123,7 +126,10 @@ def demo(
     """Make a furnished room with Kinect-like noise and run the recipe `demo` on it (or a street: --lidar)."""
     from hodge_pipeline.cli import run as running
 
-    running.demo(out, overrides or [], lidar=lidar, overwrite=overwrite, quiet=quiet, dask=dask, verbose=verbose)
+    if lidar and rooms > 1:
+        raise typer.BadParameter("--rooms and --lidar are two demos: give one of them")
+    shown = {"quiet": quiet, "verbose": verbose}
+    running.demo(out, overrides or [], lidar=lidar, rooms=rooms, overwrite=overwrite, dask=dask, **shown)
 
 
 @app.command()
@@ -235,7 +241,9 @@ def edit(
 
 @app.command()
 def review(
-    path: Annotated[Path, typer.Argument(help="A run, or a pose graph (g2o, TORO, Open3D, pair .log).")],
+    path: Annotated[
+        Path, typer.Argument(help="A run, a COLMAP model, or a pose graph (g2o, TORO, Open3D, pair .log).")
+    ],
     port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: a free one.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
 ) -> None:
@@ -289,6 +297,20 @@ def recipes(
     listing.recipes(name, schema=schema)
 
 
+@app.command("new-plugin")
+def new_plugin(
+    name: Annotated[str, typer.Argument(help="Of the stage, such as my_icp.")],
+    kind: Annotated[str, typer.Option(help="registration: a registrar that wraps Open3D's ICP; readers: a format.")] = (
+        "registration"
+    ),
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder of the package; default: its name.")] = None,
+) -> None:
+    """Write a package with a stage of your own: its entry point, its test by the contract checks, a README."""
+    from hodge_pipeline.cli import new_plugin as making
+
+    making.new_plugin(name, kind, out or Path(f"hodge-{name.replace('_', '-')}"))
+
+
 @app.command()
 def view(
     run_folder: Path,
@@ -340,13 +362,22 @@ def main() -> None:
     except MemoryError:
         print("error: this needs more memory than there is: give less data, or free some", file=sys.stderr)
         sys.exit(1)
+    except ImportError as error:
+        if (error.name or "").startswith("hodge"):
+            raise
+        from hodge_pipeline.registry import LIBRARIES
+
+        print(f"error: a library does not load ({shown(str(error))}): {LIBRARIES}", file=sys.stderr)
+        sys.exit(1)
     except Exception as error:
         from hodge_pipeline.errors import HodgeError
+        from hodge_pipeline.registry import plugin_error
 
-        if not isinstance(error, HodgeError):
+        known = plugin_error(error) or error
+        if not isinstance(known, HodgeError):
             raise
-        print(f"error: {shown(str(error))}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        print(f"error: {shown(str(known))}", file=sys.stderr)
+        sys.exit(known.exit_code)
 
 
 if __name__ == "__main__":

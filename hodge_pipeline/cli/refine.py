@@ -99,18 +99,28 @@ def colmap(
         tuple[float, float, float, float] | None,
         typer.Option("--depth-camera", help="FX FY CX CY of depth that is not on the pixels of the colour images."),
     ] = None,
+    positions: Annotated[
+        str | None,
+        typer.Option("--positions", help="Known positions: database (GPS, gravity), or a table; metric result there."),
+    ] = None,
+    refine: Annotated[
+        str | None,
+        typer.Option("--refine", help="Intrinsics to refine: focal, all, or none (default): held as they are."),
+    ] = None,
     force: Force = False,
     recipe: Annotated[str, typer.Option("--recipe", help="A recipe like colmap_refine, by name or file.")] = "",
     overrides: Overrides = None,
     dask: Dask = None,
     overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,
+    verbose: Verbose = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Refine a COLMAP model: edges measured anew, a robust solve, bundle adjustment; metric where there is depth."""
     from hodge_pipeline.cli import refine_colmap as refining_colmap
 
-    given = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale}
+    beside = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale}
+    given = {**beside, "positions": positions, "refine": refine}
     sets = [f"model.{name}={value}" for name, value in given.items() if value is not None]
     if depth_camera is not None:
         sets.append(f"model.depth_camera=[{', '.join(map(str, depth_camera))}]")
@@ -123,5 +133,6 @@ def colmap(
         overwrite=overwrite,
         quiet=quiet,
         as_json=json,
+        verbose=verbose,
         dask=dask,
     )

@@ -38,9 +38,12 @@ def run(
     loaded = load_recipe(recipe, overrides, source)
     if loaded.source.path is None:
         raise RecipeError(f"recipe '{recipe}' names no source: add --source PATH")
+    from hodge_pipeline.executors.dask import describe
     from hodge_pipeline.uses.recipe_run import run as run_pipeline
 
     with resumable(out), ProgressBars(quiet or as_json, verbose) as terminal, _viewer(live, terminal) as address:
+        if dask is not None:
+            terminal.say(describe(dask))
         result = run_pipeline(
             loaded, out, overwrite=overwrite, watcher=terminal, live=address, dask=dask, strict=strict
         )
@@ -106,17 +109,19 @@ def demo(
     overrides: Sequence[str],
     *,
     lidar: bool,
+    rooms: int,
     overwrite: bool,
     quiet: bool,
     dask: str | None,
     verbose: bool,
 ) -> None:
-    """Make the demo's room, or street, or find it in the cache, and run the recipe `demo`, or `lidar`, on it."""
-    from hodge_pipeline.demo.sequence import DemoOptions, World, demo_source
+    """Make the demo's room, building or street, or find it in the cache, and run `demo`, or `lidar`, on it."""
+    from hodge_pipeline.demo.sequence import BuildingOptions, DemoOptions, World, demo_source
     from hodge_pipeline.demo.sweeps import TRUTH_FILE, StreetOptions
 
-    options: World = StreetOptions() if lidar else DemoOptions()
-    title = "scan the demo street" if lidar else "render the demo room"
+    room: World = DemoOptions() if rooms == 1 else BuildingOptions(rooms=rooms)
+    options: World = StreetOptions() if lidar else room
+    title = "scan the demo street" if lidar else f"render the demo's {'room' if rooms == 1 else f'{rooms} rooms'}"
     with ProgressBars(quiet, verbose) as terminal, terminal.stage(title, options.frames) as advance:
         folder = demo_source(options=options, advance=advance)
     truth = named_truth(str(folder / TRUTH_FILE)) if lidar else []

@@ -1,12 +1,16 @@
-"""The path of a camera carried by hand round the middle of the room, looking across it."""
+"""The paths of a camera carried by hand: round the middle of the room, and through a building and back."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
 
 from hodge_pipeline import se3
+from hodge_pipeline.demo.room import room_origin
 from hodge_pipeline.types import Floats
 
 TREMOR_HZ = (0.6, 3.0)
@@ -37,7 +41,7 @@ class HandHeldLoop:
         share = times_s / self.duration_s
         done = share if self.turns >= 1 else (1 - np.cos(2 * np.pi * share)) / 2
         steady = self._steady(2 * np.pi * self.turns * done)
-        return np.asarray(steady @ se3.exp(self._tremor(times_s)))
+        return np.asarray(steady @ se3.exp(_tremor(self.seed, times_s, self.tremor_m, self.tremor_deg)))
 
     def _steady(self, angle: Floats) -> Floats:
         """The path without tremor: the camera opposite to where it looks, so that it sees the room's width."""
@@ -46,14 +50,69 @@ class HandHeldLoop:
         position = np.stack([-radius * np.cos(angle), -radius * np.sin(angle), height], axis=-1)
         yaw = angle + 0.15 * np.sin(2 * angle)
         pitch = np.radians(-14 + 6 * np.sin(3 * angle))
-        forward = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=-1)
-        right = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=-1)
-        return se3.from_parts(np.stack([right, np.cross(forward, right), forward], axis=-1), position)
+        return _looking(position, yaw, pitch)
 
-    def _tremor(self, times_s: Floats) -> Floats:
-        """Twists (N, 6) of the hand: a sum of slow sines, so that 100 Hz samples interpolate to well below 1 mm."""
-        rng = np.random.default_rng([self.seed, 1])
-        hertz = rng.uniform(*TREMOR_HZ, (TREMOR_TERMS, 6))
-        phase = rng.uniform(0, 2 * np.pi, (TREMOR_TERMS, 6))
-        waves = np.sin(2 * np.pi * hertz * times_s[:, None, None] + phase).sum(axis=1) * np.sqrt(2 / TREMOR_TERMS)
-        return np.asarray(waves * np.array([np.radians(self.tremor_deg)] * 3 + [self.tremor_m] * 3))
+
+@dataclass(frozen=True)
+class Walk:
+    """A walk through the rooms of a building to the last one and back to where it began, looking ahead and about."""
+
+    seed: int
+    rooms: int
+    speed_m_s: float = 0.8
+
+    @property
+    def duration_s(self) -> float:
+        """How long it takes."""
+        return float(self._way.x[-1]) / self.speed_m_s
+
+    @cached_property
+    def _way(self) -> CubicSpline:
+        """The place (2,) on the floor after a way in metres."""
+        places = np.array(_waypoints(self.rooms))
+        lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        return CubicSpline(np.concatenate([[0.0], np.cumsum(lengths)]), places)
+
+    def world_from_cam(self, times_s: Floats) -> Floats:
+        """Poses (N, 4, 4) at the times (N,); before its beginning and after its end the camera stands."""
+        times_s = np.asarray(times_s, float)
+        way = np.clip(times_s, 0, self.duration_s) * self.speed_m_s
+        place, height = self._way(way), 1.45 + 0.08 * np.sin(way / 1.7)
+        yaw = self._heading(way) + 0.35 * np.sin(way / 0.9)
+        pitch = np.radians(-12 + 8 * np.sin(way / 1.3))
+        steady = _looking(np.column_stack([place, height]), yaw, pitch)
+        return np.asarray(steady @ se3.exp(_tremor(self.seed, times_s, 0.004, 0.3)))
+
+    def _heading(self, way: Floats) -> Floats:
+        """Where (N,) the way leads, radians: the mean over a metre, so that nobody turns on the spot."""
+        grid = np.linspace(0, float(self._way.x[-1]), max(2, int(20 * self._way.x[-1])))
+        ahead = self._way(grid, 1)
+        angle = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+        return np.asarray(np.interp(way, grid, gaussian_filter1d(angle, 10, mode="nearest")))
+
+
+def _waypoints(rooms: int) -> list[Floats]:
+    """Places (2,) on the floor: through each room on its west side, and back on its east side."""
+    west = [(-0.2, -1.9), (-1.2, -0.7), (-0.9, 0.8), (0.5, 1.7)]
+    east = [(1.1, 1.7), (1.7, 0.6), (1.0, -1.0), (0.0, -1.9)]
+    turn = [(-0.2, -1.9), (-1.2, -0.7), (-0.8, 0.8), (0.3, 1.2), (1.3, 0.5), (1.0, -1.0), (0.0, -1.9)]
+    last = rooms - 1
+    there = [room_origin(number)[:2] + place for number in range(last) for place in west]
+    back = [room_origin(number)[:2] + place for number in reversed(range(last)) for place in east]
+    return [*there, *(room_origin(last)[:2] + place for place in turn), *back]
+
+
+def _looking(position: Floats, yaw: Floats, pitch: Floats) -> Floats:
+    """Poses (N, 4, 4) at positions (N, 3) of a level camera that looks along yaw and pitch."""
+    forward = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=-1)
+    right = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=-1)
+    return se3.from_parts(np.stack([right, np.cross(forward, right), forward], axis=-1), position)
+
+
+def _tremor(seed: int, times_s: Floats, tremor_m: float, tremor_deg: float) -> Floats:
+    """Twists (N, 6) of the hand: a sum of slow sines, so that 100 Hz samples interpolate to well below 1 mm."""
+    rng = np.random.default_rng([seed, 1])
+    hertz = rng.uniform(*TREMOR_HZ, (TREMOR_TERMS, 6))
+    phase = rng.uniform(0, 2 * np.pi, (TREMOR_TERMS, 6))
+    waves = np.sin(2 * np.pi * hertz * times_s[:, None, None] + phase).sum(axis=1) * np.sqrt(2 / TREMOR_TERMS)
+    return np.asarray(waves * np.array([np.radians(tremor_deg)] * 3 + [tremor_m] * 3))

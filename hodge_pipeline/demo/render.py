@@ -104,7 +104,7 @@ class Renderer:
     def _light(self, hits: Hits) -> Floats32:
         """The light (P,) that falls on each point: ambient, from the sky, and from the lamp where nothing shades it."""
         start = hits.points_in_room + SHADOW_GAP_M * hits.normals
-        towards = self.room.lamp - start
+        towards = self.room.lamp[hits.part] - start
         distance = np.linalg.norm(towards, axis=1)
         rays = np.concatenate([start, towards], axis=1).astype(np.float32)
         shaded = self._scene.test_occlusions(o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0).numpy()

@@ -21,9 +21,9 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.demo.noise import measured_depth, photographed
-from hodge_pipeline.demo.path import HandHeldLoop
+from hodge_pipeline.demo.path import HandHeldLoop, Walk
 from hodge_pipeline.demo.render import Renderer
-from hodge_pipeline.demo.room import build_room
+from hodge_pipeline.demo.room import Room, build_building, build_room
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Bytes, Camera, Floats
@@ -76,10 +76,54 @@ class DemoOptions:
         reach = self.frames * STEP_DEG / 360
         return FULL_LOOP if reach >= FULL_LOOP else min(reach, 1.0) / 2
 
+    @property
+    def path(self) -> HandHeldLoop:
+        """The camera's path."""
+        return HandHeldLoop(self.seed, self.frames * self.stride / CAMERA_HZ, self.rounds)
+
+    def build(self) -> Room:
+        """What it sees."""
+        return build_room(self.seed)
+
     def write(self, draft: Path, advance: Advance) -> None:
         """The sequence in the TUM layout: `rgb/*.jpg`, `depth/*.png` (16 bit, 5000 a metre), `rgb.txt`, `depth.txt`,
         `groundtruth.txt` (poses at 100 Hz) and `intrinsics.txt` (`fx fy cx cy width height`).
         """
+        _write(draft, self, advance)
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class BuildingOptions:
+    """What is rendered of a walk through many rooms and back, every image of a 30 Hz camera: about 450 a room."""
+
+    rooms: int = Field(default=4, ge=2, description="of the building, one behind the other")
+    width: int = Field(default=160, ge=16, description="pixels; 20,000 frames of 160 are rendered in minutes")
+    height: int = Field(default=120, ge=16, description="pixels")
+    seed: int = Field(default=0, ge=0, description="of textures, paint, pictures, books, tremor and noise")
+    noise: float = Field(default=1.0, ge=0, description="scale of every error of the camera; 0 gives exact images")
+    stride: int = Field(default=1, ge=1, description="of a 30 Hz camera's images every stride-th is kept")
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the room."""
+        return DemoOptions(width=self.width, height=self.height).camera
+
+    @property
+    def frames(self) -> int:
+        """As many images as the walk takes."""
+        return int(self.path.duration_s * CAMERA_HZ / self.stride)
+
+    @property
+    def path(self) -> Walk:
+        """The camera's path."""
+        return Walk(self.seed, self.rooms)
+
+    def build(self) -> Room:
+        """What it sees."""
+        return build_building(self.rooms, self.seed)
+
+    def write(self, draft: Path, advance: Advance) -> None:
+        """As `DemoOptions` writes the room."""
         _write(draft, self, advance)
 
 
@@ -172,13 +216,12 @@ def _publish(draft: Path, folder: Path, options: World) -> None:
             raise
 
 
-def _write(draft: Path, options: DemoOptions, advance: Advance) -> None:
+def _write(draft: Path, options: DemoOptions | BuildingOptions, advance: Advance) -> None:
     """The complete sequence; the frames are rendered by two threads, and no frame depends on another."""
     rng = np.random.default_rng([options.seed, 2])
     colour_s = np.arange(options.frames) * options.stride / CAMERA_HZ + rng.uniform(0, 0.002, options.frames) + 0.05
     depth_s = colour_s + rng.uniform(-0.006, 0.006, options.frames)
-    duration_s = options.frames * options.stride / CAMERA_HZ
-    path = HandHeldLoop(options.seed, duration_s, options.rounds)
+    path = options.path
     recorder = _Recorder(draft, options, path)
     (draft / "rgb").mkdir()
     (draft / "depth").mkdir()
@@ -196,9 +239,9 @@ def _write(draft: Path, options: DemoOptions, advance: Advance) -> None:
 class _Recorder:
     """Renders and writes one frame at a time; colour and depth each at the pose of their own time."""
 
-    def __init__(self, folder: Path, options: DemoOptions, path: HandHeldLoop) -> None:
+    def __init__(self, folder: Path, options: DemoOptions | BuildingOptions, path: HandHeldLoop | Walk) -> None:
         self.folder, self.options, self.path = folder, options, path
-        self.renderer = Renderer(build_room(options.seed), options.camera)
+        self.renderer = Renderer(options.build(), options.camera)
 
     def record(self, number: int, colour_s: float, depth_s: float) -> tuple[str, str]:
         """The names of the colour and the depth image, below the sequence's folder."""
@@ -232,7 +275,7 @@ def _write_list(path: Path, what: str, names: Sequence[str]) -> None:
     path.write_text("\n".join([f"# {what}", "# timestamp filename", *lines]) + "\n")
 
 
-def _write_truth(path: Path, loop: HandHeldLoop) -> None:
+def _write_truth(path: Path, loop: HandHeldLoop | Walk) -> None:
     times_s = np.arange(0, loop.duration_s + 0.2, 1 / TRUTH_HZ) + 0.0037
     world_from_cam: Floats = loop.world_from_cam(times_s)
     rows = np.concatenate([world_from_cam[:, :3, 3], se3.to_quat_xyzw(world_from_cam)], axis=1)

@@ -6,18 +6,18 @@ between two sets mean anything. For the same reason the score is always printed 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, DistanceBlock, block_distances
+from hodge_pipeline.pairs.overlap import pairwise_iou
 from hodge_pipeline.stages import Advance, Workers, no_progress
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, PointCloud
 
@@ -32,6 +32,8 @@ IOU = 0.5
 IOU_VOXEL_M = 0.1
 MOST_PAIRS = 1500
 """Pairs of a graph that are scored: the mean of so many is known to a fifth of a millimetre (red kitchen)."""
+MOST_FRAMES = 500
+"""Frames whose pairs with all others are looked for: 1500 pairs are taken of what they give."""
 PAIRS_PER_BLOCK = 96
 """About half a second of work: long against the cost of sending a block, short against a whole run."""
 
@@ -40,7 +42,8 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind) 
     """The edges (P, 2), i < j and sorted, on which poses are scored: near centroids, or overlapping voxels.
 
     `distance`: centroids closer than 0.2 m in the world. `iou`: intersection over union of the occupied 0.1 m voxels of
-    the world above 0.5. A frame without points, or whose pose (4, 4) is not finite, has no edges.
+    the world above 0.5. A frame without points, or whose pose (4, 4) is not finite, has no edges. Of more than 500
+    frames the edges of 500 are found, evenly spread.
     """
     if len(clouds) != len(world_from_cam):
         raise GraphError(f"{len(clouds)} clouds but {len(world_from_cam)} poses: give one pose for each cloud")
@@ -50,8 +53,11 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind) 
     if len(usable) < 2:
         return np.zeros((0, 2), np.int64)
     find = _near_centroids if kind == "distance" else _overlapping_voxels
-    pairs = usable[find(clouds, world_from_cam, usable)]
-    return np.asarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))], np.int64)
+    some = evenly(np.arange(len(usable)), MOST_FRAMES)
+    found = find([clouds[int(row)] for row in usable], world_from_cam[usable], some)
+    clouds.forget()
+    pairs = np.unique(np.sort(found[found[:, 0] != found[:, 1]], axis=1), axis=0)
+    return np.asarray(usable[pairs], np.int64)
 
 
 def has_pose(world_from_cam: Floats) -> Bools:
@@ -59,35 +65,24 @@ def has_pose(world_from_cam: Floats) -> Bools:
     return np.asarray(np.isfinite(world_from_cam).all(axis=(-1, -2)))
 
 
-def _in_world(cloud: PointCloud, world_from_cam: Floats) -> Floats:
-    return se3.transform(world_from_cam, cloud.points_in_cam.astype(np.float64))
+def _near_centroids(clouds: Sequence[PointCloud], world_from_cam: Floats, some: Ints) -> Ints:
+    """Pairs (P, 2) of one of `some` rows and any row."""
+    means = np.array([cloud.points_in_cam.mean(axis=0, dtype=float) for cloud in clouds])
+    centroids = np.einsum("nij,nj->ni", world_from_cam[:, :3, :3], means) + world_from_cam[:, :3, 3]
+    near = cKDTree(centroids[some]).sparse_distance_matrix(
+        cKDTree(centroids), CENTROID_DISTANCE_M, output_type="ndarray"
+    )
+    return np.stack([some[near["i"]], near["j"]], axis=1)
 
 
-def _near_centroids(clouds: CloudSet, world_from_cam: Floats, rows: Ints) -> Ints:
-    centroids = np.stack([_in_world(clouds[int(row)], world_from_cam[row]).mean(axis=0) for row in rows])
-    return np.asarray(cKDTree(centroids).query_pairs(CENTROID_DISTANCE_M, output_type="ndarray"), np.int64)
-
-
-def _overlapping_voxels(clouds: CloudSet, world_from_cam: Floats, rows: Ints) -> Ints:
-    """Pairs (P, 2) by one sparse product: the occupancy (frames x voxels) times its transpose counts what is shared."""
-    voxels = [_voxels(_in_world(clouds[int(row)], world_from_cam[row])) for row in rows]
-    counts = np.array([len(own) for own in voxels])
-    _, columns = np.unique(np.concatenate(voxels), axis=0, return_inverse=True)
-    frames = np.repeat(np.arange(len(rows)), counts)
-    occupied = csr_array((np.ones(len(frames), np.int32), (frames, columns.reshape(-1))))
-    shared = (occupied @ occupied.T).tocoo()
-    i, j = shared.coords
-    iou = shared.data / (counts[i] + counts[j] - shared.data)
-    return np.asarray(np.stack([i, j], axis=1)[(i < j) & (iou > IOU)], np.int64)
-
-
-def _voxels(points_in_world: Floats) -> Ints:
-    """The distinct voxels (n, 3) that points lie in."""
-    return np.unique(np.floor(points_in_world / IOU_VOXEL_M).astype(np.int64), axis=0)
+def _overlapping_voxels(clouds: Sequence[PointCloud], world_from_cam: Floats, some: Ints) -> Ints:
+    """Pairs (P, 2) of one of `some` rows and any row."""
+    iou = pairwise_iou(clouds, world_from_cam, IOU_VOXEL_M, above=IOU, partners=some).tocoo()
+    return np.stack([iou.row, iou.col], axis=1)
 
 
 def evenly(pairs: Ints, most: int) -> Ints:
-    """At most so many of the pairs (P, 2), spread evenly over their order."""
+    """At most so many of the pairs (P, 2), or of other rows, spread evenly over their order."""
     if len(pairs) <= most:
         return pairs
     return np.asarray(pairs[np.arange(most) * len(pairs) // most], np.int64)

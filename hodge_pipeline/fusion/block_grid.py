@@ -8,7 +8,9 @@ import numpy as np
 import open3d as o3d
 
 from hodge_pipeline import se3
-from hodge_pipeline.types import Bytes, Camera, Floats, Floats32
+from hodge_pipeline.fusion.boxes import Box
+from hodge_pipeline.fusion.mesh import Mesh
+from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Ints
 
 BLOCK_SIDE = 16
 BYTES_A_VOXEL = 4 + 4 + 12 + 16
@@ -22,7 +24,7 @@ TOUCH_STRIDE = 4
 
 
 class GridFull(Exception):
-    """The next frame would take the grid past its bound. Internal: the fuser starts again with coarser voxels."""
+    """The next frame would take the grid past its bound. Internal: the fuser starts again, box by box."""
 
 
 def blocks_within(memory_limit_mb: float) -> int:
@@ -34,12 +36,20 @@ class BlockGrid:
     """Integrates depth images; `max_blocks` bounds it, `GridFull` is raised before it is passed.
 
     It holds colours for all views or, without `colour`, for none; `views` of them were added, `coloured` with an image.
+    Of a `box` it holds the blocks in it and those around them, which the surface at its faces needs.
     """
 
     def __init__(
-        self, voxel_m: float, truncation_voxels: float, max_depth_m: float, max_blocks: int, colour: bool
+        self,
+        voxel_m: float,
+        truncation_voxels: float,
+        max_depth_m: float,
+        max_blocks: int,
+        colour: bool,
+        box: Box | None = None,
     ) -> None:
         self.truncation_voxels, self.max_depth_m, self.max_blocks = truncation_voxels, max_depth_m, max_blocks
+        self.voxel_m, self.box = voxel_m, box
         self.colour, self.views, self.coloured = colour, 0, 0
         float32 = o3d.core.float32
         self._grid = o3d.t.geometry.VoxelBlockGrid(
@@ -63,14 +73,11 @@ class BlockGrid:
             return False
         depth = o3d.t.geometry.Image(_tensor(depth_m, np.float32))
         pose, reach = _tensor(se3.inverse(world_from_cam), np.float64), (self.max_depth_m, self.truncation_voxels)
-        blocks = self._grid.compute_unique_block_coordinates(
-            depth,
-            _tensor(camera.matrix, np.float64),
-            pose,
-            depth_scale=1.0,
-            depth_max=reach[0],
-            trunc_voxel_multiplier=reach[1],
-        )
+        blocks = self._touched(depth, camera, pose)
+        if self.box is not None:
+            blocks = blocks[_tensor(self.box.around.holds(blocks.numpy()), bool)]
+        if not len(blocks):
+            return True
         self._make_room(len(blocks))
         matrix = _floor_matrix(camera, depth_m.shape, depth_m.shape)
         self.views, self.coloured = self.views + 1, self.coloured + (colour is not None)
@@ -82,6 +89,24 @@ class BlockGrid:
             colour_matrix = _floor_matrix(camera, depth_m.shape, colour.shape)
             self._grid.integrate(blocks, depth, image, matrix, colour_matrix, pose, 1.0, *reach)
         return True
+
+    def touched(self, depth_m: Floats32, camera: Camera, world_from_cam: Floats) -> Ints:
+        """The blocks (M, 3) that a view would be added to."""
+        if not self._reaches(depth_m):
+            return np.zeros((0, 3), np.int64)
+        depth = o3d.t.geometry.Image(_tensor(depth_m, np.float32))
+        blocks = self._touched(depth, camera, _tensor(se3.inverse(world_from_cam), np.float64))
+        return np.asarray(blocks.numpy(), np.int64)
+
+    def _touched(self, depth: Any, camera: Camera, cam_from_world: Any) -> Any:
+        return self._grid.compute_unique_block_coordinates(
+            depth,
+            _tensor(camera.matrix, np.float64),
+            cam_from_world,
+            depth_scale=1.0,
+            depth_max=self.max_depth_m,
+            trunc_voxel_multiplier=self.truncation_voxels,
+        )
 
     def _reaches(self, depth_m: Floats32) -> bool:
         """Whether the pixels that open3d looks at to find blocks hold a depth; it raises an error where none does."""
@@ -97,32 +122,22 @@ class BlockGrid:
         if needed > capacity:
             self._grid.hashmap().reserve(min(max(needed, 2 * capacity), self.max_blocks))
 
-    def mesh(self, min_weight: float) -> tuple[Floats32, Floats32, Bytes, Any]:
-        """Vertices (V, 3), normals, colours and triangles (T, 3) of the surface seen more than `min_weight` times.
-
-        They are in an order of their own, by x, y, z: the one in which the grid gives them changes from run to run.
-        """
+    def mesh(self, min_weight: float) -> Mesh:
+        """The surface seen more than `min_weight` times, of a box the part of it that lies inside."""
         if len(self) == 0:
-            nothing = np.zeros((0, 3), np.float32)
-            return nothing, nothing, nothing.astype(np.uint8), nothing.astype(np.int32)
-        mesh = self._grid.extract_triangle_mesh(min_weight)
-        points, normals = mesh.vertex.positions.numpy(), mesh.vertex.normals.numpy()
-        colours = np.rint(np.clip(mesh.vertex.colors.numpy(), 0, 255)).astype(np.uint8)
-        order = np.lexsort(points.T[::-1])
-        rank = np.empty(len(order), np.int32)
-        rank[order] = np.arange(len(order), dtype=np.int32)
-        return points[order], normals[order], colours[order], _sorted_triangles(rank[mesh.triangle.indices.numpy()])
+            return Mesh.joined([])
+        raw = self._grid.extract_triangle_mesh(min_weight)
+        points, normals = raw.vertex.positions.numpy(), raw.vertex.normals.numpy()
+        colours = np.rint(np.clip(raw.vertex.colors.numpy(), 0, 255)).astype(np.uint8)
+        mesh = Mesh(points, normals, colours, raw.triangle.indices.numpy())
+        if self.box is not None:
+            middles = points[mesh.triangles].mean(axis=1, dtype=float)
+            mesh = mesh.with_triangles(self.box.holds(np.floor(middles / (self.voxel_m * BLOCK_SIDE))))
+        return mesh.ordered()
 
 
 def _tensor(values: Any, kind: Any) -> Any:
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values, kind))
-
-
-def _sorted_triangles(triangles: Any) -> Any:
-    """The same triangles, each turned to begin with its least vertex, in ascending order."""
-    turns = (np.argmin(triangles, axis=1)[:, None] + np.arange(3)) % 3
-    turned = np.take_along_axis(triangles, turns, axis=1)
-    return turned[np.lexsort(turned.T[::-1])]
 
 
 def _floor_matrix(camera: Camera, depth_shape: tuple[int, ...], image_shape: tuple[int, ...]) -> Any:

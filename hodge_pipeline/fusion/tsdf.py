@@ -3,15 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
+import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.fusion.block_grid import BlockGrid, GridFull, blocks_within
+from hodge_pipeline.fusion.boxes import Box, boxes_of
+from hodge_pipeline.fusion.mesh import Mesh
 from hodge_pipeline.fusion.views import Skipped, posed
 from hodge_pipeline.stages import Advance, no_progress
-from hodge_pipeline.types import Floats, Frame, Model
+from hodge_pipeline.types import Floats, Frame, Ints, Model
+
+BYTES_A_VERTEX = 150
+"""Place, normal, colour and two triangles, thrice while they are put into order."""
+Views: TypeAlias = list[tuple[Frame, Floats]]
+_Made: TypeAlias = tuple[Mesh, float, bool]
+"""A mesh, the weight that its surface needed, and whether any view had colours."""
+
+
+class _Progress:
+    """Tells how many views were looked at, each once, however often they are looked at."""
+
+    def __init__(self, advance: Advance) -> None:
+        self._advance, self.told = advance, 0
+
+    def reached(self, views: int) -> None:
+        """So many views, the first ones, were looked at by now."""
+        if views > self.told:
+            self._advance(views - self.told)
+            self.told = views
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -42,8 +65,8 @@ class TsdfFuser:
     memory_limit_mb: float = Field(
         2000.0,
         ge=50,
-        description="megabytes for the grid while it grows and is meshed (not for the mesh itself); a scene that "
-        "needs more is fused again with voxels twice as large",
+        description="megabytes for the grid while it grows and is meshed, and again for the mesh: a scene whose grid "
+        "needs more is fused in boxes, one after the other; one whose mesh does, with voxels twice as large",
     )
 
     def fuse(self, frames: Sequence[Frame], world_from_cam: Floats, advance: Advance = no_progress) -> Model:
@@ -55,54 +78,84 @@ class TsdfFuser:
             raise SourceError(
                 f"fusion: tsdf: no frame, from {frames[0].frame_id} on, has a depth image: take fusion: cloud"
             )
-        voxel_m, reported, grid = self.voxel_m, 0, None
-        while grid is None:
-            skipped = Skipped()
-            views = posed(frames, world_from_cam, self.every, skipped, self.min_motion_m)
-            grid, reported = self._integrated(views, voxel_m, skipped, reported, advance)
-            voxel_m *= 2 if grid is None else 1
-        advance(len(frames) - len(views))
-        min_weight = min(self.min_weight, max(grid.views - 1.0, 0.0))
-        points, normals, colours, triangles = grid.mesh(min_weight)
+        skipped, voxel_m, made = Skipped(), self.voxel_m, None
+        views = posed(frames, world_from_cam, self.every, skipped, self.min_motion_m)
+        progress = _Progress(advance)
+        while made is None:
+            made = self._made(views, voxel_m, skipped, progress)
+            voxel_m *= 2 if made is None else 1
+        advance(len(frames) - progress.told)
+        mesh, min_weight, coloured = made
         return Model(
             name="mesh",
-            points_in_world=points,
-            normals_in_world=normals,
-            colours=colours if grid.coloured else None,
-            triangles=triangles,
+            points_in_world=mesh.points,
+            normals_in_world=mesh.normals,
+            colours=mesh.colours if coloured else None,
+            triangles=mesh.triangles,
             notes=(
                 *skipped.notes(),
-                *self._notes(voxel_m, len(triangles), min_weight),
+                *self._notes(voxel_m, len(mesh.triangles), min_weight),
                 *self._thinned(len(views), len(frames)),
             ),
         )
 
-    def _integrated(
-        self, views: list[tuple[Frame, Floats]], voxel_m: float, skipped: Skipped, reported: int, advance: Advance
-    ) -> tuple[BlockGrid | None, int]:
-        """The grid, or None where it would pass the limit; and how many views `advance` has heard of."""
-        limit = blocks_within(self.memory_limit_mb)
-        colour = self.colour and any(frame.read_colour for frame, _ in views)
-        grid = BlockGrid(voxel_m, self.truncation_voxels, self.max_depth_m, limit, colour)
-        for row, (frame, pose) in enumerate(views):
-            try:
-                self._integrate(grid, frame, pose, skipped)
-            except GridFull:
-                return None, reported
-            if row >= reported:
-                advance(1)
-                reported += 1
-        return grid, reported
+    def _made(self, views: Views, voxel_m: float, skipped: Skipped, progress: _Progress) -> _Made | None:
+        """The mesh; None where it would pass the limit. A scene that one grid cannot hold is fused box by box."""
+        grid = self._grid(voxel_m, views, None)
+        try:
+            self._integrate(grid, views, skipped, progress)
+        except GridFull:
+            return self._made_in_boxes(views, voxel_m, skipped, progress)
+        min_weight = self._min_weight(grid.views)
+        return grid.mesh(min_weight), min_weight, grid.coloured > 0
 
-    def _integrate(self, grid: BlockGrid, frame: Frame, world_from_cam: Floats, skipped: Skipped) -> None:
-        if frame.camera is None or frame.read_depth is None:
-            skipped.add("no depth image", frame)
-            return
-        with skipped.unreadable(frame):
-            depth_m = frame.read_depth()
-            colour = skipped.colour(frame) if grid.colour else None
-            if not grid.integrate(depth_m, colour, frame.camera, world_from_cam):
-                skipped.add(f"no depth within max_depth_m = {self.max_depth_m:g}", frame)
+    def _made_in_boxes(self, views: Views, voxel_m: float, skipped: Skipped, progress: _Progress) -> _Made | None:
+        """The same mesh, of boxes of space one after the other, each from the views that see it."""
+        blocks, spans = self._touched(self._grid(voxel_m, views, None), views, skipped, progress)
+        min_weight = self._min_weight(int((spans[:, 0] <= spans[:, 1]).all(axis=1).sum()))
+        parts, vertices, coloured = [], 0, False
+        for box in boxes_of(blocks, blocks_within(self.memory_limit_mb) // 2):
+            grid = self._grid(voxel_m, views, box)
+            own = np.flatnonzero(box.around.meets(spans))
+            self._integrate(grid, [views[row] for row in own.tolist()], skipped, progress)
+            parts.append(grid.mesh(min_weight))
+            vertices, coloured = vertices + len(parts[-1].points), coloured or grid.coloured > 0
+            if vertices * BYTES_A_VERTEX > self.memory_limit_mb * 1e6:
+                return None
+        return Mesh.joined(parts), min_weight, coloured
+
+    def _min_weight(self, views: int) -> float:
+        return min(self.min_weight, max(views - 1.0, 0.0))
+
+    def _grid(self, voxel_m: float, views: Views, box: Box | None) -> BlockGrid:
+        colour = self.colour and any(frame.read_colour for frame, _ in views)
+        limit = blocks_within(self.memory_limit_mb)
+        return BlockGrid(voxel_m, self.truncation_voxels, self.max_depth_m, limit, colour, box)
+
+    def _touched(self, grid: BlockGrid, views: Views, skipped: Skipped, progress: _Progress) -> tuple[Ints, Ints]:
+        """All blocks (M, 3), and each view's least and largest one (V, 2, 3), of one that has none the other way."""
+        blocks: set[tuple[int, int, int]] = set()
+        spans = np.broadcast_to(np.array([[1, 1, 1], [0, 0, 0]]), (len(views), 2, 3)).copy()
+        for row, (frame, pose) in enumerate(views):
+            with skipped.unreadable(frame):
+                if frame.camera is not None and frame.read_depth is not None:
+                    own = grid.touched(frame.read_depth(), frame.camera, pose)
+                    blocks.update(map(tuple, own.tolist()))
+                    spans[row] = [own.min(axis=0), own.max(axis=0)] if len(own) else spans[row]
+            progress.reached(row + 1)
+        return np.array(sorted(blocks), np.int64).reshape(-1, 3), spans
+
+    def _integrate(self, grid: BlockGrid, views: Views, skipped: Skipped, progress: _Progress) -> None:
+        for row, (frame, pose) in enumerate(views):
+            if frame.camera is None or frame.read_depth is None:
+                skipped.add("no depth image", frame)
+                continue
+            with skipped.unreadable(frame):
+                depth_m = frame.read_depth()
+                colour = skipped.colour(frame) if grid.colour else None
+                if not grid.integrate(depth_m, colour, frame.camera, pose):
+                    skipped.add(f"no depth within max_depth_m = {self.max_depth_m:g}", frame)
+            progress.reached(row + 1)
 
     def _thinned(self, fused: int, frames: int) -> list[str]:
         if self.min_motion_m == 0 or fused == frames:
@@ -113,7 +166,7 @@ class TsdfFuser:
         notes = []
         if voxel_m > self.voxel_m:
             notes.append(
-                f"voxels of {voxel_m:g} m instead of {self.voxel_m:g} m: the scene would take more than "
+                f"voxels of {voxel_m:g} m instead of {self.voxel_m:g} m: the mesh would take more than "
                 f"memory_limit_mb = {self.memory_limit_mb:g}"
             )
         if triangles == 0:

@@ -16,12 +16,12 @@ class Skipped:
     """A tally of the frames left out, or fused without colour: how many for each reason, and the first of them."""
 
     def __init__(self) -> None:
-        self._frames: dict[str, list[str]] = {}
+        self._frames: dict[str, dict[int, str]] = {}
 
     def add(self, reason: str, frame: Frame, detail: str = "", fate: str = "skipped") -> None:
-        """Count one frame."""
+        """Count one frame, once however often it is looked at."""
         named = f"{frame.frame_id}: {detail}" if detail else f"{frame.frame_id}"
-        self._frames.setdefault(f"{fate}: {reason}", []).append(named)
+        self._frames.setdefault(f"{fate}: {reason}", {})[id(frame)] = named
 
     @contextmanager
     def unreadable(self, frame: Frame) -> Iterator[None]:
@@ -42,7 +42,7 @@ class Skipped:
     def notes(self) -> tuple[str, ...]:
         """One line for each reason."""
         return tuple(
-            f"{len(names)} frame{'s' if len(names) > 1 else ''} {why} (the first: {names[0]})"
+            f"{len(names)} frame{'s' if len(names) > 1 else ''} {why} (the first: {next(iter(names.values()))})"
             for why, names in self._frames.items()
         )
 

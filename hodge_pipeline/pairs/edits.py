@@ -16,7 +16,8 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import read_edges
 from hodge_pipeline.store.workspace import REFINEMENT
 from hodge_pipeline.types import Bools, Edges, Floats, Ints
-from hodge_pipeline.types.edges import DISABLED, HELD_OUT, Words
+from hodge_pipeline.types.arrays import Words
+from hodge_pipeline.types.edges import DISABLED, HELD_OUT
 from hodge_pipeline.types.text import command
 
 FILE = "edits.json"

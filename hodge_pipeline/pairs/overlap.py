@@ -17,6 +17,8 @@ from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, PointClou
 AXIS_BITS = 21
 BLOCK_ENTRIES = 4_000_000
 """Bound on the entries of one block of the product: about 50 MB."""
+FRAMES_OF_A_PLACE, DIRECTIONS = 16, 4
+"""Nine edges a frame are kept in the end: 16 of each place leave a choice."""
 
 
 def voxels(points_in_world: Floats, voxel_m: float, origin: Ints) -> Ints:
@@ -61,27 +63,51 @@ def _blocks(count: int) -> Iterator[slice]:
 
 
 def pairwise_iou(
-    clouds: Sequence[PointCloud], world_from_cam: Floats, voxel_m: float, above: float = 0.0
+    clouds: Sequence[PointCloud],
+    world_from_cam: Floats,
+    voxel_m: float,
+    above: float = 0.0,
+    partners: Ints | None = None,
 ) -> csr_matrix:
     """The CSR matrix (N, N) of the intersection over union of all pairs i < j, where it exceeds `above`.
 
     |A ∩ B| of all pairs is one sparse product of the frames-by-voxels incidence with its transpose, made in blocks
     of rows, so that memory holds the answer and one block; |A ∪ B| = |A| + |B| − |A ∩ B|. The clouds are voxelised
-    in the world frame under the poses (N, 4, 4), on the lattice through the world's origin.
+    in the world frame under the poses (N, 4, 4), on the lattice through the world's origin. Where `partners (R,)` are
+    named, only pairs with one of them.
     """
     seen = incidence(clouds, world_from_cam, voxel_m)
-    sizes = np.diff(seen.indptr)
+    count, sizes = seen.shape[0], np.diff(seen.indptr)
+    partners = np.arange(count) if partners is None else partners
+    is_partner = np.isin(np.arange(count), partners)
     rows, columns, values = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
-    for block in _blocks(seen.shape[0]):
-        common = (seen[block] @ seen[block.start :].T).tocoo()
-        i, j = common.row + block.start, common.col.astype(np.int64) + block.start
+    others = seen[partners]
+    for block in _blocks(count):
+        first = int(np.searchsorted(partners, block.start)) if len(partners) == count else 0
+        common = (seen[block] @ others[first:].T).tocoo()
+        i, j = common.row + block.start, partners[common.col.astype(np.int64) + first]
         iou = common.data / (sizes[i] + sizes[j] - common.data)
-        keep = (i < j) & (iou > above)
-        rows.append(i[keep])
-        columns.append(j[keep])
+        keep = ((i < j) | ((i > j) & ~is_partner[i])) & (iou > above)
+        rows.append(np.minimum(i, j)[keep])
+        columns.append(np.maximum(i, j)[keep])
         values.append(iou[keep])
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return csr_matrix(entries, shape=(seen.shape[0], seen.shape[0]))
+    return csr_matrix(entries, shape=(count, count))
+
+
+def some_of_each_place(world_from_cam: Floats, side_m: float) -> Ints:
+    """Rows of at most `FRAMES_OF_A_PLACE` poses (N, 4, 4) of each place, evenly over its own, ascending.
+
+    A place is a cube of this side and a direction of view, about 15° wide. However often a camera comes back, a frame
+    is compared with so many of each place that it may see: what is compared grows with the frames and with the space.
+    """
+    cells = np.concatenate([world_from_cam[:, :3, 3] / side_m, world_from_cam[:, :3, 2] * DIRECTIONS], axis=1)
+    _, place = np.unique(np.floor(np.nan_to_num(cells)).astype(np.int64), axis=0, return_inverse=True)
+    order = np.argsort(place.ravel(), kind="stable")
+    sizes = np.bincount(place.ravel())
+    own = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    share = np.repeat(np.minimum(FRAMES_OF_A_PLACE / sizes, 1.0), sizes)
+    return np.sort(order[np.floor(own * share) != np.floor((own - 1) * share)])
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -100,5 +126,7 @@ class OverlapEdges:
         """Pairs whose IoU exceeds `min_iou`, with it; none for frames without points or a finite pose."""
         if len(usable_rows(clouds, world_from_cam)) < 2:
             return Edges.proposed(np.zeros((0, 2), np.int64), "overlap")
-        iou = pairwise_iou(clouds, world_from_cam, self.voxel_m, above=self.min_iou).tocoo()
+        partners = some_of_each_place(world_from_cam, 2 * self.voxel_m)
+        iou = pairwise_iou(clouds, world_from_cam, self.voxel_m, above=self.min_iou, partners=partners).tocoo()
+        clouds.forget()
         return Edges.proposed(np.stack([iou.row, iou.col], axis=1), "overlap", iou.data)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers, no_progress
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, Match
 from hodge_pipeline.types.input_files import open_input
@@ -89,6 +90,7 @@ def load_description(described: Path, row: int) -> Any:
     return _load(described / f"{row}.pickle")
 
 
+@plugin_errors()
 def _describe_block(clouds: Path, registrar: GlobalRegistrar, out: Path, rows: Ints) -> int:
     opened = CloudSet.open(clouds)
     for row in rows.tolist():
@@ -97,6 +99,7 @@ def _describe_block(clouds: Path, registrar: GlobalRegistrar, out: Path, rows: I
     return len(rows)
 
 
+@plugin_errors()
 def _match_block(described: Path, registrar: GlobalRegistrar, pairs: Ints) -> Matches:
     found = [registrar.match(load_description(described, i), load_description(described, j)) for i, j in pairs.tolist()]
     return Matches.of(pairs, found)

@@ -15,6 +15,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.gaps import over_gap
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import prepared_clouds
+from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
@@ -111,6 +112,7 @@ def _blocks(rows: Ints, stamps_s: Floats) -> list[_Block]:
     return out
 
 
+@plugin_errors()
 def _run_block(folder: Path, options: OdometryOptions, block: _Block) -> Edges:
     """The steps of one block, without its warm-up."""
     prepared = prepared_clouds(folder, options.registration)

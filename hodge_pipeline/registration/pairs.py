@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats
 
@@ -98,11 +99,14 @@ def register_pairs(
     return in_blocks.select(np.argsort(order))
 
 
+@plugin_errors()
 def _register_block(folder: Path, registrar: Registrar, block: tuple[Edges, Floats]) -> Edges:
     edges, guesses = block
     prepared = prepared_clouds(folder, registrar)
     pairs = zip(edges.pairs, guesses, strict=True)
-    return edges.with_registrations([registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in pairs])
+    found = [registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in pairs]
+    prepared.clouds.forget()
+    return edges.with_registrations(found)
 
 
 def prepared_clouds(folder: Path, registrar: Registrar) -> PreparedClouds:
@@ -120,13 +124,13 @@ class PreparedClouds:
     """Clouds prepared when they are asked for; the last `CLOUDS_KEPT` of them are kept."""
 
     def __init__(self, folder: Path, registrar: Registrar) -> None:
-        self._clouds, self._registrar = CloudSet.open(folder), registrar
+        self.clouds, self._registrar = CloudSet.open(folder), registrar
         self._kept: OrderedDict[int, Any] = OrderedDict()
 
     def __getitem__(self, row: int) -> Any:
         row = int(row)
         if row not in self._kept:
-            self._kept[row] = self._registrar.prepare(self._clouds[row])
+            self._kept[row] = self._registrar.prepare(self.clouds[row])
             if len(self._kept) > CLOUDS_KEPT:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(row)

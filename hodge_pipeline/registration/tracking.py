@@ -19,6 +19,7 @@ from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.types import Edges, Floats, Frame, Ints, PointCloud, Registration
 
 FRAMES_IN_BLOCK = 96
@@ -87,6 +88,7 @@ def frame_blocks(rows: Ints, frames: tuple[Frame, ...], times: Floats) -> list[F
     return blocks
 
 
+@plugin_errors()
 def track_block(options: TrackingOptions, block: FrameBlock) -> TrackedBlock:
     """The block, tracked."""
     return _Tracker(options, block).run()
@@ -108,7 +110,7 @@ class _View:
     def image(self) -> FlowImage | None:
         """None of a frame that flow cannot follow."""
         clouds = self._options.clouds
-        return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m))
+        return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m), clouds.unit_m)
 
     @cached_property
     def corners(self) -> Corners | None:

@@ -13,6 +13,7 @@ from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.notes import Note
+from hodge_pipeline.types.positions import PositionFit
 
 NOTHING_TO_DO_M = 0.005
 """A change of poses in a room that nobody need act on: a quarter of the voxel that clouds are thinned to."""
@@ -204,10 +205,18 @@ class RefinementSummary:
 
 @dataclass(frozen=True)
 class Path3D:
-    """The positions (N, 3) of one set of poses, aligned to be compared; NaN where a frame has none."""
+    """The positions (N, 3) and rotations (N, 3, 3) of one set of poses, aligned to be compared; NaN where a frame has
+    none; no rotations in a report of an earlier version.
+    """
 
     name: str
     positions: Floats
+    rotations: Floats | None = None
+
+    @classmethod
+    def of(cls, name: str, world_from_cam: Floats) -> Path3D:
+        """The path of poses (N, 4, 4)."""
+        return cls(name, world_from_cam[:, :3, 3], world_from_cam[:, :3, :3])
 
 
 @dataclass(frozen=True)
@@ -247,7 +256,7 @@ class Report:
     `before` and `after` name the sets of poses that the verdict compares, as in `scores` and `trajectories`.
     `last_shift_m` is how far the last round moved the positions (root mean square), None where it had none before it.
     `wrong_edges` is None where nobody judged; `unmeasured` says why no measure was taken; without `has_metres` lengths
-    are in the source's own unit.
+    are in the source's own unit. `position_fit` is None without known positions.
     """
 
     title: str
@@ -268,6 +277,7 @@ class Report:
     last_shift_m: float | None = None
     wrong_edges: WrongEdges | None = None
     unmeasured: str = ""
+    position_fit: PositionFit | None = None
     has_metres: bool = True
     pictures: Pictures = field(default_factory=Pictures)
 

@@ -18,6 +18,7 @@ from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.verdict import Refined
+from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import (
     EnergyRow,
     LoopRow,
@@ -138,6 +139,7 @@ def make_report(
         last_shift_m=_last_shift(rounds, component),
         wrong_edges=store.step(weigh_wrong, last, recipe.solver, title="edges judged wrong"),
         unmeasured=_unmeasured(recipe, scores, last),
+        position_fit=last.position_fit,
         pictures=dataclasses.replace(
             _pictures(source, rounds, sets),
             changed_most=changed_most(scene.clouds, *shown, last.graph.edges, last.vertex_ids.tolist(), component),
@@ -243,7 +245,7 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
         shown = {"truth": truth, **aligned}
     else:
         shown[first] = absolute_error(shown[first], shown["result"], component).aligned
-    paths = [Path3D(name, poses[:, :3, 3]) for name, poses in shown.items()]
+    paths = [Path3D.of(name, poses) for name, poses in shown.items()]
     finite = next(name for name, poses in sets.items() if np.isfinite(poses).all())
     residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in (finite, "result"))
     convergence = {
@@ -275,6 +277,8 @@ def write(
         write_poses(folder, scene.whole, world_from_cam)
         write_pose_table(folder, scene.whole, world_from_cam)
         write_graph(folder, scene.source, rounds[-1])
+        if (fit := rounds[-1].position_fit) is not None:
+            artifacts.write_text(folder / "positions.csv", known_positions.as_csv(fit))
         for name, path in models.items():
             artifacts.link_or_copy(path, folder / f"{name}.ply")
     report = make_report(recipe, store, scene, rounds, world_from_cam, scores, refined)

@@ -8,6 +8,7 @@ import numpy as np
 
 from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
+from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import RefinementSummary, Report
 from hodge_pipeline.report.document import Table
 from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m
@@ -28,6 +29,8 @@ def score_tables(report: Report) -> Iterator[Table]:
         yield _scores(report)
     if report.trajectories:
         yield _trajectories(report)
+    if report.position_fit is not None:
+        yield known_positions.table(report.position_fit)
 
 
 def graph_tables(report: Report) -> Iterator[Table]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
 from hodge_pipeline.evaluation.difference import MEASURABLE, Change, floor_of, length
+from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import GraphSummary, Report, TrajectoryRow
 from hodge_pipeline.types import Floats
 from hodge_pipeline.types.notes import Note
@@ -166,6 +167,7 @@ def suspicions(report: Report) -> tuple[Note, ...]:
     """What a reader should distrust and what else is to be known, by rank; the run's own notes come first in each."""
     found = (
         *_unsettled(report),
+        *(() if report.position_fit is None else known_positions.notes(report.position_fit)),
         *report.notes,
         *(() if report.graph is None else _graph_suspicions(report.graph)),
         *_wrong(report),

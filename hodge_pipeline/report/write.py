@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hodge_pipeline.evaluation.scores import SIGMA_M, ScoreTable
+from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import (
     ComponentRow,
     EdgeRow,
@@ -73,6 +74,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "trajectories": [asdict(row) for row in report.trajectories],
         "loops": [{**asdict(row), "mean": row.mean} for row in report.loops],
         "energies": [asdict(row) for row in report.energies],
+        "positions": None if report.position_fit is None else known_positions.summary(report.position_fit),
         "graph": None if report.graph is None else asdict(report.graph),
         "wrong_edges": None if report.wrong_edges is None else asdict(report.wrong_edges),
         "worst_edges": [asdict(row) for row in report.worst_edges],

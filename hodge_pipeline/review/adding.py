@@ -22,13 +22,15 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Candidate:
-    """A pair of vertex rows to be joined: its guess `i_from_j (4, 4)`, the points clicked in each cloud, then what the
-    registrar found, why acceptance rejects it (empty where it does not), and how far it is from the present poses.
+    """A pair of vertex rows to be joined: its guess `i_from_j (4, 4)` and what that comes from, the points clicked in
+    each cloud, then what the registrar found, why acceptance rejects it (empty where it does not), and how far it is
+    from the present poses.
     """
 
     i: int
     j: int
     guess: Floats
+    guess_by: str = "the poses"
     found: Registration | None = None
     rejected: str = ""
     residual_m: float = float("nan")
@@ -45,10 +47,10 @@ class Candidate:
         """With one more point, in turn in i's and in j's cloud; from three pairs on they make the guess."""
         first, second = self.points_i, self.points_j
         first, second = ((*first, point), second) if len(first) == len(second) else (first, (*second, point))
-        guess = self.guess
+        guess, by = self.guess, self.guess_by
         if len(first) == len(second) >= LEAST_POINTS:
-            guess = guess_from_points(np.array(first), np.array(second))
-        return Candidate(self.i, self.j, guess, points_i=first, points_j=second)
+            guess, by = guess_from_points(np.array(first), np.array(second)), f"{len(first)} point pairs"
+        return Candidate(self.i, self.j, guess, by, points_i=first, points_j=second)
 
 
 def guess_from_poses(world_from_cam: Floats, i: int, j: int) -> Floats:

@@ -19,23 +19,32 @@ EXTENT = 90
 
 @dataclass(frozen=True)
 class Shown:
-    """Vertex rows of two clouds, the pose of each, the size of the first and where its middle is; a cut through them;
-    the candidate whose points are clicked, where some are.
+    """Vertex rows of two clouds and the pose of each; that of the second as the edge has it and as the solution has
+    it, and which `share` of its points lies as the latter; the size of the first and where its middle is; a cut through
+    them; the candidate, and by which mode its guess is made.
     """
 
     i: int
     j: int
     world_from_i: Floats
     world_from_j: Floats
+    solved_from_j: Floats
+    share: float
     middle: Floats
     size_m: float
+    mode: str
     cut: float | None = None
     candidate: Candidate | None = None
 
     @property
     def wants_points(self) -> bool:
         """Whether a click picks a point."""
-        return self.candidate is not None
+        return self.candidate is not None and self.mode == "apart"
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether the second cloud is moved by hand."""
+        return self.candidate is not None and self.mode == "place"
 
     @property
     def next_is_first(self) -> bool:
@@ -44,7 +53,7 @@ class Shown:
 
     def picks(self) -> Floats:
         """The points clicked (N, 3), in the world."""
-        if self.candidate is None:
+        if self.candidate is None or not self.wants_points:
             return np.zeros((0, 3))
         first = np.reshape(self.candidate.points_i, (-1, 3))
         second = np.reshape(self.candidate.points_j, (-1, 3))
@@ -71,26 +80,18 @@ def shown_pair(session: Session, flip: bool) -> Shown | None:
         (i, j), motion = graph.edges[look.selected].tolist(), graph.i_from_j[look.selected]
     else:
         return None
-    middle, size_m = _extent(clouds[i])
-    inside = middle
-    by_edge, by_solution = poses[i] @ motion, poses[j]
-    share = {"edge": 0.0, "solution": 1.0, "blink": float(flip), "between": look.share}.get(look.mode, 0.0)
-    world_from_j = by_edge if share == 0 else by_solution if share == 1 else _between(by_edge, by_solution, share)
-    clicking = None
+    middle, size_m = extent(clouds[i])
+    share = {"solution": 1.0, "blink": float(flip), "between": look.share}.get(look.mode, 0.0)
     if look.mode == "apart":
-        beside = np.eye(4)
-        beside[0, 3] = APART * 2 * size_m
-        world_from_j, clicking = poses[i] @ beside, session.candidate
-        inside, size_m = middle + [APART * size_m, 0, 0], 2 * size_m
-    world = se3.transform(poses[i], inside[None])[0]
-    return Shown(i, j, poses[i], world_from_j, world, size_m, look.cut, clicking)
+        motion = np.eye(4)
+        motion[0, 3] = APART * 2 * size_m
+        middle, size_m = middle + [APART * size_m, 0, 0], 2 * size_m
+    world = se3.transform(poses[i], middle[None])[0]
+    by_edge = poses[i] @ motion
+    return Shown(i, j, poses[i], by_edge, poses[j], share, world, size_m, look.mode, look.cut, session.candidate)
 
 
-def _between(first: Floats, second: Floats, share: float) -> Floats:
-    return np.asarray(se3.interpolate(first[None], second[None], np.array([share]))[0])
-
-
-def _extent(cloud: PointCloud) -> tuple[Floats, float]:
+def extent(cloud: PointCloud) -> tuple[Floats, float]:
     """The middle of a cloud, in its camera's axes, and its size."""
     points = np.asarray(cloud.points_in_cam, float)
     if not len(points):

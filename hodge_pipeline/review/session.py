@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
 from hodge_pipeline.errors import GraphError
@@ -31,15 +32,17 @@ _EDITS: dict[str, Callable[[tuple[str, ...]], Edit]] = {
 }
 _SWITCHES = {"disable": DISABLED, "enable": ENABLED, "right": RIGHT}
 VERBS = tuple(_EDITS)
-MODES = ("all", "edge", "solution", "blink", "between", "apart")
+MODES = ("all", "edge", "solution", "blink", "between", "apart", "place")
+"""What is shown; the last two are of a candidate alone."""
 
 
 @dataclass(frozen=True)
 class Look:
     """What the scene shows: the edge selected (a row, −1: none); everything, or the two clouds of that edge or of the
-    candidate alone, by which motion (`MODES`; between: a `share` of the way from the edge's to the solution's; apart:
-    side by side, to click points); a cut through them (at this share of their size above their middle; None: whole);
-    the frames picked to be joined, the verdicts whose edges are drawn; how often all was asked for again.
+    candidate alone, by which motion (`MODES`; between: a `share` of the points as the solution says, the rest as the
+    edge does; apart: side by side, to click points; place: with handles that move the second cloud); a cut through them
+    (at this share of their size above their middle; None: whole); the frames picked to be joined, the verdicts whose
+    edges are drawn; how often all was asked for again.
     """
 
     selected: int = -1
@@ -193,7 +196,7 @@ class Session:
             assert new.found is not None
             settler.add(new.i, new.j, new.found)
         self._publish(settler, settler.solve(history, revision))
-        better = settler.checked(history, revision)
+        better = settler.checked(history, revision) if self.decisions.revision == revision else None
         if better is not None:
             self._publish(settler, better)
         self.slow.put("judging", self._judge)
@@ -264,6 +267,14 @@ class Session:
                     self.candidate = self.candidate.clicked((x, y, z))
                 except GraphError as error:
                     self.message = str(error)
+                self.bump()
+
+    def place(self, world_from_j: Floats) -> None:
+        """The candidate's second cloud was put at this pose (4, 4): its motion is the guess."""
+        with self.changed:
+            if (now := self.candidate) is not None:
+                i_from_j = se3.inverse(self.settled.world_from_cam[now.i]) @ world_from_j
+                self.candidate = Candidate(now.i, now.j, i_from_j, "the place it was put at")
                 self.bump()
 
     def register(self) -> None:

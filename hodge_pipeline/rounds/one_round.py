@@ -19,8 +19,10 @@ from hodge_pipeline.registration.acceptance import accepted
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.scene import START, Round, Scene
 from hodge_pipeline.solvers.editing import GraphEditor
+from hodge_pipeline.solvers.positions import Fixes, Placed, place
 from hodge_pipeline.sources.measured_edges import without_measured
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Step, Steps, Workers
+from hodge_pipeline.start.known_positions import up_of
 from hodge_pipeline.start.unordered.tour import propose_along_tour
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, ViewGraph
 from hodge_pipeline.types.edges import HELD_OUT
@@ -57,13 +59,25 @@ class Registered:
 
 @dataclass(frozen=True)
 class Work:
-    """What every round of a run needs: `measured` edges join each round's graph as they are."""
+    """What every round of a run needs: `measured` edges join each round's graph as they are, `fixes` are positions that
+    its poses are to meet.
+    """
 
     recipe: Recipe
     steps: Steps
     scene: Scene
     measured: ViewGraph
     workers: Workers
+    fixes: Fixes | None = None
+
+    def placed_first(self) -> Round:
+        """The first round, its poses in the world of known positions where there are any: loops are then near."""
+        scene = self.scene
+        if self.fixes is None or scene.is_given:
+            return scene.first
+        up = up_of(scene, scene.first.world_from_cam)
+        found = self.steps.step(place_first, scene.first, self.fixes, up, title="known positions")
+        return replace(scene.first, world_from_cam=found)
 
     def propose(self, number: int, before: Round) -> Edges:
         """The pairs to register in round `number` from the poses of the one before."""
@@ -101,7 +115,10 @@ class Work:
 
     def solve(self, registered: Registered, graph: ViewGraph, found: Energies | None) -> Round:
         """The round of these edges, and the poses consistent with them, of which `graph` holds those that count."""
-        return self.steps.step(solve_edges, registered, graph, self.recipe.solver, found, title=registered.title)
+        up = up_of(self.scene, registered.start)
+        return self.steps.step(
+            solve_edges, registered, graph, self.recipe.solver, found, self.fixes, up, title=registered.title
+        )
 
     def judge(self, last: Round) -> Round:
         """The last round, with the verdict of the diagnosis on each of its edges."""
@@ -148,13 +165,34 @@ def with_start_edges(candidates: Edges, first: Round) -> Edges:
     return merge([candidates, Edges.proposed(pairs, START)])[0]
 
 
+def place_first(first: Round, fixes: Fixes, up: Floats, *, step: Step) -> Floats:
+    """Step: the first poses (N, 4, 4) with the known positions, by the edges that they come from."""
+    edges = first.edges.select(first.edges.counts)
+    graph = edges.as_graph(first.vertex_ids)
+    component = connected_components(graph.edges, graph.vertex_count)
+    return place(graph, first.world_from_cam, component, np.ones(len(edges)), fixes, up).world_from_cam
+
+
 def solve_edges(
-    registered: Registered, graph: ViewGraph, solver: ConsistencySolver, found: Energies | None, *, step: Step
+    registered: Registered,
+    graph: ViewGraph,
+    solver: ConsistencySolver,
+    found: Energies | None,
+    fixes: Fixes | None,
+    up: Floats,
+    *,
+    step: Step,
 ) -> Round:
-    """Step: the round of these edges and the poses consistent with them; `found` of ω at its start is kept."""
+    """Step: the round of these edges and the poses consistent with them, and with known positions where there are any;
+    `found` of ω at its start is kept.
+    """
     edges, solution = registered.edges, solver.solve(graph, registered.start)
     if registered.right is not None:
         solution = with_right(graph, solution, registered.right[edges.counts])
+    placed: Placed | None = None
+    if fixes is not None:
+        placed = place(graph, solution.world_from_cam, solution.component, solution.weights, fixes, up)
+        solution = replace(solution, world_from_cam=placed.world_from_cam, component=placed.component)
     weights = np.zeros(len(edges))
     weights[edges.counts] = solution.weights
     solution = replace(solution, weights=weights[edges.in_graph])
@@ -162,6 +200,7 @@ def solve_edges(
     return Round(
         with_residuals(edges, solution.world_from_cam, solution.weights), graph.vertex_ids, solution.world_from_cam,
         solution, registered.fresh, registered.before, found, edited=registered.name == EDITED,
+        position_fit=None if placed is None else placed.fit,
     )  # fmt: skip
 
 

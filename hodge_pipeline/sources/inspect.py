@@ -81,6 +81,9 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
             facts.update(trajectory_facts(source.trajectory, oddities) if source.graph is None else {})
     if source.graph is not None and source.graph.vertex_count:
         facts["graph"] = graph_facts(source.graph, oddities)
+    if source.positions is not None:
+        facts["positions"] = len(source.positions)
+        facts["positions from"] = source.positions.origin
     facts["contents"] = list(source.contents) or None
     facts["notes"] = list(source.notes)
     facts["oddities"] = oddities

@@ -52,6 +52,8 @@ def without_frames(source: Source) -> str:
     """What a source without frames, of which no run can be made, is good for."""
     if source.graph is not None:
         return "a graph of measured edges, which needs no frames: give it to hodge solve or hodge diagnose"
+    if source.positions is not None:
+        return "known positions alone: give them to a run of the frames they belong to, --set positions.path=FILE"
     return "poses alone: with the frames they belong to hodge refine trajectory makes them better"
 
 

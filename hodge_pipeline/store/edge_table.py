@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hodge_pipeline.errors import WorkspaceError, not_written
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Edges
-from hodge_pipeline.types.edges import Words
+from hodge_pipeline.types.arrays import Words
 from hodge_pipeline.types.input_files import read_input
 from hodge_pipeline.types.text import cell, cell_text
 

@@ -13,7 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import FrameReader, Sniff
 from hodge_pipeline.testing.stage import check_stage
-from hodge_pipeline.types import Camera, EncodedImage, Frame, PointCloud, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import Camera, EncodedImage, Frame, PointCloud, Positions, Source, Trajectory, ViewGraph
 
 MAX_PICKLED_FRAME_BYTES = 1 << 14
 """A lazy frame is paths and numbers; anything larger holds an image."""
@@ -29,8 +29,9 @@ def check_reader(reader: FrameReader, path: Path, max_decoded: int = 3) -> Sourc
     _check_sniff(reader, path)
     source, again = reader.open(path), reader.open(path)
     assert isinstance(source, Source), f"open gives a {type(source).__name__}, not a Source"
-    has_content = len(source.frames) or source.trajectory is not None or source.graph is not None
-    assert has_content, "neither frames, nor a trajectory, nor a graph: raise SourceError instead"
+    parts = source.trajectory, source.graph, source.positions
+    has_content = len(source.frames) or any(part is not None for part in parts)
+    assert has_content, "neither frames, nor a trajectory, nor a graph, nor positions: raise SourceError instead"
     assert source.files, "no files: a run could not see that its input changed"
     absent = [file for file in source.files if not file.is_file()]
     assert not absent, f"files that are not there: {absent[:3]}"
@@ -40,6 +41,8 @@ def check_reader(reader: FrameReader, path: Path, max_decoded: int = 3) -> Sourc
         check_trajectory(source.trajectory)
     if source.graph is not None:
         check_view_graph(source.graph)
+    if source.positions is not None:
+        check_positions(source.positions)
     return source
 
 
@@ -67,6 +70,17 @@ def check_trajectory(trajectory: Trajectory) -> None:
     assert poses.shape == (len(stamps), 4, 4), f"{len(stamps)} stamps but poses {poses.shape}"
     assert np.isfinite(stamps).all() and (np.diff(stamps) > 0).all(), "stamps are not finite, or do not ascend"
     assert se3.is_motion(poses, 1e-6).all(), "a pose of the trajectory is not a rigid motion"
+
+
+def check_positions(positions: Positions) -> None:
+    """Assert columns of one length, finite points, positive covariances, and a name or a stamp for each."""
+    count = len(positions)
+    columns = (positions.points, positions.covariances, positions.names, positions.stamps_s)
+    assert all(len(column) == count for column in columns), f"columns of {[len(c) for c in columns]}"
+    assert np.isfinite(positions.points).all(), "a position is not finite"
+    assert ((positions.names != "") | np.isfinite(positions.stamps_s)).all(), "a position without name and stamp"
+    known = positions.covariances[np.isfinite(positions.covariances).all(axis=(1, 2))]
+    assert (np.linalg.eigvalsh(known) > 0).all(), "a covariance is not positive"
 
 
 def check_view_graph(graph: ViewGraph) -> None:

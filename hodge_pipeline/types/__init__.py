@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,10 +15,12 @@ from hodge_pipeline.types.arrays import Bytes as Bytes
 from hodge_pipeline.types.arrays import Floats as Floats
 from hodge_pipeline.types.arrays import Floats32 as Floats32
 from hodge_pipeline.types.arrays import Ints as Ints
+from hodge_pipeline.types.arrays import Words as Words
 from hodge_pipeline.types.edges import Edges as Edges
 from hodge_pipeline.types.edges import Priors as Priors
 from hodge_pipeline.types.edges import Registration as Registration
 from hodge_pipeline.types.edges import ViewGraph as ViewGraph
+from hodge_pipeline.types.positions import Positions as Positions
 
 
 @dataclass(frozen=True)
@@ -156,6 +159,7 @@ class Source:
 
     - `trajectory` is the whole trajectory that the frames' poses come from, on its own stamps, where there is one.
     - `notes` say what was skipped or repaired, with counts: one line each.
+    - `positions` of its frames that are known from elsewhere, such as satellite fixes; None where it has none.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
     - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
     """
@@ -168,11 +172,13 @@ class Source:
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
     contents: tuple[str, ...] = ()
+    positions: Positions | None = None
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]
         parts += [] if self.trajectory is None else [f"a trajectory of {len(self.trajectory)} poses"]
         parts += [] if self.graph is None else [repr(self.graph)]
+        parts += [] if self.positions is None else [f"{len(self.positions)} known positions"]
         return f"Source({self.name!r}: {', '.join(parts)})"
 
 
@@ -345,6 +351,13 @@ class CloudSet(Sequence[PointCloud]):
 
     def __iter__(self) -> Iterator[PointCloud]:
         return (self[row] for row in range(len(self)))
+
+    def forget(self) -> None:
+        """Give back the memory of what was read of the files; it is read again when it is needed."""
+        for name in self.FILES:
+            column = getattr(self, name)
+            if isinstance(column, np.memmap) and hasattr(mmap, "MADV_DONTNEED"):
+                column._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
     @property
     def sizes(self) -> Ints:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.types.arrays import Bools, Floats, Ints
+from hodge_pipeline.types.arrays import Bools, Floats, Ints, Words
 
-Words = NDArray[np.str_]
 CANDIDATE, HELD_OUT, REJECTED = "candidate", "held_out", "rejected"
 USED, IGNORED, DISABLED = "used", "ignored", "disabled"
 """The `status` of a row of `Edges`: proposed; kept out to judge by; registered, but no edge; an edge that counts; one

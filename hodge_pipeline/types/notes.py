@@ -35,6 +35,7 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
     ),
+    "option unknown": (Rank.LOOK, "{detail}; made by another version: it is left out of what is shown"),
     "scale": (Rank.LOOK, "{detail}"),
     "given poses": (Rank.FACT, "{count} of {detail} poses given"),
     "given file": (Rank.FACT, "{detail}"),
@@ -45,6 +46,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "tracking lost": (
         Rank.LOOK,
         "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
+    ),
+    "clock": (
+        Rank.LOOK,
+        "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
     ),
     "path broken": (
         Rank.LOOK,
@@ -62,6 +67,24 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "no truth near": (Rank.LOOK, "{detail}: no pose has a true one near in time: its error is not measured"),
     "carried": (Rank.LOOK, "{count} frames without a given pose are carried from the nearest ones by odometry"),
     "left apart": (Rank.LOOK, "nothing joins what tracking left apart: it starts where the guessed motion puts it"),
+    "positions of no frame": (
+        Rank.FACT,
+        "{count} of {detail} known positions are of no frame, or another is nearer to theirs in time.",
+    ),
+    "world": (
+        Rank.FACT,
+        "The result is in the world of {count} known positions, east, north, up: its zero is {detail}.",
+    ),
+    "positions rejected": (
+        Rank.LOOK,
+        "{count} known positions are rejected: the others contradict them by more than 5 sigma: {detail}",
+    ),
+    "not placed": (Rank.DOUBT, "{detail}"),
+    "positions scatter": (
+        Rank.LOOK,
+        "Known positions scatter {detail} times as far as their sigma says: a clock that is off, or an antenna away "
+        "from the sensor (positions.antenna_m), looks like that.",
+    ),
     "matched": (Rank.FACT, "{count} pairs between pieces matched, {detail}"),
     "suggested": (Rank.FACT, "{detail}"),
     "no decomposition": (Rank.LOOK, "{detail}"),

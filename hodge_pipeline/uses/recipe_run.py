@@ -13,6 +13,7 @@ from hodge_pipeline.recipe.recipe_file import recipe_names
 from hodge_pipeline.recipe.scale import with_scale
 from hodge_pipeline.recipe.schema import Recipe, load_recipe, with_source
 from hodge_pipeline.recording.run import Recording
+from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.report import run_files
 from hodge_pipeline.run_folder import Run, check_layout, end
 from hodge_pipeline.sources.opening import Fingerprints, changed_since, fingerprints, open_with_reader, remembered
@@ -25,6 +26,7 @@ from hodge_pipeline.types import Source
 from hodge_pipeline.types.notes import Note, notes_of
 
 
+@plugin_errors()
 def run(
     recipe: Recipe | str,
     out: Path | str,
@@ -59,6 +61,7 @@ def run(
         return _Run(recipe, workspace.folder, store, live, dask, opened, strict=strict).finished()
 
 
+@plugin_errors()
 def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str | None = None) -> Run:
     """Solve and fuse a finished run once more, with the edits in its folder, and bring all that it left up to date.
 

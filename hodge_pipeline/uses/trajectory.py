@@ -20,6 +20,7 @@ from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.start.match_poses import RECIPE, recipe_for
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source
+from hodge_pipeline.uses.image_checks import camera_of, check_colours, check_depths
 from hodge_pipeline.uses.recipe_run import run as recipe_run
 
 Array = TypeVar("Array")
@@ -46,14 +47,16 @@ def frames_from_images(
     """Frames of images in memory: depths (H, W) in metres, 0 where there is none, and RGB colours (H, W, 3), 8 bit.
 
     `camera`: ours, or the 3x3 matrix K, as Open3D's `intrinsic.intrinsic_matrix`. Without stamps the frames are
-    one second apart.
+    one second apart. Raises `SourceError` for depth that cannot be metres and a camera that cannot be one.
     """
     if not len(depths_m):
         raise SourceError("no depth image given: refinement needs what the frames saw")
-    height, width = np.asarray(depths_m[0]).shape
-    if not isinstance(camera, Camera):
-        k = np.asarray(camera, float)
-        camera = Camera(width, height, *(float(k[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))))
+    check_depths(depths_m)
+    height, width = np.shape(depths_m[0])
+    camera = camera_of(camera, height, width)
+    check_colours(colours, len(depths_m), (height, width))
+    if stamps_s is not None and len(stamps_s) != len(depths_m):
+        raise SourceError(f"{len(stamps_s)} stamps for {len(depths_m)} depth images: give one for each")
     return tuple(
         Frame(
             frame_id=row,

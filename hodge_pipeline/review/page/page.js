@@ -2,7 +2,7 @@
 "use strict";
 const $ = (id) => document.getElementById(id);
 const VERDICTS = ["wrong", "suspect", "untestable", "consistent"];
-const SORTS = ["score", "residual", "gap"];
+const SORTS = [...$("table").tHead.querySelectorAll("[data-sort]")].map((head) => head.dataset.sort);
 const COUNT = 100;
 let state = { revision: -1, version: -1, look: { selected: -1, verdicts: [] } };
 let rows = [], total = 0, first = 0, sort = "score", descending = false, shown = new Set(["wrong", "suspect"]);
@@ -160,7 +160,7 @@ function showCandidate() {
     return;
   }
   [$("first").value, $("second").value] = state.look.picked;
-  const result = found.registered ? `fitness ${found.fitness}, RMS ${metres(found.rmse_m)}, ${metres(found.residual_m)} and ${found.residual_deg}° from the poses; ${found.rejected ? `acceptance rejects it: ${found.rejected}; adding lets it in all the same` : "acceptance takes it"}` : `guess from ${found.points >= 3 ? `${found.points} point pairs` : "the poses"}${found.points && found.points < 3 ? `, ${found.points} point pairs clicked` : ""}: register it`;
+  const result = found.registered ? `fitness ${found.fitness}, RMS ${metres(found.rmse_m)}, ${metres(found.residual_m)} and ${found.residual_deg}° from the poses; ${found.rejected ? `acceptance rejects it: ${found.rejected}; adding lets it in all the same` : "acceptance takes it"}` : `guess from ${found.guess_by}${found.points && found.points < 3 ? `, ${found.points} point pairs clicked` : ""}: register it`;
   $("found").textContent = `${found.pair}: ${result}`;
   $("accept").disabled = !found.registered;
 }
@@ -232,6 +232,7 @@ $("cut").oninput = () => { $("cut-on").checked = true; cut(); };
 $("cut-on").onchange = cut;
 $("pick").onclick = () => act("pick", { frames: [$("first").value, $("second").value] });
 $("apart").onclick = () => act("look", { mode: "apart" });
+$("put").onclick = () => act("look", { mode: "place" });
 $("look").onclick = () => act("look", { mode: "edge" });
 $("adding").ontoggle = suggest;
 $("decided").ontoggle = log;

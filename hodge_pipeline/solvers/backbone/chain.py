@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class Chain:
     - `step (n, 4, 4)` from the position before, `step_covariance (n, p, p)` of ξ in `step · exp(ξ)`, and the graph's
       edge `step_edge (n,)` that they come from; identity, zeros and −1 where a path begins.
     - `loop_edge (M,)`; `ends (M, 2)`, the first the lower position; `motion (M, 4, 4)`; `covariance (M, p, p)`.
+    - `bridged (n,)`: steps with a guess in place of what the graph says; no scale is learned for its covariance.
     - `axes (p,)`: of a twist those that are free, three in the plane.
     """
 
@@ -34,6 +35,7 @@ class Chain:
     ends: Ints
     motion: Floats
     covariance: Floats
+    bridged: Bools
     axes: Ints
 
     @property
@@ -41,12 +43,17 @@ class Chain:
         """How many positions there are."""
         return len(self.order)
 
+    @property
+    def inner(self) -> Bools:
+        """Positions (n,) that a step leads to."""
+        return np.asarray((self.step_edge >= 0) | self.bridged)
+
     def poses(self) -> Floats:
         """World from each position (n, 4, 4), each path composed from the identity."""
         out = np.empty((self.size, 4, 4))
-        before = np.eye(4)
+        before, inner = np.eye(4), self.inner
         for row in range(self.size):
-            before = self.step[row] if self.step_edge[row] < 0 else before @ self.step[row]
+            before = before @ self.step[row] if inner[row] else self.step[row]
             out[row] = before
         return out
 
@@ -116,7 +123,42 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     ends = place[graph.edges[rows]]
     motion, loop_covariance = _directed(graph.i_from_j[rows], covariance[rows], ends[:, 0] > ends[:, 1], axes)
     return Chain(
-        order, path, step, step_covariance, step_edge, rows, np.sort(ends, axis=1), motion, loop_covariance, axes
+        order,
+        path,
+        step,
+        step_covariance,
+        step_edge,
+        rows,
+        np.sort(ends, axis=1),
+        motion,
+        loop_covariance,
+        np.zeros(len(order), bool),
+        axes,
+    )
+
+
+def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats) -> Chain:
+    """The chain with the path `high` behind the path `low < high`, and a bridge of this motion (4, 4) between them."""
+    second = chain.path == high
+    after = int(np.flatnonzero(chain.path == low)[-1]) + 1
+    moved = np.concatenate([np.arange(after), np.flatnonzero(second), np.flatnonzero(~second[after:]) + after])
+    place = np.empty(chain.size, np.int64)
+    place[moved] = np.arange(chain.size)
+    step, step_covariance, bridged = chain.step[moved], chain.step_covariance[moved], chain.bridged[moved]
+    step[after], step_covariance[after], bridged[after] = motion, covariance, True
+    ends = place[chain.ends]
+    loop, loop_covariance = _directed(chain.motion, chain.covariance, ends[:, 0] > ends[:, 1], chain.axes)
+    return replace(
+        chain,
+        order=chain.order[moved],
+        path=np.where(second, low, chain.path)[moved],
+        step=step,
+        step_covariance=step_covariance,
+        step_edge=chain.step_edge[moved],
+        ends=np.sort(ends, axis=1),
+        motion=loop,
+        covariance=loop_covariance,
+        bridged=bridged,
     )
 
 

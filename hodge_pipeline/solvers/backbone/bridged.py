@@ -1,0 +1,94 @@
+"""Loops judged on a chain that may be broken: a step is bridged where the loops then say much more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.solvers.backbone.breaks import Break, Testimony, Usual, agreed_breaks, unusual_breaks
+from hodge_pipeline.solvers.backbone.chain import Chain, linked
+from hodge_pipeline.solvers.backbone.evidence import Wrong
+from hodge_pipeline.solvers.backbone.fit import linearise
+from hodge_pipeline.solvers.backbone.inference import BY_CHANCE, Inferred, by_chance, infer
+from hodge_pipeline.solvers.backbone.scales import learn_scales, mixture
+from hodge_pipeline.types import Bools
+
+MOST_BREAKS, MOST_TRIED = 10, 2
+"""That are bridged one after the other, and that are tried each time."""
+
+
+def infer_bridged(chain: Chain, always: Bools, most_unknowns: int | None) -> tuple[Chain, Inferred] | None:
+    """The chain with its paths joined and its broken steps bridged, and its loops judged; None as in `infer`.
+
+    A step is tried where loops of several places agree that it is broken, or where it is unlike all others. It is
+    broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
+    """
+    chain = joined(chain)
+    found = infer(chain, always, most_unknowns)
+    for _ in range(MOST_BREAKS):
+        better = None if found is None else _better(chain, found, always, most_unknowns)
+        if better is None:
+            break
+        chain, found = better
+    return None if found is None else (chain, found)
+
+
+def _better(chain: Chain, found: Inferred, always: Bools, most_unknowns: int | None) -> tuple[Chain, Inferred] | None:
+    """The chain with one more step bridged, and its loops judged; None where it has none that is broken."""
+    for broken, least in _candidates(chain, found):
+        tried = bridged(chain, broken)
+        other = infer(tried, always, most_unknowns)
+        if other is not None and other.log_evidence > found.log_evidence + least:
+            return tried, other
+    return None
+
+
+def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
+    """Breaks worth a trial, with what each must win; one that is unlike all others has won some of it."""
+    scaled = found.scales.applied(chain)
+    linear, (right, wrong) = linearise(scaled, chain.poses()), found.judged.log_density
+    shares = np.log(mixture(found.judged.log_density)[0])
+    told = Testimony.of(scaled, linear, np.logaddexp(shares[0] + right - wrong, shares[1]), wrong)
+    usual, least, fold = Usual.of(chain), by_chance(len(right)), np.log(max(len(right), 1))
+    agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
+    unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
+    worth = [(each, least) for each in agreed[:MOST_TRIED]]
+    return worth + [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
+
+
+def bridged(chain: Chain, broken: Break) -> Chain:
+    """The chain with another motion in place of a step."""
+    step, covariance, known = chain.step.copy(), chain.step_covariance.copy(), chain.bridged.copy()
+    step[broken.at], covariance[broken.at], known[broken.at] = broken.motion, broken.covariance, True
+    return replace(chain, step=step, step_covariance=covariance, bridged=known)
+
+
+def joined(chain: Chain) -> Chain:
+    """The chain with bridges between paths, as of several robots, where loops of several places agree how they lie."""
+    while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
+        poses = chain.poses()
+        wrong = Wrong.of(chain, poses)
+        scaled = learn_scales(chain, poses, wrong)[0].applied(chain)
+        linear, none = linearise(scaled, poses), np.zeros(len(chain.ends))
+        told = Testimony.of(scaled, linear, none, wrong.log_density(scaled, poses))
+        pairs = chain.path[chain.ends]
+        best, found = BY_CHANCE + float(np.log(len(pairs))), None
+        for low, high in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).tolist():
+            rows = np.flatnonzero((pairs == [low, high]).all(axis=1))
+            for seed in told.seeds(rows) if len(rows) > 1 else ():
+                if (score := float(told.gains(seed, rows).sum())) > best:
+                    best, found = score, (low, high, seed)
+        if found is None:
+            break
+        low, high, seed = found
+        last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
+        end, covariance = told.beyond(np.array([seed]), last, first)
+        motion = se3.inverse(poses[last[0]]) @ end[0]
+        chain = linked(chain, low, high, motion, LOOSE**2 * covariance[0])
+    return chain
+
+
+LOOSE = 2.0
+"""Of the standard deviations of the one loop by which two paths are joined, those of their bridge."""

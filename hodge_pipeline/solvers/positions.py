@@ -1,0 +1,276 @@
+"""Poses in the world of known positions, such as satellite fixes: aligned to them, then solved with them as priors.
+
+Neither how far edges drift nor how far positions scatter is as their information states: both factors are estimated
+(variance components, Förstner 1979), and a position that the others and the edges contradict is rejected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.components import by_size
+from hodge_pipeline.solvers.covariance import marginal_covariances
+from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.solvers.setup import NO_ROWS
+from hodge_pipeline.types import Bools, Floats, Ints, Priors, ViewGraph, Words
+from hodge_pipeline.types.positions import PositionFit
+
+FEWEST = 3
+"""Positions that place a piece: two leave it free to turn about the line between them."""
+TRIALS = 300
+"""Of three positions each: with half of them wrong, one trial of 8 has three right ones."""
+GROSS = 5.0
+"""Times the median misfit after the alignment, which drift spreads evenly: what is farther off is no drift."""
+REJECTED_SIGMA = 5.0
+"""A position so far from what all others say is rejected: of right ones one in 65,000 is (three dimensions)."""
+SPREAD_SIGMA = 5.0
+"""Nine in ten positions nearer together say nothing of the heading: of a robot at rest they span 3.3 sigma."""
+MOST_ROUNDS, SETTLED = 30, 0.05
+"""Of factors and rejections, until both factors change by less than 5 %."""
+LOOSE = 100.0
+"""The factor on the edges' sigma to begin with: from the loose side, drift is not taken for scatter of positions."""
+FEWEST_SPARE = 30
+"""Numbers measured beyond those sought, below which nothing tells how far edges drift: then positions bend nothing."""
+INERTIA, MOST_FACTOR = 6.0, 1e3
+"""Degrees of freedom, one pose's, that the factor of the round before counts; and how large or small one may become."""
+MOST_COVARIANCES = 60
+"""Poses whose covariance is computed; the others have that of the nearest one."""
+NEAR_CERTAIN = 0.95
+"""Largest share of a position's variance that its own pose is taken to have, for what those covariances approximate."""
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """Known `points (P, 3)` of the world with their `covariances (P, 3, 3)`; each is `arms (P, 3)` in the axes of one
+    of the `vertices (P,)`. `stated (P,)`: whether its covariance is stated, not assumed.
+    """
+
+    vertices: Ints
+    arms: Floats
+    points: Floats
+    covariances: Floats
+    stated: Bools
+    labels: Words
+    origin: str = ""
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def select(self, rows: Bools | Ints) -> Fixes:
+        """Those of these rows."""
+        return Fixes(
+            self.vertices[rows], self.arms[rows], self.points[rows], self.covariances[rows], self.stated[rows],
+            self.labels[rows], self.origin,
+        )  # fmt: skip
+
+    def found(self, world_from_cam: Floats) -> Floats:
+        """Where (P, 3) poses put them."""
+        poses = world_from_cam[self.vertices]
+        return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], self.arms) + poses[:, :3, 3])
+
+    def lever(self, world_from_cam: Floats) -> Floats:
+        """The derivative (P, 3, 6) of where poses put them by ξ = (rotation, translation) in `T · exp(ξ)`."""
+        turned = world_from_cam[self.vertices, :3, :3]
+        return np.concatenate([-turned @ se3.hat(self.arms), turned], axis=2)
+
+    def priors(self, world_from_cam: Floats, factor: float) -> Priors:
+        """What they say of their poses near these, their sigma multiplied by a factor."""
+        poses = world_from_cam[self.vertices].copy()
+        poses[:, :3, 3] += self.points - self.found(world_from_cam)
+        lever = self.lever(world_from_cam)
+        weight = np.linalg.inv(self.covariances) / factor**2
+        return Priors(self.vertices, poses, np.swapaxes(lever, 1, 2) @ weight @ lever)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Poses (V, 4, 4) in the world of known positions, the `component (V,)` of one gauge of each, and how they fit."""
+
+    world_from_cam: Floats
+    component: Ints
+    fit: PositionFit
+
+
+def place(
+    graph: ViewGraph, world_from_cam: Floats, component: Ints, weights: Floats, fixes: Fixes, up: Floats
+) -> Placed:
+    """The poses (V, 4, 4) solved again with known positions; `weights (E,)` are those of the solve before.
+
+    Each component is first brought to its positions, robustly; `up (3,)` of the poses' world settles how it turns about
+    positions on a line. One with fewer than three positions, or with those of one place, stays where it is. Where there
+    are so few that nothing tells how far edges drift, nothing more is done.
+    """
+    poses, problems = world_from_cam.copy(), list[str]()
+    placed, used = np.zeros(len(poses), bool), np.zeros(len(fixes), bool)
+    for label in np.unique(component[fixes.vertices]):
+        rows, members = np.flatnonzero(component[fixes.vertices] == label), component == label
+        own = fixes.select(rows)
+        if problem := _cannot_place(own, poses):
+            problems.append(f"{int(members.sum())} frames are not placed: {problem}")
+            continue
+        found, used[rows] = align_positions(own.found(poses), own.points, _sigma(own), up)
+        poses[members], placed[members] = found @ poses[members], True
+    reached = placed[fixes.vertices]
+    left = fixes.points - fixes.found(poses)
+    settled = _Settled(poses, used, np.linalg.norm(_whitened(fixes, left), axis=1), 1.0, 1.0)
+    joined = placed[graph.edges[:, 0]] & (weights > 0)
+    if 6 * int(joined.sum()) + 3 * int(used.sum()) > 6 * int(placed.sum()) + FEWEST_SPARE:
+        gauges = 6 * len(np.unique(component[placed]))
+        settled = _settled(graph, poses, weights, fixes, used, reached, gauges)
+    solved = np.where(placed[:, None, None], settled.world_from_cam, world_from_cam)
+    fit = PositionFit(
+        fixes.labels,
+        fixes.points,
+        settled.used,
+        np.where(reached[:, None], fixes.points - fixes.found(solved), np.nan),
+        np.where(reached, settled.distance, np.nan),
+        settled.edge_factor,
+        settled.fix_factor,
+        fixes.origin,
+        tuple(problems),
+    )
+    return Placed(solved, by_size(np.where(placed, component.max(initial=0) + 1, component)), fit)
+
+
+def align_positions(
+    found: Floats, known: Floats, sigma: Floats, up: Floats | None = None, *, with_scale: bool = False
+) -> tuple[Floats, Bools]:
+    """The motion (4, 4) that lays points (P, 3) on known ones, by least median of squares, and which (P,) it fits.
+
+    With a scale its rotation part is multiplied by it. `up (3,)` is what points up among the found ones: it settles
+    what points on a line leave open.
+    """
+    rng = np.random.default_rng(0)
+    count = len(found)
+    chosen = np.stack([rng.choice(count, FEWEST, replace=False) for _ in range(TRIALS)])
+    chosen = chosen if count > FEWEST else np.arange(FEWEST)[None]
+    tie = np.median(sigma) ** 2
+    trials = [_similarity(found[rows], known[rows], tie, up, with_scale) for rows in chosen]
+    middle = [np.median(np.linalg.norm(known - se3.transform(trial, found), axis=1)) for trial in trials]
+    best = trials[int(np.argmin(middle))]
+    inliers = np.ones(count, bool)
+    for _ in range(3):
+        misfit = np.linalg.norm(known - se3.transform(best, found), axis=1)
+        inliers = misfit <= GROSS * np.maximum(np.median(misfit), sigma)
+        best = _similarity(found[inliers], known[inliers], tie, up, with_scale)
+    return best, inliers
+
+
+def _similarity(found: Floats, known: Floats, tie_m2: float, up: Floats | None, with_scale: bool) -> Floats:
+    """The least-squares motion or similarity (Umeyama 1991); where positions are within the noise, up stays up."""
+    x, y = found - found.mean(axis=0), known - known.mean(axis=0)
+    covariance = y.T @ x / len(x)
+    if up is not None:
+        covariance = covariance + tie_m2 * np.outer([0.0, 0.0, 1.0], up)
+    rotation = se3.project_to_so3(covariance)
+    spread = float((x**2).sum() / len(x))
+    scale = float(np.trace(rotation.T @ covariance)) / spread if with_scale and spread > 0 else 1.0
+    out = np.eye(4)
+    out[:3, :3] = scale * rotation
+    out[:3, 3] = known.mean(axis=0) - out[:3, :3] @ found.mean(axis=0)
+    return out
+
+
+def _sigma(fixes: Fixes) -> Floats:
+    """The sigma (P,) of each, as of one axis."""
+    return np.asarray(np.sqrt(np.trace(fixes.covariances, axis1=1, axis2=2) / 3))
+
+
+def _cannot_place(fixes: Fixes, poses: Floats) -> str:
+    if len(fixes) < FEWEST:
+        return f"{len(fixes)} known positions among them, {FEWEST} are needed"
+    spread_m = min(_extent_m(fixes.points), _extent_m(fixes.found(poses)))
+    needed_m = SPREAD_SIGMA * float(np.median(_sigma(fixes)))
+    if spread_m < needed_m:
+        return f"their known positions span {spread_m:.2g} m, which tells no heading: {needed_m:.2g} m would"
+    return ""
+
+
+def _extent_m(points: Floats) -> float:
+    """How far half of the points spread along their main axis."""
+    middle = points - np.median(points, axis=0)
+    axis = np.linalg.svd(middle, full_matrices=False)[2][0]
+    return float(np.ptp(np.quantile(middle @ axis, [0.05, 0.95])))
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """Poses, which positions are used, their distances, and the factors."""
+
+    world_from_cam: Floats
+    used: Bools
+    distance: Floats
+    edge_factor: float
+    fix_factor: float
+
+
+def _settled(
+    graph: ViewGraph, poses: Floats, weights: Floats, fixes: Fixes, used: Bools, reached: Bools, gauges: int
+) -> _Settled:
+    """The poses once neither the factors nor the rejections change any more.
+
+    How far edges drift is told by how far positions bend them, for each number that these tell beyond the `gauges`; not
+    by how well edges close among themselves, which share their errors.
+    """
+    information = graph.information * weights[:, None, None]
+    alone = replace(graph, information=information, priors=None, fixed=NO_ROWS)
+    at_rest = _chi2(alone, solve(alone, start=poses, initial="given", fixed=NO_ROWS).world_from_cam)
+    edge_factor, fix_factor = LOOSE, 1.0
+    for _ in range(MOST_ROUNDS):
+        priors = fixes.select(used).priors(poses, fix_factor)
+        whole = replace(graph, information=information / edge_factor**2, priors=priors, fixed=NO_ROWS)
+        poses = solve(whole, start=poses, initial="given", fixed=NO_ROWS).world_from_cam
+        share, distance = _tested(whole, poses, fixes, used, reached, fix_factor)
+        found = _Settled(poses, used, distance, edge_factor, fix_factor)
+        told = float(share[used].sum())
+        chi2 = _chi2(alone, poses)
+        most = GROSS**2 * np.median(chi2[weights > 0])  # a jump tears a few edges far
+        bent = np.minimum(chi2, most).sum() - np.minimum(at_rest, most).sum()
+        edge_factor = _factor(edge_factor, max(bent, 0.0), told - gauges)
+        chi2 = (_whitened(fixes, fixes.points - fixes.found(poses))[used] ** 2).sum()
+        fix_factor = _factor(fix_factor, chi2, 3 * int(used.sum()) - told)
+        fix_factor = max(fix_factor, 1.0) if fixes.stated.all() else fix_factor
+        used = reached & (distance <= REJECTED_SIGMA)
+        changes = np.log([edge_factor / found.edge_factor, fix_factor / found.fix_factor])
+        if np.array_equal(used, found.used) and np.abs(changes).max() < SETTLED:
+            break
+    return found
+
+
+def _factor(before: float, chi2: float, freedom: float) -> float:
+    """The factor on sigma with which chi2 is as large as its degrees of freedom; that of before counts as some."""
+    factor = np.sqrt((chi2 + INERTIA * before**2) / (max(freedom, 0.0) + INERTIA))
+    return float(np.clip(factor, 1 / MOST_FACTOR, MOST_FACTOR))
+
+
+def _chi2(graph: ViewGraph, poses: Floats) -> Floats:
+    i, j = graph.edges.T
+    left = se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(poses[i]) @ poses[j])
+    return np.asarray(np.einsum("ei,eij,ej->e", left, graph.information, left))
+
+
+def _whitened(fixes: Fixes, vectors: Floats) -> Floats:
+    return np.asarray(np.einsum("nij,nj->ni", np.linalg.inv(np.linalg.cholesky(fixes.covariances)), vectors))
+
+
+def _tested(
+    graph: ViewGraph, poses: Floats, fixes: Fixes, used: Bools, reached: Bools, factor: float
+) -> tuple[Floats, Floats]:
+    """Of each position: how many of its three numbers (P,) its own pose takes from it, and its distance (P,) in sigmas
+    from what all others say, NaN where its piece is not placed.
+    """
+    vertices = np.unique(fixes.vertices[reached])
+    sampled = vertices[np.unique(np.linspace(0, len(vertices) - 1, MOST_COVARIANCES).round().astype(int))]
+    covariances = marginal_covariances(graph, poses, sampled)
+    nearest = np.abs(fixes.vertices[:, None] - sampled).argmin(axis=1)
+    lever = fixes.lever(poses)
+    half = np.linalg.inv(np.linalg.cholesky(fixes.covariances * factor**2))
+    known = half @ lever @ covariances[nearest] @ np.swapaxes(lever, 1, 2) @ np.swapaxes(half, 1, 2)
+    values, axes = np.linalg.eigh(known)
+    values = np.where(used[:, None], np.clip(values, 0, NEAR_CERTAIN), values)
+    left = np.einsum("nij,ni->nj", axes, np.einsum("nij,nj->ni", half, fixes.points - fixes.found(poses)))
+    variance = np.where(used[:, None], 1 - values, 1 + values)
+    return values.sum(axis=1), np.where(reached, np.sqrt((left**2 / variance).sum(axis=1)), np.nan)

@@ -1,0 +1,151 @@
+"""`hodge new-plugin`: what it writes passes its own test, is found by its entry point, runs, and its errors name it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import registry
+from hodge_pipeline.cli.new_plugin import EXAMPLES, plugin_files, write_plugin
+from hodge_pipeline.errors import RecipeError, WorkspaceError
+from synthetic import tiny_sequence  # noqa: F401 - a fixture
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "writing-a-plugin.md"
+RUFF = ["check", "--select", "E,F,I,UP,B,SIM,D1"], ["format", "--check"]
+SMALL = (
+    "clouds.voxel_m=0.08", "outer_iterations=1", "fusion=[]", "evaluation.tables=false", "recording.level=off",
+    "start.relocalise=false",
+)  # fmt: skip
+
+
+def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Python in a folder with a package, which it finds as if it were installed."""
+    path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run(
+        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def hodge(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return python(folder, "-m", "hodge_pipeline.cli.main", *words)
+
+
+def made(folder: Path, name: str, kind: str) -> Path:
+    """A new package, with the metadata that pip would write of it beside it."""
+    write_plugin(name, kind, folder)
+    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+    metadata = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n")
+    groups = project["entry-points"].items()
+    lines = [f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in names.items()) for group, names in groups]
+    (metadata / "entry_points.txt").write_text("\n".join(lines))
+    return folder
+
+
+@pytest.fixture(scope="module", params=["o3d_icp", "npz_folder"])
+def package(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    kind = "registration" if request.param == "o3d_icp" else "readers"
+    return made(tmp_path_factory.mktemp("new") / request.param, request.param, kind)
+
+
+def test_it_passes_its_own_test_and_the_linter(package: Path) -> None:
+    done = python(package, "-m", "pytest", "-q", "-p", "no:cacheprovider")
+    assert done.returncode == 0, done.stdout
+    assert "1 passed" in done.stdout
+    for command in RUFF:
+        linted = python(package, "-m", "ruff", *command, "--isolated", "--line-length", "120")
+        assert linted.returncode == 0, linted.stdout
+
+
+def test_it_is_listed_with_its_package(package: Path) -> None:
+    name = package.name
+    kind = "registration" if name == "o3d_icp" else "readers"
+    listed = hodge(package, "stages", kind)
+    assert f"[hodge-{name.replace('_', '-')} 0.1.0]" in listed.stdout, listed.stderr
+
+
+def test_a_run_registers_with_it_and_its_error_names_it(
+    tiny_sequence: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    package = made(tmp_path / "package", "o3d_icp", "registration")
+    sets = [word for change in (*SMALL, "registration=o3d_icp") for word in ("--set", change)]
+    run = ["run", "demo", "--source", str(tiny_sequence), *sets]
+    done = hodge(package, *run, "--set", "executor.workers=0", "--out", str(tmp_path / "good"))
+    assert done.returncode == 0, done.stderr
+    assert "Improved" in done.stdout
+
+    module = package / "hodge_o3d_icp.py"
+    module.write_text(module.read_text().replace("        steps = 0\n", '        raise ValueError("no\\nluck")\n'))
+    line = module.read_text().splitlines().index('        raise ValueError("no\\nluck")') + 1
+    for workers in ("0", "1"):  # in this process, and in a worker, whose errors come back without frames
+        out = tmp_path / f"bad-{workers}"
+        done = hodge(package, *run, "--set", f"executor.workers={workers}", "--out", str(out), "--quiet")
+        assert done.returncode == 1
+        said = f"stage o3d_icp (hodge-o3d-icp 0.1.0) raised ValueError: no luck, at hodge_o3d_icp.py:{line}"
+        assert done.stderr == f"error: {said}\n"
+
+
+def test_a_reader_opens_its_format_and_its_error_names_it(tmp_path: Path) -> None:
+    package = made(tmp_path / "package", "npz_folder", "readers")
+    data = tmp_path / "data"
+    data.mkdir()
+    np.savez(data / "0.npz", points=np.random.default_rng(0).uniform(0, 2, (100, 3)))
+    done = hodge(package, "inspect", str(data), "--reader", "npz_folder")
+    assert done.returncode == 0 and re.search(r"^frames +1$", done.stdout, re.M), done.stdout + done.stderr
+    module = package / "hodge_npz_folder.py"
+    module.write_text(module.read_text().replace("        frames = tuple(", "        frames = 1 / 0, *("))
+    done = hodge(package, "inspect", str(data), "--reader", "npz_folder")
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: stage npz_folder (hodge-npz-folder 0.1.0) raised ZeroDivisionError: division")
+    assert done.stderr.count("\n") == 1
+
+
+def test_an_error_of_ours_is_no_plugins() -> None:
+    try:
+        registry.load("registration", "gicp")().prepare(None)
+    except AttributeError as error:
+        assert registry.plugin_error(error) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "message"),
+    [("My-ICP", "registration", "is no name of a stage"), ("mine", "solvers", "no template of kind 'solvers'")],
+)
+def test_a_name_that_is_none_is_one_line(name: str, kind: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=message):
+        write_plugin(name, kind, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_nothing_is_written_over(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="is there already"):
+        write_plugin("mine", "readers", tmp_path)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("o3d_icp", "registration"), ("npz_folder", "readers")])
+def test_the_page_shows_what_it_writes(name: str, kind: str) -> None:
+    assert kind in EXAMPLES
+    page = PAGE.read_text("utf-8")
+    for file, text in plugin_files(name, kind):
+        shown = file.endswith(".py") or kind == "registration"
+        assert file == "README.md" or not shown or f"\n{text}```" in page, file
+
+
+def test_the_page_names_every_field_of_what_comes_in_and_goes_out() -> None:
+    import dataclasses
+
+    from hodge_pipeline.types import PointCloud, Registration
+
+    page = PAGE.read_text("utf-8")
+    for cls in (PointCloud, Registration):
+        assert [field.name for field in dataclasses.fields(cls) if f"\n| `{field.name}` |" not in page] == []
