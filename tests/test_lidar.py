@@ -193,7 +193,7 @@ def test_a_robot_that_stands_still_has_few_key_frames_and_stays(tmp_path: Path) 
 
 def sweeps_as(layout: str, folder: Path, count: int) -> Path:
     """Sweeps of the street as a folder in KITTI's layout, or as a recording."""
-    log, own = Log(), SpinningScanner(Road(7.0), 0, beams=32, columns=512, noise=1.0)
+    log, own = Log(), SpinningScanner(Road(10.0), 0, beams=16, columns=360, noise=1.0)
     (folder / "velodyne").mkdir()
     for number in range(count):
         points = own.sweep(number).points
@@ -209,7 +209,7 @@ def sweeps_as(layout: str, folder: Path, count: int) -> Path:
 @pytest.mark.parametrize("layout", ["kitti", "recording"])
 def test_a_trajectory_of_sweeps_is_refined_by_default(layout: str, tmp_path: Path) -> None:
     count = 16
-    exact = Road(7.0).world_from_car(np.arange(count) * REVOLUTION_S)
+    exact = Road(10.0).world_from_car(np.arange(count) * REVOLUTION_S)
     noise = np.random.default_rng(0).normal(0, [1e-3] * 3 + [0.06] * 3, (count, 6))
     given = exact @ se3.exp(np.cumsum(noise, axis=0))
     frames = sweeps_as(layout, tmp_path, count)
