@@ -7,7 +7,7 @@ export OMP_NUM_THREADS ?= 1
 PYTEST_ARGS ?= -n 2 --dist loadfile
 BASELINE ?= ../hodge-baseline
 
-.PHONY: help setup demo paper test faults faults-full faults-mutants baseline compare-baseline docs site lint format clean
+.PHONY: help setup demo paper test faults faults-full faults-mutants baseline compare-baseline docs site dist lint format clean
 help:
 	@echo "make setup   system libraries, $(VENV) and everything in it: 3 GB"
 	@echo "make demo    make a room, reconstruct it: runs/demo"
@@ -19,6 +19,7 @@ help:
 	@echo "make compare-baseline  what has changed since"
 	@echo "make docs    docs/recipes.md from the code"
 	@echo "make site    docs/ as a site: build/site/index.html"
+	@echo "make dist    sdist and wheel: dist"
 	@echo "make lint    ruff, mypy, import directions"
 
 $(STAMP): pyproject.toml constraints.txt tools/system-libraries.sh
@@ -61,6 +62,10 @@ docs: $(STAMP)
 site: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "open build/site/index.html"
+
+dist: $(STAMP)
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

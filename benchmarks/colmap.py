@@ -1,6 +1,6 @@
 """Is `hodge refine colmap` ever worse than its input or plain bundle adjustment? Prints a table, exit code 1 if so.
 
-    python benchmarks/colmap.py                                  # the models of HODGE_DATA, five seeds
+    python benchmarks/colmap.py                                  # the models of HODGE_DATA, synthetic ones; five seeds
     python benchmarks/colmap.py scene/sparse/0 --seeds 1 --kinds noise wrong
     python benchmarks/colmap.py --write                          # benchmarks/colmap.md
 
@@ -21,12 +21,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pycolmap
+from synthetic_colmap import make
 
 from hodge_pipeline import se3
 
@@ -37,6 +38,8 @@ MODELS = (
     "lund_door/set1_lund_door/colmap_ground_truth",
     "astrovision_vesta/test_2011212_opnav_022",
 )
+SYNTHETIC = (("rings", 150), ("turntable", 118), ("facade", 60), ("room", 128), ("street", 80), ("joined", 80))
+"""Kinds and images of `benchmarks/synthetic_colmap.py`, seed 1."""
 MOST_WORSE_PERCENT = 0.1
 CPU_FACTOR, CPU_EXTRA_S = 5.0, 10.0
 PEER = """
@@ -221,22 +224,35 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
         yield f"| {' | '.join([row.model, row.kind, str(row.seed), *numbers, *seconds, row.kept, row.failure])} |"
 
 
+def _synthetic(folder: Path) -> Iterator[Path]:
+    for kind, images in SYNTHETIC:
+        out = folder / f"{kind}{images}"
+        out.mkdir()
+        make(kind, images, 1).write(out)
+        yield out
+
+
+def _rows(models: Iterable[Path], options: argparse.Namespace) -> Iterator[Row]:
+    for good in models:
+        for kind in options.kinds:
+            for seed in range(1 if kind == "given" else options.seeds):
+                with tempfile.TemporaryDirectory() as folder:
+                    row = measured(good, kind, seed, Path(folder))
+                print(list(table([row]))[-1], flush=True)
+                yield row
+
+
 def main() -> int:
     """Print the table; 1 where a line is not as promised."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="*", type=Path, help="folders of good models; default: those of HODGE_DATA")
+    parser.add_argument("models", nargs="*", type=Path, help="folders of good models; default: see above")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--write", action="store_true", help="the table into benchmarks/colmap.md")
     options = parser.parse_args()
     data = Path(os.environ.get("HODGE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "colmap"
-    rows = []
-    for good in options.models or [data / name for name in MODELS]:
-        for kind in options.kinds:
-            for seed in range(1 if kind == "given" else options.seeds):
-                with tempfile.TemporaryDirectory() as folder:
-                    rows.append(measured(good, kind, seed, Path(folder)))
-                print(list(table(rows[-1:]))[-1], flush=True)
+    with tempfile.TemporaryDirectory() as made:
+        rows = list(_rows(options.models or [*(data / name for name in MODELS), *_synthetic(Path(made))], options))
     failed = sum(bool(row.failure) for row in rows)
     print(f"{len(rows)} cases, {failed} not as promised")
     if options.write:

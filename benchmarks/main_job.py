@@ -44,7 +44,9 @@ def measure(recipe: str, source: Path, frames: int, overrides: list[str]) -> dic
         environment = {**os.environ, "PYTHONPATH": paths}
         before, begin = os.times(), time.perf_counter()
         command = [sys.executable, "-c", SCRIPT, recipe, str(source), str(out), str(frames), *overrides]
-        subprocess.run(command, check=True, stderr=subprocess.DEVNULL, env=environment)
+        done = subprocess.run(command, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+        if done.returncode:
+            sys.exit(done.stderr)
         after = os.times()
         report: dict[str, Any] = json.loads((out / "report.json").read_text())
         sizes = {name: (out / name).stat().st_size / 1e6 for name in ("report.html", "recording.rrd")}

@@ -19,7 +19,6 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import demo_source
 from hodge_pipeline.diagnosis.result import WRONG
 from hodge_pipeline.pairs.edits import Edit, History, write_history
-from hodge_pipeline.pipeline import solve_again
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_plots import draw
@@ -28,6 +27,7 @@ from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.types import Floats, ViewGraph
 from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
+from hodge_pipeline.uses.recipe_run import solve_again
 
 PICTURES = Path(__file__).parent / "pictures"
 RIGHT = ((2, 109), (6, 113), (10, 117))

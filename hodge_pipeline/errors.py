@@ -12,7 +12,14 @@ class HodgeError(Exception):
 
 
 class RecipeError(HodgeError):
-    """A recipe, an override or a stage's option is wrong: names file, line, key and what was expected."""
+    """A recipe, an override or a stage's option is wrong: names file, line, key and what was expected.
+
+    `keys` is the path of the option, where one is to blame.
+    """
+
+    def __init__(self, message: str, keys: tuple[str | int, ...] = ()) -> None:
+        super().__init__(message)
+        self.keys = keys
 
 
 class SourceError(HodgeError):

@@ -124,7 +124,7 @@ def refine(work: Work, last: Round, refined: Refined | None) -> Floats:
     """
     scene, refiner = work.scene, work.recipe.refiner
     if refined is None:
-        poses = pose_all_frames(scene, last.world_from_cam, work.steps, work.workers)
+        poses = pose_all_frames(scene, last.world_from_cam, work.steps, work.workers, work.scale)
     else:
         poses = refined.world_from_cam
     if refiner is None:

@@ -98,6 +98,11 @@ def suggestion(given: str, known: list[str]) -> str:
     return f" (did you mean '{close[0]}'?)" if close else f" (known: {', '.join(known) or 'none'})"
 
 
+OURS = "hodge-pipeline "
+LIBRARIES = "on Debian or Ubuntu apt-get install libusb-1.0-0 libegl1 libgl1 libx11-6 libgomp1 has what open3d needs"
+"""As tools/system-libraries.sh installs them."""
+
+
 def load(kind: str, name: str) -> Any:
     """The class of a stage. Raises `RecipeError` for an unknown name, or for a plugin that does not import."""
     known = _entries(KINDS[kind].group)
@@ -108,8 +113,10 @@ def load(kind: str, name: str) -> Any:
     except Exception as error:  # a plugin can fail in any way
         _give_way_to_ctrl_c(error)
         reason = f"{type(error).__name__}: {error}"
+        ours = isinstance(error, ImportError) and origin(kind, name).startswith(OURS)
         raise RecipeError(
-            f"stage '{name}' of kind '{kind}' ({origin(kind, name)}) does not load: {reason}; repair or remove it"
+            f"stage '{name}' of kind '{kind}' ({origin(kind, name)}) does not load: {reason}; "
+            f"{LIBRARIES if ours else 'repair or remove it'}"
         ) from error
 
 
@@ -135,9 +142,6 @@ def name_of_class(cls: type) -> str:
             if entry.value == path:
                 return name
     return path
-
-
-OURS = "hodge-pipeline "
 
 
 @contextmanager

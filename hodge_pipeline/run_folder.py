@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.evaluate import evaluate
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.fusion.fuse import fuse
-from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.recipe.schema import Recipe, recipe_of_run
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.notebook import as_html
@@ -167,10 +168,28 @@ class Run:
         """Every pair of the last round, between the key frames."""
         return self.result.edges
 
+    def posed_source(self) -> Source:
+        """All frames with their final poses, the key frames with their clouds, the edges between these."""
+        row_of = {int(row): number for number, row in enumerate(self.key_frames.rows)}
+        frames = tuple(
+            replace(
+                frame,
+                world_from_cam=_known(pose),
+                read_points=partial(self.clouds.__getitem__, row_of[row]) if row in row_of else None,
+            )
+            for row, (frame, pose) in enumerate(zip(self.source.frames, self.poses, strict=True))
+        )
+        return replace(self.source, frames=frames, path=self.folder, graph=self.result.graph)
+
     @property
     def recipe(self) -> Recipe:
-        """The recipe in the folder."""
-        return load_recipe(str(self.folder / RECIPE_FILE))
+        """The recipe in the folder, without the options of another version (`options_left_out`)."""
+        return recipe_of_run(self.folder / RECIPE_FILE)[0]
+
+    @property
+    def options_left_out(self) -> tuple[str, ...]:
+        """What is in the folder's recipe and unknown here, one line each: only running it again needs it."""
+        return recipe_of_run(self.folder / RECIPE_FILE)[1]
 
     def show(self, width: int = 960, height: int = 540) -> Any:
         """The recording in a Rerun viewer in a notebook's cell, in pixels (extra `notebook`); elsewhere `hodge view`.

@@ -49,6 +49,19 @@ def _series(angle: Floats) -> tuple[Floats, Floats]:
     return a, b
 
 
+def rescaled(motions: Floats, factor: float) -> Floats:
+    """Motions (..., 4, 4) with every length times the factor."""
+    out = np.array(motions, float)
+    out[..., :3, 3] *= factor
+    return out
+
+
+def rescaled_information(information: Floats, factor: float) -> Floats:
+    """Information (..., 6, 6) over (rotation, translation) of motions whose lengths are taken times the factor."""
+    unit = np.repeat([1.0, 1 / factor], 3)
+    return np.asarray(unit[:, None] * information * unit)
+
+
 def left_jacobian(phi: Floats) -> Floats:
     """V(φ) (..., 3, 3), the left Jacobian of SO(3): the translation of exp(φ, ρ) is V(φ) ρ."""
     phi = np.asarray(phi, float)

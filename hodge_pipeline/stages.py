@@ -312,6 +312,20 @@ class TrackedModel(Protocol):
         """The model in another unit of length."""
         ...
 
+    def placed(self) -> TrackedModel:
+        """The model in the world of positions that are known of its images; as it is where none are."""
+        ...
+
+    @property
+    def placing(self) -> str:
+        """What gave the model its place in the world, empty where nothing did."""
+        ...
+
+    @property
+    def known_positions(self) -> PositionPriors | None:
+        """Where bodies should be, of a model that was placed by known positions, metres."""
+        ...
+
     @property
     def held_apart(self) -> int:
         """How many pairs of images are well matched while they hardly share a point."""

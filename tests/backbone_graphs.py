@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -50,24 +50,26 @@ def drive(
     seed: int = 1,
     count: int = 400,
     dimension: int = 2,
+    world: str = "ring",
     loops: int = 100,
     wrong: float = 0.5,
     in_groups: bool = False,
     misstated: tuple[float, float] = (1.0, 1.0),
     turned: bool = False,
 ) -> Drive:
-    """Three laps round a ring. `wrong`: share of the loops that join places at random, or in groups of 12 that agree.
+    """Three laps round a ring, or another of `WORLDS`. `wrong`: share of the loops that join places at random, or in
+    groups of 12 that agree.
 
     `misstated`: what the stated standard deviations of steps and of loops are too large by; `turned`: every edge is
     written the other way round.
     """
     rng = np.random.default_rng(seed)
-    truth = _ring(count, dimension)
+    truth = _world(rng, world, count, dimension)
     steps = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
     near = cKDTree(truth[:, :3, 3]).query_pairs(3.0, output_type="ndarray")
     near = np.sort(near[np.abs(near[:, 0] - near[:, 1]) > 20], axis=1)
-    good = near[rng.choice(len(near), round(loops * (1 - wrong)), replace=False)]
-    bad, bad_motion = _wrong(rng, truth, loops - len(good), in_groups, dimension)
+    good = near[rng.choice(len(near), min(len(near), round(loops * (1 - wrong))), replace=False)]
+    bad, bad_motion = _wrong(rng, truth, round(loops * wrong), in_groups, dimension)
     edges = np.concatenate([steps, good, bad])
     exact = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]]
     exact[len(steps) + len(good) :] = bad_motion
@@ -86,18 +88,66 @@ def drive(
     return Drive(graph, truth, np.arange(len(edges)) < len(steps) + len(good))
 
 
-def _ring(count: int, dimension: int) -> Floats:
-    angle = np.linspace(0, 6 * np.pi, count)
+WORLDS = ("ring", "town", "corridor", "room")
+
+
+def broken(made: Drive, step: int, *, shift_m: float = 5.0, turn_deg: float = 30.0, seed: int = 0) -> ViewGraph:
+    """The graph with the edge between vertices `step` and `step + 1` off by so much in a random direction."""
+    rng = np.random.default_rng(seed)
+    graph, xi = made.graph, np.zeros(6)
+    way, axis = rng.normal(size=(2, 3))
+    if graph.dimension == 2:
+        way, axis = np.array([way[0], way[1], 0.0]), np.array([0.0, 0.0, axis[2]])
+    off = np.eye(4)
+    xi[:3] = np.radians(turn_deg) * axis / np.linalg.norm(axis)
+    off[:3, :3], off[:3, 3] = se3.exp(xi)[:3, :3], shift_m * way / np.linalg.norm(way)
+    row = int(np.flatnonzero((np.sort(graph.edges, axis=1) == [step, step + 1]).all(axis=1))[0])
+    motion = graph.i_from_j.copy()
+    motion[row] = motion[row] @ off
+    return replace(graph, i_from_j=motion)
+
+
+def spanned(made: Drive) -> Ints:
+    """Steps that a right loop spans."""
+    loops = made.graph.edges[made.right & (np.abs(np.diff(made.graph.edges, axis=1)[:, 0]) > 1)]
+    low, high = np.sort(loops, axis=1).T
+    count = made.graph.vertex_count
+    change = np.bincount(low, minlength=count + 1) - np.bincount(high, minlength=count + 1)
+    return np.flatnonzero(np.cumsum(change)[: count - 1] > 0)
+
+
+def _world(rng: np.random.Generator, world: str, count: int, dimension: int) -> Floats:
+    """Poses (count, 4, 4), a metre apart: a ring, streets of 20 m, a corridor there and back, a room of 12 m."""
+    heading, place = np.empty(count), np.empty((count, 2))
+    at, yaw, side = np.zeros(2), 0.0, {"town": 60.0, "room": 6.0}.get(world, 0.0)
+    for k in range(count):
+        if world == "ring":
+            yaw = 6 * np.pi * k / count + np.pi / 2
+            at = count / (6 * np.pi) * np.array([np.sin(yaw), -np.cos(yaw)])
+        elif world == "corridor":
+            reach = min(60, count // 4)
+            out = k % (2 * reach) < reach
+            yaw = 0.0 if out else np.pi
+            at = np.array([reach - abs(k % (2 * reach) - reach), 0.3 * np.sin(k / 7)], float)
+        else:
+            turns = rng.integers(-1, 2) * np.pi / 2 if world == "town" and k % 20 == 0 else 0.0
+            yaw += turns if world == "town" else rng.normal(0, 0.2)
+            for _ in range(8):
+                ahead = at + [np.cos(yaw), np.sin(yaw)]
+                if np.abs(ahead).max() <= side + 1e-6:
+                    break
+                yaw += np.pi / 2 if world == "town" else np.pi / 4
+            at = ahead
+        heading[k], place[k] = yaw, at
     twist = np.zeros((count, 6))
-    twist[:, 2] = angle + np.pi / 2
+    twist[:, 2] = heading
     poses = se3.exp(twist)
-    radius = count / (6 * np.pi)
-    poses[:, 0, 3], poses[:, 1, 3] = radius * np.cos(angle), radius * np.sin(angle)
+    poses[:, :2, 3] = place
     if dimension == 3:
         tilt = np.zeros((count, 6))
         tilt[:, 0], tilt[:, 1] = 0.3 * np.sin(np.arange(count) / 31), 0.2 * np.cos(np.arange(count) / 53)
         poses = poses @ se3.exp(tilt)
-        poses[:, 2, 3] = 2 * np.sin(np.arange(count) / 97)
+        poses[:, 2, 3] = 0.5 * np.sin(np.arange(count) / 97)
     return poses
 
 

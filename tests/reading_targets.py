@@ -170,6 +170,17 @@ def mcap_of(encoding: str) -> Callable[[Path], Path]:
     return make
 
 
+def bag_of(kind: str) -> Callable[[Path], Path]:
+    """Every kind of message, by the writers of another library."""
+
+    def make(folder: Path) -> Path:
+        from bag_data import WRITERS  # skips where that library is absent
+
+        return WRITERS[kind](everything(), folder)
+
+    return make
+
+
 def split_bag(folder: Path) -> Path:
     for row in range(2):
         write_depth_log(folder / f"bag_{row}.mcap", some_images(1))
@@ -287,6 +298,9 @@ TARGETS: dict[str, Target] = {
     "mcap_protobuf": Target(McapReader(depth_topic="/rvl"), mcap_of(PROTOBUF)),
     "mcap_json": Target(McapReader(depth_topic="/png"), mcap_of(JSON)),
     "mcap_clouds": Target(McapReader(frames="points"), mcap_of(CDR)),
+    "db3": Target(McapReader(), bag_of("db3 before Iron")),
+    "bag": Target(McapReader(), bag_of("bag")),
+    "bag_bz2": Target(McapReader(frames="points"), bag_of("bag bz2")),
     "mcap_split": Target(McapReader(), split_bag),
     "mcap": Target(McapReader(), lambda folder: write_depth_log(folder / "a.mcap", some_images(2))),
     "colmap_bin": Target(ColmapReader(edges="none"), colmap("bin")),

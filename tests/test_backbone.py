@@ -16,7 +16,7 @@ from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.robust import solve_robust
-from tests.backbone_graphs import drive
+from tests.backbone_graphs import WORLDS, broken, drive, spanned
 
 NEVER_WORSE = 1.02
 
@@ -151,3 +151,37 @@ def test_ids_give_the_sequence_not_rows() -> None:
     shuffled = np.random.default_rng(0).permutation(made.graph.vertex_count)
     mixed = replace(made.graph, edges=shuffled[made.graph.edges], vertex_ids=np.argsort(shuffled) * 10)
     np.testing.assert_array_equal(diagnose(mixed).kept, diagnose(made.graph).kept)
+
+
+BROKEN = [
+    ("ring", 2, 400, 80, 0.4),
+    ("ring", 2, 400, 20, 0.4),
+    ("room", 3, 400, 80, 0.4),
+    ("corridor", 2, 1000, 200, 0.0),
+    ("town", 2, 1000, 200, 0.6),
+]
+
+
+@pytest.mark.parametrize(("world", "dimension", "count", "loops", "wrong"), BROKEN)
+def test_a_broken_step_is_named_and_no_other(world: str, dimension: int, count: int, loops: int, wrong: float) -> None:
+    made = drive(world=world, dimension=dimension, count=count, loops=loops, wrong=wrong)
+    step = int(np.random.default_rng(count + loops).choice(spanned(made)))
+    found = diagnose(broken(made, step))
+    assert np.flatnonzero(found.verdict[: count - 1] == "wrong").tolist() == [step]
+    assert "confirmed loops over it contradict" in found.reason[step]
+    assert made.error_m(found.world_from_cam) < 1.1 * made.error_m(diagnose(made.graph).world_from_cam)
+
+
+def test_two_broken_steps_are_named() -> None:
+    made = drive(loops=200)
+    once = broken(made, 90)
+    found = diagnose(broken(replace(made, graph=once), 310, seed=1))
+    assert np.flatnonzero(found.verdict[:399] == "wrong").tolist() == [90, 310]
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.5, 0.9, 1.0])
+def test_no_right_step_is_called_wrong(wrong: float) -> None:
+    for seed in range(4):
+        made = drive(seed=seed, world=WORLDS[seed], wrong=wrong, in_groups=bool(seed % 2), count=200, loops=60)
+        backbone = find_backbone(made.graph)
+        assert backbone is None or backbone.used[:199].all()

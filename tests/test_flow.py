@@ -1,5 +1,6 @@
 """Optical flow, poses by corners, and the rolling shutter."""
 
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -174,6 +175,13 @@ def test_a_frame_that_fits_nothing_is_named() -> None:
     block.sightings.seen[:80] = project(points_in_view(80, 9), CAMERA)
     found = repose(block)
     assert found.misfits.tolist() == [1] and len(found.rows) == 0
+
+
+def test_a_block_that_saw_nothing_is_no_error() -> None:
+    block, _ = rolling_block(0.0)
+    nothing = Sightings(*(getattr(block.sightings, field.name)[:0] for field in fields(Sightings)))
+    found = repose(replace(block, sightings=nothing, rows=block.rows[:0]))
+    assert found.rows.shape == (0,) and found.world_from_cam.shape == (0, 4, 4) and found.misfits.shape == (0,)
 
 
 def test_readers_tell_the_shutter_and_by_how_much_colour_is_late(tmp_path: Path, source: Source) -> None:

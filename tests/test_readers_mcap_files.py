@@ -83,10 +83,10 @@ def test_a_split_bag(tmp_path: Path) -> None:
     [
         ({}, "give the folder"),
         ({"bag_0.mcap.zstd": b""}, r"unpack bag_0\.mcap\.zstd first"),
-        ({"bag_0.db3": b"SQLite"}, "ros2 bag convert"),
-        ({"metadata.yaml": metadata("bag_0.mcap").encode()}, "lists no .mcap file that is there"),
+        ({"bag_0.db3": b"SQLite"}, "not a whole SQLite bag"),
+        ({"metadata.yaml": metadata("bag_0.mcap").encode()}, "lists no .mcap or .db3 file that is there"),
         ({"a.mcap": b""}, "does not start as an MCAP file"),
-        ({"a.mcap": b"#ROSBAG V2.0\n"}, "does not start as an MCAP file"),
+        ({"a.bag": b"#ROSBAG V1.2\n"}, "does not start as a ROS 1 bag"),
     ],
 )
 def test_what_is_no_recording(tmp_path: Path, files: dict[str, bytes], remedy: str) -> None:

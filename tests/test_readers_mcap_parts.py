@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hodge_adapters.mcap import McapReader
 from hodge_adapters.mcap_protobuf import protobuf_decoder
 from hodge_adapters.mcap_records import Malformed
-from hodge_adapters.ros_cdr import cdr_decoder
+from hodge_adapters.ros_cdr import ros_decoder
 from hodge_adapters.ros_rvl import decode_rvl
 from hodge_adapters.ros_tf import TransformTree
 from hodge_pipeline import se3
@@ -58,7 +58,7 @@ string[] texts
     body += struct.pack("<I", 1) + b"\xfe" + bytes(3) + struct.pack("<II", 1, 2) + b"t\0" + bytes(2)
     body += struct.pack("<iI", 5, 6)
     data = b"\0\1\0\0" + body
-    message = cdr_decoder("pkg/msg/Outer", text)(data)
+    message = ros_decoder("pkg/msg/Outer", text)(data)
     assert message["flag"] is True and message["number"] == 2.5 and message["name"] == "ab"
     assert message["pair"].tolist() == [-1, 2] and message["words"].tolist() == [9]
     assert data[message["bytes"]] == b"xyz"
@@ -73,7 +73,7 @@ def test_cdr_that_is_cut_is_refused(cut: int) -> None:
     name = "nav_msgs/msg/Odometry"
     for big_endian in (False, True):
         whole = encode_cdr(name, odometry(12.5, some_poses(1)[0]), big_endian)
-        decode = cdr_decoder(name, ROS_SCHEMAS[name])
+        decode = ros_decoder(name, ROS_SCHEMAS[name])
         decoded = decode(whole)
         assert decoded["header"]["stamp"] == {"sec": 12, "nanosec": 500_000_000}
         assert decoded["child_frame_id"] == "base_link" and len(decoded["pose"]["covariance"]) == 36
@@ -85,16 +85,16 @@ def test_cdr_that_is_cut_is_refused(cut: int) -> None:
 @pytest.mark.parametrize("text", ["Gone gone", "pkg/Gone[] gone"])
 def test_a_schema_that_is_not_whole(text: str) -> None:
     with pytest.raises(Malformed, match="does not define pkg/Gone"):
-        cdr_decoder("pkg/msg/Outer", text)
+        ros_decoder("pkg/msg/Outer", text)
 
 
 def test_schemas_that_never_end() -> None:
     with pytest.raises(Malformed, match="too deep"):
-        cdr_decoder("pkg/msg/Loop", "Loop again")(b"\0\1\0\0" + bytes(100))
+        ros_decoder("pkg/msg/Loop", "Loop again")(b"\0\1\0\0" + bytes(100))
     # A count of four billion empty messages in a few bytes.
     text = f"Empty[] empties\n{'=' * 80}\nMSG: pkg/Empty\n"
     with pytest.raises(Malformed, match="shorter"):
-        cdr_decoder("pkg/msg/Outer", text)(b"\0\1\0\0\xff\xff\xff\xff" + bytes(100))
+        ros_decoder("pkg/msg/Outer", text)(b"\0\1\0\0\xff\xff\xff\xff" + bytes(100))
 
 
 def test_protobuf_by_hand() -> None:
@@ -111,7 +111,7 @@ def test_protobuf_by_hand() -> None:
 @given(data=st.binary(max_size=64), name=st.sampled_from(["foxglove.PointCloud", "foxglove.CameraCalibration"]))
 @settings(deadline=None)
 def test_any_bytes_as_protobuf_or_cdr(data: bytes, name: str) -> None:
-    for decode in (protobuf_decoder(name, descriptor_set()), cdr_decoder(CLOUD, ROS_SCHEMAS[CLOUD])):
+    for decode in (protobuf_decoder(name, descriptor_set()), ros_decoder(CLOUD, ROS_SCHEMAS[CLOUD])):
         with suppress(Malformed):
             assert isinstance(decode(data), dict)
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hodge_adapters.association import interpolated_poses, nearest_pairs
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
+from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.testing import check_reader
@@ -255,3 +256,20 @@ def test_frame_numbers_for_stamps(data_dir: Path) -> None:
     assert [frame.frame_id for frame in source.frames] == list(range(58))
     assert source.frames[0].camera == Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
     np.testing.assert_allclose(source.frames[1].world_from_cam[:3, 3], [-2.4691, 1.0757, 1.0996])
+
+
+@pytest.mark.parametrize("name", ["fr1_rpy_part", "rgbd_dataset_freiburg1_xyz_60"])
+def test_a_renamed_folder_is_known_by_its_images(name: str, data_dir: Path, tmp_path: Path) -> None:
+    for entry in (data_dir / "tum" / name).iterdir():
+        (tmp_path / entry.name).symlink_to(entry)
+    source = TumReader().open(tmp_path)
+    assert source.frames[0].camera.fx == 517.3
+    assert any("intrinsics of fr1 taken, tried on the images" in note for note in source.notes)
+
+
+def test_a_camera_without_distortion_is_not_taken_for_another(tmp_path: Path) -> None:
+    folder = make_sequence(tmp_path / "office", DemoOptions(frames=30, width=640, height=480, stride=2, turns=0.2))
+    (folder / "intrinsics.txt").unlink()
+    source = TumReader().open(folder)
+    assert source.frames[0].camera.fx == 525.0
+    assert any("whose cameras fit no better" in note for note in source.notes)

@@ -49,7 +49,7 @@ def sparse(tmp_path: Path) -> Path:
 
 
 def test_several_models_are_all_named_with_their_images_and_the_largest_is_taken(sparse: Path) -> None:
-    named = f"2 models in {sparse}: 0 (1 images), 1 (8 images)"
+    named = f"2 models in {sparse}: 0 (1 image), 1 (8 images)"
     source = ColmapReader(edges="none").open(sparse.parent)
     assert len(source.frames) == 8 and source.notes[0].startswith(f"{named}: 1 is taken")
     found = ColmapModels().open_models(sparse.parent)

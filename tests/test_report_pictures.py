@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.report import raster
-from hodge_pipeline.report.contents import EdgeRow
+from hodge_pipeline.report.contents import EdgeRow, Path3D, Pictures, Report, SourceSummary
+from hodge_pipeline.report.painting import turns_deg
 from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud, Source
 
@@ -124,3 +127,19 @@ def test_the_place_that_changed_most_is_shown_before_and_after() -> None:
     assert image.shape == (540, 2 * 720 + raster.GAP, 3)
     nowhere = np.full((6, 4, 4), np.nan)
     assert changed_most(clouds, nowhere, poses, pairs, list("abcdef"), np.zeros(6, int)) == ()
+
+
+def test_the_rotation_error_of_each_frame_is_that_of_its_pose() -> None:
+    """Against the truth where there is one; a frame without a pose has none, nor has a report of an earlier version."""
+    truth = se3.exp(np.random.default_rng(0).standard_normal((5, 6)))
+    turned = truth @ se3.exp(np.radians([[0, 0, k * 40.0, 0, 0, 0] for k in range(5)]))
+    turned[3] = np.nan
+    paths = (Path3D.of("truth", truth), Path3D.of("odometry", turned), Path3D.of("result", truth))
+    report = Report("", SourceSummary("", "", 5), before="odometry", after="result", pictures=Pictures(paths=paths))
+    found = turns_deg(report)
+    np.testing.assert_allclose(found["odometry"], [0, 40, 80, np.nan, 160], atol=1e-6)
+    np.testing.assert_allclose(found["result"], 0, atol=1e-6)
+    without = replace(report, pictures=Pictures(paths=tuple(replace(path, rotations=None) for path in paths)))
+    assert turns_deg(without) == {}
+    moved = replace(report, pictures=Pictures(paths=paths[1:]))
+    np.testing.assert_allclose(turns_deg(moved)["result"], [0, 40, 80, np.nan, 160], atol=1e-6)

@@ -16,7 +16,7 @@ from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_adapters.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError, WorkspaceError
-from hodge_pipeline.pairs.edits import Edit, History, read_history_file, write_history_file
+from hodge_pipeline.pairs.edits import Edit, History, pair_names, read_history_file, write_history_file
 from hodge_pipeline.review.adding import Candidate, guess_from_points
 from hodge_pipeline.review.decisions import LockedError, StaleError
 from hodge_pipeline.review.front import Front
@@ -25,8 +25,10 @@ from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.picking import nearest_point, nearest_segment
 from hodge_pipeline.review.routes import site
 from hodge_pipeline.review.session import Session
+from hodge_pipeline.review.settle import Settler, moved_m
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.rounds.one_round import with_right
+from hodge_pipeline.solvers.editing import GraphEditor
 
 VIEWS, REACH, PLANTED = 24, 3, (5, 40)
 """A ring of views, each joined to the next three; two of these edges have another motion."""
@@ -88,6 +90,20 @@ def test_verdicts_follow_and_what_is_off_keeps_its_own(session: Session) -> None
     assert session.table.edges.verdict[PLANTED[0]] == "wrong"
     assert session.judged.row(PLANTED[1]) == PLANTED[1] - 1
     assert describe(session, PLANTED[1])["cycles"]
+
+
+def test_poses_are_shown_before_they_are_checked_and_converge(graph_file: Path) -> None:
+    settler = Settler(open_for_review(graph_file))
+    settler.table = replace(settler.table, base=np.ones(len(settler.table)))
+    history = History((Edit(disable=tuple(pair_names(np.arange(VIEWS), settler.table.graph.edges[list(PLANTED)]))),))
+    settler._solution = replace(settler._solution, world_from_cam=np.tile(np.eye(4), (VIEWS, 1, 1)))
+    settler._editor = GraphEditor(settler.table.graph, settler._solution)
+    settler.settled = replace(settler.settled, world_from_cam=settler._solution.world_from_cam)
+    first, then = settler.solve(history, 1), settler.checked(history, 1)
+    assert not first.converged and then is not None and then.converged
+    assert then.residual_m[then.weights > 0].max() < first.residual_m[first.weights > 0].max()
+    assert settler.checked(history, 1) is None
+    assert then.moved_m == pytest.approx(moved_m(np.tile(np.eye(4), (VIEWS, 1, 1)), then.world_from_cam))
 
 
 def test_nothing_is_lost_when_the_program_ends(session: Session, graph_file: Path) -> None:

@@ -119,7 +119,7 @@ def test_the_same_by_keyboard(browser: Any, review: Review, run_folder: Path) ->
     page.press("1")
     page.until(lambda: review.session.look.mode == "all")
     page.press("1")
-    middle = np.median(review.session.settled.world_from_cam[:, :3, 3], axis=0)
+    _, middle = review.scene.overview(review.session.settled.world_from_cam)
     page.until(lambda: np.allclose(page.scene.camera.look_at, middle, atol=1e-3))
 
 

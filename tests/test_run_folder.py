@@ -15,13 +15,16 @@ from hodge_adapters.poses_text import parse_tum, write_tum
 from hodge_adapters.tum import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.report.comparison import compare
 from hodge_pipeline.report.write import as_json
+from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.artifacts import json_text
 from hodge_pipeline.types import Trajectory
+from hodge_pipeline.uses.diagnosed import open_subject
 from hodge_pipeline.uses.record_again import record_again
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_pipeline import Log
@@ -183,6 +186,37 @@ def test_the_layout_of_an_earlier_version_is_refused_and_made_again(recipe: Reci
     hodge_pipeline.run(load_recipe(str(folder / "recipe.yaml")), folder, overwrite=True)
     assert not old.exists()
     np.testing.assert_array_equal(Run.load(folder).poses, run.poses)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("seed: 0", "seed: 0\npace: 2", "pace: unknown option"),
+        ("whole_up_to: 10", "hole_up_to: 10", "did you mean 'whole_up_to'"),
+        ("stage: poisson", "stage: poison\n  strength: 3", "no stage 'poison'"),
+        ("stage: local", "stage: dask\n  address: tcp://127.0.0.1:1", "no stage 'dask'"),
+        ("level: summary", "level: all", "recording.level"),
+    ],
+    ids=["section", "option", "stage", "cluster", "value"],
+)
+def test_a_run_of_another_version_is_read_and_not_run(run: Run, tmp_path: Path, old: str, new: str, named: str) -> None:
+    folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
+    text = (folder / "recipe.yaml").read_text()
+    assert old in text
+    (folder / "recipe.yaml").write_text(text.replace(old, new, 1))
+
+    loaded = Run.load(folder)
+    assert [named in line for line in loaded.options_left_out] == [True]
+    assert loaded.recipe.diagnosis == run.recipe.diagnosis and not run.options_left_out
+    assert record_again(folder, {"level": "summary"}) == (folder / "recording.rrd", True)
+    assert compare(run.folder, folder).apart_m.max() < 1e-12
+    assert any(named in note for note in open_for_review(folder).notes)
+    assert any(named in note for note in open_subject(folder).notes)
+    assert (folder / "recipe.yaml").read_text() == text.replace(old, new, 1)
+
+    with pytest.raises(HodgeError, match=r"recipe\.yaml:\d+: ") as refused:
+        hodge_pipeline.solve_again(folder)
+    assert "\n" not in str(refused.value)
 
 
 def test_nothing_is_left_behind(run: Run, recipe: Recipe) -> None:

@@ -13,6 +13,7 @@ from hodge_adapters.ply_points import write_ply
 from hodge_pipeline import se3
 from hodge_pipeline.recipe.scale import measured_scale, scaled_recipe
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.registration.in_units import InUnits
 from hodge_pipeline.types import Floats, Frame, PointCloud
 from test_global_registration import furnished_corner
 
@@ -58,7 +59,7 @@ def test_every_length_is_taken_times_the_factor_and_nothing_else() -> None:
     after = scaled_recipe(before, 10.0)
     assert after.clouds.voxel_m == pytest.approx(0.4) and after.clouds.normal_neighbours == 10
     assert after.start.registrar.voxel_m == pytest.approx(0.5)  # type: ignore[attr-defined]
-    assert after.start.refine.distances_m == pytest.approx((3.0, 1.0, 0.5))  # type: ignore[attr-defined]
+    assert after.start.refine == InUnits(before.start.refine, 10.0)  # type: ignore[attr-defined]
     assert after.start.limits.max_rmse_m == pytest.approx(0.6)  # type: ignore[attr-defined]
     assert after.edges.builders[1].voxel_m == pytest.approx(1.0)  # type: ignore[attr-defined]
     assert after.fusion[0].voxel_m == pytest.approx(0.1)  # type: ignore[attr-defined]

@@ -51,6 +51,17 @@ def test_edits_give_what_a_fresh_solve_gives(seed, objective):
         same(editor.solve(), solve(scaled(graph, editor.weights), objective=objective))
 
 
+def test_a_solve_cut_short_goes_on_where_it_was():
+    graph = ring(noise=0.3)
+    editor = GraphEditor(graph)
+    editor.disable([2, 5])
+    first = editor.solve(max_iterations=1)
+    assert first.converged is False
+    rest = editor.solve()
+    assert rest.metrics["objective"] < first.metrics["objective"]
+    same(rest, solve(scaled(graph, editor.weights)))
+
+
 def test_undo_takes_back_edit_and_solve():
     editor = GraphEditor(ring())
     before = editor.solution

@@ -49,6 +49,7 @@ FILES = {
     "euroc": "data.csv",
     "log": "poses.log",
     "ply": "cloud.ply",
+    "mcap": "poses.mcap",
 }
 READERS = {
     "tum": "tum_poses",

@@ -292,6 +292,17 @@ def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(sequ
     assert np.abs(poses - expected).max() < 0.06
 
 
+def test_a_clock_that_goes_back_is_said_and_costs_no_frame(sequence: Path, tmp_path: Path) -> None:
+    source = TumReader().open(sequence)
+    frames = [replace(frame, stamp_s=frame.stamp_s - 5.0 * (row >= 30)) for row, frame in enumerate(source.frames)]
+    whole, _ = track(source, tmp_path / "whole")
+    found, notes = track(replace(source, frames=tuple(frames)), tmp_path / "back")
+    assert found.found.all()
+    assert any("the clock goes back at 1 frames (30)" in note for note in notes)
+    poses, expected = (all_poses(source, one, one.world_from_key) for one in (found, whole))
+    assert np.abs(poses - expected).max() < 0.06
+
+
 @pytest.mark.parametrize(
     ("step_s", "first_s", "is_tracked"), [(1 / 30, 0.5, True), (0.7, 0.5, False), (1.0, 0.0, False)]
 )

@@ -66,8 +66,7 @@ def test_a_folder_of_nothing_known_says_so(tmp_path: Path) -> None:
         ("points3D.txt", "one file of a COLMAP model: give its folder"),
         ("database.db", "give the folder of a model, with --database for this one"),
         ("gt.info", "give the .log beside it"),
-        ("drive.bag", "a ROS 1 bag: convert it with `mcap convert`"),
-        ("drive_0.db3", "an SQLite bag: convert it with `ros2 bag convert`"),
+        ("drive.bag", "a ROS 1 bag of another format than 2.0"),
         ("drive.mcap.zstd", "packed: unpack it first"),
         ("bag.tar.xz", "packed: unpack it first"),
     ],
@@ -93,12 +92,6 @@ def test_a_model_further_down_is_named(tmp_path: Path, ending: str) -> None:
             opened(tmp_path / "nowhere")
         with pytest.raises(SourceError, match="no COLMAP model: give the folder with cameras.bin"):
             opened(Path(__file__).parent)
-
-
-def test_a_bag_of_sqlite_files(tmp_path: Path) -> None:
-    for part in ("metadata.yaml", "drive_0.db3"):
-        (tmp_path / part).write_text("")
-    assert "no .mcap file in this bag: convert it with `ros2 bag convert`" in complaint(tmp_path)
 
 
 def test_of_a_graph_with_landmarks_the_poses_are_solved(tmp_path: Path) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
-from urllib.parse import quote
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,23 +13,21 @@ from hodge_adapters.colmap_edges import Pair, camera_table, positions
 from hodge_adapters.colmap_records import Model
 from hodge_adapters.colmap_relative import Sighting
 from hodge_adapters.pycolmap_import import pycolmap
+from hodge_adapters.sqlite_file import DAMAGED, opened_database
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Ints
-from hodge_pipeline.types.input_files import open_input
 
 MAX_IMAGE_ID = 2147483647
 """A pair's key is `first · this + second`."""
 MAX_KEYPOINT_COLUMNS = 16
 USABLE = (2, 3, 4, 5, 6)
 """Calibrated, uncalibrated, planar, panoramic, either of the last two: not degenerate, not a watermark."""
-DAMAGED = (sqlite3.Error, OSError, OverflowError, TypeError, ValueError)
-"""What a file that is no database, or one whose cells hold values of another type, ends in."""
 MATRICES = ("F", "E", "H")
-TABLES = ("images", "keypoints", "two_view_geometries")
+TABLES = ("images", "keypoints", "two_view_geometries", "pose_priors")
+CAMERA, GEODETIC = 0, 0
+"""A type of sensor, and a coordinate system (WGS 84), as the database numbers them."""
 MAX_VALUE_BYTES = 1 << 26
 """The keypoints of an image, or the matches of a pair: 64 MiB are 2.8 million keypoints of six columns."""
-ALWAYS_STEPS, STEPS_A_BYTE, STEPS_AT_ONCE = 10_000_000, 10, 10_000
-"""Steps of SQLite's virtual machine: reading a row takes 20, and a row some 100 bytes of the file."""
 
 
 def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) -> Iterator[Pair]:
@@ -40,7 +36,7 @@ def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) 
     Raises `SourceError` for a file that is no database of COLMAP, or one that is damaged.
     """
     try:
-        with _opened(path) as database:
+        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
             yield from _pairs(database, path, model, min_shared, notes)
     except DAMAGED as error:
         raise SourceError(
@@ -51,7 +47,7 @@ def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) 
 def database_names(path: Path) -> set[str]:
     """The names of the images in a database. Raises `SourceError` where it is none."""
     try:
-        with _opened(path) as database:
+        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
             return {str(name) for (name,) in database.execute("SELECT name FROM images")}
     except DAMAGED as error:
         raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
@@ -64,35 +60,62 @@ def has_verified_pairs(path: Path) -> bool:
     """
     query = "SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'two_view_geometries'"
     try:
-        with _opened(path) as database:
+        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
             return bool(database.execute(query).fetchone()[0])
     except (sqlite3.Error, OverflowError) as error:
         raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[sqlite3.Connection]:
-    """The database, read-only: `immutable` needs no write access, not even for a journal beside the file.
+class PriorRow(NamedTuple):
+    """What COLMAP noted of an image beside its pixels: NaN where it noted nothing.
 
-    What is read must be tables: a view, or a table that a module makes up, computes what its author likes. No value is
-    larger, and no query works longer, than the file's size has use for.
+    `position (3,)`: latitude, longitude (degrees) and height where it is geodetic; `gravity (3,)` in the camera's axes.
     """
-    open_input(path).close()
-    with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as database:
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
-        steps = iter(range(1 + (ALWAYS_STEPS + STEPS_A_BYTE * path.stat().st_size) // STEPS_AT_ONCE))
-        database.set_progress_handler(lambda: next(steps, None) is None, STEPS_AT_ONCE)
-        for table in TABLES:
-            found = database.execute("SELECT type, rootpage FROM sqlite_master WHERE name = ? COLLATE NOCASE", (table,))
-            if any(kind != "table" or not page for kind, page in found):
-                raise sqlite3.DatabaseError(f"{table} is no plain table")
-        yield database
+
+    name: str
+    position: Floats
+    covariance: Floats
+    gravity: Floats
+    geodetic: bool
+
+
+def prior_rows(path: Path) -> Sequence[PriorRow]:
+    """The pose priors of a database, empty where it has none. Raises `SourceError` where it is none."""
+    try:
+        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
+            there = database.execute("SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'pose_priors'")
+            if not there.fetchone()[0]:
+                return ()
+            names = dict(database.execute("SELECT image_id, name FROM images"))
+            table = database.execute("SELECT * FROM pose_priors")
+            columns = [column for column, *_ in table.description]
+            rows = [dict(zip(columns, row, strict=True)) for row in table]
+            return [_prior(names[_image_of(row)], row) for row in rows if _image_of(row) in names]
+    except DAMAGED as error:
+        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
+
+
+def _image_of(row: Mapping[str, Any]) -> int | None:
+    """Of a prior: the image, None where it is of another sensor; databases of before COLMAP 4 name it otherwise."""
+    if row.get("corr_sensor_type", CAMERA) != CAMERA:
+        return None
+    return int(row["corr_data_id"] if "corr_data_id" in row else row["image_id"])
+
+
+def _prior(name: str, row: Mapping[str, Any]) -> PriorRow:
+    cells = []
+    for column, count in (("position", 3), ("position_covariance", 9), ("gravity", 3)):
+        data = row.get(column)
+        whole = isinstance(data, bytes) and len(data) == 8 * count
+        cells.append(np.frombuffer(data, "<f8").copy() if whole and data is not None else np.full(count, np.nan))
+    position, covariance, gravity = cells
+    return PriorRow(name, position, covariance.reshape(3, 3), gravity, row["coordinate_system"] == GEODETIC)
 
 
 def database_matches(path: Path, row_of_name: Mapping[str, int]) -> Iterator[tuple[int, int, Ints]]:
     """Rows i and j of two images by name, and the keypoints (M, 2) of i and of j that are verified to match."""
     try:
-        with _opened(path) as database:
+        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
             row_of_id = {
                 int(image_id): row_of_name[name]
                 for image_id, name in database.execute("SELECT image_id, name FROM images")

@@ -9,6 +9,7 @@ from itertools import islice
 from pathlib import Path
 
 from hodge_adapters.colmap_check import image_count
+from hodge_adapters.text_rows import counted
 from hodge_pipeline.errors import SourceError
 
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
@@ -101,7 +102,9 @@ def largest_model(folders: Sequence[Path]) -> tuple[Path, str]:
     if len(folders) == 1:
         return folders[0], ""
     counts = [image_count(folder / f"images{model_ending(folder)}") for folder in folders]
-    named = ", ".join(f"{folder.name} ({count} images)" for folder, count in zip(folders, counts, strict=True))
+    named = ", ".join(
+        f"{folder.name} ({counted(count, 'image')})" for folder, count in zip(folders, counts, strict=True)
+    )
     return folders[counts.index(max(counts))], f"{len(folders)} models in {folders[0].parent}: {named}"
 
 

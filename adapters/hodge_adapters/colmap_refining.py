@@ -17,12 +17,14 @@ from hodge_adapters.colmap_content import checked_content, read_model
 from hodge_adapters.colmap_database import database_names, has_verified_pairs
 from hodge_adapters.colmap_depth import sensor_depth
 from hodge_adapters.colmap_files import find_database, find_models, largest_model, model_ending, no_model
+from hodge_adapters.colmap_priors import database_priors, table_priors
 from hodge_adapters.colmap_records import Model
 from hodge_adapters.colmap_scale import other_camera_note
 from hodge_adapters.colmap_ties import similarity, tie_points
-from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions
+from hodge_adapters.colmap_tracked import ColmapModel, DepthOptions, EdgeOptions, PriorOptions
 from hodge_adapters.colmap_union import united
 from hodge_adapters.pycolmap_import import pycolmap
+from hodge_adapters.text_rows import counted
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Frame
 
@@ -51,6 +53,12 @@ class ColmapModels:
     refine: Intrinsics = Field(
         "none", description="intrinsics that bundle adjustment refines: focal lengths, all with the distortion, or none"
     )
+    positions: str = Field(
+        "none",
+        description="known positions of images, whose world the result is then in: database (its pose priors: GPS, "
+        "gravity), or a table of name and e,n,u or lat,lon,alt; none",
+    )
+    position_sigma_m: float = Field(1.0, gt=0, description="metres: sigma of positions that state none")
     seed: int = Field(0, ge=0, description="of RANSAC")
 
     def open_models(self, source: Path | Sequence[pycolmap.Reconstruction]) -> Sequence[ColmapModel]:
@@ -117,6 +125,7 @@ class ColmapModels:
             text=model_ending(folder) == ".txt",
             files=content.files,
             refine=self.refine,
+            known=self._known(database, notes),
             tracks=content,
             notes=tuple(notes),
         )
@@ -163,6 +172,22 @@ class ColmapModels:
             return None
         return found
 
+    def _known(self, database: Path | None, notes: list[str]) -> PriorOptions:
+        """What is known of images beside their pixels."""
+        if self.positions == "none":
+            count = len(database_priors(database)) if database else 0
+            if count:
+                notes.append(
+                    f"the database has pose priors of {counted(count, 'image')}: --positions database places the model"
+                )
+            return PriorOptions()
+        if self.positions == "database":
+            if database is None:
+                raise SourceError("--positions database: there is no database: give --database, or a table")
+            return PriorOptions(database_priors(database), None, self.position_sigma_m)
+        path = Path(self.positions)
+        return PriorOptions(table_priors(path, notes), path, self.position_sigma_m)
+
     def _with_depth(self, frame: Frame, depth: Path | None) -> Frame:
         """The frame in the camera of its depth, where that is another one than the colour's."""
         if depth is None or self.depth_camera is None:
@@ -173,7 +198,7 @@ class ColmapModels:
 
 def _unposed(reconstruction: pycolmap.Reconstruction) -> list[str]:
     unposed = reconstruction.num_images() - reconstruction.num_reg_images()
-    return [f"{unposed} images of the model have no pose: they stay without"] if unposed else []
+    return [f"{counted(unposed, 'image')} of the model without a pose: left without"] if unposed else []
 
 
 def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
@@ -187,11 +212,13 @@ def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
     points = f"{agreeing} of {len(ties.ids)} points in both"
     note = f"{other.name} joined to {whole.name} by {points}, scale {whole_from_other.scale:.4g}"
     depth = replace(whole.depth, files={**other.depth.files, **whole.depth.files})
+    known = replace(whole.known, images={**other.known.images, **whole.known.images})
     return replace(
         whole,
         reconstruction=united(whole.reconstruction, moved),
         all_frames={**other.all_frames, **whole.all_frames},
         depth=depth,
+        known=known,
         files=(),
         notes=(*whole.notes, *(line for line in other.notes if line not in whole.notes), note),
         tracks=None,

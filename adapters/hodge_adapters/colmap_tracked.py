@@ -6,8 +6,8 @@ frames: all cameras of a rig at one moment, or a single image.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from hodge_adapters.colmap_content import content_of, read_reconstruction, refre
 from hodge_adapters.colmap_database import database_pairs
 from hodge_adapters.colmap_edges import covisible_pairs, measured_graph
 from hodge_adapters.colmap_points import parallaxes, points_of_rays
+from hodge_adapters.colmap_priors import Known, body_priors, placing
 from hodge_adapters.colmap_records import Model
 from hodge_adapters.colmap_reprojection import reprojection_errors, update_errors
 from hodge_adapters.colmap_resection import resected
@@ -68,6 +69,15 @@ class EdgeOptions:
 
 
 @dataclass(frozen=True)
+class PriorOptions:
+    """What is known of images by name beside their pixels, the file it comes from, and sigma where none is stated."""
+
+    images: Mapping[str, Known] = field(default_factory=dict)
+    file: Path | None = None
+    sigma_m: float = 1.0
+
+
+@dataclass(frozen=True)
 class ColmapModel:
     """See `stages.TrackedModel`. The reconstruction is never changed in place."""
 
@@ -80,6 +90,9 @@ class ColmapModel:
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
     refine: Intrinsics = "none"
+    known: PriorOptions = field(default_factory=PriorOptions)
+    placing: str = ""
+    """What gave the model its place in the world, empty where nothing did."""
     tracks: Model | None = None
     """The content of a model with the same tracks, from which this one differs by poses and positions alone."""
 
@@ -90,9 +103,9 @@ class ColmapModel:
 
     @property
     def measurements(self) -> tuple[Path, ...]:
-        """The database and the depth images."""
-        database = () if self.edges.database is None else (self.edges.database,)
-        return (*database, *self.depth.files.values())
+        """The database, known positions and the depth images."""
+        files = (self.edges.database, self.known.file, *self.depth.files.values())
+        return tuple(dict.fromkeys(file for file in files if file is not None))
 
     @cached_property
     def records(self) -> Model:
@@ -188,6 +201,25 @@ class ColmapModel:
     def resected(self, bodies: Bools | None = None) -> Floats:
         """Poses (B, 4, 4): those of these bodies (B,), all by default, by the points; see `colmap_resection`."""
         return resected(self.records, self.bodies, bodies)
+
+    @property
+    def known_positions(self) -> PositionPriors | None:
+        """Where bodies should be, of a model that was placed by known positions."""
+        names = [image.name for image in self.records.images]
+        return body_priors(names, self.bodies, self.known.images, self.known.sigma_m) if self.placing else None
+
+    def placed(self) -> ColmapModel:
+        """The model in the world of what is known of its images; as it is, with a note, where that does not tell."""
+        if not self.known.images:
+            return self
+        images = self.records.images
+        poses = np.array([image.world_from_cam for image in images])
+        found = placing([image.name for image in images], poses, self.known.images, self.known.sigma_m)
+        if isinstance(found, str):
+            return replace(self, notes=(*self.notes, found))
+        copy = self._copy()
+        copy.transform(found.world_from_model)
+        return replace(self, reconstruction=copy, files=(), tracks=self.records, placing=found.told)
 
     def scaled(self, factor: float) -> ColmapModel:
         """Positions times the factor."""

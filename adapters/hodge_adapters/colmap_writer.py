@@ -17,7 +17,7 @@ from hodge_adapters.colmap_content import read_model
 from hodge_adapters.colmap_files import find_model
 from hodge_adapters.posed import written
 from hodge_adapters.pycolmap_import import pycolmap
-from hodge_adapters.text_rows import listed, write_bytes_atomically
+from hodge_adapters.text_rows import counted, listed, write_bytes_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.types import Frame, Source
@@ -53,8 +53,8 @@ class ColmapWriter:
         whole = _whole_model(source, frames)
         if whole is not None:
             _write_folder(Path(path), _files_of(whole, self.form))
-            count = f"{whole.num_reg_images()} images, {whole.num_cameras()} cameras, {whole.num_points3D()} points"
-            return written(count, source, {"cameras", "names", "images"})
+            points = counted(whole.num_points3D(), "point")
+            return written(f"{_sizes(whole)}, {points}", source, {"cameras", "names", "images"})
         names = _names(frames)
         blank = [name for name in names if len(name.split()) != 1]
         if blank and self.form == "txt":
@@ -63,8 +63,11 @@ class ColmapWriter:
             )
         made = _made_model(frames, names)
         _write_folder(Path(path), _files_of(made, self.form))
-        count = f"{len(frames)} images, {made.num_cameras()} cameras, no points"
-        return written(count, source, {"cameras", "names", "images"})
+        return written(f"{_sizes(made)}, no points", source, {"cameras", "names", "images"})
+
+
+def _sizes(model: pycolmap.Reconstruction) -> str:
+    return f"{counted(model.num_reg_images(), 'image')}, {counted(model.num_cameras(), 'camera')}"
 
 
 def _whole_model(source: Source, frames: list[Frame]) -> pycolmap.Reconstruction | None:

@@ -155,6 +155,8 @@ def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: in
     if len(fixed):
         notes.append(f"{len(fixed)} vertices are marked FIX")
     motions, information = half.motions, half.information
+    if count := int((edges[:, 0] == edges[:, 1]).sum()):
+        notes.append(f"{count} edges join a vertex to itself: they say nothing of poses")
     graph = ViewGraph.from_edges(ids, edges, motions, information, kind, dimension=dimension, fixed=fixed)
     priors = g2o_priors.as_priors(half.prior_keys, half.prior_poses, half.prior_information, ids, str(path))
     if priors is not None:

@@ -1,4 +1,4 @@
-"""MCAP recordings: ROS 2 bags (CDR) and Foxglove logs (protobuf, JSON) with depth images, point clouds and poses.
+"""Recordings: ROS 2 bags (MCAP, SQLite), ROS 1 bags, Foxglove logs with depth images, point clouds and poses.
 
 A recording is gone through once when opened, without decoding an image; frames know where their bytes lie.
 """
@@ -45,7 +45,7 @@ UNITS_PER_METRE = 1000.0
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class McapReader:
-    """Reads an MCAP file, or a folder with the files of a split recording."""
+    """Reads an MCAP file, a `.db3` or a `.bag`, or a folder with the files of a split recording."""
 
     frames: Literal["auto", "depth", "points", "colour"] = Field(
         "auto", description="what makes a frame; auto: depth images if there are any, else point clouds, else colour"
@@ -73,7 +73,7 @@ class McapReader:
     every: int = Field(1, ge=1, description="take every n-th frame")
 
     def sniff(self, path: Path) -> Sniff:
-        """Sure where the file starts as MCAP does, or the folder has such files beside `metadata.yaml`."""
+        """Sure where the file starts as a recording does, or the folder has some beside `metadata.yaml`."""
         return sniff_recording(Path(path))
 
     def open(self, path: Path) -> Source:
@@ -85,7 +85,7 @@ class McapReader:
         notes: list[str] = []
         listing = find_files(path, notes)
         recording = Recording(TransformTree(self.max_gap_s))
-        for file in listing.mcap:
+        for file in listing.logs:
             recording.read_file(file)
         notes += recording.complaints.notes()
         notes += filter(None, [recording.clock_note()])

@@ -20,7 +20,7 @@ from mcap.records import Channel, Schema
 
 from hodge_adapters.mcap_protobuf import protobuf_decoder
 from hodge_adapters.mcap_records import Malformed, Place, read_place
-from hodge_adapters.ros_cdr import cdr_decoder
+from hodge_adapters.ros_cdr import ros_decoder
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
 
@@ -59,11 +59,13 @@ def decoder_for(channel: Channel, schema: Schema | None) -> Decoder:
     encodings = channel.message_encoding, schema.encoding if schema else ""
     if encodings[0] == "json":
         return decode_json
-    if schema and encodings == ("cdr", "ros2msg"):
-        return cdr_decoder(schema.name, schema.data.decode("utf-8", "replace"))
+    if schema and encodings in (("cdr", "ros2msg"), ("ros1", "ros1msg")):
+        return ros_decoder(schema.name, schema.data.decode("utf-8", "replace"), ros1=encodings[0] == "ros1")
     if schema and encodings == ("protobuf", "protobuf"):
         return protobuf_decoder(schema.name, schema.data)
-    raise Malformed(f"{encodings[0]} messages with {encodings[1] or 'no'} schema: convert it to ROS 2 (ros2msg, CDR)")
+    raise Malformed(
+        f"{encodings[0]} messages with {encodings[1] or 'no'} schema: record ROS messages, protobuf or JSON"
+    )
 
 
 def decode_json(data: bytes) -> Message:

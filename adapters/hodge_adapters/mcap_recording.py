@@ -30,9 +30,15 @@ from hodge_adapters.mcap_fields import (
 )
 from hodge_adapters.mcap_fixes import Fix, fix_of
 from hodge_adapters.mcap_images import ImageLayout, compressed_layout, raw_layout
-from hodge_adapters.mcap_log import LogFile, Logged, Tally
+from hodge_adapters.mcap_log import LogFile
 from hodge_adapters.mcap_records import Malformed
+from hodge_adapters.message_file import Logged, MessageFile, Tally
+from hodge_adapters.ros1_bag import MAGIC as BAG_MAGIC
+from hodge_adapters.ros1_bag import BagFile
 from hodge_adapters.ros_tf import PoseColumns, TransformTree
+from hodge_adapters.sqlite_bag import SqliteBag
+from hodge_adapters.sqlite_file import MAGIC as SQLITE_MAGIC
+from hodge_pipeline.types.input_files import beginning
 
 Layout = TypeVar("Layout")
 
@@ -90,8 +96,8 @@ class Recording:
     _decoders: dict[tuple[str, str], Decoder | None] = field(default_factory=dict)
 
     def read_file(self, path: Path) -> None:
-        """Go once through a file; raises `SourceError` only where it is no MCAP file or cannot be read."""
-        for logged in LogFile(path, self._wants, self.complaints, tallies=self.tallies).messages():
+        """Go once through a file; raises `SourceError` only where it is no recording or cannot be read."""
+        for logged in _kind_of_file(path)(path, self._wants, self.complaints, tallies=self.tallies).messages():
             topic = logged.channel.topic
             try:
                 self._add(path, logged)
@@ -140,6 +146,17 @@ class Recording:
         if abs(difference_s) < 1:
             return None
         return f"header stamps are taken: the log's clock differs from them by {difference_s:.6g} s (median)"
+
+
+def _kind_of_file(path: Path) -> type[MessageFile]:
+    """What reads a file: by how it starts, else by its ending."""
+    begins = beginning(path, len(SQLITE_MAGIC))
+    if begins.startswith(BAG_MAGIC):
+        return BagFile
+    if begins == SQLITE_MAGIC:
+        return SqliteBag
+    by_ending: dict[str, type[MessageFile]] = {".bag": BagFile, ".db3": SqliteBag}
+    return by_ending.get(path.suffix, LogFile)
 
 
 Add = Callable[[Recording, Message, Path, Logged], None]
@@ -247,6 +264,7 @@ _KINDS: dict[tuple[str, str], Add] = {
     ("foxglove", "PoseInFrame"): _add_pose,
     ("geometry", "TransformStamped"): _add_transforms,
     ("tf2", "TFMessage"): _add_transforms,
+    ("tf", "tfMessage"): _add_transforms,
     ("foxglove", "FrameTransform"): _add_transforms,
     ("foxglove", "FrameTransforms"): _add_transforms,
 }

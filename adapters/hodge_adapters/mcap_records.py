@@ -6,6 +6,7 @@ Several faults are told apart by their `Malformed` text, which the caller counts
 
 from __future__ import annotations
 
+import bz2
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -19,6 +20,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
+from hodge_adapters.sqlite_file import DAMAGED, opened_database
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types.input_files import open_input
 
@@ -61,11 +63,12 @@ class Chunk(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where bytes lie: straight in the file, or at an offset of a chunk's expanded contents."""
+    """Where bytes lie: straight in the file, at an offset of a chunk's expanded contents, or of a message's row."""
 
     offset: int
     length: int
     chunk: Chunk | None = None
+    row: int | None = None
 
     def part(self, start: int, stop: int) -> Place:
         """The place of a part of these bytes."""
@@ -86,7 +89,9 @@ def read_place(path: Path, place: Place) -> bytes:
     """The bytes at a place; raises `Malformed` where they are not all there, `SourceError` without the file."""
     try:
         with open_input(path) as file:
-            if place.chunk is None:
+            if place.row is not None:
+                contents = _read_row(path, place.row, place.offset, place.length)
+            elif place.chunk is None:
                 contents = read_at(file)(place.offset, place.length)
             else:
                 expanded = expand(read_at(file), place.chunk, place.offset + place.length)
@@ -96,6 +101,19 @@ def read_place(path: Path, place: Place) -> bytes:
     if len(contents) < place.length:
         raise Malformed("the file has changed since it was opened")
     return contents
+
+
+def _read_row(path: Path, row: int, offset: int, length: int) -> bytes:
+    """A part of a message of an SQLite bag."""
+    try:
+        with (
+            opened_database(path, ("messages",), MAX_MESSAGE_BYTES) as database,
+            database.blobopen("messages", "data", row, readonly=True) as blob,
+        ):
+            blob.seek(min(offset, len(blob)))
+            return blob.read(length)
+    except DAMAGED as error:
+        raise Malformed("the file has changed since it was opened") from error
 
 
 def records(read: ReadAt, start: int, end: int) -> Iterator[Record]:
@@ -155,8 +173,10 @@ def expand(read: ReadAt, chunk: Chunk, limit: int) -> bytes:
         if chunk.compression == "zstd":
             # Not the one-shot call: it believes the size in the frame's own header, which nothing checks.
             return zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES).stream_reader(compressed).read(limit)
+        if chunk.compression == "bz2":
+            return bz2.BZ2Decompressor().decompress(compressed, max_length=limit)
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(compressed, max_length=limit))
-    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
+    except (zstandard.ZstdError, RuntimeError, OSError, EOFError, MemoryError) as error:
         raise Malformed(f"a chunk that {chunk.compression} cannot expand") from error
 
 

@@ -1,4 +1,4 @@
-"""ROS 2 messages: the text of a `.msg` definition and of all it uses, and the CDR bytes that it describes.
+"""ROS messages: the text of a `.msg` definition and of all it uses, and the bytes, CDR or ROS 1, that it describes.
 
 Byte arrays are not copied: they are given as a `slice` of the message, so that an image can be read again without its
 schema.
@@ -25,6 +25,7 @@ _FIELD = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<constant>=)?"
 )
 _TIME = "int32 sec\nuint32 nanosec"
+_ROS1_TIMES = {"time": "uint32 sec\nuint32 nanosec", "duration": _TIME}
 _MAX_DEPTH = 16
 
 Message: TypeAlias = dict[str, Any]
@@ -41,9 +42,10 @@ class Field:
 
 
 def parse_definition(name: str, text: str) -> dict[str, list[Field]]:
-    """The fields of every type in a ros2msg text, by full name without `/msg/`; the first type is `name`."""
+    """The fields of every type in a ros2msg or ros1msg text, by full name without `/msg/`; the first is `name`."""
     sections = re.split(r"^=+\s*$", text, flags=re.MULTILINE)
-    types = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME, _short(name): sections[0]}
+    times = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME, **_ROS1_TIMES}
+    types = {**times, _short(name): sections[0]}
     for section in sections[1:]:
         head, _, body = section.lstrip().partition("\n")
         if head.startswith("MSG:"):
@@ -51,8 +53,8 @@ def parse_definition(name: str, text: str) -> dict[str, list[Field]]:
     return {full: _fields(full, body) for full, body in types.items()}
 
 
-def cdr_decoder(name: str, text: str) -> Callable[[bytes], Message]:
-    """A function from the CDR bytes of such a message to its fields; it raises `Malformed`.
+def ros_decoder(name: str, text: str, *, ros1: bool = False) -> Callable[[bytes], Message]:
+    """A function from the CDR bytes of such a message, or those of ROS 1, to its fields; it raises `Malformed`.
 
     Raises `Malformed` where the text does not define all that it uses.
     """
@@ -61,11 +63,14 @@ def cdr_decoder(name: str, text: str) -> Callable[[bytes], Message]:
         for field in fields:
             if field.type not in _FORMATS and field.type not in ("string", "wstring") and field.type not in definitions:
                 raise Malformed(f"its schema does not define {field.type}")
-    return partial(_decode, definitions, _short(name))
+    return partial(_decode, definitions, _short(name), Ros1Cursor if ros1 else Cursor)
 
 
 class Cursor:
     """Where in a message the reading is; every read is held against the message's end."""
+
+    empty_bytes = 1
+    """Of a message without fields: CDR knows no empty structure."""
 
     def __init__(self, data: bytes) -> None:
         if len(data) < 4 or data[0] or data[1] not in (0, 1, 6, 7):
@@ -98,8 +103,17 @@ class Cursor:
         return self.data[start : start + length * width].decode(encoding, "replace").rstrip("\0")
 
 
-def _decode(definitions: dict[str, list[Field]], name: str, data: bytes) -> Message:
-    return _read_message(Cursor(data), definitions, name, 0)
+class Ros1Cursor(Cursor):
+    """The bytes of ROS 1: the same fields, one after the other without a head or gaps."""
+
+    empty_bytes = 0
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at, self.order, self.max_alignment = data, 0, "<", 1
+
+
+def _decode(definitions: dict[str, list[Field]], name: str, cursor: type[Cursor], data: bytes) -> Message:
+    return _read_message(cursor(data), definitions, name, 0)
 
 
 def _read_message(cursor: Cursor, definitions: dict[str, list[Field]], name: str, depth: int) -> Message:
@@ -107,7 +121,7 @@ def _read_message(cursor: Cursor, definitions: dict[str, list[Field]], name: str
         raise Malformed("its schema nests too deep")
     fields = definitions[name]
     if not fields:
-        cursor.take(1)  # An empty message is one byte, since CDR knows no empty structure.
+        cursor.take(cursor.empty_bytes)
     return {field.name: _read_field(cursor, definitions, field, depth) for field in fields}
 
 
@@ -156,7 +170,7 @@ def _fields(owner: str, body: str) -> list[Field]:
 
 
 def _resolved(name: str, owner: str) -> str:
-    if name in _FORMATS or name in ("string", "wstring"):
+    if name in _FORMATS or name in ("string", "wstring") or name in _ROS1_TIMES:
         return name
     if "/" not in name:
         return "std_msgs/Header" if name == "Header" else f"{owner.split('/')[0]}/{name}"

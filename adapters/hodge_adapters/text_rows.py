@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import IO
 
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.types.input_files import read_input_text
@@ -52,6 +53,11 @@ def listed(items: Sequence[object]) -> str:
     return ", ".join(str(item) for item in items[:SHOWN]) + more
 
 
+def counted(count: int, noun: str) -> str:
+    """A count with its noun: `1 image`, `2 images`."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 def inside(folder: Path, name: str) -> Path | None:
     """The path of a file named in a list, or None for one that leaves the folder by `..` or an absolute path.
 
@@ -70,14 +76,23 @@ def write_text_atomically(path: Path, text: str) -> None:
 
 def write_bytes_atomically(path: Path, contents: bytes) -> None:
     """Write the file in one step: a reader sees the old one or the whole new one. Raises `WorkspaceError`."""
+    with opened_atomically(path) as file:
+        file.write(contents)
+
+
+@contextmanager
+def opened_atomically(path: Path) -> Iterator[IO[bytes]]:
+    """A file to be written, which takes its name once the body ends well. Raises `WorkspaceError`."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:
-            file.write(contents)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except OSError as error:
+    except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
-        raise not_written(path, error) from error
+        if isinstance(error, OSError):
+            raise not_written(path, error) from error
+        raise

@@ -17,7 +17,8 @@ from hodge_adapters import images
 from hodge_adapters.association import interpolated_poses
 from hodge_adapters.camera_files import Intrinsics, checked, fit_note, read_intrinsics
 from hodge_adapters.image_frames import image_frame
-from hodge_adapters.image_lists import find_association_file, read_pairs, stamped_images
+from hodge_adapters.image_lists import StampedImages, find_association_file, read_pairs, stamped_images
+from hodge_adapters.known_cameras import fitting
 from hodge_adapters.lens import Lens
 from hodge_adapters.poses_text import parse_tum
 from hodge_pipeline.errors import SourceError
@@ -41,6 +42,8 @@ CAMERAS = {
     "fr3": Intrinsics(535.4, 539.2, 320.1, 247.6, (640, 480)),
     "default": Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480)),
 }
+RECORDED_ON = {"fr1": {"2011-05-10"}, "fr2": {"2011-07-28"}, "fr3": {"2012-07-08", "2012-07-09"}}
+"""The days, UTC, of the benchmark's sequences: what tells fr1 from fr2, whose lenses bend images nearly alike."""
 CAMERA_FILES = (
     "intrinsics.txt",
     "camera-intrinsics.txt",
@@ -65,7 +68,8 @@ class TumReader:
     camera: str | tuple[float, float, float, float] = Field(
         "auto",
         description="fr1, fr2, fr3, default (525 525 319.5 239.5), a file in the folder, or fx fy cx cy in pixels; "
-        "auto: intrinsics.txt or another camera file in the folder, else the folder's name (freiburg1), else default",
+        "auto: intrinsics.txt or another camera file in the folder, else the folder's name (freiburg1), else that of "
+        "fr1, fr2 and fr3 under which frames agree better than under default, else default",
     )
     depth_scale: float | None = Field(
         None, gt=0, description="stored units per metre; none: DepthMapFactor of the camera file, else TUM's 5000"
@@ -118,7 +122,7 @@ class TumReader:
             raise SourceError(f"{path}: not a folder: give the folder that holds depth.txt and rgb.txt")
         notes: list[str] = []
         listing = read_pairs(path, self.max_difference_s, notes)
-        found, camera_file = self._intrinsics(path, notes)
+        found, camera_file = self._intrinsics(path, listing, notes)
         camera = found.camera(found.size or images.common_size(listing.depth))
         notes.extend(filter(None, [fit_note(camera)]))
         lens = Lens(camera, found.distortion) if found.distortion and self.undistort else None
@@ -155,7 +159,7 @@ class TumReader:
             files=(*listing.files, *camera_file, *truth_file, *listing.depth, *filter(None, listing.colour)),
         )
 
-    def _intrinsics(self, path: Path, notes: list[str]) -> tuple[Intrinsics, tuple[Path, ...]]:
+    def _intrinsics(self, path: Path, listing: StampedImages, notes: list[str]) -> tuple[Intrinsics, tuple[Path, ...]]:
         if not isinstance(self.camera, str):
             return checked(Intrinsics(*self.camera), "option camera"), ()
         if self.camera in CAMERAS:
@@ -171,11 +175,29 @@ class TumReader:
             name = f"fr{match[1] or match[2]}"
             notes.append(f"intrinsics of {name} taken: by the folder's name")
             return CAMERAS[name], ()
+        tried = self._tried(listing)
+        own = "give those of your camera with camera=[fx,fy,cx,cy]"
+        if tried:
+            days = {str(day) for day in np.asarray(listing.stamps_s, "datetime64[s]").astype("datetime64[D]")}
+            name = next((name for name in tried if RECORDED_ON[name] & days), next(iter(tried)))
+            gains = ", ".join(f"{name} by {100 * gain:.0f} %" for name, gain in tried.items())
+            notes.append(
+                f"intrinsics of {name} taken, tried on the images: errors are smaller than with 525 525 319.5 239.5 "
+                f"({gains}): {own}"
+            )
+            return CAMERAS[name], ()
         notes.append(
             "default intrinsics taken (525 525 319.5 239.5), since there is no camera file, and no freiburg1, 2 or 3 "
-            "in the folder's name: give those of your camera with camera=[fx,fy,cx,cy]"
+            f"in the folder's name, whose cameras fit no better: {own}"
         )
         return CAMERAS["default"], ()
+
+    def _tried(self, listing: StampedImages) -> dict[str, float]:
+        """The known cameras that fit the images better than the default one, the best first, and by what share."""
+        if images.common_size(listing.depth) != CAMERAS["default"].size:
+            return {}
+        scale = self.depth_scale or UNITS_PER_METRE
+        return fitting(CAMERAS, "default", listing.depth, listing.colour, listing.stamps_s, scale)
 
     def _from_file(self, file: Path, notes: list[str]) -> tuple[Intrinsics, tuple[Path, ...]]:
         found = read_intrinsics(file)

@@ -14,7 +14,9 @@ from hodge_pipeline import registry
 from hodge_pipeline.cli.paths import keep_source
 from hodge_pipeline.cli.reader_choice import choose_reader
 from hodge_pipeline.errors import RecipeError, SourceError, not_written
+from hodge_pipeline.run_folder import Run
 from hodge_pipeline.stages import Writer
+from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Source, Trajectory
 
 BY_NAME = {"transforms.json": "nerfstudio"}
@@ -42,13 +44,18 @@ def convert(
 ) -> None:
     """Read a path with the surest reader, or the one named, and write it, in the format of its name or of `to`.
 
+    A run folder is read as its frames with their final poses, and the clouds of its key frames.
+
     Prints what was written, what the format lost, and every note of the reader. Raises `RecipeError` where no writer is
     meant by the name, or there is something at `out` that is not to be replaced.
     """
     keep_source(source, out)
     if not overwrite and out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise RecipeError(f"{out}: is there already: give another name, or --overwrite to replace it")
-    opened = with_trajectory(choose_reader(source, reader, settings).open(source))
+    whole = is_run_folder(source) and reader is None
+    opened = with_trajectory(
+        Run.load(source).posed_source() if whole else choose_reader(source, reader, settings).open(source)
+    )
     name = to or writer_name(out, opened)
     writer: Writer = registry.load("writers", name)()
     try:

@@ -360,6 +360,13 @@ def main() -> None:
     except MemoryError:
         print("error: this needs more memory than there is: give less data, or free some", file=sys.stderr)
         sys.exit(1)
+    except ImportError as error:
+        if (error.name or "").startswith("hodge"):
+            raise
+        from hodge_pipeline.registry import LIBRARIES
+
+        print(f"error: a library does not load ({shown(str(error))}): {LIBRARIES}", file=sys.stderr)
+        sys.exit(1)
     except Exception as error:
         from hodge_pipeline.errors import HodgeError
         from hodge_pipeline.registry import plugin_error

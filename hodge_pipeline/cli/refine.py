@@ -99,6 +99,10 @@ def colmap(
         tuple[float, float, float, float] | None,
         typer.Option("--depth-camera", help="FX FY CX CY of depth that is not on the pixels of the colour images."),
     ] = None,
+    positions: Annotated[
+        str | None,
+        typer.Option("--positions", help="Known positions: database (GPS, gravity), or a table; metric result there."),
+    ] = None,
     refine: Annotated[
         str | None,
         typer.Option("--refine", help="Intrinsics to refine: focal, all, or none (default): held as they are."),
@@ -114,7 +118,8 @@ def colmap(
     """Refine a COLMAP model: edges measured anew, a robust solve, bundle adjustment; metric where there is depth."""
     from hodge_pipeline.cli import refine_colmap as refining_colmap
 
-    given = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale, "refine": refine}
+    beside = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale}
+    given = {**beside, "positions": positions, "refine": refine}
     sets = [f"model.{name}={value}" for name, value in given.items() if value is not None]
     if depth_camera is not None:
         sets.append(f"model.depth_camera=[{', '.join(map(str, depth_camera))}]")

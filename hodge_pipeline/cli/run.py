@@ -38,9 +38,12 @@ def run(
     loaded = load_recipe(recipe, overrides, source)
     if loaded.source.path is None:
         raise RecipeError(f"recipe '{recipe}' names no source: add --source PATH")
+    from hodge_pipeline.executors.dask import describe
     from hodge_pipeline.uses.recipe_run import run as run_pipeline
 
     with resumable(out), ProgressBars(quiet or as_json, verbose) as terminal, _viewer(live, terminal) as address:
+        if dask is not None:
+            terminal.say(describe(dask))
         result = run_pipeline(
             loaded, out, overwrite=overwrite, watcher=terminal, live=address, dask=dask, strict=strict
         )

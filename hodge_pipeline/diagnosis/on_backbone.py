@@ -21,15 +21,18 @@ from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 MOST_ENTRIES = 500_000
 """Edges of all cycles that are listed, the shortest first."""
 RIGHT_STEP = 0.99
-"""The probability of a step that confirmed loops pass over; what could be wrong with it, they would show."""
+"""The probability of a step that confirmed loops pass over; what could be wrong with it, they would show, so that the
+other probability is that of a step which they call wrong.
+"""
 
 
 def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisOptions) -> Diagnosis:
-    """The verdicts that follow from a backbone; its own edges are kept."""
+    """The verdicts that follow from a backbone; its own edges are kept, but for steps that are broken."""
     kept = backbone.used
     in_loop = np.zeros(graph.edge_count, bool)
     in_loop[np.flatnonzero(kept)] = series_classes(graph.edges[kept], graph.vertex_count) >= 0
     probability = np.where(backbone.steps, np.where(in_loop, RIGHT_STEP, np.nan), backbone.right)
+    probability[backbone.steps & ~kept] = 1 - RIGHT_STEP
     untestable = np.isnan(probability)
     wrong = ~kept & (probability < options.wrong_below)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
@@ -103,7 +106,9 @@ def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floa
     lines = []
     for edge, name in enumerate(verdict.tolist()):
         away = distance(residual[0][edge], residual[1][edge])
-        if backbone.steps[edge]:
+        if backbone.steps[edge] and name == WRONG:
+            lines.append(f"an edge of the backbone that {over[edge]} confirmed loops over it contradict: {away}")
+        elif backbone.steps[edge]:
             passed = f"{over[edge]} confirmed loops pass over it" if over[edge] else "no confirmed loop passes over it"
             lines.append(f"an edge of the backbone: {passed}")
         elif backbone.used[edge]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import ScoreTable, edge_distances, score_table
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import CloudSet, Floats, Ints
@@ -22,7 +23,7 @@ def scaled_score_table(
     if scale == 1.0:
         return score_table(clouds_folder, pose_sets, reference, workers)
     with _clouds_in_units(clouds_folder, scale, scratch):
-        sets = {name: _in_units(poses, scale) for name, poses in pose_sets.items()}
+        sets = {name: se3.rescaled(poses, 1 / scale) for name, poses in pose_sets.items()}
         table = score_table(scratch, sets, reference, workers)
     graphs = tuple(replace(graph, distances_m=graph.distances_m * scale, scale=scale) for graph in table.graphs)
     return replace(table, graphs=graphs)
@@ -35,7 +36,7 @@ def scaled_distances(
     if scale == 1.0:
         return edge_distances(clouds_folder, pairs, pose_sets, workers)
     with _clouds_in_units(clouds_folder, scale, scratch):
-        return edge_distances(scratch, pairs, _in_units(pose_sets, scale), workers)
+        return edge_distances(scratch, pairs, se3.rescaled(pose_sets, 1 / scale), workers)
 
 
 @contextmanager
@@ -51,9 +52,3 @@ def _clouds_in_units(folder: Path, scale: float, scratch: Path) -> Iterator[None
         yield
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _in_units(world_from_cam: Floats, scale: float) -> Floats:
-    out: Floats = world_from_cam.copy()
-    out[..., :3, 3] /= scale
-    return out

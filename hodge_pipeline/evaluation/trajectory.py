@@ -34,9 +34,7 @@ class Alignment:
 
     def apply(self, world_from_cam: Floats) -> Floats:
         """Poses (..., 4, 4) of the estimate, in the reference's world."""
-        scaled = np.array(world_from_cam, float)
-        scaled[..., :3, 3] *= self.scale
-        return np.asarray(self.reference_from_estimate @ scaled)
+        return np.asarray(self.reference_from_estimate @ se3.rescaled(world_from_cam, self.scale))
 
 
 def align(estimate: Floats, reference: Floats, with_scale: bool = False) -> Alignment:

@@ -25,25 +25,44 @@ def open_workers(executor: Executor, dask: str | None) -> AbstractContextManager
     return executor.open() if dask is None else cluster_workers(dask)
 
 
+def describe(address: str) -> str:
+    """What a cluster has to offer, in one line: workers, hosts, memory, and where its dashboard is.
+
+    Raises `WorkerError` as `cluster_workers` does.
+    """
+    with _client(address) as client:
+        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        hosts = {worker["host"] for worker in workers}
+        memory_gb = sum(worker["memory_limit"] for worker in workers) / 1e9
+        threads = sum(worker["nthreads"] for worker in workers)
+        return (
+            f"Dask at {address}: {len(workers)} workers with {threads} threads on {len(hosts)} "
+            f"host{'' if len(hosts) == 1 else 's'}, {memory_gb:.1f} GB; dashboard: {client.dashboard_link}"
+        )
+
+
 @contextmanager
 def cluster_workers(address: str) -> Iterator[Workers]:
     """The workers of a running cluster, which see the same files under the same paths. It is left as it is.
 
     Raises `WorkerError` where the extra is missing, or nothing answers.
     """
+    with _client(address) as client:
+        yield ClusterWorkers(client)
+
+
+def _client(address: str) -> Any:
     try:
         import distributed
     except ImportError as error:
         raise WorkerError("a Dask cluster needs the extra: pip install 'hodge-pipeline[dask]'") from error
     try:
-        client = distributed.Client(address, timeout=TIMEOUT_S)
+        return distributed.Client(address, timeout=TIMEOUT_S)
     except (OSError, ValueError) as error:
         reason = str(error) or type(error).__name__
         raise WorkerError(
             f"no Dask scheduler answers at '{address}' ({reason}): start one there, or leave out --dask"
         ) from error
-    with client:
-        yield ClusterWorkers(client)
 
 
 class ClusterWorkers:

@@ -31,13 +31,14 @@ def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | 
     Raises `RecipeError`: `file:line: key: what was expected`, with the nearest known name for an unknown key.
     """
     if not isinstance(data, Mapping):
-        raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected a mapping of options, got {data!r}")
+        raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected a mapping of options, got {data!r}", keys)
     hints = get_type_hints(cls)
     known = {field.name: hints[field.name] for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for key in data:
         if key not in known:
             here = (*keys, key)
-            raise RecipeError(f"{where(here)}: {_dotted(here)}: unknown option{registry.suggestion(key, list(known))}")
+            suggestion = registry.suggestion(key, list(known))
+            raise RecipeError(f"{where(here)}: {_dotted(here)}: unknown option{suggestion}", here)
     if isinstance(data.get("seed"), int):
         seed = data["seed"]
     elif "seed" in known and seed is not None:
@@ -47,6 +48,37 @@ def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | 
         return cls(**values)
     except ValidationError as error:
         raise _first_error(error, where, keys, known) from error
+
+
+def bind_known(
+    cls: type[T], data: dict[str, Any], where: Where, otherwise: dict[str, Any]
+) -> tuple[T, tuple[str, ...]]:
+    """What `bind` makes of the options that are known here, and why each of the others was left out.
+
+    Sections of which nothing is known are those of `otherwise`, which binds as it is.
+    """
+    left_out: list[str] = []
+    data = {**otherwise, **data}
+    while True:
+        try:
+            return bind(cls, data, where), tuple(left_out)
+        except RecipeError as error:
+            if not error.keys or error.keys[0] not in data:
+                raise
+            left_out.append(str(error))
+            data = {**otherwise, **_without(data, error.keys)}
+
+
+def _without(data: Any, keys: Keys) -> Any:
+    """A copy of the data without what stands at the path, or without the last part of the path that is there."""
+    head, rest = keys[0], keys[1:]
+    copy = data.copy()
+    inside = data[head]
+    if rest and (isinstance(inside, list) or (isinstance(inside, dict) and rest[0] in inside)):
+        copy[head] = _without(inside, rest)
+    else:
+        del copy[head]
+    return copy
 
 
 def _value(annotation: Any, value: Any, where: Where, keys: Keys, seed: int | None) -> Any:
@@ -74,11 +106,11 @@ def bind_stage(kind: str, value: Any, where: Where, keys: Keys, seed: int | None
     options = {"stage": value} if isinstance(value, str) else value
     if not isinstance(options, Mapping) or not isinstance(options.get("stage"), str):
         known = ", ".join(registry.names(kind))
-        raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected {{stage: NAME, …}} with a NAME of: {known}")
+        raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected {{stage: NAME, …}} with a NAME of: {known}", keys)
     try:
         cls = registry.load(kind, options["stage"])
     except RecipeError as error:
-        raise RecipeError(f"{where((*keys, 'stage'))}: {_dotted(keys)}: {error}") from error
+        raise RecipeError(f"{where((*keys, 'stage'))}: {_dotted(keys)}: {error}", keys) from error
     return bind(cls, {key: item for key, item in options.items() if key != "stage"}, where, keys, seed=seed)
 
 
@@ -142,14 +174,14 @@ def _first_error(error: ValidationError, where: Where, keys: Keys, known: Mappin
     field = first["loc"][0] if first["loc"] else None
     if isinstance(field, str) and len({other["loc"][1:2] for other in error.errors() if other["loc"][0] == field}) > 1:
         given, here = error.errors()[0]["input"], (*keys, field)
-        return RecipeError(f"{where(here)}: {_dotted(here)}: expected {_spelled(known[field])}, got {given!r}")
+        return RecipeError(f"{where(here)}: {_dotted(here)}: expected {_spelled(known[field])}, got {given!r}", here)
     here = (*keys, *(key for key in first["loc"] if isinstance(key, (str, int))))
     while len(here) > len(keys) and isinstance(here[-1], str) and "-" in here[-1]:
         here = here[:-1]
     what = first["msg"][0].lower() + first["msg"][1:]
     if first["type"] == "missing":
-        return RecipeError(f"{where(keys)}: {_dotted(here)}: this option is required")
-    return RecipeError(f"{where(here)}: {_dotted(here)}: {what.rstrip('.')}, got {first['input']!r}")
+        return RecipeError(f"{where(keys)}: {_dotted(here)}: this option is required", keys)
+    return RecipeError(f"{where(here)}: {_dotted(here)}: {what.rstrip('.')}, got {first['input']!r}", here)
 
 
 KIND = "x-stage-kind"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.schema import Recipe
-from hodge_pipeline.stages import Step, Steps
+from hodge_pipeline.registration.in_units import InUnits
+from hodge_pipeline.stages import Registrar, Step, Steps
 from hodge_pipeline.types import Floats, Frame, Source
 from hodge_pipeline.types.notes import Note
 
@@ -62,11 +63,18 @@ def scaled_recipe(recipe: Recipe, factor: float) -> Recipe:
 
 
 def scaled(value: T, factor: float) -> T:
-    """Options with every number whose name ends in `_m`, and those of the stages inside, times the factor."""
+    """Options with every number whose name ends in `_m`, and those of the stages inside, times the factor.
+
+    A registrar keeps its options, and is given clouds in the unit that they are written for.
+    """
     if isinstance(value, tuple):
         return type(value)(scaled(each, factor) for each in value)
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         return value
+    if isinstance(value, InUnits):
+        return dataclasses.replace(value, unit_m=value.unit_m * factor)
+    if isinstance(value, Registrar):
+        return cast(T, InUnits(value, factor))
     changed = {}
     for field in dataclasses.fields(value):
         old = getattr(value, field.name)

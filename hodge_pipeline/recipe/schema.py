@@ -32,6 +32,7 @@ from hodge_pipeline.stages import (
 )
 from hodge_pipeline.start.key_frames import KeyFrameStart
 from hodge_pipeline.start.known_positions import PositionOptions
+from hodge_pipeline.store import yaml_file
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
@@ -104,6 +105,10 @@ class Recipe:
     recording: RecordingOptions = RecordingOptions()
 
 
+REQUIRED = ("edges", "registration", "solver", "executor")
+"""Stages that have no default."""
+
+
 def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path | None = None) -> Recipe:
     """The recipe of a name or file, with overrides such as `solver.inner_iterations=5` and another source.
 
@@ -114,6 +119,17 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path |
         raise RecipeError(f"recipe '{name_or_path}' refines a model: hodge refine colmap MODEL --recipe {name_or_path}")
     recipe = binding.bind(Recipe, document.data, document.where)
     return recipe if source is None else with_source(recipe, source)
+
+
+def recipe_of_run(path: Path) -> tuple[Recipe, tuple[str, ...]]:
+    """The recipe that a run was made by, as far as this version knows its options, and why others were left out.
+
+    It is for looking at the run: `load_recipe`, which runs it again, refuses it. Stages that are required and unknown
+    here are those of the recipe `tum`. Raises `RecipeError` where the file is no YAML.
+    """
+    document = yaml_file.read(path)
+    basic = {key: value for key, value in recipe_file.load("tum").data.items() if key in REQUIRED}
+    return binding.bind_known(Recipe, document.data, document.where, basic)
 
 
 def with_source(recipe: Recipe, path: Path) -> Recipe:

@@ -13,7 +13,6 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
-from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.live import Live
@@ -22,10 +21,10 @@ from hodge_pipeline.recording.recorder import APPLICATION, Recorder
 from hodge_pipeline.scene import FIRST, START, Round, given_poses, has_given, has_truth, pose_sets, true_poses
 from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.start.clouds import clouds as clouds_step
-from hodge_pipeline.store import artifacts, yaml_file
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.log import log
 from hodge_pipeline.store.store import stored
-from hodge_pipeline.store.workspace import RUN, identity_of
+from hodge_pipeline.store.workspace import RECIPE_FILE, RUN, identity_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
 from hodge_pipeline.types.input_files import read_input_text
 from hodge_pipeline.types.notes import notes_of
@@ -165,7 +164,7 @@ class Recording:
         recorder = self._recorder(folder)
         notes = _record_reference(recorder, self._source, self._rounds)
         lines = read_input_text(self._folder / "log.txt", errors="replace").splitlines()
-        recorder.text(yaml_file.dump(binding.unbind(self._recipe)), lines)
+        recorder.text(read_input_text(self._folder / RECIPE_FILE, errors="replace"), lines)
         parts = [*self._parts, *find_parts(folder)]
         if self._live is not None:
             self._live.show(parts)

@@ -49,6 +49,15 @@ class Found:
     notes: tuple[str, ...]
 
     @property
+    def positions_off(self) -> Floats:
+        """The median distance (K,) of each candidate's bodies from their known positions; NaN without any."""
+        known = self.candidates[0].model.known_positions
+        if known is None:
+            return np.full(len(self.candidates), np.nan)
+        found = np.array([one.model.world_from_body[:, :3, 3] for one in self.candidates])
+        return np.asarray(np.nanmedian(np.linalg.norm(found - known.positions, axis=2), axis=1))
+
+    @property
     def best(self) -> int:
         """The row of the candidate with the lowest cost."""
         return best(self.costs)
@@ -65,6 +74,7 @@ class _Weighing:
     def __init__(self, inputs: Sequence[TrackedModel], start: TrackedModel, steps: Steps) -> None:
         self._inputs, self._steps = [model.quality for model in inputs], steps
         self.candidates, self.notes = [Candidate(GIVEN, start)], list[str]()
+        self._known = start.known_positions
         self.update()
 
     def update(self) -> None:
@@ -85,7 +95,7 @@ class _Weighing:
         self, name: str, model: TrackedModel, poses: Floats | None = None, priors: PositionPriors | None = None
     ) -> None:
         try:
-            found = self._steps.step(adjusted_model, model, poses, priors, title=name)
+            found = self._steps.step(adjusted_model, model, poses, priors or self._known, title=name)
         except SourceError as error:
             self.notes.append(f"{name}: {error}")
             return

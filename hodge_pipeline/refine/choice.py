@@ -48,7 +48,7 @@ def choose(found: Found, distances_m: Floats, seed: int, steps: Steps, *, force:
     at = _best(found, merging, distances_m)
     reason = "no candidate costs less" if at == 0 else ""
     by_depth = found.with_depth and found.candidates[at].name == CONSISTENT and _fits_depth(distances_m[[0, at]])
-    if at and not merging[at] and not by_depth:
+    if at and not merging[at] and not by_depth and not _fits_positions(found, 0, at):
         reason = _reason_to_keep(found, at, seed, steps)
     if not reason:
         return Choice(at, "")
@@ -58,15 +58,19 @@ def choose(found: Found, distances_m: Floats, seed: int, steps: Steps, *, force:
 
 
 def _best(found: Found, merging: Sequence[bool], distances_m: Floats) -> int:
-    """The lowest cost, or a little more where further measurements took part: points that matches merged, or depth
-    whose pairs held out fit no worse.
+    """The lowest cost, or a little more where further measurements took part: points that matches merged, depth whose
+    pairs held out fit no worse, or known positions that fit clearly better.
     """
     at = found.best
     for row, candidate in enumerate(found.candidates):
         if _per_freedom(found, row) > (1 + MERGE_LOSS) * _per_freedom(found, at):
             continue
         with_depth = found.with_depth and candidate.name == CONSISTENT
-        if merging[row] > merging[at] or (with_depth and _fits_depth(distances_m[[0, row]])):
+        if (
+            merging[row] > merging[at]
+            or (with_depth and _fits_depth(distances_m[[0, row]]))
+            or _fits_positions(found, at, row)
+        ):
             at = row
     return at
 
@@ -77,6 +81,12 @@ def _per_freedom(found: Found, row: int) -> float:
     numbers = 2.0 * len(model.quality.errors_px)
     fitted = 3.0 * model.quality.points + 6.0 * len(model.body_names)
     return cost.px * float(np.sqrt(numbers / max(numbers - fitted, 1.0)))
+
+
+def _fits_positions(found: Found, before: int, after: int) -> bool:
+    """Whether a candidate is nearer to known positions by more than fitting their noise would bring it."""
+    off = found.positions_off
+    return bool(off[after] < (1 - GAIN_TO_MOVE) * off[before])
 
 
 def _fits_depth(distances_m: Floats) -> bool:

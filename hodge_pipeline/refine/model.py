@@ -79,6 +79,7 @@ def refine_models(
     with open_workers(options.executor, dask) as workers:
         for number, joined in enumerate(options.model.join(metric)):
             parts = [row for row, model in enumerate(metric) if set(model.body_names) & set(joined.body_names)]
+            joined = joined.placed()
             steps.remember(joined, f"{key}-{number}")
             given = tuple(models[row] for row in parts), tuple(scales[row] for row in parts)
             out.append(_refine(joined, *given, options, steps, workers, force))
@@ -123,12 +124,13 @@ def _refine(
     distances_m = held_out_distances(found.depth, _image_poses([one.model for one in found.candidates]), workers)
     choice = choose(found, distances_m, options.seed, steps, force=force)
     at, chosen = choice.row, found.candidates[choice.row].model
-    model = chosen if at == 0 or is_metric else _in_the_scale_of(start, chosen)
+    in_world = start.known_positions is not None
+    model = chosen if at == 0 or is_metric or in_world else _in_the_scale_of(start, chosen)
     final = metric_scale(model.depth_ratios()) if any(scale.is_observable for scale in scales) else scales[0]
-    if final.is_observable:
+    if final.is_observable and not in_world:
         model, final = model.scaled(final.metres_per_unit), replace(final, metres_per_unit=1.0)
-    change = _change(start, scales[0], model) if len(inputs) == 1 and at else None
-    decision = _decision(found, choice, scales, force)
+    change = _change(start, scales[0], model, in_world) if len(inputs) == 1 and at else None
+    decision = _placed_decision(start, found, choice) or _decision(found, choice, scales, force)
     measures = _measures(found, at, start, model, distances_m)
     names = [(one.name, cost) for one, cost in zip(found.candidates, found.costs, strict=True)]
     candidates = names if len(inputs) == 1 else [(f"{len(inputs)} models apart", found.inputs), *names]
@@ -136,6 +138,16 @@ def _refine(
     decision = replace(decision, measures=measures, change=change)
     kept = 0 if decision.keeps_input else at + len(candidates) - len(names)
     return RefinedModel(inputs, start, model, scales, final, tuple(candidates), kept, found.solved, decision, notes)
+
+
+def _placed_decision(start: TrackedModel, found: Found, choice: Choice) -> Decision | None:
+    """Of a model that was placed in the world the result is written, whether or not a candidate is better."""
+    if not start.placing:
+        return None
+    off, name = found.positions_off, found.candidates[choice.row].name
+    fit = f", {off[0]:.3g} -> {off[choice.row]:.3g} m off in the median" if np.isfinite(off[0]) else ""
+    told = f"mean error {found.costs[0].px:.4g} -> {found.costs[choice.row].px:.4g} px by {name}"
+    return Decision("refined", f"{start.placing}{fit}; {told}")
 
 
 def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool) -> Decision:
@@ -202,7 +214,7 @@ def _laid_onto(before: Floats, after: Floats) -> Floats:
     return np.asarray(se3.from_parts(turn, shift) @ before)
 
 
-def _change(start: TrackedModel, scale: Scale, model: TrackedModel) -> Change:
+def _change(start: TrackedModel, scale: Scale, model: TrackedModel, in_world: bool) -> Change:
     """How far the poses moved from those of the input, laid onto each other: in metres where depth tells the scale."""
     before, after = start.world_from_body, model.world_from_body
     moved = se3.log(se3.inverse(_laid_onto(before, after)) @ after)
@@ -215,5 +227,5 @@ def _change(start: TrackedModel, scale: Scale, model: TrackedModel) -> Change:
         rotation_deg=float(np.degrees(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=1))))),
         translation_uncertainty_m=float(SIGMAS * position * np.sqrt(3)),
         rotation_uncertainty_deg=float(np.degrees(SIGMAS * rotation * np.sqrt(3))),
-        is_metric=scale.is_observable,
+        is_metric=scale.is_observable or in_world,
     )

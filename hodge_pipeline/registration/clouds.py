@@ -49,6 +49,12 @@ class CloudOptions:
         description="SIFT landmarks of a frame, at most, the strongest; `rgbd` needs them, 800 serve it. About 60 ms a "
         "frame; 0: none",
     )
+    unit_m: float = Field(
+        default=1.0,
+        gt=0,
+        description="the metre in the unit of the source, which `scale` sets: the noise of pixels and depth is known "
+        "in metres",
+    )
 
     @model_validator(mode="after")
     def _check_ranges(self) -> CloudOptions:

@@ -29,12 +29,15 @@ BACKWARD_PX = 0.7
 
 @dataclass(frozen=True)
 class FlowImage:
-    """One frame as the flow wants it: its grey image and its depth image (H, W), its camera, its range of depth."""
+    """One frame as the flow wants it: its grey image and its depth image (H, W), its camera, its range of depth, and
+    the metre in the unit of its depth.
+    """
 
     grey: Bytes
     depth: Floats32
     camera: Camera
     range_m: tuple[float, float]
+    unit_m: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ class Followed:
     rmse_m: float
 
 
-def flow_image(frame: Frame, range_m: tuple[float, float]) -> FlowImage | None:
+def flow_image(frame: Frame, range_m: tuple[float, float], unit_m: float = 1.0) -> FlowImage | None:
     """The frame's image; None where it has no colour, depth or camera, or its files cannot be read."""
     if frame.read_colour is None or frame.read_depth is None or frame.camera is None:
         return None
@@ -75,7 +78,7 @@ def flow_image(frame: Frame, range_m: tuple[float, float]) -> FlowImage | None:
     grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
     if grey.shape != depth.shape:
         grey = cv2.resize(grey, depth.shape[::-1], interpolation=cv2.INTER_AREA)
-    return FlowImage(np.asarray(grey, np.uint8), depth, frame.camera, range_m)
+    return FlowImage(np.asarray(grey, np.uint8), depth, frame.camera, range_m, unit_m)
 
 
 def find_corners(image: FlowImage) -> Corners:
@@ -99,7 +102,7 @@ def follow(corners: Corners, view: FlowImage, guess: Floats) -> Followed | None:
     back, here = _flow(view, corners.image, ends, begun + (ends - start))
     kept = (there & here & (np.abs(back - begun) < BACKWARD_PX).all(axis=1)).nonzero()[0]
     rows, seen = inside[kept], _seen(view, ends[kept])
-    found = resect(corners.points[rows], seen, view.camera, guess)
+    found = resect(corners.points[rows], seen, view.camera, guess, view.unit_m)
     return None if found is None else _followed(corners, rows, seen, view.camera, found)
 
 

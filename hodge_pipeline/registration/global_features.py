@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from hodge_pipeline.registration.one_thread import o3d
 from hodge_pipeline.types import Floats, Floats32, Ints, PointCloud
 
 NORMAL_NEIGHBOURS = 30
@@ -42,6 +41,8 @@ class DescribedCloud:
     @property
     def open3d_features(self) -> Any:
         """The features as open3d wants them."""
+        from hodge_pipeline.registration.one_thread import o3d
+
         out = o3d.pipelines.registration.Feature()
         out.data = np.ascontiguousarray(self.features.T, dtype=np.float64)
         return out
@@ -53,6 +54,8 @@ def describe(cloud: PointCloud, voxel_m: float) -> DescribedCloud:
     Normals are of 30 neighbours and turned to the `viewpoint`, since features know one side from the other; a feature
     looks at what is within 5 voxels.
     """
+    from hodge_pipeline.registration.one_thread import o3d
+
     points = np.asarray(cloud.points_in_cam, np.float64)
     coarse = _geometry(points[np.isfinite(points).all(axis=1)], None).voxel_down_sample(voxel_m)
     if len(coarse.points) < FEWEST_POINTS:
@@ -109,6 +112,8 @@ def _nearest(queries: Floats32, features: Floats32) -> tuple[Ints, Floats32]:
 
 
 def _geometry(points: Floats, normals: Floats | None) -> Any:
+    from hodge_pipeline.registration.one_thread import o3d
+
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     if normals is not None:
         cloud.normals = o3d.utility.Vector3dVector(normals)

@@ -19,7 +19,8 @@ FEWEST_POINTS = 20
 @dataclass(frozen=True)
 class PosedBlock:
     """Sightings and, of their frames and key frames `rows (R,)`, what is known so far: poses (R, 4, 4), whether each
-    `is_key (R,)`, velocities (R, 6), the cameras, and by how many seconds colour is later than depth (R,).
+    `is_key (R,)`, velocities (R, 6), the cameras, by how many seconds colour is later than depth
+    (R,), and the metre in the unit of these lengths.
     """
 
     sightings: Sightings
@@ -29,6 +30,7 @@ class PosedBlock:
     twists: Floats
     cameras: tuple[Camera, ...]
     colour_delays_s: Floats
+    unit_m: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ def repose(block: PosedBlock) -> Reposed:
         if block.is_key[place]:
             continue
         points, start = corners[sightings.corner[own]], block.world_from_cam[place]
-        found = resect(points, seen[own], block.cameras[place], start)
+        found = resect(points, seen[own], block.cameras[place], start, block.unit_m)
         if found is None or found.inliers.sum() < FEWEST_POINTS:
             misfits.append(row)
         else:
@@ -61,7 +63,9 @@ def repose(block: PosedBlock) -> Reposed:
 
 
 def _groups(labels: Ints) -> list[tuple[int, Ints]]:
-    """The rows of each label, labels ascending."""
+    """The rows of each label, labels ascending; none of a block that saw nothing, as in the dark."""
+    if not len(labels):
+        return []
     order = np.argsort(labels, kind="stable")
     values, begin = np.unique(labels[order], return_index=True)
     return list(zip(values.tolist(), np.split(order, begin[1:]), strict=True))

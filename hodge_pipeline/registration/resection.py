@@ -37,7 +37,7 @@ class Resection:
 
 def project(points_in_cam: Floats, camera: Camera) -> Floats:
     """Columns u, v, z (n, 3) of points (n, 3): pixels and metres; not finite where a point is not before the camera."""
-    z = np.where(points_in_cam[:, 2] > 1e-3, points_in_cam[:, 2], np.nan)
+    z = np.where(points_in_cam[:, 2] > 0, points_in_cam[:, 2], np.nan)
     u = camera.fx * points_in_cam[:, 0] / z + camera.cx
     v = camera.fy * points_in_cam[:, 1] / z + camera.cy
     return np.stack([u, v, z], axis=1)
@@ -49,12 +49,15 @@ def back_project(seen: Floats, camera: Camera) -> Floats:
     return np.stack([(seen[:, 0] - camera.cx) / camera.fx * z, (seen[:, 1] - camera.cy) / camera.fy * z, z], axis=1)
 
 
-def resect(points: Floats, seen: Floats, camera: Camera, known_from_cam: Floats) -> Resection | None:
+def resect(
+    points: Floats, seen: Floats, camera: Camera, known_from_cam: Floats, unit_m: float = 1.0
+) -> Resection | None:
     """The pose that sees points (n, 3) at `seen (n, 3)`, columns u, v, z (NaN: no depth there), from a guess.
 
-    None where fewer than 12 points agree on it.
+    None where fewer than 12 points agree on it. `unit_m` is the metre, in the unit of these lengths.
     """
-    pose = known_from_cam
+    points, seen = points / unit_m, seen / [1.0, 1.0, unit_m]
+    pose = se3.rescaled(known_from_cam, 1 / unit_m)
     for scale in ANNEALED:
         found = _step(points, seen, camera, pose, scale)
         if found is None:
@@ -64,7 +67,9 @@ def resect(points: Floats, seen: Floats, camera: Camera, known_from_cam: Floats)
         if scale == 1.0 and np.abs(step).max() < 1e-6:
             break
     inliers = _agree(points, seen, camera, pose)
-    return Resection(pose, information, inliers) if inliers.sum() >= FEWEST else None
+    if inliers.sum() < FEWEST:
+        return None
+    return Resection(se3.rescaled(pose, unit_m), se3.rescaled_information(information, unit_m), inliers)
 
 
 def _residuals(points: Floats, seen: Floats, camera: Camera, pose: Floats) -> tuple[Floats, Floats]:

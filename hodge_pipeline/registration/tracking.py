@@ -110,7 +110,7 @@ class _View:
     def image(self) -> FlowImage | None:
         """None of a frame that flow cannot follow."""
         clouds = self._options.clouds
-        return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m))
+        return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m), clouds.unit_m)
 
     @cached_property
     def corners(self) -> Corners | None:

@@ -76,7 +76,7 @@ def _paths(comparison: Comparison) -> Report:
         for run in (a, b)
         for name, values in run.report.get("convergence", {}).items()
     }
-    paths = tuple(Path3D(name, poses[:, :3, 3]) for name, poses in named if len(poses))
+    paths = tuple(Path3D.of(name, poses) for name, poses in named if len(poses))
     pictures = Pictures(paths=paths, component=np.zeros(len(comparison.a_poses), np.int64), convergence=series)
     return Report("", SourceSummary("", "", 0), before=a.name, after=b.name, pictures=pictures)
 

@@ -205,10 +205,18 @@ class RefinementSummary:
 
 @dataclass(frozen=True)
 class Path3D:
-    """The positions (N, 3) of one set of poses, aligned to be compared; NaN where a frame has none."""
+    """The positions (N, 3) and rotations (N, 3, 3) of one set of poses, aligned to be compared; NaN where a frame has
+    none; no rotations in a report of an earlier version.
+    """
 
     name: str
     positions: Floats
+    rotations: Floats | None = None
+
+    @classmethod
+    def of(cls, name: str, world_from_cam: Floats) -> Path3D:
+        """The path of poses (N, 4, 4)."""
+        return cls(name, world_from_cam[:, :3, 3], world_from_cam[:, :3, :3])
 
 
 @dataclass(frozen=True)

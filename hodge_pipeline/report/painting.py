@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from hodge_pipeline import se3
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Floats
@@ -44,7 +45,9 @@ def error_plots(report: Report) -> Iterator[Picture]:
     against = "from the truth, aligned" if has_truth(report) else f"from where it lay in the {report.before} poses"
     title = "Error" if has_truth(report) else "Movement"
     yield painted(
-        f"{title} over time, per axis", f"How far each frame lies {against}.", lambda figure: _over_time(figure, report)
+        f"{title} over time, per axis",
+        f"How far each frame lies {against}; below, by how much it is turned.",
+        lambda figure: _over_time(figure, report),
     )
     last = report.after if report.after in errors else next(iter(errors))
     yield painted(
@@ -70,6 +73,21 @@ def offsets(report: Report) -> dict[str, Floats]:
     return found if all(np.isfinite(each).any() for each in found.values()) else {}
 
 
+def turns_deg(report: Report) -> dict[str, Floats]:
+    """By how many degrees (N,) each set of poses is turned against what `offsets` compares it with."""
+    rotations = {path.name: path.rotations for path in report.pictures.paths}
+    reference = rotations.get(TRUTH if has_truth(report) else report.before)
+    found = {}
+    for name in offsets(report):
+        own = rotations[name]
+        if own is not None and reference is not None:
+            known = np.isfinite(own).all(axis=(1, 2)) & np.isfinite(reference).all(axis=(1, 2))
+            found[name] = np.full(len(own), np.nan)
+            apart = np.swapaxes(reference[known], 1, 2) @ own[known]
+            found[name][known] = np.degrees(np.linalg.norm(se3.so3_log(apart), axis=-1))
+    return found
+
+
 def _unit(report: Report, offsets: Sequence[Floats]) -> tuple[str, float]:
     """The unit that suits these offsets, and how many of them a metre has."""
     if not report.has_metres:
@@ -82,16 +100,18 @@ def _over_time(figure: Figure, report: Report) -> None:
     errors = offsets(report)
     unit, factor = _unit(report, list(errors.values()))
     times, label = _times(report, len(next(iter(errors.values()))))
-    panels = figure.subplots(3, 1, sharex=True)
-    for axis, (axes, name) in enumerate(zip(panels, "xyz", strict=True)):
-        for rank, (poses, offset) in enumerate(errors.items()):
-            style = {
-                "linestyle": "-" if poses == report.after else ":",
-                "color": ("#D55E00", "#0072B2")[rank - len(errors)],
-            }
-            line, colour = LINES[rank - len(errors)]
-            axes.plot(times, offset[:, axis] * factor, linewidth=1.1, label=poses, **style)
-        axes.set_ylabel(f"{name}, {unit}", fontsize=8)
+    curves = {
+        f"{name}, {unit}": {poses: each[:, axis] * factor for poses, each in errors.items()}
+        for axis, name in enumerate("xyz")
+    }
+    turns = turns_deg(report)
+    if turns:
+        curves["rotation, °"] = turns
+    panels = figure.subplots(len(curves), 1, sharex=True)
+    for axes, (title, series) in zip(panels, curves.items(), strict=True):
+        for (line, colour), (poses, values) in zip(LINES[-len(series) :], series.items(), strict=True):
+            axes.plot(times, values, linewidth=1.1, label=poses, linestyle=line, color=colour)
+        axes.set_ylabel(title, fontsize=8)
     panels[-1].set_xlabel(label)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False, fontsize=8)
 

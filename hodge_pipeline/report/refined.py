@@ -78,7 +78,7 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
     solved = first.solved
     sets = {"start": first.start.world_from_body, "result": first.model.world_from_body}
     quality = first.start.quality
-    pictures = Pictures(paths=tuple(Path3D(name, poses[:, :3, 3]) for name, poses in sets.items()))
+    pictures = Pictures(paths=tuple(Path3D.of(name, poses) for name, poses in sets.items()))
     graph, worst = None, tuple[EdgeRow, ...]()
     if solved is not None:
         edges, names = solved.edges(first.model.world_from_body), solved.graph.vertex_ids

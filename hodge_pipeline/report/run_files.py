@@ -245,7 +245,7 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
         shown = {"truth": truth, **aligned}
     else:
         shown[first] = absolute_error(shown[first], shown["result"], component).aligned
-    paths = [Path3D(name, poses[:, :3, 3]) for name, poses in shown.items()]
+    paths = [Path3D.of(name, poses) for name, poses in shown.items()]
     finite = next(name for name, poses in sets.items() if np.isfinite(poses).all())
     residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in (finite, "result"))
     convergence = {

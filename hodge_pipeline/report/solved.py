@@ -83,7 +83,7 @@ def _report(solved: SolvedFile) -> Report:
         notes=notes_of("solver", solution.notes),
         versions=versions(),
         pictures=Pictures(
-            paths=tuple(Path3D(name, poses[:, :3, 3]) for name, poses in sets.items()),
+            paths=tuple(Path3D.of(name, poses) for name, poses in sets.items()),
             component=solution.component,
             residuals=tuple(Residuals(name, *edge_residuals(graph, poses)) for name, poses in sets.items()),
             graph=graph,

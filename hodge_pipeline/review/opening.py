@@ -32,7 +32,8 @@ class Review:
             self.viewer = Viewer() if scene else None
             if self.viewer is not None:
                 stack.callback(self.viewer.close)
-                stack.callback(Scene(self.session, self.viewer.server).close)
+                self.scene = Scene(self.session, self.viewer.server)
+                stack.callback(self.scene.close)
             self._front = Front(site(self.session, None if self.viewer is None else self.viewer.path), port)
             stack.callback(self._front.close)
             self._stack = stack.pop_all()

@@ -22,6 +22,10 @@ COLOURS = {verdict: tuple(bytes.fromhex(colour[1:])) for verdict, colour in REPO
 SELECTED, BEFORE = (190, 0, 190), (170, 170, 200)
 MOST_POINTS = 3_000_000
 """Of the overview: 9 bytes each, 27 MB for a page to receive."""
+SAMPLED = 3000
+"""Points that tell where the scene lies."""
+CROWD = 200
+"""Cameras above which they are drawn smaller, lest they hide the edges."""
 BLINK_S = 0.6
 BARELY = 1e-7
 """A pose that changed by less stays where it is drawn."""
@@ -54,7 +58,7 @@ class Scene:
     def _begin(self) -> None:
         """The scene of a subject that was just opened."""
         scene, poses = self._server.scene, self._session.settled.world_from_cam
-        position, centre = self._overview(poses)
+        position, centre = self.overview(poses)
         scene.set_up_direction(tuple(self._up))
         self._server.initial_camera.up = tuple(self._up)
         self._server.initial_camera.position = tuple(position)
@@ -64,11 +68,11 @@ class Scene:
         self._closeup = Closeup(self._session, self._server)
         if self._subject.clouds is not None:
             self._add_clouds(self._subject.clouds, poses)
-        self._poses = poses.copy()
+        self._poses, self._before = poses.copy(), (0, poses)
 
     def _add_clouds(self, clouds: CloudSet, poses: Floats) -> None:
         step = thinning(clouds.offsets, MOST_POINTS)
-        size = max(0.004 * self._size, 0.01)
+        size = max(0.004 * self._size, 0.01 if self._subject.unit == "m" else 0.0)
         for row in range(len(clouds)):
             points, colours = thinned(clouds, row, step)
             if len(points) and np.isfinite(poses[row]).all():
@@ -90,17 +94,17 @@ class Scene:
             if not self._closed.is_set():
                 self.draw(flip)
 
-    def _overview(self, poses: Floats) -> tuple[Floats, Floats]:
+    def overview(self, poses: Floats) -> tuple[Floats, Floats]:
         """Where the whole scene is seen from at these poses, and its middle; up and its size follow from them too."""
         known = poses[np.isfinite(poses).all(axis=(1, 2))]
-        centre = np.median(known[:, :3, 3], axis=0) if len(known) else np.zeros(3)
-        spread = np.linalg.norm(known[:, :3, 3] - centre, axis=1) if len(known) else np.ones(1)
-        self._size = max(float(np.percentile(spread, 90)), 0.5)
+        _, radius = _ball(known[:, :3, 3])
+        self._size = max(radius, 0.5) if self._subject.unit == "m" else radius
         up = -known[:, :3, 1].mean(axis=0) if len(known) and self._subject.clouds is not None else np.array([0, 0, 1.0])
         self._up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0, 0, 1.0])
         side = np.cross(self._up, [1.0, 0.3, 0.2])
         side /= np.linalg.norm(side)
-        return centre + self._size * (2.2 * self._up + 1.6 * side), centre
+        centre, radius = _ball(np.concatenate([known[:, :3, 3], _sampled(self._subject.clouds, poses)]))
+        return centre + max(radius, self._size) * (1.8 * self._up + 1.3 * side), centre
 
     def draw(self, flip: bool = False) -> None:
         """Bring the scene up to date with the session; what has not changed is not sent again."""
@@ -116,7 +120,7 @@ class Scene:
             self._shown = {}
             self._begin()
         with self._server.atomic():
-            self._move(settled.world_from_cam)
+            self._move(settled.world_from_cam, settled.revision)
             self._cameras(settled.world_from_cam)
             for verdict in COLOURS:
                 rows = np.flatnonzero((table.edges.verdict == verdict) & (settled.weights > 0))
@@ -132,23 +136,24 @@ class Scene:
             self._closeup.draw(pair, self._subject.clouds, self._up, self._size)
         self._turn_to(pair, look.home)
 
-    def _move(self, poses: Floats) -> None:
-        """The clouds at new poses, and a line where the cameras were before."""
+    def _move(self, poses: Floats, revision: int) -> None:
+        """The clouds at new poses, and a line from where each camera was before the latest decision."""
         if np.array_equal(poses, self._poses, equal_nan=True):
             return
-        moved = np.flatnonzero(np.abs(poses - self._poses).max(axis=(1, 2)) > BARELY)
-        ways = np.stack([self._poses[:, :3, 3], poses[:, :3, 3]], axis=1)[moved]
-        for row in moved.tolist():
+        for row in np.flatnonzero(np.abs(poses - self._poses).max(axis=(1, 2)) > BARELY).tolist():
             if row in self._clouds:
                 self._clouds[row].wxyz, self._clouds[row].position = placed(poses[row])
+        if revision != self._before[0]:
+            self._before = revision, self._poses
         self._poses = poses.copy()
-        self._draw_lines("/before", ways, BEFORE, 1.0)
+        ways = np.stack([self._before[1][:, :3, 3], poses[:, :3, 3]], axis=1)
+        self._draw_lines("/before", ways[np.ptp(ways, axis=1).max(axis=1) > BARELY], BEFORE, 1.0)
 
     def _cameras(self, poses: Floats) -> None:
         if self._same("/cameras", poses):
             return
         known = poses[np.isfinite(poses).all(axis=(1, 2))]
-        length = 0.04 * self._size
+        length = 0.04 * self._size / max(1.0, (len(known) / CROWD) ** 0.5)
         self._server.scene.add_batched_axes(
             "/cameras", quat_wxyz(known), known[:, :3, 3], axes_length=length,
             axes_radius=length / 12,
@@ -181,7 +186,7 @@ class Scene:
             elif number in self._looked:
                 client.camera.position, client.camera.look_at = self._looked.pop(number)
             else:
-                position, centre = self._overview(self._session.settled.world_from_cam)
+                position, centre = self.overview(self._session.settled.world_from_cam)
                 client.camera.up_direction, client.camera.position, client.camera.look_at = self._up, position, centre
 
     def _same(self, name: str, *drawn: Any) -> bool:
@@ -238,6 +243,24 @@ def thinned(clouds: CloudSet, row: int, step: int) -> tuple[Floats32, np.ndarray
     entry = slice(int(clouds.offsets[row]), int(clouds.offsets[row + 1]), step)
     points, colours = np.asarray(clouds.points[entry]), np.asarray(clouds.colours[entry])
     return points, colours if colours.any() else np.full_like(colours, 150)
+
+
+def _ball(points: Floats) -> tuple[Floats, float]:
+    """The middle of points (N, 3) and the distance from it within which most lie; 1 where they are one or none."""
+    if not len(points):
+        return np.zeros(3), 1.0
+    centre = np.median(points, axis=0)
+    return centre, float(np.percentile(np.linalg.norm(points - centre, axis=1), 90)) or 1.0
+
+
+def _sampled(clouds: CloudSet | None, world_from_cam: Floats) -> Floats:
+    """A few of the points (N, 3) of all clouds, in the world."""
+    if clouds is None or not int(clouds.offsets[-1]):
+        return np.zeros((0, 3))
+    rows = np.arange(0, int(clouds.offsets[-1]), thinning(clouds.offsets, SAMPLED))
+    owner = np.searchsorted(clouds.offsets, rows, side="right") - 1
+    points = se3.transform(world_from_cam[owner], np.asarray(clouds.points[rows], float)[:, None])[:, 0]
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def _around(along: Ints) -> Ints:

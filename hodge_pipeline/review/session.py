@@ -196,7 +196,7 @@ class Session:
             assert new.found is not None
             settler.add(new.i, new.j, new.found)
         self._publish(settler, settler.solve(history, revision))
-        better = settler.checked(history, revision)
+        better = settler.checked(history, revision) if self.decisions.revision == revision else None
         if better is not None:
             self._publish(settler, better)
         self.slow.put("judging", self._judge)

@@ -24,6 +24,8 @@ from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
 
 MOST_CHECKED = 20_000
 """Edges up to which a solve is checked by one from the edges alone: that takes about 0.05 CPU seconds for each 1000."""
+PREVIEW_STEPS = 8
+"""Newton steps after which poses are shown, done or not: a change that leads nowhere new takes 2 to 6."""
 LOWER = 1e-6
 """Share by which a cost must be lower to count as lower."""
 
@@ -32,8 +34,8 @@ LOWER = 1e-6
 class Settled:
     """Poses (V, 4, 4) at a revision of the decisions, what each edge (E,) leaves of them, and what that took.
 
-    `moved_m` is the farthest that a pose moved since the last, `error_m` the trajectory's error where the truth is
-    known.
+    `moved_m` is the farthest that a pose moved by the latest decision, `error_m` the trajectory's error where the truth
+    is known.
     """
 
     revision: int
@@ -126,6 +128,7 @@ class Settler:
     def __init__(self, subject: Subject) -> None:
         self._truth = subject.truth
         self._solution = subject.solution
+        self._before = 0, subject.solution.world_from_cam
         self.table = Table.of(subject)
         self._editor = _editor(subject.graph, replace(subject.solution, weights=self.table.base))
         self.settled = self._settled(0, subject.solution, 0.0)
@@ -147,34 +150,39 @@ class Settler:
         else:
             changed = np.flatnonzero(weights != self._editor.weights)
             self._editor.reweight(changed, weights[changed])
-            self._solution = self._editor.solve()
+            self._solution = self._editor.solve(PREVIEW_STEPS)
         self.settled = self._settled(revision, replace(self._solution, weights=weights), time.perf_counter() - began)
         return self.settled
 
     def checked(self, history: History, revision: int) -> Settled | None:
         """The poses from the edges alone, where these have a lower cost: the ones at hand, where wrong edges had put
-        them, may lead to a minimum that is none. None where they do not, or the graph is large and the solve converged.
+        them, may lead to a minimum that is none. Else those at hand, solved to the end; None where they are already.
         """
         counted = np.flatnonzero(self.table.weights(history) > 0)
         before, began = self._solution, time.perf_counter()
-        if before.converged is not False and len(counted) > MOST_CHECKED or self._editor is None:
+        converged = before.converged is not False
+        if converged and len(counted) > MOST_CHECKED or self._editor is None:
             return None
         found = solve(self.table.graph.select(counted))
-        if before.converged is not False and found.metrics["objective"] >= (1 - LOWER) * before.metrics["objective"]:
+        if found.metrics["objective"] < (1 - LOWER) * before.metrics["objective"]:
+            poses, weights = found.world_from_cam, np.zeros(len(self.table))
+            weights[counted] = found.weights
+            if not len(self.table.graph.fixed):
+                poses = align(poses, before.world_from_cam).apply(poses)
+            self._solution = replace(found, world_from_cam=poses, weights=weights)
+            self._editor = _editor(self.table.graph, self._solution)
+        elif converged:
             return None
-        poses, weights = found.world_from_cam, np.zeros(len(self.table))
-        weights[counted] = found.weights
-        if not len(self.table.graph.fixed):
-            poses = align(poses, before.world_from_cam).apply(poses)
-        self._solution = replace(found, world_from_cam=poses, weights=weights)
-        self._editor = _editor(self.table.graph, self._solution)
+        else:
+            self._solution = self._editor.solve()
         seconds = self.settled.seconds + time.perf_counter() - began
         self.settled = self._settled(revision, self._solution, seconds)
         return self.settled
 
     def _settled(self, revision: int, solution: Solution, seconds: float) -> Settled:
         residual_m, residual_rad = edge_residuals(self.table.graph, solution.world_from_cam)
-        before = self.settled.world_from_cam if revision else solution.world_from_cam
+        if revision != self._before[0]:
+            self._before = revision, self.settled.world_from_cam
         return Settled(
             revision=revision,
             world_from_cam=solution.world_from_cam,
@@ -183,7 +191,7 @@ class Settler:
             residual_m=residual_m,
             residual_rad=residual_rad,
             seconds=seconds,
-            moved_m=moved_m(before, solution.world_from_cam),
+            moved_m=moved_m(self._before[1], solution.world_from_cam),
             error_m=error_m(solution.world_from_cam, self._truth),
             converged=solution.converged is not False,
         )

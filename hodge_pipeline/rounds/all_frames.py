@@ -17,19 +17,26 @@ from hodge_pipeline.types import Floats, Source
 from hodge_pipeline.types.notes import Note
 
 
-def pose_all_frames(scene: Scene, world_from_key: Floats, steps: Steps, workers: Workers) -> Floats:
-    """Poses (N, 4, 4) of all frames that follow from those (K, 4, 4) of the key frames."""
+def pose_all_frames(scene: Scene, world_from_key: Floats, steps: Steps, workers: Workers, unit_m: float) -> Floats:
+    """Poses (N, 4, 4) of all frames that follow from those (K, 4, 4) of the key frames; `unit_m` is as of `resect`."""
     poses = scene.key_frames.expand(world_from_key)
     if scene.sightings is None:
         return poses
     return steps.step(
-        pose_frames, scene.whole, scene.key_frames, scene.sightings, poses, title="all frames",
+        pose_frames, scene.whole, scene.key_frames, scene.sightings, poses, unit_m, title="all frames",
         total=len(poses), workers=workers,
     )  # fmt: skip
 
 
 def pose_frames(
-    source: Source, key_frames: KeyFrames, sightings: Path, world_from_cam: Floats, *, workers: Workers, step: Step
+    source: Source,
+    key_frames: KeyFrames,
+    sightings: Path,
+    world_from_cam: Floats,
+    unit_m: float,
+    *,
+    workers: Workers,
+    step: Step,
 ) -> Floats:
     """Step: each frame posed anew by what it saw of its key frame; one that fits nothing keeps its pose (N, 4, 4)."""
     twists = velocities(world_from_cam, stamps_of(source), key_frames.sequence, key_frames.found)
@@ -43,7 +50,7 @@ def pose_frames(
         frames = [source.frames[row] for row in rows]
         cameras = tuple(frame.camera for frame in frames if frame.camera is not None)
         delays_s = np.array([frame.colour_delay_s for frame in frames])
-        return PosedBlock(own, rows, world_from_cam[rows], is_key[rows], twists[rows], cameras, delays_s)
+        return PosedBlock(own, rows, world_from_cam[rows], is_key[rows], twists[rows], cameras, delays_s, unit_m)
 
     paths = sorted(sightings.glob("*.npz"))
     for _, found in workers.map(repose, [block(path) for path in paths]):

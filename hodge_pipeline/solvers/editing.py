@@ -146,8 +146,9 @@ class GraphEditor:
             raise GraphError("there is no edit to undo")
         self._state = self._history.pop()
 
-    def solve(self) -> Solution:
-        """The optimum of the edges as they are now."""
+    def solve(self, max_iterations: int = LIMITS.max_iterations) -> Solution:
+        """The optimum of the edges as they are now; not converged after so many iterations, the next call goes on."""
+        limits = replace(LIMITS, max_iterations=max_iterations)
         base = self._fitting_base()
         weights, scale = base.setup.weights, self._state.weights
         information = weights.information
@@ -165,11 +166,12 @@ class GraphEditor:
         changed = scale != before
         moved = np.flatnonzero(changed[base.used])
         everywhere = len(moved) < np.count_nonzero(changed)
-        near, to_come = (setup, math.inf) if everywhere else settled_nearby(setup, moved, LIMITS, full)
+        near, to_come = (setup, math.inf) if everywhere else settled_nearby(setup, moved, limits, full)
         owed = self._state.owed + to_come
         descent = here(near, full)
         if owed > LIMITS.relative_tolerance * descent.point.cost:
-            descent, owed = minimise(near, "given", LIMITS, full, near_minimum=True), 0.0
+            descent = minimise(near, "given", limits, full, near_minimum=True)
+            owed = 0.0 if descent.converged else math.inf
         used = np.zeros(self.graph.edge_count)
         used[base.used] = scale[base.used]
         solution = replace(self._solution(base, descent), weights=used)

@@ -220,8 +220,10 @@ class Problem:
         """The scalar Laplacian of τ, factorised once: that of κ, where every edge has the same ratio of the two."""
         if self.factors is not None:
             return self.factors.translation
-        ratio = self.tau / self.kappa
-        if len(ratio) and np.ptp(ratio) <= SAME_RATIO * ratio[0]:
+        counted = (self.tau > 0) | (self.kappa > 0)
+        with np.errstate(divide="ignore"):  # a kappa of 0 has an infinite ratio, which no other is near
+            ratio = self.tau[counted] / self.kappa[counted]
+        if len(ratio) and np.isfinite(ratio).all() and np.ptp(ratio) <= SAME_RATIO * ratio[0]:
             solve, scale = self.rotation_factor.solve, 1 / ratio[0]
             return Factor(self.free_count, lambda rhs: scale * solve(rhs))
         return self.structure.backend.factorise(self.structure.laplacian(self.tau))

@@ -226,6 +226,9 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
     notes = [Note("key frames", len(tracked.key_rows), str(len(tracked.anchors)))]
     lost = np.flatnonzero(~tracked.found)
     ids = vertex_ids(source)
+    back = [row for rows in sequences_of(source).values() for row in _where_the_clock_goes_back(source, rows)]
+    if back:
+        notes.append(Note("clock", len(back), in_runs(np.array(back), ids)))
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
     sizes = np.bincount(tracked.piece)
@@ -233,6 +236,14 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
     if pieces > len(sequences_of(source)):
         notes.append(Note("path broken", pieces - 1, str(pieces)))
     return (*notes, *notes_of("clouds", _few(list(dict.fromkeys(note for part in parts for note in part.notes)))))
+
+
+def _where_the_clock_goes_back(source: Source, rows: Ints) -> list[int]:
+    """The rows of a sequence whose real stamp is no later than the one before."""
+    if not has_real_stamps([source.frames[row] for row in rows]):
+        return []
+    stamps = np.array([source.frames[row].stamp_s for row in rows])
+    return [int(row) for row in rows[1:][np.diff(stamps) <= 0]]
 
 
 def _few(notes: list[str]) -> list[str]:

@@ -35,6 +35,7 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
     ),
+    "option unknown": (Rank.LOOK, "{detail}; made by another version: it is left out of what is shown"),
     "scale": (Rank.LOOK, "{detail}"),
     "given poses": (Rank.FACT, "{count} of {detail} poses given"),
     "given file": (Rank.FACT, "{detail}"),
@@ -45,6 +46,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "tracking lost": (
         Rank.LOOK,
         "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
+    ),
+    "clock": (
+        Rank.LOOK,
+        "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
     ),
     "path broken": (
         Rank.LOOK,

@@ -33,6 +33,7 @@ from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, USED
+from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import command
 
 PICTURED, LEAST_PICTURED = 6, 2
@@ -88,6 +89,7 @@ def _run_subject(path: Path, run: Run) -> Subject:
     _ = run.report  # raises where the run has not ended
     last, recipe = run.result, run.recipe
     frames, notes = _frames(recipe)
+    unknown = tuple(str(Note("option unknown", detail=line)) for line in run.options_left_out)
     known = len(frames) == len(run.source.frames)
     return Subject(
         path,
@@ -100,7 +102,7 @@ def _run_subject(path: Path, run: Run) -> Subject:
         tried=last.rejected.pairs,
         frames=tuple(frames[row] for row in run.key_frames.rows) if known else (),
         clouds=run.clouds,
-        notes=notes,
+        notes=(*unknown, *notes),
     )
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from hodge_pipeline.errors import HodgeError, WorkspaceError
-from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.run import FILE, Recording
 from hodge_pipeline.run_folder import Run, check_layout
@@ -17,7 +16,7 @@ from hodge_pipeline.sources.opening import fingerprints, open_with_reader, remem
 from hodge_pipeline.store.log import log, logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
-from hodge_pipeline.store.workspace import Workspace
+from hodge_pipeline.store.workspace import holding
 from hodge_pipeline.types import Source
 from hodge_pipeline.types.notes import Note
 
@@ -37,10 +36,11 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
     changed = replace(recipe, recording=replace(recipe.recording, **options))
     if changed.recording.level == "off":
         raise WorkspaceError(f"{folder}: its recipe records nothing: add --level normal")
-    with Workspace.reopen(folder, binding.unbind(recipe)), logging_to(folder / "log.txt"):
+    with holding(folder), logging_to(folder / "log.txt"):
         log.info("recording made again from the run folder")
         (folder / PARTS).mkdir(exist_ok=True)
         store = Store(folder / PARTS, watcher)
+        store.note(*(Note("option unknown", detail=line) for line in run.options_left_out))
         source = _with_images(run, recipe, store)
         with Recording(store, folder, changed, source) as recording:
             recording.begin(source, run.clouds, run.rounds[0])

@@ -1,4 +1,4 @@
-"""The same scene in other units: the poses and pairs of every registrar and builder follow its one scale."""
+"""The same scene in other units: the poses and pairs of every registrar, builder and start follow its scale."""
 
 from __future__ import annotations
 
@@ -17,19 +17,24 @@ from hodge_pipeline.errors import HodgeError
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.types import Floats32, Frame, Source
 
-UNITS = {"millimetres": 1024.0, "units of 32 m": 1 / 32}
+UNITS = {"millimetres": 1024.0, "kilometres": 1 / 1024}
 """Powers of two: no digit of any length is lost, so that only a constant in metres makes a difference."""
-UNIT_BOUND = ("coloured_icp",)
-"""Weighs metres against colours by a factor of its library."""
+OPTIONS = {
+    "edges/combined": "{stage: combined, builders: [overlap, centroid, {stage: drift, reach: 1}]}",
+    "start/key_frames": "{stage: key_frames, whole_up_to: 1, distance_m: 0.05, repose: true, registration: rgbd}",
+    "start/odometry": "{stage: odometry, registration: vgicp}",
+    "start/unordered": "unordered",
+}
+"""What a stage needs to be told, and the starts that find poses by themselves."""
 CLOSE = 1e-3
 """Of the path's length, and radians: searches that stop within a tolerance stop a little elsewhere."""
 
 
 def cases(full: bool, scratch: Path, seed: int) -> list[str]:
-    """Each registrar and each builder in each unit."""
+    """Each registrar, each builder and each start in each unit."""
     stages = [f"{kind}/{name}" for kind in ("registration", "edges") for name in registry.names(kind)]
-    stages = [stage for stage in stages if stage.split("/")[1] not in UNIT_BOUND]
-    return [f"{unit}/{stage}" for unit in UNITS for stage in stages]
+    stages += [stage for stage in OPTIONS if stage not in stages]
+    return [f"{unit}/{stage}" for stage in stages for unit in UNITS]
 
 
 def check(name: str, scratch: Path) -> dict[str, int]:
@@ -50,10 +55,10 @@ def check(name: str, scratch: Path) -> dict[str, int]:
 
 
 def _run(kind: str, stage: str, factor: float, scratch: Path) -> Run:
-    section = kind
     folder = scratch / "units" / f"{kind}-{stage}-{factor:g}"
     shutil.rmtree(folder, ignore_errors=True)
-    more = [f"{section}={stage}", f"scale={factor}", "clouds.landmarks=200"]
+    option = OPTIONS.get(f"{kind}/{stage}", stage)
+    more = [f"{kind}={option}", f"scale={factor}", "clouds.landmarks=200"]
     return hodge_pipeline.run(recipe(made(scratch).source, *more), folder, source=_source(made(scratch).source, factor))
 
 

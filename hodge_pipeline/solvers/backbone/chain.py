@@ -22,6 +22,7 @@ class Chain:
     - `step (n, 4, 4)` from the position before, `step_covariance (n, p, p)` of ξ in `step · exp(ξ)`, and the graph's
       edge `step_edge (n,)` that they come from; identity, zeros and −1 where a path begins.
     - `loop_edge (M,)`; `ends (M, 2)`, the first the lower position; `motion (M, 4, 4)`; `covariance (M, p, p)`.
+    - `bridged (n,)`: steps with a guess in place of what the graph says; no scale is learned for its covariance.
     - `axes (p,)`: of a twist those that are free, three in the plane.
     """
 
@@ -34,6 +35,7 @@ class Chain:
     ends: Ints
     motion: Floats
     covariance: Floats
+    bridged: Bools
     axes: Ints
 
     @property
@@ -116,7 +118,17 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     ends = place[graph.edges[rows]]
     motion, loop_covariance = _directed(graph.i_from_j[rows], covariance[rows], ends[:, 0] > ends[:, 1], axes)
     return Chain(
-        order, path, step, step_covariance, step_edge, rows, np.sort(ends, axis=1), motion, loop_covariance, axes
+        order,
+        path,
+        step,
+        step_covariance,
+        step_edge,
+        rows,
+        np.sort(ends, axis=1),
+        motion,
+        loop_covariance,
+        np.zeros(len(order), bool),
+        axes,
     )
 
 

@@ -39,7 +39,8 @@ class Inferred:
     """The result: loops that are `used (M,)`, how all were judged, the poses of the used ones, and what their errors
     were found to be: scales, and `step_width`, `loop_width (M,)`, factors on standard deviations for the last solve.
 
-    `confirmed`: whether the loops say more than chance; if not, none is used, and the poses are those of the chain.
+    `log_evidence`: of the loops as judged, against all being wrong. `confirmed`: whether they say more than chance; if
+    not, none is used, and the poses are those of the chain.
     """
 
     used: Bools
@@ -48,6 +49,7 @@ class Inferred:
     scales: Scales
     step_width: float
     loop_width: Floats
+    log_evidence: float
     confirmed: bool
 
 
@@ -84,7 +86,7 @@ def infer(chain: Chain, always: Bools, most_unknowns: int | None = None) -> Infe
     confirmed = _confirmed(judged.factor[used], len(used))
     used = (used & confirmed) | always
     linear, width = polished(chain, used, linear if used.any() else start)
-    return Inferred(used, judged, linear.poses, scales, LOCAL, width, confirmed)
+    return Inferred(used, judged, linear.poses, scales, LOCAL, width, top, confirmed)
 
 
 SETTLING = 2
@@ -97,8 +99,12 @@ random loops in simulated graphs and in those of Bicocca and RobotCar, whose bes
 
 def _confirmed(factor: Floats, count: int) -> bool:
     """Whether used loops with these log Bayes factors, of so many loops, are more than chance finds."""
-    fold = float(np.log(max(count, 1)))
-    return float((factor - fold).sum()) > BY_CHANCE + BY_CHANCE_EACH_FOLD * fold
+    return float((factor - np.log(max(count, 1))).sum()) > by_chance(count)
+
+
+def by_chance(count: int) -> float:
+    """The log-evidence that chance may reach among so many loops."""
+    return BY_CHANCE + BY_CHANCE_EACH_FOLD * float(np.log(max(count, 1)))
 
 
 def settled_globally(chain: Chain, reduced: Reduced, poses: Floats) -> Linear:

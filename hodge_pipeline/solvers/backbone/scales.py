@@ -37,7 +37,9 @@ class Scales:
         step, loop = self.units(chain)
         return replace(
             chain,
-            step_covariance=chain.step_covariance * np.outer(step, step),
+            step_covariance=np.where(
+                chain.bridged[:, None, None], chain.step_covariance, chain.step_covariance * np.outer(step, step)
+            ),
             covariance=chain.covariance * np.outer(loop, loop),
         )
 
@@ -98,6 +100,7 @@ class _Model:
     """
 
     residual: Floats
+    fixed: Floats
     path: Floats
     own: Floats
     away: Floats
@@ -108,6 +111,9 @@ class _Model:
         rows = np.flatnonzero(chain.path[a] == chain.path[b])
         if len(rows) > MOST_LOOPS:
             rows = np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
+        bridges = replace(chain, step_covariance=chain.step_covariance * chain.bridged[:, None, None])
+        fixed = linearise(bridges, poses).path(a[rows], b[rows])
+        chain = replace(chain, step_covariance=chain.step_covariance * ~chain.bridged[:, None, None])
         parts = []
         for step in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
             part = Scales(*step, *step).applied(chain)
@@ -116,14 +122,14 @@ class _Model:
         path, own = (np.stack(each) for each in zip(*parts, strict=True))
         for parted in (path, own):
             parted[2] -= parted[0] + parted[1]
-        return cls(linear.loop_residual[rows], path, own, wrong.log_density(chain, poses)[rows])
+        return cls(linear.loop_residual[rows], fixed, path, own, wrong.log_density(chain, poses)[rows])
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
         if not len(self.residual):
             return 0.0, EVEN
         turn, shift, own_turn, own_shift = np.exp(logs)
-        covariance = _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
+        covariance = self.fixed + _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
         factor = student(self.residual, covariance)[0] - self.away
         shares, likelihood = mixture(np.stack([factor, np.zeros_like(factor)]))
         return likelihood, shares

@@ -9,8 +9,9 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.backbone.bridged import infer_bridged
 from hodge_pipeline.solvers.backbone.chain import Chain, linear_forest, make_chain, sequential_edges
-from hodge_pipeline.solvers.backbone.inference import Inferred, infer
+from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.tested import tested_by_pairs, tested_steps
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
@@ -36,8 +37,8 @@ MOST_UNKNOWNS = 1500
 class Backbone:
     """The edges that are trusted and what they say of the others.
 
-    - `steps`, `used (E,)`: edges of the backbone, and all that count; `right (E,)`: the probability of each loop, NaN
-      for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
+    - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
+      the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
     """
 
@@ -55,7 +56,7 @@ class Backbone:
         if start is None:
             return poses
         ends = self.chain.order[self.chain.ends[self.found.used]]
-        steps = np.flatnonzero(self.chain.step_edge >= 0)
+        steps = np.flatnonzero((self.chain.step_edge >= 0) & ~self.chain.bridged)
         joined = np.concatenate([np.stack([self.chain.order[steps - 1], self.chain.order[steps]], axis=1), ends])
         component = connected_components(joined, len(poses))
         first = np.unique(component, return_index=True)[1]
@@ -79,7 +80,9 @@ class Backbone:
         trusted = f"{int(self.steps.sum())} consecutive edges are trusted as a backbone"
         if not self.found.confirmed:
             return f"{trusted}, {loops} loops that nothing confirms: the poses are the backbone's"
-        return f"{trusted}, {used} of {loops} loops confirmed"
+        broken = int((self.steps & ~self.used).sum())
+        said = f", {broken} of them called wrong by the loops over it" if broken else ""
+        return f"{trusted}{said}, {used} of {loops} loops confirmed"
 
 
 def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
@@ -104,8 +107,11 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
     if trust == AUTO and tested_steps(chain, chain.poses()).sum() > TESTED * steps.sum():
         return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
-    found = infer(chain, always, MOST_UNKNOWNS if trust == AUTO else None)
-    if found is None or (trust == AUTO and not found.confirmed and _loops_agree(chain, steps)):
+    inferred = infer_bridged(chain, always, MOST_UNKNOWNS if trust == AUTO else None)
+    if inferred is None:
+        return None
+    chain, found = inferred
+    if trust == AUTO and not found.confirmed and _loops_agree(chain, steps):
         return None
     return _backbone(graph, chain, found, steps)
 
@@ -127,6 +133,7 @@ def _of_source(graph: ViewGraph, source: str) -> Bools:
 def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools) -> Backbone:
     used, right, chi2 = steps.copy(), np.full(graph.edge_count, np.nan), np.full(graph.edge_count, np.nan)
     used[chain.loop_edge] = found.used
+    used[chain.step_edge[chain.bridged]] = False
     probability = 1 / (1 + np.exp(-np.clip(found.judged.log_odds, -500, 500)))
     right[chain.loop_edge] = np.where(found.used, probability, np.minimum(probability, UNUSED))
     chi2[chain.loop_edge] = found.judged.chi2

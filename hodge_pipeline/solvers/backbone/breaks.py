@@ -1,0 +1,213 @@
+"""Where a chain may be broken: one step is off, and the loops over it agree on where it should have led."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hodge_pipeline import se3
+from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, student, turns
+from hodge_pipeline.solvers.backbone.fit import Linear
+from hodge_pipeline.types import Floats, Ints
+
+NEIGHBOURS, SEEDS = 8, 16
+"""Loops that each is compared with first, and those that are then compared with all: a limit on cost."""
+PLACE = 4.0
+"""Loops of which the steps between their ends vary less than so many loops do are of one place, and one testimony: a
+place that is mistaken for another has many loops that agree.
+"""
+STEPS_OF_PLACE = 20
+"""Steps that a place has at the least, however large the errors of steps are."""
+PLATEAU = 12.0
+"""Nats: a step at which the loops' evidence is lower by more is not where the chain is broken."""
+TAIL = 0.1
+"""Share of the most unusual steps, whose sizes tell how often one is larger still (Hill 1975)."""
+
+
+@dataclass(frozen=True)
+class Break:
+    """The position `at` of a step that may be broken, its motion (4, 4) and covariance (p, p) in its place, and the
+    log-evidence of loops from several places.
+    """
+
+    at: int
+    motion: Floats
+    covariance: Floats
+    log_evidence: float
+
+
+@dataclass(frozen=True)
+class Testimony:
+    """Loops of a chain held against each other: `explained (M,)`, the log-density of each as the chain is, and `away
+    (M,)` if it is wrong, of which the first is a factor.
+    """
+
+    chain: Chain
+    linear: Linear
+    explained: Floats
+    away: Floats
+    ends: Floats
+
+    @classmethod
+    def of(cls, chain: Chain, linear: Linear, explained: Floats, away: Floats) -> Testimony:
+        """At the poses of the bare chain."""
+        own = np.median(np.einsum("mii->mi", chain.covariance), axis=0)
+        steps = np.where(chain.bridged[:, None], 0.0, np.einsum("nii->ni", chain.step_covariance))
+        along = np.minimum((steps / own).mean(axis=1) / PLACE, 1 / STEPS_OF_PLACE)
+        return cls(chain, linear, explained, away, np.cumsum(along)[chain.ends])
+
+    def displaced(self, loop: Ints) -> Floats:
+        """The motion (K, 4, 4) of the world beyond a break that each of these loops asks for."""
+        low, high = self.chain.ends[loop].T
+        poses = self.linear.poses
+        return np.asarray(poses[low] @ self.chain.motion[loop] @ se3.inverse(poses[high]))
+
+    def factor(self, first: Ints, second: Ints) -> Floats:
+        """Log Bayes factor (K,) of the loops `second` if the loops `first` are right: by the paths between their lower
+        ends and between their upper ends, whatever lies between lower and upper.
+        """
+        chain, (c, d) = self.chain, self.chain.ends[second].T
+        away, covariance = self.beyond(first, c, d)
+        residual = chain.log(se3.inverse(chain.motion[second]) @ se3.inverse(self.linear.poses[c]) @ away)
+        return np.asarray(student(residual, covariance + chain.covariance[second])[0] - self.away[second])
+
+    def beyond(self, loop: Ints, low: Ints, high: Ints) -> tuple[Floats, Floats]:
+        """Where these loops take the poses (K, 4, 4) of positions `high`, and the covariance (K, p, p), in the axes
+        there, of the motion to them from positions `low`.
+        """
+        chain, poses, total = self.chain, self.linear.poses, self.linear.covariance
+        a, b = chain.ends[loop].T
+        end = self.displaced(loop) @ poses[high]
+
+        def carried(frame: Floats, covariance: Floats) -> Floats:
+            into = chain.adjoint(frame).astype(np.longdouble)
+            return np.asarray(into @ covariance @ np.swapaxes(into, 1, 2), float)
+
+        before = carried(se3.inverse(end), total[np.maximum(a, low)] - total[np.minimum(a, low)])
+        after = carried(se3.inverse(poses[high]), total[np.maximum(b, high)] - total[np.minimum(b, high)])
+        return end, before + after + carried(se3.inverse(poses[high]) @ poses[b], chain.covariance[loop])
+
+    def seeds(self, rows: Ints) -> list[int]:
+        """Loops of these with which others near them, yet of other places, agree most: each differs from the others."""
+        near = cKDTree(self.ends[rows]).query(self.ends[rows], k=min(4 * NEIGHBOURS, len(rows)))[1]
+        near = near.reshape(len(rows), -1)
+        apart = np.abs(self.ends[rows[near]] - self.ends[rows][:, None]).max(axis=2) >= 1.0
+        first, nth = np.nonzero(apart & (np.cumsum(apart, axis=1) <= NEIGHBOURS))
+        second = rows[near[first, nth]]
+        gain = np.maximum(np.logaddexp(self.factor(rows[first], second), 0.0) - self.explained[second], 0.0)
+        potential = np.bincount(first, gain, minlength=len(rows))
+        out: list[int] = []
+        left = np.ones(len(rows), bool)
+        while left.any() and len(out) < SEEDS:
+            seed = int(np.argmax(np.where(left, potential, -1.0)))
+            out.append(int(rows[seed]))
+            left[seed] = False
+            others = np.flatnonzero(left)
+            left[others[self.factor(np.full(len(others), rows[seed]), rows[others]) > 0]] = False
+        return out
+
+    def gains(self, seed: int, rows: Ints) -> Floats:
+        """What each of these loops (K,) gains if `seed` is right: a place counts once, and that of the seed not."""
+        factor = self.factor(np.full(len(rows), seed), rows)
+        agrees = factor > 0
+        share = (agrees.sum() + 0.5) / (len(rows) + 1)
+        gain = np.logaddexp(np.log(share) + factor, np.log1p(-share)) - self.explained[rows]
+        for alike in (agrees, ~agrees):
+            at = self.ends[rows[alike]]
+            if len(at):
+                gain[alike] /= cKDTree(at).query_ball_point(at, 1.0, p=np.inf, return_length=True)
+        gain[np.abs(self.ends[rows] - self.ends[seed]).max(axis=1) < 1.0] = 0.0
+        return np.asarray(gain)
+
+
+@dataclass(frozen=True)
+class Usual:
+    """How a chain's steps usually are: their `centre (4, 4)` and `covariance (p, p)`, and how many nats more `unusual
+    (n,)` each is than the most unusual of as many should be.
+    """
+
+    centre: Floats
+    covariance: Floats
+    unusual: Floats
+
+    @classmethod
+    def of(cls, chain: Chain) -> Usual:
+        """By Student's distribution, which single steps hardly change, and the tail of the steps' own sizes."""
+        rows = np.flatnonzero((chain.step_edge >= 0) & ~chain.bridged)
+        twist = chain.log(chain.step[rows])
+        centre = np.median(twist, axis=0)
+        left, weight = twist - centre, np.ones(len(twist))
+        for _ in range(ROUNDS):
+            covariance = (left * weight[:, None]).T @ left / len(left)
+            covariance += np.diag(LEAST * np.diag(covariance) + np.finfo(float).tiny ** 0.5)
+            chi2 = gaussian(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[1]
+            weight = (FREEDOM + left.shape[1]) / (FREEDOM + chi2)
+        size = np.log(np.maximum(chi2, np.finfo(float).tiny)) / 2
+        floor = np.quantile(size, 1 - TAIL)
+        mean = float(np.mean(size[size > floor] - floor)) if (size > floor).any() else np.inf
+        unusual = np.full(chain.size, -np.inf)
+        unusual[rows] = np.maximum((size - floor) / mean + np.log(1 / TAIL), 0.0) - np.log(len(rows))
+        return cls(chain.exp(centre[None])[0], covariance, unusual)
+
+
+ROUNDS, LEAST = 10, 1e-6
+"""Of the fit; and of a variance, what is added to it."""
+
+
+def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:
+    """The likeliest break that each of the loops that others agree with asks for, the likeliest first."""
+    chain, poses = told.chain, told.linear.poses
+    rows = np.flatnonzero(chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])
+    out = []
+    for seed in told.seeds(rows) if len(rows) > 1 else ():
+        low, high = chain.ends[seed]
+        at = np.arange(low + 1, high + 1)
+        score = _over(chain, rows, told.gains(seed, rows))[at]
+        at, score = at[score > score.max() - PLATEAU], score[score > score.max() - PLATEAU]
+        fits = _fits(told, usual, seed, at)
+        score = score + np.maximum(fits, 0.0) - told.explained[seed] + usual.unusual[at]
+        row = int(np.argmax(score))
+        best = int(at[row])
+        motion, covariance = usual.centre, usual.covariance
+        if fits[row] <= 0:
+            motion = se3.inverse(poses[best - 1]) @ told.displaced(np.array([seed]))[0] @ poses[best]
+            covariance = covariance + _wide(chain, best, motion)
+        out.append(Break(best, motion, covariance, float(score[row])))
+    return sorted(out, key=lambda each: -each.log_evidence)
+
+
+def _over(chain: Chain, rows: Ints, gain: Floats) -> Floats:
+    """Sums over the loops of these rows that pass over each step (n,)."""
+    low, high = chain.ends[rows].T
+    change = np.bincount(low + 1, gain, chain.size + 1) - np.bincount(high + 1, gain, chain.size + 1)
+    return np.asarray(np.cumsum(change)[:-1])
+
+
+def _fits(told: Testimony, usual: Usual, seed: int, at: Ints) -> Floats:
+    """Log Bayes factor (K,) that the loop is right and the step at a position a usual one."""
+    chain, many = told.chain, np.full(len(at), seed)
+    end, covariance = told.beyond(many, at - 1, at)
+    residual = chain.log(se3.inverse(usual.centre) @ se3.inverse(told.linear.poses[at - 1]) @ end)
+    return np.asarray(student(residual, covariance + usual.covariance)[0] - told.away[seed])
+
+
+def _wide(chain: Chain, at: int, motion: Floats) -> Floats:
+    """A covariance (p, p) as wide as the change of the step."""
+    off = chain.log((se3.inverse(chain.step[at]) @ motion)[None])[0]
+    split = turns(chain)
+    sizes = np.linalg.norm(off[:split]), np.linalg.norm(off[split:])
+    return np.diag(np.repeat(sizes, (split, len(off) - split)) ** 2)
+
+
+def unusual_breaks(usual: Usual) -> list[Break]:
+    """Breaks at steps, the most unusual first, as if nothing but how steps are were known of them; `log_evidence` is by
+    how many nats one is.
+    """
+    rows = np.argsort(-usual.unusual)
+    return [Break(int(at), usual.centre, usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
+
+
+MOST_UNUSUAL = 3

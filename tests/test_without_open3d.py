@@ -1,0 +1,95 @@
+"""What works where importing open3d fails, as on a bare machine: solve, diagnose, convert, inspect."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hodge_pipeline
+from hodge_pipeline import se3
+from hodge_pipeline.registry import load
+from hodge_pipeline.types import Source, Trajectory
+from synthetic import tiny_sequence  # noqa: F401 - a fixture
+
+SCRIPT = Path(__file__).resolve().parents[1] / "tools" / "system-libraries.sh"
+DEBIAN = re.findall(r"^need \S+ (\S+)", SCRIPT.read_text("utf-8"), re.M)
+MESSAGE = "libGL.so.1: cannot open shared object file"
+
+
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a machine where open3d is installed and does not load."""
+    site = tmp_path_factory.mktemp("broken")
+    (site / "open3d").mkdir()
+    (site / "open3d" / "__init__.py").write_text(f'raise ImportError("{MESSAGE}")\n')
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])}
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ring of twenty poses, each joined with the next two, in a g2o file."""
+    count = 20
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    poses = se3.exp(np.stack([0 * angle, 0 * angle, angle, 0 * angle, 0 * angle, 0 * angle], axis=1))
+    poses[:, :2, 3] = 3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    edges = np.array([(i, (i + step) % count) for i in range(count) for step in (1, 2)])
+    noise = se3.exp(0.01 * np.random.default_rng(0).standard_normal((len(edges), 6)))
+    motions = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ noise
+    measured = hodge_pipeline.ViewGraph.from_edges(np.arange(count), edges, motions)
+    path = tmp_path_factory.mktemp("graph") / "ring.g2o"
+    trajectory = Trajectory(np.arange(count, dtype=float), poses)
+    load("writers", "g2o")().write(path, Source("ring", path, trajectory=trajectory, graph=measured))
+    return path
+
+
+def hodge(environment: dict[str, str], *words: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "hodge_pipeline.cli.main", *map(str, words)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_open3d_does_not_load_there(broken: dict[str, str]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", "import open3d"], env=broken, capture_output=True, text=True, check=False
+    )
+    assert MESSAGE in done.stderr
+
+
+def test_a_pose_graph_needs_no_open3d(broken: dict[str, str], graph: Path, tmp_path: Path) -> None:
+    solved = tmp_path / "solved.g2o"
+    for words in (
+        ("inspect", graph),
+        ("solve", graph, "--out", solved, "--certificate", "--objective", "isotropic"),
+        ("solve", graph, "--out", tmp_path / "robust.tum", "--robust"),
+        ("diagnose", graph, "--out", tmp_path / "why"),
+        ("convert", solved, tmp_path / "graph.json"),
+        ("convert", solved, tmp_path / "poses.tum"),
+        ("inspect", tmp_path / "poses.tum"),
+    ):
+        done = hodge(broken, *words)
+        assert done.returncode == 0, (words, done.stderr)
+    assert (tmp_path / "why" / "diagnosis.html").is_file() and (tmp_path / "why" / "edges.csv").is_file()
+
+
+def test_a_sequence_is_inspected_and_converted_without_open3d(
+    broken: dict[str, str],
+    tiny_sequence: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    for words in (("inspect", tiny_sequence), ("convert", tiny_sequence, tmp_path / "poses.kitti"), ("stages",)):
+        done = hodge(broken, *words)
+        assert done.returncode == 0, (words, done.stderr)
+    assert "point_to_plane" in done.stdout and "gicp" in done.stdout and MESSAGE in done.stdout
+
+
+def test_what_needs_it_says_so_in_a_line(broken: dict[str, str], tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    sets = ["--set", "registration=point_to_plane"]
+    done = hodge(broken, "run", "demo", "--source", tiny_sequence, *sets, "--out", tmp_path / "run")
+    assert done.returncode == 1
+    assert MESSAGE in done.stderr and done.stderr.count("\n") == 1
+    assert all(package in done.stderr for package in DEBIAN)
