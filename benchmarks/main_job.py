@@ -2,6 +2,7 @@
 
     python benchmarks/main_job.py SEQUENCE [--recipe seven_scenes] [--frames 50 100 200 250] [--repeat 1]
     python benchmarks/main_job.py SEQUENCE --frames 1000 5000 20000 --plot length.svg
+    OMP_NUM_THREADS=1 python benchmarks/main_job.py SEQUENCE --recipe tum --frames 60 --open3d
 
 The first N frames of the sequence are run in a fresh process each; one that has fewer is played back and forth. The
 table is Markdown, the plot shows time and memory against frames.
@@ -61,6 +62,18 @@ def measure(recipe: str, source: Path, frames: int, overrides: list[str]) -> dic
     }
 
 
+def open3d_odometry(name: str, path: Path, frames: int, overrides: list[str]) -> str:
+    """The row of Open3D's odometry."""
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from benchmarks.back_and_forth import first_frames
+    from benchmarks.open3d_odometry import open3d_row
+    from hodge_pipeline.recipe.schema import load_recipe
+    from hodge_pipeline.sources.opening import open_with_reader
+
+    whole, _ = open_with_reader(path, load_recipe(name, overrides, path).source.reader)
+    return open3d_row(first_frames(whole, frames))
+
+
 def errors(report: dict[str, Any]) -> str:
     """The cells of a result's errors and scores; a dash where there is no truth."""
     row = {row["name"]: row for row in report["trajectories"]}.get("result")
@@ -101,6 +114,7 @@ def main() -> None:
     parser.add_argument("--recipe", default="seven_scenes")
     parser.add_argument("--frames", type=int, nargs="+", default=[50, 100, 200, 250])
     parser.add_argument("--repeat", type=int, default=1, help="runs of each; the medians are printed")
+    parser.add_argument("--open3d", action="store_true", help="beside it Open3D's RGB-D odometry of the same frames")
     parser.add_argument("--plot", type=Path, help="an SVG file: CPU seconds and peak memory against frames")
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     options = parser.parse_args()
@@ -124,6 +138,8 @@ def main() -> None:
             flush=True,
         )
         last = runs[0]
+        if options.open3d:
+            print(open3d_odometry(options.recipe, options.source, frames, options.overrides), flush=True)
         points.append((posed, cpu, peak))
         if options.plot:
             plot(points, options.plot)

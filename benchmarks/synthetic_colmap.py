@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -21,8 +22,20 @@ import pycolmap
 from hodge_pipeline import se3
 
 WIDTH, HEIGHT = 2000, 1500
-NOISE_PX, OUTLIER_PX, OUTLIER_SHARE = 0.6, 8.0, 0.01
-VIEW_CHANGE_DEG, GRAZING_DEG, DETECTED = 25.0, 65.0, 0.5
+GRAZING_DEG = 65.0
+
+
+class Keypoints(NamedTuple):
+    """Noise and gross errors in pixels, the share of these, that of points found, and the turn that ends a track."""
+
+    noise_px: float
+    outlier_px: float
+    outlier_share: float
+    found_share: float
+    view_change_deg: float
+
+
+USUAL, HARD = Keypoints(0.6, 8.0, 0.01, 0.5, 25.0), Keypoints(1.0, 15.0, 0.05, 0.35, 18.0)
 Array = np.ndarray
 Scene = tuple[Array, Array, Array, float]
 """Points and normals (P, 3), poses `world_from_cam` (N, 4, 4), focal length in pixels."""
@@ -130,7 +143,7 @@ KINDS: dict[str, Callable[[np.random.Generator, int], Scene]] = {
 }
 
 
-def make(kind: str, images: int, seed: int) -> pycolmap.Reconstruction:
+def make(kind: str, images: int, seed: int, keypoints: Keypoints = USUAL) -> pycolmap.Reconstruction:
     """A model of this kind at the optimum of its own observations."""
     rng = np.random.default_rng(seed)
     points, normals, poses, focal = KINDS[kind](rng, images)
@@ -138,7 +151,7 @@ def make(kind: str, images: int, seed: int) -> pycolmap.Reconstruction:
         camera_id=1, model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=[focal, WIDTH / 2, HEIGHT / 2]
     )  # fmt: skip
     model.add_camera_with_trivial_rig(camera)
-    seen, pixels = _observed(rng, points, normals, poses, focal)
+    seen, pixels = _observed(rng, keypoints, points, normals, poses, focal)
     columns = np.where(seen, np.cumsum(seen, axis=1) - 1, -1)
     for row, pose in enumerate(poses):
         image = pycolmap.Image(f"{row:04d}.jpg", pixels[row, seen[row]], 1, row + 1)
@@ -158,7 +171,7 @@ def make(kind: str, images: int, seed: int) -> pycolmap.Reconstruction:
 
 
 def _observed(
-    rng: np.random.Generator, points: Array, normals: Array, poses: Array, focal: float
+    rng: np.random.Generator, keypoints: Keypoints, points: Array, normals: Array, poses: Array, focal: float
 ) -> tuple[Array, Array]:
     """Which camera (N, P) sees which point, and where (N, P, 2)."""
     seen, pixels = np.zeros((len(poses), len(points)), bool), np.zeros((len(poses), len(points), 2))
@@ -172,15 +185,15 @@ def _observed(
         facing = np.einsum("pi,pi->p", rays[row], normals) > np.cos(np.deg2rad(GRAZING_DEG)) * np.linalg.norm(
             normals, axis=1
         )
-        seen[row] = inside & facing & (rng.random(len(points)) < DETECTED)
+        seen[row] = inside & facing & (rng.random(len(points)) < keypoints.found_share)
     for number in range(len(points)):
         rows = np.flatnonzero(seen[:, number])
         if len(rows):
-            near = rays[rows, number] @ rays[rng.choice(rows), number] > np.cos(np.deg2rad(VIEW_CHANGE_DEG))
+            near = rays[rows, number] @ rays[rng.choice(rows), number] > np.cos(np.deg2rad(keypoints.view_change_deg))
             seen[rows[~near], number] = False
-    pixels += NOISE_PX * rng.normal(size=pixels.shape)
-    wrong = rng.random(seen.shape) < OUTLIER_SHARE
-    pixels[wrong] += OUTLIER_PX * rng.normal(size=(int(wrong.sum()), 2)) / 2**0.5
+    pixels += keypoints.noise_px * rng.normal(size=pixels.shape)
+    wrong = rng.random(seen.shape) < keypoints.outlier_share
+    pixels[wrong] += keypoints.outlier_px * rng.normal(size=(int(wrong.sum()), 2)) / 2**0.5
     return seen, pixels
 
 
@@ -191,8 +204,9 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--images", type=int, default=150)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--hard", action="store_true", help="more noise, 5 %% of the keypoints wrong, shorter tracks")
     options = parser.parse_args()
-    model = make(options.kind, options.images, options.seed)
+    model = make(options.kind, options.images, options.seed, HARD if options.hard else USUAL)
     options.out.mkdir(parents=True, exist_ok=True)
     model.write(options.out)
     print(model.summary())

@@ -32,7 +32,7 @@ def why_no_browser() -> str:
     return f"no {' and no '.join(missing)} here: apt-get install chromium chromium-driver" if missing else ""
 
 
-def start_browser(width: int = 1500, height: int = 1000) -> Any:
+def start_browser(width: int = 1500, height: int = 1000, *flags: str) -> Any:
     """A headless Chromium. Selenium looks nothing up: browser and driver are the ones that are installed."""
     from selenium import webdriver
     from selenium.webdriver.chrome.options import Options
@@ -40,7 +40,7 @@ def start_browser(width: int = 1500, height: int = 1000) -> Any:
 
     options = Options()
     options.binary_location = str(shutil.which("chromium"))
-    for flag in (*FLAGS, f"--window-size={width},{height}"):
+    for flag in (*FLAGS, *flags, f"--window-size={width},{height}"):
         options.add_argument(flag)
     browser = webdriver.Chrome(options=options, service=Service(str(shutil.which("chromedriver"))))
     browser.set_script_timeout(PATIENCE_S)

@@ -185,3 +185,26 @@ def test_no_right_step_is_called_wrong(wrong: float) -> None:
         made = drive(seed=seed, world=WORLDS[seed], wrong=wrong, in_groups=bool(seed % 2), count=200, loops=60)
         backbone = find_backbone(made.graph)
         assert backbone is None or backbone.used[:199].all()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("wrong", [0.0, 0.5])
+def test_robots_in_one_file_are_joined_by_loops_that_agree(dimension: int, wrong: float) -> None:
+    made = drive(dimension=dimension, wrong=wrong, count=600)
+    step = np.flatnonzero((np.sort(made.graph.edges, axis=1) == [249, 250]).all(axis=1))
+    rows = np.setdiff1d(np.arange(made.graph.edge_count), step)
+    robots = (ord("a") << 56) + np.arange(250), (ord("b") << 56) + np.arange(350)
+    graph = replace(made.graph.select(rows), vertex_ids=np.concatenate(robots))
+    found = diagnose(graph)
+    assert any("598 consecutive edges are trusted as a backbone" in note for note in found.notes)
+    assert not (found.kept & ~made.right[rows]).any()
+    assert (found.kept & made.right[rows]).sum() >= made.right[rows].sum() - 2
+    assert made.error_m(found.world_from_cam) < made.error_m(made.odometry())
+
+
+def test_robots_whose_loops_are_all_wrong_stay_apart() -> None:
+    made = drive(wrong=1.0, count=600, loops=60)
+    step = np.flatnonzero((np.sort(made.graph.edges, axis=1) == [249, 250]).all(axis=1))
+    found = diagnose(made.graph.select(np.setdiff1d(np.arange(made.graph.edge_count), step)))
+    assert not found.kept[598:].any() and found.kept[:598].all()
+    assert len(np.unique(found.piece)) == 2

@@ -181,3 +181,22 @@ def test_a_scan_of_many_points_is_said_to_be_down_sampled(monkeypatch: pytest.Mo
     frame = Frame(7, 0.0, read_points=lambda: PointCloud(points))
     _, counts = make_cloud(frame, CloudOptions(voxel_m=0.5, min_range_m=0.0))
     assert str(counts.odd) == f"frame 7: down-sampled in parts: 2000 points to {counts.points}, one a voxel of 0.5 m"
+
+
+def test_clouds_on_disk_give_their_memory_back(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(size=(1_000_000, 3)).astype(np.float32)
+    CloudSet.from_clouds([PointCloud(points)]).save(tmp_path)
+    clouds = CloudSet.open(tmp_path)
+
+    def resident_kb() -> int:
+        """Of the file of the points, in this process."""
+        parts = Path("/proc/self/smaps").read_text().split("points.npy\n")[1:]
+        return sum(int(part.split("Rss:")[1].split()[0]) for part in parts)
+
+    if not Path("/proc/self/smaps").is_file():
+        pytest.skip("this system has no /proc/self/smaps, which tells the memory of a file")
+    total = clouds[0].points_in_cam.sum(dtype=float)
+    assert resident_kb() > 10_000
+    clouds.forget()
+    assert resident_kb() < 1_000
+    assert clouds[0].points_in_cam.sum(dtype=float) == total

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import sqlite3
 import struct
 from contextlib import closing
@@ -13,6 +14,7 @@ import pytest
 
 import hodge_pipeline
 from bag_data import WRITERS, rosbag1, typesys, write_bag, write_db3
+from hodge_adapters import ros1_bag
 from hodge_adapters.mcap import McapReader
 from hodge_adapters.mcap_writer import McapWriter
 from hodge_adapters.ros_definitions import TYPES, definition
@@ -87,6 +89,28 @@ def test_a_chunk_that_lies_is_left_out(tmp_path: Path, old: bytes, new: bytes, n
     path.write_bytes(contents[:at] + new + contents[at + len(new) :])
     with pytest.raises(SourceError, match=note):
         McapReader().open(path)
+
+
+def bag_record(data: bytes, **header: bytes) -> bytes:
+    fields = b"".join(
+        struct.pack("<I", len(name) + 1 + len(value)) + name.encode() + b"=" + value for name, value in header.items()
+    )
+    return struct.pack("<I", len(fields)) + fields + struct.pack("<I", len(data)) + data
+
+
+def test_zeroed_bytes_and_chunks_in_chunks_end_a_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    record, read = ros1_bag._record, list[int]()
+    monkeypatch.setattr(ros1_bag, "_record", lambda *given: (read.append(1), record(*given))[1])
+    deep = b""
+    for _ in range(2000):
+        deep = bag_record(deep, op=b"\5", compression=b"none")
+    zeros = bag_record(bz2.compress(bytes(1 << 24)), op=b"\5", compression=b"bz2", size=struct.pack("<I", 1 << 24))
+    for contents in (deep, zeros):
+        path = tmp_path / "a.bag"
+        path.write_bytes(b"#ROSBAG V2.0\n" + contents)
+        with pytest.raises(SourceError, match="holds no message"):
+            McapReader().open(path)
+    assert len(read) < 10, "of two million empty records, or two thousand levels"
 
 
 def test_a_definition_in_a_bag_executes_nothing(tmp_path: Path) -> None:

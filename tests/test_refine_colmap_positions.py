@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -138,6 +139,18 @@ def test_what_a_database_knows_is_said_and_used_only_when_asked_for(tmp_path: Pa
     (opened,) = ColmapModels().open_models(model)
     assert any("16 images: --positions database" in note for note in opened.notes)
     assert not opened.placed().placing and len(database_priors(tmp_path / "database.db")) == 16
+
+
+def test_priors_of_databases_before_colmap_4(tmp_path: Path) -> None:
+    path = database(tmp_path / "database.db", {"a.jpg": np.array([1.0, 2.0, 3.0])}, geodetic=False)
+    with sqlite3.connect(path) as opened:
+        ((position, system),) = opened.execute("SELECT position, coordinate_system FROM pose_priors")
+        opened.execute("DROP TABLE pose_priors")
+        opened.execute("CREATE TABLE pose_priors (image_id INTEGER, position BLOB, coordinate_system INTEGER)")
+        opened.execute("INSERT INTO pose_priors VALUES (1, ?, ?)", (position, system))
+    known = database_priors(path)["a.jpg"]
+    np.testing.assert_array_equal(known.position, [1, 2, 3])
+    assert np.isnan(known.covariance).all() and np.isnan(known.gravity).all()
 
 
 def test_positions_that_do_not_tell_leave_the_model_where_it_is(tmp_path: Path) -> None:

@@ -270,6 +270,21 @@ def test_a_server_that_is_killed_loses_no_decision(browser: Any, run_folder: Pat
     assert read_history(run_folder).disabled == (name,)
 
 
+def test_without_webgl_there_is_a_line_and_every_decision(review: Review, run_folder: Path) -> None:
+    bare = start_browser(1500, 1000, "--disable-3d-apis")
+    try:
+        bare.get(review.address)
+        page = Page.__new__(Page)
+        page.browser, page.review = bare, review
+        page.settled()
+        assert "has no WebGL" in page.find("#no-webgl").text and not bare.find_elements("css selector", "#scene")
+        page.choose(sorted(PLANTED)[0])
+        page.decided(lambda: page.press("d"))
+        assert read_history(run_folder).disabled == (sorted(PLANTED)[0],)
+    finally:
+        bare.quit()
+
+
 def test_another_origin_gets_no_socket(browser: Any, review: Review) -> None:
     """A page of a stranger's, opened in the same browser, that even knows the token."""
     browser.get("data:text/html,<p>a stranger's page</p>")

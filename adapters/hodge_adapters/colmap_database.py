@@ -99,7 +99,7 @@ def _image_of(row: Mapping[str, Any]) -> int | None:
     """Of a prior: the image, None where it is of another sensor; databases of before COLMAP 4 name it otherwise."""
     if row.get("corr_sensor_type", CAMERA) != CAMERA:
         return None
-    return int(row["corr_data_id"] if "corr_data_id" in row else row["image_id"])
+    return int(row.get("corr_data_id", row.get("image_id")))
 
 
 def _prior(name: str, row: Mapping[str, Any]) -> PriorRow:
@@ -109,7 +109,7 @@ def _prior(name: str, row: Mapping[str, Any]) -> PriorRow:
         whole = isinstance(data, bytes) and len(data) == 8 * count
         cells.append(np.frombuffer(data, "<f8").copy() if whole and data is not None else np.full(count, np.nan))
     position, covariance, gravity = cells
-    return PriorRow(name, position, covariance.reshape(3, 3), gravity, row["coordinate_system"] == GEODETIC)
+    return PriorRow(name, position, covariance.reshape(3, 3), gravity, row.get("coordinate_system") == GEODETIC)
 
 
 def database_matches(path: Path, row_of_name: Mapping[str, int]) -> Iterator[tuple[int, int, Ints]]:

@@ -49,6 +49,8 @@ class BagFile(MessageFile):
             try:
                 header, start, length, complete = _record(read, at, end)
                 operation = header.get("op", b"")
+                if not operation:  # zeroed bytes are empty records without end, eight bytes each
+                    raise BreaksOff
                 if operation == bytes([MESSAGE]) and complete:
                     yield from self._message(read, header, Place(start, length, chunk))
                 elif operation == bytes([CONNECTION]) and complete:

@@ -241,7 +241,9 @@ def edit(
 
 @app.command()
 def review(
-    path: Annotated[Path, typer.Argument(help="A run, or a pose graph (g2o, TORO, Open3D, pair .log).")],
+    path: Annotated[
+        Path, typer.Argument(help="A run, a COLMAP model, or a pose graph (g2o, TORO, Open3D, pair .log).")
+    ],
     port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: a free one.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
 ) -> None:

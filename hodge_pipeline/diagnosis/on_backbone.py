@@ -74,7 +74,7 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
     chain = backbone.chain
     same = chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]]
     spans = np.where(same, chain.ends[:, 1] - chain.ends[:, 0], graph.edge_count)
-    bare = np.cumsum((chain.step_edge >= 0) & ~in_loop[chain.step_edge])
+    bare = np.cumsum((chain.step_edge < 0) | ~in_loop[chain.step_edge])
     same &= bare[chain.ends[:, 1]] == bare[chain.ends[:, 0]]
     order = np.argsort(spans, kind="stable")
     order = order[same[order] & (np.cumsum(spans[order] + 1) <= MOST_ENTRIES)]

@@ -55,6 +55,7 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind) 
     find = _near_centroids if kind == "distance" else _overlapping_voxels
     some = evenly(np.arange(len(usable)), MOST_FRAMES)
     found = find([clouds[int(row)] for row in usable], world_from_cam[usable], some)
+    clouds.forget()
     pairs = np.unique(np.sort(found[found[:, 0] != found[:, 1]], axis=1), axis=0)
     return np.asarray(usable[pairs], np.int64)
 

@@ -128,4 +128,5 @@ class OverlapEdges:
             return Edges.proposed(np.zeros((0, 2), np.int64), "overlap")
         partners = some_of_each_place(world_from_cam, 2 * self.voxel_m)
         iou = pairwise_iou(clouds, world_from_cam, self.voxel_m, above=self.min_iou, partners=partners).tocoo()
+        clouds.forget()
         return Edges.proposed(np.stack([iou.row, iou.col], axis=1), "overlap", iou.data)

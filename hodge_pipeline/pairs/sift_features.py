@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.descriptors import root_sift
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Bytes, Floats32, Frame, Ints
 
 DESCRIPTOR_LENGTH = 128
@@ -28,6 +29,7 @@ class Features:
     def __init__(self, frames: Sequence[Frame], rows: Ints, max_features: int) -> None:
         self._file = tempfile.TemporaryFile(prefix="hodge-sift-")  # noqa: SIM115 - lives as long as the features
         size = max(1, len(rows)) * max_features * DESCRIPTOR_LENGTH
+        artifacts.reserve(self._file, size)
         column = np.memmap(self._file, np.uint8, "w+", shape=(size,))
         self._bytes: Bytes = column.reshape(-1, max_features, DESCRIPTOR_LENGTH)
         self._place = {int(row): place for place, row in enumerate(rows)}

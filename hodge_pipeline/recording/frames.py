@@ -89,6 +89,7 @@ def log_clouds(
             positions=np.asarray(clouds.points[picked]), colors=np.asarray(clouds.colours[picked])
         ).partition([len(part) for part in parts]),
     )
+    clouds.forget()
     _log_counts(stream, frames, sizes)
     notes = (f"recording: {len(picked)} of {total} cloud points",) if len(picked) < total else ()
     log_notes(stream, 0, notes)

@@ -104,7 +104,9 @@ def _register_block(folder: Path, registrar: Registrar, block: tuple[Edges, Floa
     edges, guesses = block
     prepared = prepared_clouds(folder, registrar)
     pairs = zip(edges.pairs, guesses, strict=True)
-    return edges.with_registrations([registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in pairs])
+    found = [registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in pairs]
+    prepared.clouds.forget()
+    return edges.with_registrations(found)
 
 
 def prepared_clouds(folder: Path, registrar: Registrar) -> PreparedClouds:
@@ -122,13 +124,13 @@ class PreparedClouds:
     """Clouds prepared when they are asked for; the last `CLOUDS_KEPT` of them are kept."""
 
     def __init__(self, folder: Path, registrar: Registrar) -> None:
-        self._clouds, self._registrar = CloudSet.open(folder), registrar
+        self.clouds, self._registrar = CloudSet.open(folder), registrar
         self._kept: OrderedDict[int, Any] = OrderedDict()
 
     def __getitem__(self, row: int) -> Any:
         row = int(row)
         if row not in self._kept:
-            self._kept[row] = self._registrar.prepare(self._clouds[row])
+            self._kept[row] = self._registrar.prepare(self.clouds[row])
             if len(self._kept) > CLOUDS_KEPT:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(row)

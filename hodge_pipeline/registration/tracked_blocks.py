@@ -111,6 +111,9 @@ class TrackedBlocks:
 def _empty_file(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """An array to be filled that is the file; an empty array cannot be mapped, and is written as it is."""
     if shape[0]:
-        return np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+        mapped: NDArray[Any] = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+        with path.open("r+b") as file:
+            artifacts.reserve(file, path.stat().st_size)
+        return mapped
     np.save(path, np.zeros(shape, dtype))
     return np.zeros(shape, dtype)

@@ -21,6 +21,8 @@ CUT_SHARE = 0.04
 """Thickness of a cut, of the size of what is cut."""
 POINT_SHARE = 0.5
 """How large a point is drawn, of the distance between points spread evenly over a square of the cloud's size."""
+LARGEST_POINT = 0.015
+"""Of the cloud's size."""
 NAMES = ("first", "second", "solved")
 
 
@@ -68,7 +70,7 @@ class Closeup:
             self._parts[name] = [
                 self._scene.add_point_cloud(
                     f"{_at(name)}/{number}", points[number::SLICES], colour, precision="float32",
-                    point_size=POINT_SHARE * size_m / max(len(points), 1) ** 0.5,
+                    point_size=size_m * min(POINT_SHARE / max(len(points), 1) ** 0.5, LARGEST_POINT),
                 )
                 for number in range(SLICES)
             ]  # fmt: skip

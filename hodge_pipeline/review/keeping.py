@@ -17,6 +17,9 @@ from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.types import Floats, Trajectory, ViewGraph
 from hodge_pipeline.uses.model_folder import MODELS
 
+SAME_PX = 1e-3
+"""Less than keypoints are found to, and more than a bundle adjustment stops short by."""
+
 
 def save(session: Session) -> tuple[Path, str]:
     """The new file or folder with the latest decisions solved, its decisions beside it, and what to know of it.
@@ -56,7 +59,8 @@ def _write_model(path: Path, model: TrackedModel, world_from_body: Floats) -> st
     folder = path / MODELS / "0"
     folder.mkdir(parents=True)
     done.write(folder)
-    worse = "; that is worse: keep the model as it was" if after.px > (1 + SAME_COST) * before.px else ""
+    is_worse = after.px > (1 + SAME_COST) * before.px + SAME_PX
+    worse = "; that is worse: keep the model as it was" if is_worse else ""
     return f"after bundle adjustment, mean reprojection error {before.px:.3g} -> {after.px:.3g} px{worse}"
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields
 from importlib.resources import as_file, files
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.errors import GraphError
@@ -30,6 +30,7 @@ FILES = {
     "page.css": ("page.css", "text/css; charset=utf-8"),
 }
 SUGGESTED = 12
+QUERY = TypeAdapter(Query)
 Asked = dict[str, Any]
 
 
@@ -178,22 +179,12 @@ def _note(asked: Asked) -> str:
 
 
 def _query(asked: Asked) -> Query:
-    known = {field.name for field in fields(Query)}
-    if strange := set(asked) - known:
-        raise GraphError(f"{', '.join(sorted(strange))}: expected {', '.join(sorted(known))}")
+    verdicts = tuple(word for word in str(asked.get("verdicts", "")).split(",") if word)
     try:
-        return Query(
-            verdicts=tuple(word for word in str(asked.get("verdicts", "")).split(",") if word),
-            min_gap=int(asked.get("min_gap") or 0),
-            min_residual_m=float(asked.get("min_residual_m") or 0),
-            frame=str(asked.get("frame", "")),
-            sort=asked.get("sort", "score"),
-            descending=asked.get("descending") == "true",
-            first=max(0, int(asked.get("first") or 0)),
-            count=max(1, int(asked.get("count") or 100)),
-        )
-    except ValueError as error:
-        raise GraphError(f"a filter is no number: {error}") from None
+        return QUERY.validate_python({key: value for key, value in asked.items() if value} | {"verdicts": verdicts})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise GraphError(f"{first['loc'][0]}: {first['msg']}") from None
 
 
 def _look(asked: Asked) -> dict[str, Any]:

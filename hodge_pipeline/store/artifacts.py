@@ -33,6 +33,15 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         raise
 
 
+def reserve(file: IO[bytes], size: int) -> None:
+    """Room for so many bytes, before the file is mapped: on a full disk, writing to a mapped page kills the process.
+
+    Raises `OSError`.
+    """
+    if size and hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), 0, size)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically; what is no text in a file name becomes its escape."""
     write_atomically(path, lambda stream: stream.write(text.encode(errors="backslashreplace")))

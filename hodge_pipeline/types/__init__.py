@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -350,6 +351,13 @@ class CloudSet(Sequence[PointCloud]):
 
     def __iter__(self) -> Iterator[PointCloud]:
         return (self[row] for row in range(len(self)))
+
+    def forget(self) -> None:
+        """Give back the memory of what was read of the files; it is read again when it is needed."""
+        for name in self.FILES:
+            column = getattr(self, name)
+            if isinstance(column, np.memmap) and hasattr(mmap, "MADV_DONTNEED"):
+                column._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
     @property
     def sizes(self) -> Ints:

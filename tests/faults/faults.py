@@ -10,7 +10,6 @@ import argparse
 import faulthandler
 import json
 import os
-import re
 import resource
 import subprocess
 import sys
@@ -128,6 +127,16 @@ def table(tally: dict[str, Tally], command: str, seed: int) -> str:
     return "\n".join(rows)
 
 
+def write_page(shown: str) -> None:
+    """Put the figures into the page; kinds that were not tried this time keep their rows."""
+    text = PAGE.read_text("utf-8")
+    before = text[text.index(BEGIN) : text.index(END)]
+    rows = {row.split(" | ")[0][2:]: row for row in (before + shown).splitlines() if row.startswith("| ")}
+    head = shown.split("\n| kind")[0]
+    lines = [head, rows.pop("kind"), "|---|---|---|---|---|---|", *(rows[kind] for kind in KINDS if kind in rows)]
+    PAGE.write_text(text.replace(before, "\n".join([BEGIN, *lines, ""])), "utf-8")
+
+
 def cases_of(kind: str, scratch: Path, *, full: bool, seed: int) -> list[str]:
     """The names of the cases of a kind."""
     return [f"{kind}/{name}" for name in import_module(kind).cases(full, scratch, seed)]
@@ -159,8 +168,7 @@ def main() -> int:
     command = "make faults-full" if options.full else "make faults"
     print(shown := table(tally, command, options.seed))
     if options.write:
-        text = PAGE.read_text("utf-8")
-        PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: f"{BEGIN}\n{shown}\n{END}", text, flags=re.DOTALL))
+        write_page(shown)
     return 1 if any(one.failures for one in tally.values()) else 0
 
 

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.breaks import Break, Testimony, Usual, agreed_breaks, unusual_breaks
-from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.chain import Chain, linked
+from hodge_pipeline.solvers.backbone.evidence import Wrong
 from hodge_pipeline.solvers.backbone.fit import linearise
 from hodge_pipeline.solvers.backbone.inference import BY_CHANCE, Inferred, by_chance, infer
-from hodge_pipeline.solvers.backbone.scales import mixture
+from hodge_pipeline.solvers.backbone.scales import learn_scales, mixture
 from hodge_pipeline.types import Bools
 
 MOST_BREAKS, MOST_TRIED = 10, 2
@@ -18,11 +20,12 @@ MOST_BREAKS, MOST_TRIED = 10, 2
 
 
 def infer_bridged(chain: Chain, always: Bools, most_unknowns: int | None) -> tuple[Chain, Inferred] | None:
-    """The chain with its broken steps bridged, and its loops judged; None as in `infer`.
+    """The chain with its paths joined and its broken steps bridged, and its loops judged; None as in `infer`.
 
     A step is tried where loops of several places agree that it is broken, or where it is unlike all others. It is
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
     """
+    chain = joined(chain)
     found = infer(chain, always, most_unknowns)
     for _ in range(MOST_BREAKS):
         better = None if found is None else _better(chain, found, always, most_unknowns)
@@ -60,3 +63,32 @@ def bridged(chain: Chain, broken: Break) -> Chain:
     step, covariance, known = chain.step.copy(), chain.step_covariance.copy(), chain.bridged.copy()
     step[broken.at], covariance[broken.at], known[broken.at] = broken.motion, broken.covariance, True
     return replace(chain, step=step, step_covariance=covariance, bridged=known)
+
+
+def joined(chain: Chain) -> Chain:
+    """The chain with bridges between paths, as of several robots, where loops of several places agree how they lie."""
+    while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
+        poses = chain.poses()
+        wrong = Wrong.of(chain, poses)
+        scaled = learn_scales(chain, poses, wrong)[0].applied(chain)
+        linear, none = linearise(scaled, poses), np.zeros(len(chain.ends))
+        told = Testimony.of(scaled, linear, none, wrong.log_density(scaled, poses))
+        pairs = chain.path[chain.ends]
+        best, found = BY_CHANCE + float(np.log(len(pairs))), None
+        for low, high in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).tolist():
+            rows = np.flatnonzero((pairs == [low, high]).all(axis=1))
+            for seed in told.seeds(rows) if len(rows) > 1 else ():
+                if (score := float(told.gains(seed, rows).sum())) > best:
+                    best, found = score, (low, high, seed)
+        if found is None:
+            break
+        low, high, seed = found
+        last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
+        end, covariance = told.beyond(np.array([seed]), last, first)
+        motion = se3.inverse(poses[last[0]]) @ end[0]
+        chain = linked(chain, low, high, motion, LOOSE**2 * covariance[0])
+    return chain
+
+
+LOOSE = 2.0
+"""Of the standard deviations of the one loop by which two paths are joined, those of their bridge."""

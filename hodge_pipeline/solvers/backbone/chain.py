@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,12 +43,17 @@ class Chain:
         """How many positions there are."""
         return len(self.order)
 
+    @property
+    def inner(self) -> Bools:
+        """Positions (n,) that a step leads to."""
+        return np.asarray((self.step_edge >= 0) | self.bridged)
+
     def poses(self) -> Floats:
         """World from each position (n, 4, 4), each path composed from the identity."""
         out = np.empty((self.size, 4, 4))
-        before = np.eye(4)
+        before, inner = np.eye(4), self.inner
         for row in range(self.size):
-            before = self.step[row] if self.step_edge[row] < 0 else before @ self.step[row]
+            before = before @ self.step[row] if inner[row] else self.step[row]
             out[row] = before
         return out
 
@@ -129,6 +134,31 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
         loop_covariance,
         np.zeros(len(order), bool),
         axes,
+    )
+
+
+def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats) -> Chain:
+    """The chain with the path `high` behind the path `low < high`, and a bridge of this motion (4, 4) between them."""
+    second = chain.path == high
+    after = int(np.flatnonzero(chain.path == low)[-1]) + 1
+    moved = np.concatenate([np.arange(after), np.flatnonzero(second), np.flatnonzero(~second[after:]) + after])
+    place = np.empty(chain.size, np.int64)
+    place[moved] = np.arange(chain.size)
+    step, step_covariance, bridged = chain.step[moved], chain.step_covariance[moved], chain.bridged[moved]
+    step[after], step_covariance[after], bridged[after] = motion, covariance, True
+    ends = place[chain.ends]
+    loop, loop_covariance = _directed(chain.motion, chain.covariance, ends[:, 0] > ends[:, 1], chain.axes)
+    return replace(
+        chain,
+        order=chain.order[moved],
+        path=np.where(second, low, chain.path)[moved],
+        step=step,
+        step_covariance=step_covariance,
+        step_edge=chain.step_edge[moved],
+        ends=np.sort(ends, axis=1),
+        motion=loop,
+        covariance=loop_covariance,
+        bridged=bridged,
     )
 
 

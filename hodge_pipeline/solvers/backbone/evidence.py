@@ -51,6 +51,7 @@ class Wrong:
         a, b = chain.ends.T
         residual = parallel(chain, chain.motion, poses[a], poses[b])
         squares = np.einsum("mi,ij,mj->m", residual, self.precision, residual)
+        squares[chain.path[a] != chain.path[b]] = residual.shape[1]  # how two paths lie is not known
         return np.asarray(-0.5 * (1 + residual.shape[1]) * np.log1p(squares) - self.log_scale)
 
 

@@ -51,7 +51,7 @@ class Linear:
 def linearise(chain: Chain, poses: Floats) -> Linear:
     """The chain's sums at these poses (n, 4, 4)."""
     before = np.concatenate([poses[:1], poses[:-1]])
-    inner = (chain.step_edge >= 0)[:, None]
+    inner = chain.inner[:, None]
     frame = chain.adjoint(poses)
     moved_origin = np.broadcast_to(np.eye(4), poses.shape).copy()
     moved_origin[:, :3, 3] = -poses[:, :3, 3]

@@ -114,7 +114,7 @@ def settled_globally(chain: Chain, reduced: Reduced, poses: Floats) -> Linear:
     cost = reduced.cost(linear) if dof else 0.0
     if cost <= TOO_HIGH * dof:
         return linear
-    rows = np.arange(chain.size)[chain.step_edge >= 0]
+    rows = np.flatnonzero(chain.inner)
     edges = np.concatenate([np.stack([rows - 1, rows], axis=1), chain.ends[reduced.active]])
     axes = np.ix_(np.arange(len(edges)), chain.axes, chain.axes)
     information = np.zeros((len(edges), 6, 6))

@@ -17,7 +17,8 @@ from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
 FEWEST_STEPS = 100
-"""Of a backbone that is looked for: shorter sequences are fragments of rooms, whose edges test each other."""
+"""Of a backbone that is looked for: and of its paths on average: shorter sequences are fragments of rooms, whose
+edges test each other."""
 COVERED = 0.9
 """Of the vertices that consecutive edges must join, so that a sequence is a backbone."""
 TESTED = 0.3
@@ -102,7 +103,7 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
     chain = make_chain(graph, steps)
     if not len(chain.loop_edge):
         return None
-    if trust == AUTO and (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
+    if trust == AUTO and steps.sum() < FEWEST_STEPS * len(np.unique(chain.path[chain.step_edge >= 0])):
         return None
     if trust == AUTO and tested_steps(chain, chain.poses()).sum() > TESTED * steps.sum():
         return None
@@ -133,7 +134,7 @@ def _of_source(graph: ViewGraph, source: str) -> Bools:
 def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools) -> Backbone:
     used, right, chi2 = steps.copy(), np.full(graph.edge_count, np.nan), np.full(graph.edge_count, np.nan)
     used[chain.loop_edge] = found.used
-    used[chain.step_edge[chain.bridged]] = False
+    used[chain.step_edge[chain.bridged & (chain.step_edge >= 0)]] = False
     probability = 1 / (1 + np.exp(-np.clip(found.judged.log_odds, -500, 500)))
     right[chain.loop_edge] = np.where(found.used, probability, np.minimum(probability, UNUSED))
     chi2[chain.loop_edge] = found.judged.chi2
