@@ -4,7 +4,8 @@
     python -m benchmarks.reliability --right 200     # simulated graphs without a wrong edge: in how many is one blamed?
 
 The expected calibration error (ECE) is the mean distance of ten classes' probability from the share that is right, each
-class by its edges; untestable edges have no probability. No constant of the diagnosis was chosen on these simulations.
+class by its edges; untestable edges have no probability. The form of the probability was compared with others on such
+simulations, of other seeds, and on the real graphs.
 """
 
 from __future__ import annotations

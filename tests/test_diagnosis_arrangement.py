@@ -9,7 +9,7 @@ from diagnosis_graphs import every_pair_tried
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis import consensus
 from hodge_pipeline.diagnosis.arrangement_evidence import arrangement_log_evidence
-from hodge_pipeline.diagnosis.arrangements import FAIR_SHARES, best_arrangement
+from hodge_pipeline.diagnosis.arrangements import best_arrangement
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.rearrange import rearranged
@@ -57,7 +57,7 @@ def test_a_part_that_lies_elsewhere_is_laid_back(solved: tuple[Evidence, ViewGra
     moved = np.where(PART[:, None, None], ASIDE @ found.poses, found.poses)
     i, j = evidence.edges.T
     wrong = replace(found, poses=moved, component=PART * int(not in_one_piece), used=found.used & (PART[i] == PART[j]))
-    back = rearranged(evidence, graph, wrong, FAIR_SHARES[0])[-1]
+    back = rearranged(evidence, graph, wrong)[-1]
     assert np.ptp(back.component) == 0
     relative = se3.inverse(back.poses[:1]) @ back.poses, se3.inverse(found.poses[:1]) @ found.poses
     assert np.linalg.norm((relative[0] - relative[1])[:, :3, 3], axis=1).max() < 0.3

@@ -10,17 +10,12 @@ from diagnosis_graphs import SIGMA, measured, near_pairs, poses_on_a_ring
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis import clusters
-from hodge_pipeline.diagnosis.clusters import Springs, clustered
+from hodge_pipeline.diagnosis.clusters import Quotient, clustered
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.result import CONSISTENT
-from hodge_pipeline.types import Floats, Ints, ViewGraph
-
-
-def _evidence(edges: Ints, motion: Floats, count: int) -> Evidence:
-    ones, none = np.ones(len(edges)), np.zeros(len(edges), bool)
-    return Evidence(edges, count, motion, ones / 2, Noise(SIGMA[0] * ones, SIGMA[3] * ones), ones, none, False, 1.0)
+from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.types import ViewGraph
 
 
 @given(seed=st.integers(0, 1000))
@@ -28,11 +23,11 @@ def _evidence(edges: Ints, motion: Floats, count: int) -> Evidence:
 def test_clusters_that_were_moved_are_moved_back(seed: int) -> None:
     rng, count = np.random.default_rng(seed), 40
     true, edges = poses_on_a_ring(count, seed), near_pairs(count, 3)
-    evidence = _evidence(edges, se3.inverse(true[edges[:, 0]]) @ true[edges[:, 1]], count)
-    cluster = np.arange(count) // 8
+    graph = measured(true, edges, noise=0.0)
+    ones, cluster = np.ones(len(edges)), np.arange(count) // 8
     astray = se3.exp(0.2 * rng.normal(size=(5, 6)))[cluster] @ true
-    springs = Springs.of(evidence, np.ones(len(edges), bool), cluster)
-    found = springs.settled(evidence, astray, np.full(len(edges), 1e4), 1e3)
+    parts = Quotient.of(graph, Noise(SIGMA[0] * ones, SIGMA[3] * ones), ones > 0, cluster, astray)
+    found = parts.whole(solve(parts.graph, start=parts.poses).world_from_cam)
     np.testing.assert_allclose(se3.inverse(found[:1]) @ found, se3.inverse(true[:1]) @ true, atol=1e-6)
 
 

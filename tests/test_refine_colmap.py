@@ -138,6 +138,20 @@ def test_a_candidate_that_is_worse_is_kept_out_unless_forced(tmp_path: Path, mon
     assert (out / "sparse/0/images.bin").read_bytes() != (model / "images.bin").read_bytes()
 
 
+def test_the_terminal_has_ten_lines_of_80_columns_and_verbose_has_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = noisy(tmp_path)
+    command = ["refine", "colmap", str(model), "--out", "out", "--set", FREE[0], "--overwrite"]
+    monkeypatch.chdir(tmp_path)
+    brief = CliRunner().invoke(app, command).stdout.splitlines()
+    whole = CliRunner().invoke(app, [*command, "--verbose"]).stdout
+    assert brief[0].startswith("verdict  ") and brief[-1] == "report   out/report.html"
+    assert len(brief) <= 10 and max(map(len, brief)) <= 80
+    assert any("mean reprojection error" in line for line in brief)
+    assert "candidate" in whole and "bundle adjustment" in whole and len(whole.splitlines()) > len(brief)
+
+
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     model = noisy(tmp_path)
     for option in ("database", "depth"):

@@ -112,6 +112,7 @@ def colmap(
     overrides: Overrides = None,
     dask: Dask = None,
     overwrite: Annotated[bool, typer.Option(help="Replace another refined model in --out.")] = False,
+    verbose: Verbose = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -132,5 +133,6 @@ def colmap(
         overwrite=overwrite,
         quiet=quiet,
         as_json=json,
+        verbose=verbose,
         dask=dask,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,9 +11,13 @@ from hodge_pipeline.cli.console import ProgressBars, print_table
 from hodge_pipeline.cli.run import resumable
 from hodge_pipeline.errors import CheckError
 from hodge_pipeline.refine.model_options import RECIPE, load_model_refinement
+from hodge_pipeline.report.brief import COLUMNS, LABEL, labelled
 
 if TYPE_CHECKING:
     from hodge_pipeline.refine.model import RefinedModel
+
+MEASURES, NOTES = 4, 1
+"""Of a model, where nobody asks for all."""
 
 
 def refine(
@@ -25,6 +30,7 @@ def refine(
     overwrite: bool,
     quiet: bool,
     as_json: bool,
+    verbose: bool,
     dask: str | None,
 ) -> None:
     """Refine a model into a run folder. Raises `CheckError` (exit code 3) where the guard kept the input as worse."""
@@ -38,10 +44,12 @@ def refine(
         print(read_input_text(out / "report.json"), end="")
     elif not quiet:
         for result in done.results:
-            _print(result)
+            if verbose:
+                _print_tables(result)
+            print("\n".join(_lines(result, alone=len(done.results) == 1, verbose=verbose)))
         if (out / "sparse").is_dir():
-            print(f"{'model':<8} {out / 'sparse'}")
-        print(f"{'report':<8} {out / 'report.html'}")
+            print(f"{'model':<9}{out / 'sparse'}")
+        print(f"{'report':<9}{out / 'report.html'}")
     failed = [result.decision.reason for result in done.results if result.decision.exit_code]
     if failed:
         written = any(result.decision.outcome == "worse" for result in done.results)
@@ -51,7 +59,7 @@ def refine(
         raise CheckError(f"{'; '.join(failed)}: {kept}")
 
 
-def _print(result: RefinedModel) -> None:
+def _print_tables(result: RefinedModel) -> None:
     rows = [(m.name, f"{m.before:.4g}", f"{m.after:.4g}", m.unit) for m in result.decision.measures]
     if rows:
         print_table(f"{result.start.quality.images} images", ("measure", "before", "after", "unit"), rows)
@@ -60,8 +68,19 @@ def _print(result: RefinedModel) -> None:
         for row, (name, cost) in enumerate(result.candidates)
     ]
     print_table("candidates", ("candidate", "mean px", "median px", "images off", ""), costs)
-    print(f"{'verdict':<8} {result.decision.outcome}: {result.decision.reason}")
-    if result.decision.change is not None:
-        print(f"{'change':<8} {result.decision.change}")
-    for note in result.notes:
-        print(f"{'note':<8} {note}")
+
+
+def _lines(result: RefinedModel, *, alone: bool, verbose: bool) -> list[str]:
+    """The result of a model in eight lines of 80 columns, two where there are several; `verbose`: every note, whole."""
+    decision = result.decision
+    lines = labelled("verdict", f"{decision.outcome}: {decision.reason}")
+    if verbose or alone:
+        lines += [f"  - {measure}" for measure in decision.measures[: len(decision.measures) if verbose else MEASURES]]
+    if verbose and decision.change is not None:
+        lines += labelled("change", str(decision.change))
+    kept = result.candidates[result.kept_row][0]
+    lines.append(f"{'kept':<9}{kept}, of {len(result.candidates)} candidates{'' if verbose else ': --verbose has all'}")
+    if verbose:
+        return lines + [line for note in result.notes for line in labelled("note", str(note))]
+    shown = [textwrap.shorten(str(note), COLUMNS - LABEL, placeholder=" …") for note in result.notes]
+    return lines + [f"{'look':<9}{note}" for note in shown[: NOTES if alone else 0]]

@@ -16,12 +16,10 @@ from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.scene_model import SceneModel
 from hodge_pipeline.types import Bools, Floats, Ints
 
-FAIR_SHARE = 0.75
-
 
 def arrangement_log_evidence(evidence: Evidence, poses: Floats, piece: Ints, models: Sequence[SceneModel]) -> float:
     """Log-evidence for poses (V, 4, 4) in pieces (V,), the mean over several scene models."""
-    criteria = [placement_criteria(evidence, model, poses, piece, FAIR_SHARE) for model in models]
+    criteria = [placement_criteria(evidence, model, poses, piece) for model in models]
     return sum(_log_evidence(each, poses, piece) for each in criteria) / len(models)
 
 

@@ -15,7 +15,10 @@ from hodge_pipeline.diagnosis.robust_poses import GATE, LARGE, TWICE, Fit, fit, 
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Floats, ViewGraph
 
-PRIOR_SHARE = 0.3
+PRIOR_SHARE = 0.25
+"""Of the prior's log odds. The probability, its root of 1 - chi2 / gate among it, was chosen for calibration: of right
+edges of 90 simulated rings, corridors and streets and 16 rooms, and of nine graphs of real fragments.
+"""
 EXTREME = 0.01
 UNVOUCHED = 0.9
 STEPS = 3
@@ -56,7 +59,7 @@ def find_consensus(evidence: Evidence, graph: ViewGraph, options: DiagnosisOptio
                 # an error that is spread over a loop in annealing can put all of its edges out of use
                 best = max(best, fit(evidence, graph, grown, TWICE), key=_used)
             best = mend(evidence, graph, best)
-    agreeing = np.maximum(0.0, 1 - best.chi2 / GATE)
+    agreeing = np.sqrt(np.maximum(0.0, 1 - best.chi2 / GATE))
     return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
 
 

@@ -21,14 +21,10 @@ GATE = 60.0
 """χ² over six dimensions of an edge that agrees, while the poses are not settled."""
 PER_FOLD = 2.0
 """Nats for each e-fold of agreeing edges."""
-SHARE_SPREAD = 0.35
-"""Of the share of expected edges that are there."""
+FAIR_SHARE, SHARE_SPREAD = 0.75, 0.35
+"""Of the edges expected under a placement, the share from which on it has evidence in its favour, and its spread."""
 PER_EXPECTED_FOLD = 1.0
 """Nats for each e-fold of expected edges, at one spread from the usual share."""
-AGREEING = 2.0
-"""Nats of an agreeing edge by itself, where one is expected."""
-ALIKE = 0.5
-"""Of the edges that are expected where a place is what it looks like, those that are there where it is another."""
 JUMP = 1e-4
 """Share of consecutive views that do not see the same place."""
 SURE = 5.0
@@ -43,18 +39,16 @@ class PlacementCriteria:
 
     - `model`: the probability of edges by poses, and the distribution of up.
     - `usual`: the mean probability that views of one piece are joined, 0 where views have no order.
-    - `fair_share`: share of the edges expected under a placement from which on it has evidence in its favour.
     """
 
     evidence: Evidence
     model: SceneModel
     usual: float
-    fair_share: float
 
     def log_evidence(self, sums: Floats) -> Floats:
         """Log-evidence for cuts with these sums (3, ...) of their layers."""
         agreeing, expected, order = sums
-        share = np.clip((agreeing / np.maximum(expected, 1e-9) - self.fair_share) / SHARE_SPREAD, -1, 1)
+        share = np.clip((agreeing / np.maximum(expected, 1e-9) - FAIR_SHARE) / SHARE_SPREAD, -1, 1)
         return np.asarray(PER_FOLD * np.log1p(agreeing) + PER_EXPECTED_FOLD * share * np.log1p(expected) + order)
 
     def layers(self, still: Floats, moved: Floats) -> Floats:
@@ -91,26 +85,17 @@ class PlacementCriteria:
         return np.asarray(np.sqrt(np.maximum(0.0, 1 - squares / GATE)))
 
 
-def placement_criteria(
-    evidence: Evidence, model: SceneModel, poses: Floats, piece: Ints, fair_share: float = 1.0
-) -> PlacementCriteria:
+def placement_criteria(evidence: Evidence, model: SceneModel, poses: Floats, piece: Ints) -> PlacementCriteria:
     """The criteria for moves of poses (V, 4, 4) in pieces (V,)."""
     same = piece[:, None] == piece[None]
     usual = float(model.joining.between(poses, poses)[same].mean()) if np.ptp(evidence.prior) > 0 else 0.0
-    return PlacementCriteria(evidence, model, usual, fair_share)
+    return PlacementCriteria(evidence, model, usual)
 
 
 def consecutive_log_evidence(evidence: Evidence) -> Floats:
     """Log-evidence of each edge (E,) if it joins consecutive views: by its prior odds, and by the cycles over it."""
     odds = evidence.prior / (1 - evidence.prior) * (evidence.support + UNSUPPORTED) / SUPPORTED
     return np.minimum(np.log1p(odds), SURE)
-
-
-def pair_log_evidence(layers: Floats) -> Floats:
-    """Log-evidence of each single pair (V, V): an agreeing edge, a missing one, the order of the views."""
-    agreeing, expected, order = layers
-    missing = np.log((1 - expected) / (1 - ALIKE * expected))
-    return np.asarray(agreeing * np.log1p(np.expm1(AGREEING) * expected) + (1 - agreeing) * missing + order)
 
 
 def sums_of(layers: Floats, inside: Bools) -> Floats:

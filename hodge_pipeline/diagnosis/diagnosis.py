@@ -37,6 +37,7 @@ from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
+LIKELIER_RIGHT = 0.5
 
 
 def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosis:
@@ -85,7 +86,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     cycles = _with_witnesses(graph, cycles, consensus.fit.used, evidence)
     undecided = unattributable(graph.edges, graph.vertex_count, cycles)
     blame = share_blame(cycles, consensus.fit, evidence)
-    unvouched = blame.unvouched & (consensus.probability >= options.consistent_from)
+    unvouched = blame.unvouched & (consensus.probability >= LIKELIER_RIGHT)
     untestable = evidence.in_no_listed_cycle | (undecided >= 0) | unvouched
     probability = np.where(untestable, np.nan, np.maximum(consensus.probability, blame.probability))
     undecided = np.where(undecided >= 0, undecided, np.where(unvouched | (blame.probability > 0), blame.cycle, -1))

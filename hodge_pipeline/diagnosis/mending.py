@@ -8,8 +8,6 @@ Fulkerson 1956): where that is lighter, the side of the cut moves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -17,8 +15,8 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.pieces import Alignment
+from hodge_pipeline.diagnosis.proposals import Proposals
 from hodge_pipeline.diagnosis.robust_poses import GATE, GENTLE, LARGE, TWICE, Fit, chi2_at, fit, rough_fit
-from hodge_pipeline.diagnosis.votes import agreement_of, mean_motion
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 ROUNDS, MOVES = 4, 40
@@ -29,25 +27,10 @@ MOST_PROPOSALS = 1200
 """Edges left out that are compared with each other; of more, evenly spread ones."""
 TRIED = 40
 """Groups of them, the weightiest, for each move."""
-DRIFTED_RAD, ALIKE = 0.1, 12.0
-"""Motions are compared where they turn alike but for this, and for so many standard deviations."""
 LEAST_GAIN, AGREES = 0.5, 1.0
 """Nats."""
 UNIT = 1000
 """Of a nat, since flows are whole numbers."""
-
-
-@dataclass(frozen=True)
-class _Proposals:
-    """Edges left out, each in both directions: view `mover (P,)` should move by `motion (P, 4, 4)` of the world,
-    `stayer (P,)` not; `alike (P, P)` from 1 down to 0 how well the second agrees with the motion of the first.
-    """
-
-    edge: Ints
-    mover: Ints
-    stayer: Ints
-    motion: Floats
-    alike: csr_matrix
 
 
 def mend(evidence: Evidence, graph: ViewGraph, start: Fit) -> Fit:
@@ -73,7 +56,10 @@ def _after_moves(evidence: Evidence, graph: ViewGraph, found: Fit, log_evidence:
     poses, moves = found.poses, 0
     for _ in range(MOVES if len(log_evidence) <= LARGE else SWEEPS_OF_LARGE):
         agreeing = np.maximum(0.0, 1 - chi2_at(evidence, graph, poses, found.component, found.resistance) / GATE)
-        proposals = _proposals(evidence, poses, found.component, agreeing, log_evidence)
+        i, j = found.component[evidence.edges].T
+        rows = np.flatnonzero((agreeing == 0) & (i == j) & (evidence.edges[:, 0] != evidence.edges[:, 1]))
+        most = MOST_PROPOSALS if len(agreeing) <= LARGE else PROPOSALS_OF_LARGE
+        proposals = Proposals.of(evidence, poses, rows[:: max(-(-len(rows) // most), 1)])
         found_now = _good_moves(evidence, poses, found.component, agreeing, log_evidence, proposals)
         if not found_now:
             break
@@ -85,35 +71,8 @@ def _after_moves(evidence: Evidence, graph: ViewGraph, found: Fit, log_evidence:
     return poses if moves else None
 
 
-def _proposals(
-    evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, log_evidence: Floats
-) -> _Proposals:
-    i, j = evidence.edges.T
-    rows = np.flatnonzero((agreeing == 0) & (component[i] == component[j]) & (i != j))
-    most = MOST_PROPOSALS if len(i) <= LARGE else PROPOSALS_OF_LARGE
-    rows = rows[:: max(-(-len(rows) // most), 1)]
-    motion = poses[i[rows]] @ evidence.i_from_j[rows] @ se3.inverse(poses[j[rows]])
-    motion = np.concatenate([motion, se3.inverse(motion)])
-    edge, mover, stayer = np.tile(rows, 2), np.concatenate([j[rows], i[rows]]), np.concatenate([i[rows], j[rows]])
-    point = poses[mover, :3, 3]
-    first, second = _near_in_angle(evidence, edge, motion)
-    alike = agreement_of(evidence, edge, motion, point, first, second)
-    matrix = csr_matrix((alike, (first, second)), shape=(len(edge), len(edge)))
-    matrix.eliminate_zeros()
-    return _Proposals(edge, mover, stayer, motion, matrix)
-
-
-def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints, Ints]:
-    """Pairs of motions whose rotations may agree."""
-    quat = se3.to_quat_xyzw(motion).astype(np.float32)
-    likeness = np.abs(quat @ quat.T)
-    widest = min(DRIFTED_RAD + ALIKE * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
-    first, second = np.nonzero(likeness >= np.cos(widest / 2))
-    return first, second
-
-
 def _good_moves(
-    evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, log_evidence: Floats, proposals: _Proposals
+    evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, log_evidence: Floats, proposals: Proposals
 ) -> list[tuple[Bools, Floats]]:
     """The groups that outweigh their cuts, the weightiest first: the views (V,) that move, and how. No group has to do
     with views that move for another.
@@ -125,20 +84,14 @@ def _good_moves(
         left &= ~(moved[proposals.mover] | moved[proposals.stayer])
         if not left.any():
             break
-        row = int(np.argmax(np.where(left, weight, -1.0)))
-        entry = slice(proposals.alike.indptr[row], proposals.alike.indptr[row + 1])
-        group, alike = proposals.alike.indices[entry], proposals.alike.data[entry]
-        left[group[alike > 0.5]] = False
-        left[row] = False
+        row = proposals.next(left, weight)
+        group, alike = proposals.group(row)
         share = alike * log_evidence[proposals.edge[group]]
         inside = _cut(evidence, agreeing * log_evidence, proposals, group, share)
         if inside is None:
             continue
         whole = component == component[proposals.mover[row]]
-        inside, motion = (
-            inside & whole,
-            mean_motion(proposals.motion[group], poses[proposals.mover[group], :3, 3], share),
-        )
+        inside, motion = inside & whole, proposals.mean_motion(group, share, poses)
         if 2 * inside.sum() > whole.sum():  # the smaller part moves, so that others can at the same time
             inside, motion = whole & ~inside, se3.inverse(motion)
         if not (inside & moved).any():
@@ -147,7 +100,7 @@ def _good_moves(
     return moves
 
 
-def _cut(evidence: Evidence, held: Floats, proposals: _Proposals, group: Ints, share: Floats) -> Bools | None:
+def _cut(evidence: Evidence, held: Floats, proposals: Proposals, group: Ints, share: Floats) -> Bools | None:
     """The views (V,) on the movers' side of the lightest cut; None where it is not lighter than the group.
 
     An edge of the group whose ends are not parted counts as lost, as does each used edge that is.

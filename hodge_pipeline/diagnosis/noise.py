@@ -8,7 +8,7 @@ import numpy as np
 
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.judging import has_unit_information, mean_variances
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 MAXWELL_MEDIAN = 1.538
 DEFAULT_ANGLE_RAD = 0.03
@@ -47,6 +47,10 @@ class Noise:
     rotation_rad: Floats
     translation_m: Floats
     doubts: tuple[str, ...] = ()
+
+    def select(self, rows: Ints | Bools) -> Noise:
+        """That of these edges."""
+        return Noise(self.rotation_rad[rows], self.translation_m[rows], self.doubts)
 
 
 def edge_noise(

@@ -32,7 +32,13 @@ class DiagnosisOptions:
     max_cycles_per_edge: int = Field(
         default=64, gt=0, description="triangles kept to an edge, so that memory is bounded"
     )
-    consistent_from: float = Field(default=0.5, gt=0, lt=1, description="probability from which an edge is consistent")
+    consistent_from: float = Field(
+        default=0.7,
+        gt=0,
+        lt=1,
+        description="probability from which an edge is consistent: with 0.7 a wrong edge that is kept costs as much as "
+        "two or three right ones that are lost",
+    )
     wrong_below: float = Field(
         default=0.2, gt=0, lt=1, description="probability below which an edge is wrong, not suspect"
     )

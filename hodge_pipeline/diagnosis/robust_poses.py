@@ -9,8 +9,9 @@ import numpy as np
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.judging import left_over, squares_at_both_ends
-from hodge_pipeline.diagnosis.clusters import DIMENSION, FREEDOM, Springs, clustered
+from hodge_pipeline.diagnosis.clusters import Quotient, clustered
 from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.pieces import Alignment
 from hodge_pipeline.diagnosis.resistance import effective_resistance
 from hodge_pipeline.solvers.minimise import descend_isotropic
@@ -27,6 +28,10 @@ non-convexity, Yang et al. 2020), and what does not follow falls out.
 """
 GENTLE = ANNEALED[-1:]
 """For poses that are near already."""
+FREEDOM, DIMENSION = 4.0, 6
+"""Degrees of freedom of Student's t, the tails of real registration errors, and of a pose."""
+FULLY, ROUGHLY, COARSELY = (4, Limits(20, 1e-6)), (4, Limits(6, 1e-4)), (4, Limits(10, 1e-4))
+"""Rounds of weights and what ends the steps in each: of a solve, of a large graph's, and of clusters."""
 LARGE = 20_000
 """From so many edges on, a solve is stopped early: verdicts need millimetres less than seconds."""
 
@@ -59,7 +64,10 @@ def fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates: tuple
         used = found.chi2 < gate
         if following < gate and np.array_equal(used, found.chi2 < following):
             continue
-        poses, student_weight = _solve(evidence, graph, found.poses, used)
+        how = ROUGHLY if graph.edge_count > LARGE else FULLY
+        squares = np.full(int(used.sum()), float(DIMENSION))
+        poses = _solve(evidence.noise.select(used), graph.select(np.flatnonzero(used)), found.poses, squares, how)
+        student_weight = np.where(used, FREEDOM / (FREEDOM + _squares(evidence.noise, graph, poses)), 0.0)
         found = _refitted(evidence, graph, poses, used, student_weight)
     return found
 
@@ -74,8 +82,10 @@ def rough_fit(evidence: Evidence, graph: ViewGraph, alignment: Alignment, gates:
         used, widened = found.chi2 < gate, gate / GATE
         if np.array_equal(used, found.chi2 < following):
             continue
-        poses = Springs.of(evidence, used, cluster).settled(evidence, found.poses, found.chi2, widened)
-        student_weight = np.where(used, FREEDOM / (FREEDOM + _squares(evidence, graph, poses) / widened), 0.0)
+        parts = Quotient.of(graph, evidence.noise, used, cluster, found.poses)
+        squares = found.chi2[parts.rows] / widened
+        poses = parts.whole(_solve(parts.noise, parts.graph, parts.poses, squares, COARSELY, widened))
+        student_weight = np.where(used, FREEDOM / (FREEDOM + _squares(evidence.noise, graph, poses) / widened), 0.0)
         found = _refitted(evidence, graph, poses, used, student_weight)
     return found
 
@@ -95,27 +105,29 @@ def _refitted(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools, 
     return Fit(poses, component, chi2, chi2 < GATE, resistance)
 
 
-def _solve(evidence: Evidence, graph: ViewGraph, poses: Floats, used: Bools) -> tuple[Floats, Floats]:
-    """Poses, and the Student weight (E,) of each edge: 1 for one that fits exactly, 0 for one that is not used."""
-    chosen = graph.select(np.flatnonzero(used))
-    rough = graph.edge_count > LARGE
-    limits = Limits(3 if rough else 20, 1e-3 if rough else 1e-6)
-    setup = prepare(chosen, poses, dimension=3)
+def _solve(
+    noise: Noise, graph: ViewGraph, poses: Floats, squares: Floats, how: tuple[int, Limits], widened: float = 1.0
+) -> Floats:
+    """The poses (V, 4, 4) that all edges lead to, weighed by Student's t, at first for χ² of `squares (E,)`.
+
+    `widened`: how much larger than noise squared errors may be.
+    """
+    rounds, limits = how
+    setup = prepare(graph, poses, dimension=3)
     rotations, translations = setup.initial("given")
-    squares = np.full(graph.edge_count, float(DIMENSION))
-    for _ in range(2 if rough else 4):
-        share = ((FREEDOM + DIMENSION) / (FREEDOM + squares[used]))[setup.weights.used]
+    for _ in range(rounds):
+        share = ((FREEDOM + DIMENSION) / (FREEDOM + squares))[setup.weights.used]
         problem = replace(setup.problem, kappa=share * setup.problem.kappa, tau=share * setup.problem.tau)
         point = descend_isotropic(problem, (rotations, translations), limits, setup.rounding).point
         rotations, translations, poses = point.rotations, point.translations, setup.poses(point)
-        squares = _squares(evidence, graph, poses)
-    return poses, np.where(used, FREEDOM / (FREEDOM + squares), 0.0)
+        squares = _squares(noise, graph, poses) / widened
+    return poses
 
 
-def _squares(evidence: Evidence, graph: ViewGraph, poses: Floats) -> Floats:
+def _squares(noise: Noise, graph: ViewGraph, poses: Floats) -> Floats:
     """χ² (E,) by the noise of the edges, without that of the poses."""
     turned, shifted = squares_at_both_ends(graph.i_from_j, left_over(graph, poses))
-    return np.asarray(turned / evidence.noise.rotation_rad**2 + shifted / evidence.noise.translation_m**2)
+    return np.asarray(turned / noise.rotation_rad**2 + shifted / noise.translation_m**2)
 
 
 def chi2_at(evidence: Evidence, graph: ViewGraph, poses: Floats, component: Ints, resistance: Floats) -> Floats:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lu_factor, lu_solve
 from scipy.sparse import csc_matrix
 
 from hodge_pipeline.complex.components import connected_components, first_of_component
@@ -69,11 +70,12 @@ class Network:
         np.add.at(rows, self.slot[inside], -off[inside])
         core: list[Floats] = [np.zeros((0, 0))]
 
-        def invert(matrix: csc_matrix) -> object:
-            core[0] = np.linalg.inv(matrix.toarray())
-            return lambda rhs: core[0] @ rhs
+        def solver(matrix: csc_matrix) -> object:
+            core[0] = matrix.toarray()
+            factored = lu_factor(core[0], check_finite=False)
+            return lambda rhs: lu_solve(factored, rhs, check_finite=False)
 
-        factor = eliminate_blocks(self.plan, diagonal[:size], rows, invert)  # type: ignore[arg-type]
+        factor = eliminate_blocks(self.plan, diagonal[:size], rows, solver)  # type: ignore[arg-type]
         return Factored(self, carry, factor, core[0])
 
 
@@ -83,7 +85,7 @@ def _as_they_are(pattern: csc_matrix) -> Ordering:
 
 @dataclass(frozen=True)
 class Factored:
-    """A factorised network: `core` is the inverse of what the rounds leave."""
+    """A factorised network: `core` is what the rounds leave."""
 
     network: Network
     carry: Floats
@@ -118,7 +120,7 @@ class Factored:
         diagonal, rows = np.zeros((plan.size + 1, p, p)), np.zeros((len(plan.slot_rows) + 1, p, p))
         begin = plan.core
         if begin < plan.size:
-            dense = self.core.reshape(plan.size - begin, p, plan.size - begin, p)
+            dense = np.linalg.inv(self.core).reshape(plan.size - begin, p, plan.size - begin, p)
             diagonal[begin : plan.size] = np.einsum("iajb->ijab", dense)[(np.arange(plan.size - begin),) * 2]
             first = plan.groups[-1].slots.stop if plan.groups else 0
             a, b = plan.slot_rows[first:] - begin, plan.slot_columns[first:] - begin
