@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.acceptance import contradicts_odometry
+from hodge_pipeline.registration.acceptance import accepted, contradicts_odometry, with_odometry
+from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Edges, Floats, Registration
 
@@ -40,6 +41,21 @@ def test_where_odometry_was_lost_it_says_nothing() -> None:
     part = np.array([0, 0, 0, 1, 1, 1, 1, 1])
     found = registered([[1, 2], [2, 3], [3, 4]], shifted(9.0, 9.0, 9.0))
     assert contradicts_odometry(found, Drift(POSES, part, 0.3)).tolist() == [True, False, True]
+
+
+def test_a_step_that_odometry_measured_keeps_its_measurement() -> None:
+    found = registered([[0, 1], [1, 2], [2, 4]], shifted(0.0, 0.4, 0.9))
+    judged = accepted(found, Acceptance(min_spread=0), Drift(POSES, ONE, 0.3))
+    assert judged.status.tolist() == ["used", "rejected", "rejected"]
+    odometry = registered([[0, 1], [1, 2]], shifted(0.001, 0.002)).put(slice(None), proposed_by="sequential")
+    odometry = odometry.put(slice(None), information=7 * np.eye(6))
+    kept = with_odometry(judged, odometry)
+    assert kept.status.tolist() == ["used", "used", "rejected"] and kept.why[:2].tolist() == ["", ""]
+    assert np.array_equal(kept.i_from_j[:2], [judged.i_from_j[0], odometry.i_from_j[1]])
+    assert kept.information[1, 0, 0] == 7 and kept.information[0, 0, 0] == 1
+    assert (
+        with_odometry(judged, odometry.put(slice(None), proposed_by="image")).status.tolist() == judged.status.tolist()
+    )
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])

@@ -18,11 +18,16 @@ from hodge_pipeline.demo.sequence import make_sequence
 from hodge_pipeline.demo.street import HOUSES_M, Road, build_street
 from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, TRUTH_FILE, SpinningScanner, StreetOptions, Sweep
 from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.scale import measured_scale
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.sweeps import deskewed, velocities
 from hodge_pipeline.types import Floats, Frame, PointCloud, Source
 from hodge_pipeline.uses.recipe_run import run
+from hodge_pipeline.uses.trajectory import refine_trajectory
+from mcap_data import SECOND, Log, point_cloud, ros_header
+from mcap_encoding import CDR
 
 
 def test_a_revolution_tells_the_unit_of_its_times() -> None:
@@ -170,3 +175,44 @@ def test_the_package_that_kiss_icp_needs_is_named(tmp_path: Path, monkeypatch: p
     folder = make_sequence(tmp_path / "street", StreetOptions(frames=2, beams=4, columns=72))
     with pytest.raises(RecipeError, match=r"kiss-icp: pip install hodge-pipeline\[lidar\]"):
         run(load_recipe("lidar", [], folder), tmp_path / "run")
+
+
+def test_a_point_at_the_scanner_itself_is_no_measurement() -> None:
+    points = np.array([[0, 0, 0], [5, 0, 0], [0, 0, 0], [0, 5, 0], [0, 0, 5]], np.float32)
+    cloud, _ = make_cloud(Frame(0, 0.0, read_points=lambda: PointCloud(points)), CloudOptions(min_range_m=0))
+    assert len(cloud) == 3 and np.linalg.norm(cloud.points_in_cam, axis=1).min() > 1
+
+
+def test_a_robot_that_stands_still_has_few_key_frames_and_stays(tmp_path: Path) -> None:
+    pytest.importorskip("kiss_icp", reason="the extra lidar is not installed")
+    folder = make_sequence(tmp_path / "street", StreetOptions(frames=15, beams=16, columns=360, speed_m_s=1e-6))
+    recipe = load_recipe("lidar", ["recording.level=off", "fusion=[]", "evaluation.tables=false"], folder)
+    done = run(recipe, tmp_path / "run")
+    assert len(done.key_frames.rows) <= 2 and np.linalg.norm(done.poses[:, :3, 3], axis=1).max() < 0.5
+
+
+def sweeps_as(layout: str, folder: Path, count: int) -> Path:
+    """Sweeps of the street as a folder in KITTI's layout, or as a recording."""
+    log, own = Log(), SpinningScanner(Road(10.0), 0, beams=16, columns=360, noise=1.0)
+    (folder / "velodyne").mkdir()
+    for number in range(count):
+        points = own.sweep(number).points
+        np.column_stack([points, np.full(len(points), 0.3)]).astype("<f4").tofile(
+            folder / "velodyne" / f"{number:06d}.bin"
+        )
+        columns = {axis: points[:, row] for row, axis in enumerate("xyz")}
+        message = {"header": ros_header(float(number), "lidar"), **point_cloud(columns, {"x": 0, "y": 4, "z": 8}, 16)}
+        log.add("/points", "sensor_msgs/msg/PointCloud2", message, CDR, number * SECOND + 1)
+    return folder / "velodyne" if layout == "kitti" else log.write(folder / "log.mcap")
+
+
+@pytest.mark.parametrize("layout", ["kitti", "recording"])
+def test_a_trajectory_of_sweeps_is_refined_by_default(layout: str, tmp_path: Path) -> None:
+    count = 16
+    exact = Road(10.0).world_from_car(np.arange(count) * REVOLUTION_S)
+    noise = np.random.default_rng(0).normal(0, [1e-3] * 3 + [0.06] * 3, (count, 6))
+    given = exact @ se3.exp(np.cumsum(noise, axis=0))
+    frames = sweeps_as(layout, tmp_path, count)
+    refined = refine_trajectory(given, frames, overrides=["recording.level=off"])
+    before, after = (absolute_error(poses, exact).rmse_m for poses in (given, refined.poses))
+    assert before > 0.1 and after < before / 2

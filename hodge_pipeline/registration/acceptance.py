@@ -8,12 +8,14 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Bools, Edges, Floats
-from hodge_pipeline.types.edges import HELD_OUT, REJECTED, USED
+from hodge_pipeline.types.edges import HELD_OUT, MEASURED, REJECTED, USED
 
 ARM_M = 1.0
 """A rotation counts as the displacement that it causes at this distance."""
 MIN_PATH_M = 0.05
 """Added to the length of every path: frames of a camera at rest differ by the error of a registration."""
+
+CONTRADICTS = "farther off than odometry drifts"
 
 
 def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, scale: float = 1.0) -> Edges:
@@ -26,8 +28,21 @@ def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, scale: f
     reasons = acceptance.reasons(registered)
     if drift is not None:
         far = contradicts_odometry(registered, drift, scale)
-        reasons[(reasons == "") & far] = "farther off than odometry drifts"
+        reasons[(reasons == "") & far] = CONTRADICTS
     return edges.put(rows, status=np.where(reasons == "", USED, REJECTED), why=reasons)
+
+
+def with_odometry(edges: Edges, odometry: Edges) -> Edges:
+    """The table with odometry's own measurements, which count, in the place of registrations that contradict them.
+
+    Where clouds slide, a registration from the poses of a round ends where one from the step before did not.
+    """
+    steps = np.flatnonzero((odometry.proposed_by == "sequential") & (odometry.status == USED))
+    measured = {(int(i), int(j)): int(row) for row, (i, j) in zip(steps, odometry.pairs[steps], strict=True)}
+    lost = [row for row in np.flatnonzero(edges.why == CONTRADICTS) if tuple(edges.pairs[row].tolist()) in measured]
+    rows = [measured[int(i), int(j)] for i, j in edges.pairs[lost]]
+    columns = {name: getattr(odometry, name)[rows] for name in (*MEASURED, "iterations", "converged")}
+    return edges.put(np.array(lost, np.int64), status=USED, why="", **columns)
 
 
 def contradicts_odometry(registered: Edges, drift: Drift, scale: float = 1.0) -> Bools:

@@ -207,11 +207,11 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
 
 
 def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
-    """Points of a scanner, which sees all round: its range is the distance, not the depth."""
+    """Points of a scanner, which sees all round: its range is the distance, not the depth, 0 for no return."""
     points = np.asarray(cloud.points_in_cam, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         ranges = np.linalg.norm(points, axis=1)
-    kept = (ranges >= options.min_range_m) & (ranges <= options.max_range_m)
+    kept = (ranges > 0) & (ranges >= options.min_range_m) & (ranges <= options.max_range_m)
     colours = cloud.colours if options.colours else None
     if not kept.all():  # a copy of what may be large
         points, colours = points[kept], None if colours is None else colours[kept]

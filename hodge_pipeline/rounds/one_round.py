@@ -15,7 +15,7 @@ from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.pairs.candidates import merge
 from hodge_pipeline.pairs.held_out import HeldOut
 from hodge_pipeline.recipe.schema import Recipe
-from hodge_pipeline.registration.acceptance import accepted
+from hodge_pipeline.registration.acceptance import accepted, with_odometry
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.scene import START, Round, Scene
 from hodge_pipeline.solvers.editing import GraphEditor
@@ -101,8 +101,11 @@ class Work:
         return Registered(f"round {number}", edges, fresh, world_from_cam, world_from_cam)
 
     def accept(self, edges: Edges) -> Edges:
-        """The table with the status of every registered pair."""
-        return accepted(edges, self.recipe.acceptance, self.scene.drift, self.scale)
+        """The table with the status of every registered pair; one that odometry measured, and that was registered to
+        somewhere else, keeps odometry's measurement.
+        """
+        found = accepted(edges, self.recipe.acceptance, self.scene.drift, self.scale)
+        return found if self.scene.drift is None else with_odometry(found, self.scene.first.edges)
 
     @property
     def scale(self) -> float:
