@@ -37,9 +37,10 @@ class Subject:
     """What is reviewed.
 
     `edges` are those of the graph and the pairs that were rejected with a motion, row by row `graph`'s; `solution` is
-    that of the graph with a weight for each of them. A run also has a recipe, clouds and, where its source is still
-    there, frames (its key frames'); a `model` its points as clouds, in its own unit. `truth (V, 4, 4)` is NaN where
-    unknown. Decisions are kept in `edits`, their log in `log`; `locked` says why none can be taken.
+    that of the graph with a weight for each of them. A run also has a recipe, its scale on every length, clouds and,
+    where its source is still there, frames (its key frames'); a `model` its points as clouds, in its own unit.
+    `truth (V, 4, 4)` is NaN where unknown. Decisions are kept in `edits`, their log in `log`; `locked` says why none
+    can be taken.
     """
 
     path: Path
@@ -85,7 +86,7 @@ def open_for_review(path: Path) -> Subject:
 
 def _of_run(path: Path) -> Subject:
     run = Run.load(path)
-    last, recipe = run.result, run.recipe
+    last, recipe = run.result, run.scaled_recipe
     rows = np.flatnonzero(last.edges.in_graph | _rejected_with_motion(last.edges))
     edges = last.edges.select(rows)
     left = int((last.edges.status == REJECTED).sum() - (edges.status == REJECTED).sum())
