@@ -77,8 +77,8 @@ def joined(chain: Chain) -> Chain:
         best, found = BY_CHANCE + float(np.log(len(pairs))), None
         for low, high in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).tolist():
             rows = np.flatnonzero((pairs == [low, high]).all(axis=1))
-            for seed in told.seeds(rows) if len(rows) > 1 else ():
-                if (score := float(told.gains(seed, rows).sum())) > best:
+            for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
+                if (score := float(told.gains(seed, rows, factor).sum())) > best:
                     best, found = score, (low, high, seed)
         if found is None:
             break

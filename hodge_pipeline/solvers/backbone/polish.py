@@ -22,6 +22,8 @@ ALIKE = 0.5
 """
 ROUNDS = 5
 STEPS, TOLERANCE = 3, 1e-3
+SAME_WEIGHT = 0.01
+"""Loops whose weights change by less are not solved for again."""
 
 
 def polished(chain: Chain, used: Bools, linear: Linear) -> tuple[Linear, Floats]:
@@ -39,7 +41,10 @@ def polished(chain: Chain, used: Bools, linear: Linear) -> tuple[Linear, Floats]
         weighted = replace(chain, covariance=chain.covariance / weights[:, None, None])
         linear = settled(weighted, reduced, linear.poses, STEPS, TOLERANCE)
         _, chi2 = gaussian(linear.loop_residual[rows], linear.loop_covariance[rows] * weights[rows, None, None])
+        before = weights[rows]
         weights[rows] = (FREEDOM + len(chain.axes)) / (FREEDOM + chi2)
+        if np.abs(weights[rows] - before).max() < SAME_WEIGHT:
+            break
     return linear, np.sqrt(wide / weights)
 
 
