@@ -14,6 +14,7 @@ from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.evaluate import evaluate
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.fusion.fuse import fuse
+from hodge_pipeline.recipe.scale import scale_of_scans, scaled_recipe
 from hodge_pipeline.recipe.schema import Recipe, recipe_of_run
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report.contents import Report
@@ -185,6 +186,13 @@ class Run:
     def recipe(self) -> Recipe:
         """The recipe in the folder, without the options of another version (`options_left_out`)."""
         return recipe_of_run(self.folder / RECIPE_FILE)[0]
+
+    @property
+    def scaled_recipe(self) -> Recipe:
+        """The recipe with its `scale` on every length, as the run used it; auto: what was measured on its scans."""
+        recipe = self.recipe
+        scale = (*stored(self.folder / RUN, scale_of_scans), 1.0)[0] if recipe.scale == "auto" else recipe.scale
+        return replace(scaled_recipe(recipe, scale), scale=scale)
 
     @property
     def options_left_out(self) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.recipe.scale import measured_scale, scaled_recipe
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.in_units import InUnits
+from hodge_pipeline.review.opening import Review
 from hodge_pipeline.types import Floats, Frame, PointCloud
 from test_global_registration import furnished_corner
 
@@ -81,3 +82,12 @@ def test_a_scene_of_another_size_gives_the_same_poses_in_its_size(tmp_path: Path
     assert np.abs(se3.log(se3.inverse(se3.inverse(POSES[0]) @ POSES[1]) @ found)).max() < 0.01
     assert any("all lengths of the recipe are taken times" in str(note) for note in run.report.notes)
     assert run.report.scores is not None and run.report.scores.scale == pytest.approx(size, rel=1.0)
+    with Review(tmp_path / "run", scene=False) as review:
+        review.session.wait()
+        review.session.pick([0, 1])
+        review.session.place(run.result.world_from_cam[1] @ se3.exp(np.array([0, 0, 0.02, 0.03 * size, 0, 0])))
+        review.session.register()
+        review.session.wait()
+        candidate = review.session.candidate
+    assert candidate is not None and candidate.found is not None and candidate.rejected == ""
+    assert candidate.residual_m < 0.005 * size

@@ -74,7 +74,10 @@ def guess_from_points(points_in_i: Floats, points_in_j: Floats) -> Floats:
 
 
 def register_candidate(recipe: Recipe, clouds: CloudSet, wanted: Candidate) -> Registration:
-    """What the run's registrar finds for the pair, from its guess. Raises `GraphError` where a frame has no cloud."""
+    """What the recipe's registrar finds for the pair, from its guess; of a run that recipe is `run.scaled_recipe`.
+
+    Raises `GraphError` where a frame has no cloud.
+    """
     for row in (wanted.i, wanted.j):
         if not len(clouds[row]):
             raise GraphError(f"frame {row} has no points: pick another")

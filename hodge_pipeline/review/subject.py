@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +30,7 @@ from hodge_pipeline.types.notes import Note
 SIDE_FILE, SIDE_LOG = ".edits.json", ".decisions.csv"
 LOG = "decisions.csv"
 
-UNITS = "the unit of length is the model's own, which reasons call metres"
+UNITS = "the unit of length is the model's own"
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,10 @@ class Subject:
     """What is reviewed.
 
     `edges` are those of the graph and the pairs that were rejected with a motion, row by row `graph`'s; `solution` is
-    that of the graph with a weight for each of them. A run also has a recipe, clouds and, where its source is still
-    there, frames (its key frames'); a `model` its points as clouds, in its own unit. `truth (V, 4, 4)` is NaN where
-    unknown. Decisions are kept in `edits`, their log in `log`; `locked` says why none can be taken.
+    that of the graph with a weight for each of them. A run also has a recipe, its scale on every length, clouds and,
+    where its source is still there, frames (its key frames'); a `model` its points as clouds, in its own unit.
+    `truth (V, 4, 4)` is NaN where unknown. Decisions are kept in `edits`, their log in `log`; `locked` says why none
+    can be taken.
     """
 
     path: Path
@@ -75,6 +77,10 @@ class Subject:
         """Of its lengths: those of a model without a scale are its own."""
         return "m" if self.model is None else "units"
 
+    def worded(self, sentence: str) -> str:
+        """A sentence of the diagnosis, which speaks of metres, in the unit of these lengths."""
+        return re.sub(r"(?<=\d) m\b", f" {self.unit}", sentence)
+
 
 def open_for_review(path: Path) -> Subject:
     """What a path holds: a run, finished or not, a COLMAP model, a pose graph. Raises `HodgeError` for others."""
@@ -85,7 +91,7 @@ def open_for_review(path: Path) -> Subject:
 
 def _of_run(path: Path) -> Subject:
     run = Run.load(path)
-    last, recipe = run.result, run.recipe
+    last, recipe = run.result, run.scaled_recipe
     rows = np.flatnonzero(last.edges.in_graph | _rejected_with_motion(last.edges))
     edges = last.edges.select(rows)
     left = int((last.edges.status == REJECTED).sum() - (edges.status == REJECTED).sum())
