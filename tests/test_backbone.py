@@ -9,6 +9,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.solver import DiagnosedSolver
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.backbone import inference
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.backbone.fit import Reduced, linearise, settled
 from hodge_pipeline.solvers.backbone.inference import left_out, uncertainty
@@ -208,3 +209,18 @@ def test_robots_whose_loops_are_all_wrong_stay_apart() -> None:
     found = diagnose(made.graph.select(np.setdiff1d(np.arange(made.graph.edge_count), step)))
     assert not found.kept[598:].any() and found.kept[:598].all()
     assert len(np.unique(found.piece)) == 2
+
+
+def test_more_loops_than_can_be_inverted_are_judged_at_the_poses_of_some(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inference, "MOST_UNKNOWNS", 150)
+    made = drive(count=3000, dimension=3, world="town", loops=1400)
+    chain = chain_of(made.graph)
+    right = np.flatnonzero(made.right[chain.loop_edge])
+    some = inference.thinned(chain, right)
+    assert 0 < len(some.active) < len(right)
+    assert some.network.core_size * 6 <= 150
+    found = find_backbone(made.graph)
+    assert found is not None
+    assert not (found.used & ~made.right).any()
+    assert found.used[made.right].mean() > 0.95
+    assert made.error_m(found.world_from_cam) < made.error_m(made.odometry())

@@ -70,10 +70,14 @@ def test_the_wrong_edge_is_printed_first_with_what_to_do(wrong_edge: tuple[Path,
     folder, text, graph = wrong_edge
     i, j = graph.vertex_ids[graph.edges[17]]
     lines = text.splitlines()
-    assert re.match(rf"{i}-{j} +wrong +0\.\d\d  0 of \d+ cycles close; .* fails by .*-> disable it", lines[0])
-    assert lines[3].startswith("… and 33 more edges")
-    assert f"1 of 36 edges is wrong, worst of all {i}–{j}" in text
-    assert f"next     hodge solve {folder / 'ring.g2o'} --out solved.g2o --disable {i}-{j}" in text
+    assert lines[0] == f"verdict  1 of 36 edges is wrong, worst of all {i}–{j}."
+    assert re.match(rf"  - {i}-{j} wrong: 0 of \d+ cycles close; .* fails by", lines[1])
+    assert lines[4] == f"  - … and 33 more edges, none of them worse: {folder / 'why/edges.csv'}"
+    assert lines[-1] == f"next     hodge solve {folder / 'ring.g2o'} --out solved.g2o --disable {i}-{j}"
+    assert all(len(line) <= 80 for line in lines if str(folder) not in line)
+    rows = hodge(folder / "ring.g2o", "--verbose").split("verdict  1 of 36")[0]
+    assert re.search(rf"{i}-{j} +wrong +0\.\d\d +0 of \d+ cycles close.*disable it", rows)
+    assert "note     cycles: " in rows and "energy   rotation " in rows
 
 
 def test_the_files_say_the_same(wrong_edge: tuple[Path, str, ViewGraph]) -> None:
@@ -138,9 +142,10 @@ def test_json_has_every_edge(tmp_path: Path) -> None:
     for row in answer["energy"]:
         for kind in ("rotation", "translation"):
             assert sum(row[kind][part] for part in ("exact", "co-exact", "harmonic")) == pytest.approx(1)
-    text = hodge(tmp_path / "a.g2o")
-    assert text.count("energy   rotation ") == 2 and "only their linearisation" in text
-    assert text.splitlines()[3].startswith("… and 9 more edges")
+    text = hodge(tmp_path / "a.g2o", "--verbose", "--top", 3)
+    assert text.count("energy   rotation ") == 2 and "ω is only their linearisation" in text
+    assert "  - … and 9 more edges, none of them worse: --verbose" in text.splitlines()
+    assert hodge(tmp_path / "a.g2o") == "verdict  All 12 edges are consistent with each other.\n"
     joined = {frozenset((edge["i"], edge["j"])) for edge in answer["edges"]}
     nexts = [frozenset((pair["i"], pair["j"])) for pair in answer["register_next"]]
     assert nexts and not joined & set(nexts)
@@ -152,8 +157,8 @@ def test_a_chain_with_one_bad_loop_edge_names_the_loop(tmp_path: Path) -> None:
     spoil(graph, 5)
     write_g2o(tmp_path / "chain.g2o", graph, poses)
     text = hodge(tmp_path / "chain.g2o", "--out", tmp_path / "why")
-    assert "consistent  " not in text.split("verdict")[0]
-    assert "one of its 6 edges is wrong" in text
+    assert text.count(" untestable: ") == 5 and " consistent: " not in text
+    assert "6 of 6 edges may be to blame for the loop" in text
     with (tmp_path / "why/edges.csv").open() as file:
         assert [row["probability"] for row in csv.DictReader(file) if row["verdict"] == "untestable"] == [""] * 6
 

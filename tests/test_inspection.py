@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
+from hodge_pipeline.cli.list import next_command
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.sources.graph_facts import graph_facts
@@ -51,6 +52,11 @@ def test_a_run_folder_is_no_source(tmp_path: Path) -> None:
         (tmp_path / name).write_text("")
     with pytest.raises(SourceError, match="the folder of a run, no source: give a file of it, such as poses.tum"):
         inspect(tmp_path)
+
+
+def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
+    command = next_command(Path("in"), {"frames": 3, "frames with depth": 0, "formats": []}, "mine")
+    assert command == "hodge run clouds --source in --set source.reader=mine --out runs/in"
 
 
 def test_a_sound_sequence_has_no_oddities() -> None:

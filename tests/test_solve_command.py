@@ -102,7 +102,7 @@ def test_a_run_folder_is_left_and_solved_again(tmp_path):
 
 def test_the_certificate_is_told(tmp_path):
     graph_file(tmp_path / "in.g2o")
-    assert "globally optimal" in hodge(tmp_path / "in.g2o", "--certificate")
+    assert hodge(tmp_path / "in.g2o", "--certificate").startswith("verdict  Solved, globally optimal: F ")
     assert hodge(tmp_path / "in.g2o", "--certificate", "--quiet") == ""
     plain = json.loads(hodge(tmp_path / "in.g2o", "--objective", "isotropic", "--json"))
     sesync = json.loads(hodge(tmp_path / "in.g2o", "--sesync-units", "--json"))
@@ -185,7 +185,7 @@ def test_what_nothing_confirms_is_said_first_and_fails(tmp_path):
     done = CliRunner().invoke(app, ["solve", str(tmp_path / "random.g2o"), "--robust"])
     assert isinstance(done.exception, CheckError) and done.exception.exit_code == 3
     assert "nothing confirms the result" in str(done.exception)
-    assert done.stdout.startswith("result      NOT CONFIRMED by any cycle of its edges\n")
+    assert done.stdout.startswith("verdict  Solved, but NOT CONFIRMED by any cycle of its edges: ")
     plain = json.loads(CliRunner().invoke(app, ["solve", str(tmp_path / "random.g2o"), "--robust", "--json"]).stdout)
     assert plain["confirmed"] is False
     tree = graph.select(np.array([0]))

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -66,7 +67,12 @@ class CloudFolderReader:
         for file in files:
             _require(file)
         fragments = _fragments(files, notes)
-        numbers = _numbers([f"{f.path.stem}" if f.row is None else f"{f.path.stem} {f.row}" for f in fragments], notes)
+        scanners = _scanners([fragment.path for fragment in fragments])
+        if scanners:
+            counts = ", ".join(f"{name} {scanners.count(name)}" for name in dict.fromkeys(scanners))
+            notes.append(f"several scanners, by the names of the files ({counts}): each is a sequence of its own")
+        stems = [f"{f.path.stem}" if f.row is None else f"{f.path.stem} {f.row}" for f in fragments]
+        numbers = list(range(len(stems))) if scanners else _numbers(stems, notes)
         order = np.argsort(numbers, kind="stable")
         fragments, numbers = [fragments[row] for row in order], [numbers[row] for row in order]
         log = self._log(path if path.is_dir() else path.parent) if path.is_dir() or self.log != "auto" else None
@@ -84,8 +90,9 @@ class CloudFolderReader:
                 stamp_s=float(number),
                 read_points=partial(read_fragment, fragment, units_per_metre=self.units_per_metre),
                 world_from_cam=poses.get(number, fragment.in_metres(self.units_per_metre)),
+                sequence=scanner,
             )
-            for number, fragment in zip(numbers, fragments, strict=True)
+            for number, fragment, scanner in zip(numbers, fragments, scanners or [""] * len(fragments), strict=True)
         )
         graph = _graph(names, parsed.pairs, parsed.i_from_j, notes) if parsed and len(parsed.pairs) else None
         every = frames[:: self.every]
@@ -176,7 +183,7 @@ def read_fragment(fragment: Fragment, *, units_per_metre: float) -> PointCloud:
         cloud = READERS[fragment.path.suffix.lower()](fragment.path)
     if units_per_metre == 1.0:
         return cloud
-    return PointCloud(cloud.points_in_cam / np.float32(units_per_metre), cloud.normals_in_cam, cloud.colours)
+    return replace(cloud, points_in_cam=cloud.points_in_cam / np.float32(units_per_metre))
 
 
 def _fragments(files: list[Path], notes: list[str]) -> list[Fragment]:
@@ -218,6 +225,21 @@ def _require(path: Path) -> None:
         raise SourceError(f"{path}: not one of {', '.join(READERS)}: convert it to PLY")
     if ending in LIBRARIES:
         library(LIBRARIES[ending], path)
+
+
+def _scanners(paths: list[Path]) -> list[str]:
+    """The names of the files with a * in place of the last number, where the same numbers come with several names; else
+    nothing.
+    """
+    found = [_NUMBER.search(path.stem) for path in paths]
+    numbers = [int(match[1]) for match in found if match]
+    names = [
+        f"{path.stem[: match.start(1)]}*{path.stem[match.end(1) :]}{path.suffix}"
+        for path, match in zip(paths, found, strict=True)
+        if match
+    ]
+    each = set(zip(names, numbers, strict=True))
+    return names if len(set(numbers)) < len(numbers) == len(each) == len(paths) else []
 
 
 def _numbers(stems: list[str], notes: list[str]) -> list[int]:

@@ -112,11 +112,11 @@ class RateColumn(ProgressColumn):
         return Text(f"{rate:.3g}/s" if rate and (task.total or 0) > 1 else "", style="progress.data.speed")
 
 
-def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table on stdout, numbers to the right."""
+def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], *, words: Sequence[str] = ()) -> None:
+    """A table on stdout, numbers to the right; `words` are columns of text, as the first is."""
     table = Table(title=Text(visible(title)), title_justify="left", box=box.SIMPLE_HEAD)
     for row, name in enumerate(header):
-        table.add_column(name, justify="left" if row == 0 else "right")
+        table.add_column(name, justify="left" if row == 0 or name in words else "right")
     for cells in rows:
         table.add_row(*(Text(visible(cell)) for cell in cells))
     Console(highlight=False, file=unguarded(sys.stdout)).print(table)

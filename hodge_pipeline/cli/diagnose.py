@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import sys
+import textwrap
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hodge_pipeline.cli.console import ProgressBars
+from hodge_pipeline.cli.console import ProgressBars, print_table
+from hodge_pipeline.report.brief import COLUMNS, LABEL, LINES, at_most, labelled
 
 if TYPE_CHECKING:
     from hodge_pipeline.diagnosis.energy import EnergyRow
@@ -14,15 +16,17 @@ if TYPE_CHECKING:
 
 SUGGESTED = 3
 LEAST_SHOWN, MOST_BAD = 3, 20
-"""Rows of the table where nobody says how many: the edges that are not consistent, and a few in any case."""
+"""Rows of the whole table where nobody says how many: the edges that are not consistent, and a few in any case."""
 HEADER = ("edge", "verdict", "right", "why", "what to do")
 
 
-def diagnose(path: Path, out: Path | None, *, top: int | None, trust: str | None, quiet: bool, as_json: bool) -> None:
+def diagnose(
+    path: Path, out: Path | None, *, top: int | None, trust: str | None, quiet: bool, as_json: bool, verbose: bool
+) -> None:
     """Judge every edge, print the worst, and leave the rest in a folder where one is given."""
     from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
 
-    with ProgressBars(quiet or as_json) as terminal:
+    with ProgressBars(quiet or as_json, verbose) as terminal:
         with terminal.stage("diagnosis", 1):
             found = diagnose_subject(open_subject(path, trust))
         if out is not None:
@@ -33,38 +37,56 @@ def diagnose(path: Path, out: Path | None, *, top: int | None, trust: str | None
 
         print(json_text(_as_json(found, out)), end="")
     elif not quiet:
-        _print(found, out, top)
+        _print(found, out, top, verbose=verbose)
 
 
-def _print(found: Diagnosed, out: Path | None, top: int | None) -> None:
+def _print(found: Diagnosed, out: Path | None, top: int | None, *, verbose: bool) -> None:
+    bad = int((found.diagnosis.verdict != "consistent").sum())
+    if verbose:
+        rows = found.rows[: min(MOST_BAD, max(LEAST_SHOWN, bad)) if top is None else top]
+        print_table("Edges, the worst first", HEADER, [_cells(found, int(row)) for row in rows], words=HEADER)
+        print("\n".join(_details(found)))
+    print("\n".join(_lines(found, out, top, bad)))
+
+
+def _details(found: Diagnosed) -> Iterator[str]:
     from hodge_pipeline.diagnosis.energy import CAVEAT, in_words
+
+    for line in in_words(found.energy):
+        yield from labelled("energy", line)
+    for note in (*found.notes, *((CAVEAT,) if found.energy else ())):
+        yield from labelled("note", note)
+    for line in _to_register(found)[1:SUGGESTED]:
+        yield from labelled("register", line)
+
+
+def _to_register(found: Diagnosed) -> list[str]:
+    """The pairs worth registering, and why, the best first."""
+    useful = found.suggestions.score >= found.subject.suggestions.min_gain
+    pairs = zip(_suggested(found), found.suggestions.reason[useful], strict=False)
+    return [f"{i}-{j} {reason}" for (i, j), reason in pairs]
+
+
+def _lines(found: Diagnosed, out: Path | None, top: int | None, bad: int) -> list[str]:
+    """The verdict, the worst edges, what to heed and what to type next: ten lines, or `top` edges."""
     from hodge_pipeline.report.diagnosis_page import sentence
 
-    if top is None:
-        top = min(MOST_BAD, max(LEAST_SHOWN, int((found.diagnosis.verdict != "consistent").sum())))
-    rows = [_cells(found, int(row)) for row in found.rows[:top]]
-    if sys.stdout.isatty():
-        _print_rich(rows)
-    else:
-        widths = [max((len(cells[column]) for cells in rows), default=0) for column in range(3)]
-        for cells in rows:
-            first = "  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=False))
-            print(f"{first}  {cells[3]}  -> {cells[4]}")
-    left = found.subject.graph.edge_count - len(rows)
-    if left > 0:
-        print(f"… and {left} more edges, none of them worse" + ("" if out is None else f": {out / 'edges.csv'}"))
-    print(f"verdict  {sentence(found.subject.graph, found.diagnosis)}")
-    for line in in_words(found.energy):
-        print(f"energy   {line}")
-    for note in (*found.notes, *((CAVEAT,) if found.energy else ())):
-        print(f"note     {note}")
-    useful = found.suggestions.score >= found.subject.suggestions.min_gain
-    for (i, j), reason in list(zip(_suggested(found), found.suggestions.reason[useful], strict=False))[:SUGGESTED]:
-        print(f"register {i}-{j}  {reason}")
-    for command in found.commands:
-        print(f"next     {command}")
-    if out is not None:
-        print(f"report   {out / 'diagnosis.html'}")
+    head = labelled("verdict", sentence(found.subject.graph, found.diagnosis))
+    worrying = [note for note in found.notes if note not in found.diagnosis.notes]
+    tail = [line for note in worrying[:1] for line in at_most(labelled("look", note), 1)]
+    tail += [line for one in _to_register(found)[:1] if bad for line in at_most(labelled("register", one), 1)]
+    tail += [] if out is None else [f"{'report':<{LABEL}}{out / 'diagnosis.html'}"]
+    tail += [f"{'next':<{LABEL}}{command}" for command in found.commands]
+    shown = min(bad, LINES - len(head) - len(tail) - 1) if top is None else top
+    points = []
+    for row in found.rows[: max(shown, 0)].tolist():
+        name, verdict, _, why, _ = _cells(found, row)
+        points += at_most(textwrap.wrap(f"  - {name} {verdict}: {why}", COLUMNS), 1)
+    left = found.subject.graph.edge_count - len(points)
+    if left and (points or top is not None):
+        where = "--verbose" if out is None else str(out / "edges.csv")
+        points.append(f"  - … and {left} more edges, none of them worse: {where}")
+    return [*head, *points, *tail]
 
 
 def _suggested(found: Diagnosed) -> list[list[Any]]:
@@ -78,23 +100,6 @@ def _cells(found: Diagnosed, row: int) -> tuple[str, ...]:
     probability = diagnosis.probability[row]
     right = "-" if probability != probability else f"{probability:.2f}"
     return f"{i}-{j}", str(diagnosis.verdict[row]), right, diagnosis.reason[row], found.advice[row]
-
-
-def _print_rich(rows: list[tuple[str, ...]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from hodge_pipeline.cli.guard import unguarded
-    from hodge_pipeline.types.text import visible
-
-    styles = {"wrong": "bold magenta", "suspect": "yellow", "untestable": "dim", "consistent": "blue"}
-    table = Table(title="Edges, the worst first", title_justify="left")
-    for name in HEADER:
-        table.add_column(name, justify="right" if name == "right" else "left", overflow="fold")
-    for cells in rows:
-        table.add_row(*(Text(visible(cell)) for cell in cells), style=styles.get(cells[1], ""))
-    Console(highlight=False, file=unguarded(sys.stdout)).print(table)
 
 
 def _energy(row: EnergyRow) -> dict[str, Any]:

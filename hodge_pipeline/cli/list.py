@@ -38,8 +38,10 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None) -> str:
 
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
     recipe = {"clouds": "scans"}.get(name, name)
-    recipe = recipe if recipe in recipe_names() else "RECIPE"
-    return f"hodge run {recipe} --source {path} --out runs/{path.stem}"
+    if recipe in recipe_names():
+        return f"hodge run {recipe} --source {path} --out runs/{path.stem}"
+    recipe = "seven_scenes" if facts["frames with depth"] else "clouds"
+    return f"hodge run {recipe} --source {path} --set source.reader={name} --out runs/{path.stem}"
 
 
 def _rows(value: Any) -> list[str]:

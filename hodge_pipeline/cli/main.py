@@ -193,16 +193,17 @@ def diagnose(
         typer.Option("--out", "-o", help="Folder for edges.csv, poses.tum, diagnosis.html and diagnosis.rrd."),
     ] = None,
     top: Annotated[
-        int | None, typer.Option(min=0, help="Edges to print; default: those that are not consistent, 20 at most.")
+        int | None, typer.Option(min=0, help="Edges to print; default: those that are not consistent, in ten lines.")
     ] = None,
     trust: Trust = None,
+    verbose: Verbose = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Say which edges are wrong, why, and what to do: by the cycles that they lie in, before any solve."""
     from hodge_pipeline.cli import diagnose as diagnosing
 
-    diagnosing.diagnose(path, out, top=top, trust=trust, quiet=quiet, as_json=json)
+    diagnosing.diagnose(path, out, top=top, trust=trust, quiet=quiet, as_json=json, verbose=verbose)
 
 
 @app.command()

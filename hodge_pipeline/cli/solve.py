@@ -12,15 +12,20 @@ from hodge_pipeline.cli.paths import check_result, keep_source
 from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.pairs.edits import read_history
 from hodge_pipeline.refine.pose_graph import Choices, SolvedFile, solve_file, write_solved
+from hodge_pipeline.report.brief import LABEL, at_most, labelled
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.newton import TIME_LIMIT_REACHED
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.store.workspace import RECIPE_FILE
 from hodge_pipeline.types import Source
+from hodge_pipeline.types.text import command
 
 KNOWN_ENDINGS = (".tum", ".kitti", ".csv", ".log", ".json", ".ply")
 """Endings that say the format. `.txt` does not: many programs name their g2o files so."""
+
+NOTES = 2
+"""In ten lines."""
 
 
 def choices(
@@ -78,7 +83,7 @@ def solve(
     if out is not None:
         check_result(out)
         keep_source(path, out)
-    with ProgressBars(quiet or as_json) as terminal, terminal.stage("solve", 1):
+    with ProgressBars(quiet or as_json, verbose) as terminal, terminal.stage("solve", 1):
         solved = solve_file(path, options)
     if out is not None:
         write_solved(out, solved, _writer(out, solved.source))
@@ -96,8 +101,7 @@ def solve(
             json_text({"source": str(solved.source.path), "out": None if out is None else str(out), **summary}), end=""
         )
     elif not quiet:
-        for label, text in _lines(solved, summary, out, run_folder):
-            print(f"{label:<12}{text}")
+        print("\n".join(_lines(solved, summary, out, run_folder, verbose=verbose)))
     _check(summary)
 
 
@@ -116,32 +120,24 @@ def _solve_run(folder: Path, *, quiet: bool, as_json: bool, dask: str | None, ve
 
 
 def _lines(
-    solved: SolvedFile, summary: dict[str, Any], out: Path | None, run_folder: Path | None
-) -> list[tuple[str, str]]:
-    """What the summary says, a label and a text each."""
-    name = {"full": "chi2", "isotropic": "F"}[summary["objective"]]
-    before = summary["cost_before"]
+    solved: SolvedFile, summary: dict[str, Any], out: Path | None, run_folder: Path | None, *, verbose: bool
+) -> list[str]:
+    """The verdict, what was solved, what to heed, where it is: ten lines; `verbose`: with every note, whole."""
+    pieces = f"{summary['pieces']} piece{'s' * (summary['pieces'] != 1)}"
     ignored = f", {summary['edges_ignored']} ignored" if summary["edges_ignored"] else ""
-    lines = [("result", "NOT CONFIRMED by any cycle of its edges")] if summary["confirmed"] is False else []
-    lines += [
-        (
-            "graph",
-            f"{solved.source.name}, {summary['dimension']}-D: {summary['poses']} poses, {summary['edges']} edges",
-        ),
-        ("", f"{summary['pieces']} piece{'s' * (summary['pieces'] != 1)}{ignored}"),
-        (name, f"{summary['cost_after']:.12g}" if before is None else f"{before:.12g} -> {summary['cost_after']:.12g}"),
-    ]
-    if summary["certified"] is not None:
-        within = (
-            f"globally optimal, within {summary['gap_bound']:.3g}" if summary["certified"] else "NOT proven optimal"
-        )
-        lines.append(("certificate", within))
-    lines.append(
-        ("time", f"{summary['wall_s']:.3f} s, {summary['cpu_s']:.3f} s of CPU, {summary['newton_steps']} steps")
-    )
-    lines += [("note", note) for note in summary["notes"]]
-    lines += [("written", str(path)) for path in (out, run_folder) if path is not None]
-    return lines
+    shape = f"{summary['dimension']}-D, {summary['poses']} poses, {summary['edges']} edges{ignored}, {pieces}"
+    lines = [*labelled("verdict", solved.headline), f"  - {solved.source.name}: {shape}"]
+    if verbose:
+        lines += [line for note in summary["notes"] for line in labelled("note", note)]
+    else:
+        lines += [line for note in summary["notes"][:NOTES] for line in at_most(labelled("look", note), 1)]
+        if (left := len(summary["notes"]) - NOTES) > 0:
+            lines.append(f"  - … and {left} more notes: --verbose")
+    time = f"{summary['wall_s']:.3f} s, {summary['cpu_s']:.3f} CPU s, {summary['newton_steps']} steps"
+    lines.append(f"{'time':<{LABEL}}{time}")
+    lines += [f"{'written':<{LABEL}}{out}"] if out is not None else []
+    lines += [f"{'report':<{LABEL}}{run_folder / 'report.html'}"] if run_folder is not None else []
+    return [*lines, f"{'next':<{LABEL}}{command('hodge', 'diagnose', solved.source.path)}"]
 
 
 def _check(summary: dict[str, Any]) -> None:

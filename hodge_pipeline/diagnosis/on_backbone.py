@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.series import series_classes
@@ -79,7 +80,9 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
     order = np.argsort(spans, kind="stable")
     order = order[same[order] & (np.cumsum(spans[order] + 1) <= MOST_ENTRIES)]
     loops = _listed(graph, chain, order)
-    angle, displacement_m = cycle_errors(loops, graph.i_from_j)
+    poses, (low, high) = chain.poses(), chain.ends[order].T
+    products = se3.inverse(poses[low]) @ poses[high] @ se3.inverse(chain.motion[order])
+    angle, displacement_m = cycle_errors(loops, graph.i_from_j, products)
     edges = chain.loop_edge[order]
     row = np.full(graph.edge_count, -1, np.int64)
     row[edges] = np.arange(len(edges))

@@ -43,11 +43,11 @@ def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, 
     return _distinct(_joined([loops, more.select(np.flatnonzero(passes))]), len(edges))
 
 
-def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
+def cycle_errors(loops: Loops, i_from_j: Floats, products: Floats | None = None) -> tuple[Floats, Floats]:
     """The angle (L,) in radians and the displacement (L,) in metres that the product of motions along each cycle
-    leaves, the latter at the middle of the cycle's frames.
+    leaves, the latter at the middle of the cycle's frames; `products (L, 4, 4)` where they are known.
     """
-    products = loop_products(loops, i_from_j)
+    products = loop_products(loops, i_from_j) if products is None else products
     middle = _middles(loops, i_from_j)
     displacement_m = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
     return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(displacement_m, axis=1)

@@ -25,6 +25,7 @@ from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, Vi
 RUN_GRAPH = "graph.g2o"
 GRAPH_WRITERS = ("g2o", "open3d_pose_graph")
 """Writers that take the poses by the rows of the vertices."""
+OBJECTIVES = {"full": "chi2", "isotropic": "F"}
 SESYNC_UNITS = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 """SE-Sync takes the information of q_vec, half an angle, for that of the angle."""
 
@@ -57,6 +58,25 @@ class SolvedFile:
     def start(self) -> Floats | None:
         """The file's own poses, where it has one for each vertex."""
         return None if self.source.trajectory is None else self.source.trajectory.world_from_cam
+
+    @property
+    def doubt(self) -> str:
+        """Why the poses are not to be trusted; empty where nothing speaks against them."""
+        solution = self.solution
+        if solution.confirmed is False:
+            return "NOT CONFIRMED by any cycle of its edges"
+        if solution.certified is False:
+            return "NOT proven to be the global minimum"
+        return "" if solution.converged is not False else "stopped before it converged"
+
+    @property
+    def headline(self) -> str:
+        """What the solve did to its own objective: a file of edges has nothing else to measure poses by."""
+        summary = self.summary()
+        before, after, name = summary["cost_before"], summary["cost_after"], OBJECTIVES[summary["objective"]]
+        fell = f"{name} {after:.6g}" if before is None else f"{name} {before:.6g} → {after:.6g}"
+        proven = ", globally optimal" if summary["certified"] else ""
+        return f"Solved, but {self.doubt}: {fell}" if self.doubt else f"Solved{proven}: {fell}"
 
     def summary(self) -> dict[str, Any]:
         """The numbers of the solve under stable keys, for people and programs."""

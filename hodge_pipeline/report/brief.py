@@ -22,14 +22,14 @@ def brief(report: Report, folder: str) -> list[str]:
     worrying = [str(note) for note in suspicions(report) if note.rank < Rank.FACT]
     tail = [line for place in list(worst_places(report))[:1] for line in labelled("worst", place)]
     for note in worrying[:MOST_NOTES]:
-        tail += _at_most(labelled("look", note), 1 if len(worrying) > 1 else MOST_OF_A_NOTE)
+        tail += at_most(labelled("look", note), 1 if len(worrying) > 1 else MOST_OF_A_NOTE)
     tail += list(_end(report, folder))
     room = max(LINES - len(head) - len(tail), FEWEST_POINTS)
     points = verdict.points
     if len(points) > room:
         left = len(points) - room + 1
         points = (*points[: room - 1], f"… and {left} more measures: --verbose")
-    return [*head, *(line for point in points for line in _at_most(textwrap.wrap(f"  - {point}", COLUMNS), 1)), *tail]
+    return [*head, *(line for point in points for line in at_most(textwrap.wrap(f"  - {point}", COLUMNS), 1)), *tail]
 
 
 def all_notes(report: Report) -> list[str]:
@@ -52,7 +52,8 @@ def labelled(label: str, text: str) -> list[str]:
     return [f"{label:<{LABEL}}{lines[0]}", *(f"{'':<{LABEL}}{line}" for line in lines[1:])]
 
 
-def _at_most(lines: list[str], count: int) -> list[str]:
+def at_most(lines: list[str], count: int) -> list[str]:
+    """The first lines, the last of them ending in … where there are more."""
     if len(lines) <= count:
         return lines
     cut = f"{lines[count - 1]} {lines[count].strip()}"[: COLUMNS - 1].rsplit(" ", 1)[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,19 +31,31 @@ EXAGGERATIONS = (2, 5, 10, 20, 50, 100)
 
 
 def edge_pictures(
-    graph: ViewGraph, diagnosis: Diagnosis, rows: Ints, frames: Sequence[Frame], clouds: CloudSet | None
+    graph: ViewGraph,
+    diagnosis: Diagnosis,
+    rows: Ints,
+    frames: Sequence[Frame],
+    clouds: CloudSet | None,
+    *,
+    has_metres: bool = True,
 ) -> tuple[EdgePictures, ...]:
-    """The pictures of these edges; nothing for a graph without frames or clouds."""
+    """The pictures of these edges; nothing for a graph without frames or clouds. `has_metres`: as of a `Report`."""
+    said = length if has_metres else "{:.3g} units".format
     found = []
     for row in map(int, rows):
-        plots = tuple(_plots(graph, diagnosis, row, frames, clouds))
+        plots = tuple(_plots(graph, diagnosis, row, frames, clouds, said))
         if plots:
             found.append(EdgePictures(row, plots))
     return tuple(found)
 
 
 def _plots(
-    graph: ViewGraph, diagnosis: Diagnosis, row: int, frames: Sequence[Frame], clouds: CloudSet | None
+    graph: ViewGraph,
+    diagnosis: Diagnosis,
+    row: int,
+    frames: Sequence[Frame],
+    clouds: CloudSet | None,
+    said: Callable[[float], str],
 ) -> Iterator[Picture]:
     i, j = graph.edges[row].tolist()
     names = graph.vertex_ids[i], graph.vertex_ids[j]
@@ -53,7 +65,7 @@ def _plots(
         if diagnosis.piece[i] == diagnosis.piece[j]:
             robust = se3.inverse(diagnosis.world_from_cam[i]) @ diagnosis.world_from_cam[j]
             known.append(("As the robust poses say", robust))
-            yield _cut(clouds[i], clouds[j], measured, robust, up, names[1])
+            yield _cut(clouds[i], clouds[j], measured, robust, up, names[1], said)
         views = _views(clouds[i], clouds[j], [motion for _, motion in known], up)
         shown = f"Frame {names[0]} blue, frame {names[1]} orange; left as camera {names[0]} looks, right from above."
         for title, motion in known:
@@ -91,6 +103,7 @@ def _cut(
     robust: Floats,
     up_in_i: Floats,
     name: object,
+    said: Callable[[float], str],
 ) -> Picture:
     """Both clouds cut open along the offset between the edge and the robust poses, which is exaggerated if small."""
     blue, points = np.asarray(first.points_in_cam, float), np.asarray(second.points_in_cam, float)
@@ -118,8 +131,8 @@ def _cut(
 
     told = f", here {times} times as large" if times > 1 else ""
     caption = (
-        f"A slice through both clouds, {length(CUT_SHARE * extent)} thick, along the offset: frame {name} (orange) "
-        f"lies {length(size)} apart{told}."
+        f"A slice through both clouds, {said(CUT_SHARE * extent)} thick, along the offset: frame {name} (orange) "
+        f"lies {said(size)} apart{told}."
     )
     return painted("Cut open", caption, paint)
 

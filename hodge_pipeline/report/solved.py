@@ -26,7 +26,6 @@ from hodge_pipeline.types import Edges, Floats
 from hodge_pipeline.types.notes import notes_of
 
 SOLVED = "solved.json"
-OBJECTIVES = {"full": "chi2", "isotropic": "F"}
 
 
 def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
@@ -55,16 +54,9 @@ def _before(solved: SolvedFile) -> dict[str, Floats]:
 
 
 def _outcome(solved: SolvedFile) -> RefinementSummary:
-    """What the solve did to its own objective: a file of edges has nothing else to measure poses by."""
     summary = solved.summary()
-    before, after, name = summary["cost_before"], summary["cost_after"], OBJECTIVES[summary["objective"]]
-    fell = f"{name} {after:.6g}" if before is None else f"{name} {before:.6g} → {after:.6g}"
-    doubt = summary["confirmed"] is False or summary["certified"] is False or not summary["converged"]
-    proven = "; proven to be the global minimum" if summary["certified"] else ""
-    reason = f"{summary['edges']} edges, {summary['edges_ignored']} of them ignored{proven}"
-    if doubt:
-        return RefinementSummary("worse", f"Solved, but not to be trusted: {fell}", reason)
-    return RefinementSummary("solved", f"Solved: {fell}", reason)
+    reason = f"{summary['edges']} edges, {summary['edges_ignored']} of them ignored"
+    return RefinementSummary("worse" if solved.doubt else "solved", solved.headline, reason)
 
 
 def _report(solved: SolvedFile) -> Report:

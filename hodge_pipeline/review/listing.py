@@ -60,7 +60,7 @@ def list_edges(session: Session, query: Query) -> dict[str, Any]:
             "counts": bool(settled.weights[row] > 0),
             "status": str(edges.status[row]),
             "decision": str(switches[row]),
-            "reason": str(edges.why[row]),
+            "reason": session.subject.worded(str(edges.why[row])),
         }
         for row, name in zip(rows.tolist(), pair_names(ids, table.graph.edges[rows]), strict=True)
     ]
@@ -128,7 +128,8 @@ def describe(session: Session, edge: int) -> dict[str, Any]:
         table, judged = session.table, session.judged
     if not 0 <= edge < len(table):
         raise GraphError(f"there is no edge {edge}: rows go from 0 to {len(table) - 1}")
-    cycles = [{"closes": closes, "text": text, "error": error} for closes, text, error, _ in witnesses(session, edge)]
+    said = session.subject.worded
+    cycles = [{"closes": closes, "text": text, "error": said(off)} for closes, text, off, _ in witnesses(session, edge)]
     (name,) = pair_names(table.graph.vertex_ids, table.graph.edges[[edge]])
     beside = len(table.rows[name])
     known = judged is not None and judged.row(edge) is not None

@@ -39,7 +39,9 @@ class Pictures:
         with self._lock:
             if key not in self._made:
                 poses = replace(judged.diagnosis, world_from_cam=settled.world_from_cam, piece=settled.component)
-                found = edge_pictures(table.graph, poses, np.array([row]), subject.frames, subject.clouds)
+                found = edge_pictures(
+                    table.graph, poses, np.array([row]), subject.frames, subject.clouds, has_metres=subject.unit == "m"
+                )
                 plots = tuple(_told(plot) for one in found for plot in one.plots)
                 self._made[key] = plots
                 while len(self._made) > KEPT:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +30,7 @@ from hodge_pipeline.types.notes import Note
 SIDE_FILE, SIDE_LOG = ".edits.json", ".decisions.csv"
 LOG = "decisions.csv"
 
-UNITS = "the unit of length is the model's own, which reasons call metres"
+UNITS = "the unit of length is the model's own"
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,10 @@ class Subject:
     def unit(self) -> str:
         """Of its lengths: those of a model without a scale are its own."""
         return "m" if self.model is None else "units"
+
+    def worded(self, sentence: str) -> str:
+        """A sentence of the diagnosis, which speaks of metres, in the unit of these lengths."""
+        return re.sub(r"(?<=\d) m\b", f" {self.unit}", sentence)
 
 
 def open_for_review(path: Path) -> Subject:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, student, turns
-from hodge_pipeline.solvers.backbone.fit import Linear
+from hodge_pipeline.solvers.backbone.fit import Linear, shifted
 from hodge_pipeline.types import Floats, Ints
 
 NEIGHBOURS, SEEDS = 8, 16
@@ -82,16 +82,23 @@ class Testimony:
         a, b = chain.ends[loop].T
         end = self.displaced(loop) @ poses[high]
 
-        def carried(frame: Floats, covariance: Floats) -> Floats:
-            into = chain.adjoint(frame).astype(np.longdouble)
-            return np.asarray(into @ covariance @ np.swapaxes(into, 1, 2), float)
+        def local(frame: Floats, covariance: Floats) -> Floats:
+            turned, origin = frame.copy(), np.broadcast_to(np.eye(4), frame.shape).copy()
+            turned[:, :3, 3], origin[:, :3, 3] = 0.0, -frame[:, :3, 3]
+            return carried(se3.inverse(turned), shifted(covariance, chain.adjoint(origin)))
 
-        before = carried(se3.inverse(end), total[np.maximum(a, low)] - total[np.minimum(a, low)])
-        after = carried(se3.inverse(poses[high]), total[np.maximum(b, high)] - total[np.minimum(b, high)])
+        def carried(frame: Floats, covariance: Floats) -> Floats:
+            into = chain.adjoint(frame)
+            return np.asarray(into @ covariance @ np.swapaxes(into, 1, 2))
+
+        before = local(end, total[np.maximum(a, low)] - total[np.minimum(a, low)])
+        after = local(poses[high], total[np.maximum(b, high)] - total[np.minimum(b, high)])
         return end, before + after + carried(se3.inverse(poses[high]) @ poses[b], chain.covariance[loop])
 
-    def seeds(self, rows: Ints) -> list[int]:
-        """Loops of these with which others near them, yet of other places, agree most: each differs from the others."""
+    def seeds(self, rows: Ints) -> list[tuple[int, Floats]]:
+        """Loops of these with which others near them, yet of other places, agree most, each with its `factor` (K,) for
+        all of them: each differs from the others.
+        """
         near = cKDTree(self.ends[rows]).query(self.ends[rows], k=min(4 * NEIGHBOURS, len(rows)))[1]
         near = near.reshape(len(rows), -1)
         apart = np.abs(self.ends[rows[near]] - self.ends[rows][:, None]).max(axis=2) >= 1.0
@@ -99,19 +106,19 @@ class Testimony:
         second = rows[near[first, nth]]
         gain = np.maximum(np.logaddexp(self.factor(rows[first], second), 0.0) - self.explained[second], 0.0)
         potential = np.bincount(first, gain, minlength=len(rows))
-        out: list[int] = []
+        out: list[tuple[int, Floats]] = []
         left = np.ones(len(rows), bool)
         while left.any() and len(out) < SEEDS:
             seed = int(np.argmax(np.where(left, potential, -1.0)))
-            out.append(int(rows[seed]))
+            out.append((int(rows[seed]), self.factor(np.full(len(rows), rows[seed]), rows)))
+            left &= out[-1][1] <= 0
             left[seed] = False
-            others = np.flatnonzero(left)
-            left[others[self.factor(np.full(len(others), rows[seed]), rows[others]) > 0]] = False
         return out
 
-    def gains(self, seed: int, rows: Ints) -> Floats:
-        """What each of these loops (K,) gains if `seed` is right: a place counts once, and that of the seed not."""
-        factor = self.factor(np.full(len(rows), seed), rows)
+    def gains(self, seed: int, rows: Ints, factor: Floats) -> Floats:
+        """What each of these loops (K,), with this `factor`, gains if `seed` is right: a place counts once, and that of
+        the seed not.
+        """
         agrees = factor > 0
         share = (agrees.sum() + 0.5) / (len(rows) + 1)
         gain = np.logaddexp(np.log(share) + factor, np.log1p(-share)) - self.explained[rows]
@@ -162,10 +169,10 @@ def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:
     chain, poses = told.chain, told.linear.poses
     rows = np.flatnonzero(chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])
     out = []
-    for seed in told.seeds(rows) if len(rows) > 1 else ():
+    for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
         low, high = chain.ends[seed]
         at = np.arange(low + 1, high + 1)
-        score = _over(chain, rows, told.gains(seed, rows))[at]
+        score = _over(chain, rows, told.gains(seed, rows, factor))[at]
         at, score = at[score > score.max() - PLATEAU], score[score > score.max() - PLATEAU]
         fits = _fits(told, usual, seed, at)
         score = score + np.maximum(fits, 0.0) - told.explained[seed] + usual.unusual[at]

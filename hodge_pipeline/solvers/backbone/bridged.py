@@ -19,27 +19,27 @@ MOST_BREAKS, MOST_TRIED = 10, 2
 """That are bridged one after the other, and that are tried each time."""
 
 
-def infer_bridged(chain: Chain, always: Bools, most_unknowns: int | None) -> tuple[Chain, Inferred] | None:
+def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Inferred] | None:
     """The chain with its paths joined and its broken steps bridged, and its loops judged; None as in `infer`.
 
     A step is tried where loops of several places agree that it is broken, or where it is unlike all others. It is
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
     """
     chain = joined(chain)
-    found = infer(chain, always, most_unknowns)
+    found = infer(chain, always, thin)
     for _ in range(MOST_BREAKS):
-        better = None if found is None else _better(chain, found, always, most_unknowns)
+        better = None if found is None else _better(chain, found, always, thin)
         if better is None:
             break
         chain, found = better
     return None if found is None else (chain, found)
 
 
-def _better(chain: Chain, found: Inferred, always: Bools, most_unknowns: int | None) -> tuple[Chain, Inferred] | None:
+def _better(chain: Chain, found: Inferred, always: Bools, thin: bool) -> tuple[Chain, Inferred] | None:
     """The chain with one more step bridged, and its loops judged; None where it has none that is broken."""
     for broken, least in _candidates(chain, found):
         tried = bridged(chain, broken)
-        other = infer(tried, always, most_unknowns)
+        other = infer(tried, always, thin)
         if other is not None and other.log_evidence > found.log_evidence + least:
             return tried, other
     return None
@@ -77,8 +77,8 @@ def joined(chain: Chain) -> Chain:
         best, found = BY_CHANCE + float(np.log(len(pairs))), None
         for low, high in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).tolist():
             rows = np.flatnonzero((pairs == [low, high]).all(axis=1))
-            for seed in told.seeds(rows) if len(rows) > 1 else ():
-                if (score := float(told.gains(seed, rows).sum())) > best:
+            for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
+                if (score := float(told.gains(seed, rows, factor).sum())) > best:
                     best, found = score, (low, high, seed)
         if found is None:
             break

@@ -37,8 +37,7 @@ class Linear:
         third position, by default the second.
         """
         low, high = np.minimum(a, b), np.maximum(a, b)
-        carry = self.shift[b if at is None else at].astype(np.longdouble)
-        return np.asarray(carry @ (self.covariance[high] - self.covariance[low]) @ np.swapaxes(carry, 1, 2), float)
+        return shifted(self.covariance[high] - self.covariance[low], self.shift[b if at is None else at])
 
     def carry(self, a: Ints, b: Ints) -> Floats:
         """What takes twists (K, p, p) at one position's origin to another's."""
@@ -46,6 +45,19 @@ class Linear:
         split = out.shape[-1] - (2 if out.shape[-1] == 3 else 3)
         out[:, split:, :split] = self.shift[b, split:, :split] - self.shift[a, split:, :split]
         return out
+
+
+def shifted(covariance: Floats, shift: Floats) -> Floats:
+    """Covariances (K, p, p) about the world's origin, in extended precision, in axes with another (K, p, p) there."""
+    split = shift.shape[-1] - (2 if shift.shape[-1] == 3 else 3)
+    lever = shift[:, split:, :split]
+    turn, across = covariance[:, :split, :split], covariance[:, split:, :split]
+    moved = across + lever @ turn
+    out = np.empty(covariance.shape)
+    out[:, :split, :split], out[:, split:, :split], out[:, :split, split:] = turn, moved, np.swapaxes(moved, 1, 2)
+    far = lever @ np.swapaxes(across, 1, 2) + moved @ np.swapaxes(lever, 1, 2)
+    out[:, split:, split:] = covariance[:, split:, split:] + far
+    return out
 
 
 def linearise(chain: Chain, poses: Floats) -> Linear:
@@ -180,11 +192,14 @@ def moved(chain: Chain, reduced: Reduced, linear: Linear, moves: Floats) -> Floa
     out = moves[left] - (linear.residual - linear.residual[low])
     out[~touched] = 0.0
     k = np.flatnonzero(bent)
-    run = low[k]
-    gap = moves[right[k]] - moves[left[k]] + linear.residual[high[k]] - linear.residual[run]
-    here = linear.shift[k]
-    whole = inverse(linear.path(run, high[k], k)) @ here @ gap[..., None]
-    out[k] += np.linalg.solve(here, linear.path(run, k) @ whole)[..., 0]
+    begin, end = ends[reduced.runs].T
+    first, second = reduced.runs.T
+    gap = moves[second] - moves[first] + linear.residual[end] - linear.residual[begin]
+    pull = np.empty((len(ends), gap.shape[1], 1))
+    pull[first] = inverse(linear.path(begin, end)) @ linear.shift[end] @ gap[..., None]
+    back = 2 * np.eye(gap.shape[1]) - linear.shift[k]
+    along = np.swapaxes(linear.carry(k, high[k]), 1, 2) @ pull[left[k]]
+    out[k] += (back @ linear.path(low[k], k) @ along)[..., 0]
     return np.asarray(chain.exp(out) @ linear.poses)
 
 

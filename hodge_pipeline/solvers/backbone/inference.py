@@ -13,7 +13,7 @@ from hodge_pipeline.solvers.backbone.polish import LOCAL, polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales, mixture
 from hodge_pipeline.solvers.backbone.sparse import Factored
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 ROUNDS = 6
 SAMPLES = 64
@@ -53,9 +53,9 @@ class Inferred:
     confirmed: bool
 
 
-def infer(chain: Chain, always: Bools, most_unknowns: int | None = None) -> Inferred | None:
-    """Judge the loops of a chain; those of `always (M,)` count whatever they say. None where there would be more than
-    so many unknowns in a dense matrix.
+def infer(chain: Chain, always: Bools, thin: bool = True) -> Inferred | None:
+    """Judge the loops of a chain; those of `always (M,)` count whatever they say. Where they would leave more than
+    `MOST_UNKNOWNS`, all are judged at the poses of some of the right ones, or None comes back without `thin`.
     """
     poses = chain.poses()
     wrong = Wrong.of(chain, poses)
@@ -67,8 +67,8 @@ def infer(chain: Chain, always: Bools, most_unknowns: int | None = None) -> Infe
     used = (judged.factor > limit) | always
     best, top, seen = (judged, start), -np.inf, b""
     for number in range(ROUNDS):
-        reduced = Reduced.of(chain, np.flatnonzero(used))
-        if most_unknowns is not None and reduced.network.core_size * len(chain.axes) > most_unknowns:
+        reduced = thinned(chain, np.flatnonzero(used))
+        if not thin and len(reduced.active) < used.sum():
             return None
         linear = settled_globally(chain, reduced, linear.poses)
         judged = _judge(chain, linear, reduced, shares, wrong)
@@ -85,7 +85,8 @@ def infer(chain: Chain, always: Bools, most_unknowns: int | None = None) -> Infe
     used = (judged.factor > np.log(max(len(always), 1))) & (judged.log_odds > 0)
     confirmed = _confirmed(judged.factor[used], len(used))
     used = (used & confirmed) | always
-    linear, width = polished(chain, used, linear if used.any() else start)
+    rows = thinned(chain, np.flatnonzero(used)).active
+    linear, width = polished(chain, rows, linear if used.any() else start)
     return Inferred(used, judged, linear.poses, scales, LOCAL, width, top, confirmed)
 
 
@@ -95,6 +96,25 @@ BY_CHANCE, BY_CHANCE_EACH_FOLD = float(np.log(100.0)), 3.0
 """Log-evidence that chance reaches in one graph of a hundred, and what each e-fold of loops adds to it: measured with
 random loops in simulated graphs and in those of Bicocca and RobotCar, whose best reach half of it.
 """
+
+
+def thinned(chain: Chain, rows: Ints) -> Reduced:
+    """The network of these loops, or of as many of them, spread evenly over their ends, as can be inverted."""
+    spread, count = rows[np.argsort(chain.ends[rows, 0], kind="stable")], min(len(rows), MOST_ACTIVE)
+    while True:
+        chosen = spread[np.linspace(0, len(spread) - 1, count).astype(np.int64)]
+        reduced = Reduced.of(chain, np.sort(chosen))
+        if reduced.network.core_size * len(chain.axes) <= MOST_UNKNOWNS:
+            return reduced
+        count = round(THINNING * count)
+
+
+MOST_UNKNOWNS = 1500
+"""In a dense matrix, which takes .5 CPU s to invert."""
+MOST_ACTIVE = 2000
+"""Loops at the most: between their ends even a long path drifts by little."""
+THINNING = 0.8
+"""Of the loops that are left where these leave too many unknowns."""
 
 
 def _confirmed(factor: Floats, count: int) -> bool:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, turns
 from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, settled
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Floats, Ints
 
 LOCAL = 0.5
 """Of the scale of the steps' errors over long paths, that over short ones: these errors are alike from step to step.
@@ -22,24 +22,29 @@ ALIKE = 0.5
 """
 ROUNDS = 5
 STEPS, TOLERANCE = 3, 1e-3
+SAME_WEIGHT = 0.01
+"""Loops whose weights change by less are not solved for again."""
 
 
-def polished(chain: Chain, used: Bools, linear: Linear) -> tuple[Linear, Floats]:
-    """The chain at the poses of the used loops (M,), and the factors (M,) on their standard deviations."""
-    rows = np.flatnonzero(used)
+def polished(chain: Chain, rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
+    """The chain at the poses of the loops of these rows, and the factors (M,) on the standard deviations of all."""
+    count = len(chain.ends)
     if not len(rows):
-        return linear, np.ones(len(used))
+        return linear, np.ones(count)
     reduced = Reduced.of(chain, rows)
     chain = replace(chain, step_covariance=LOCAL**2 * chain.step_covariance)
-    wide = np.ones(len(used))
+    wide = np.ones(count)
     wide[rows] = crowding(chain, rows) ** ALIKE
     chain = replace(chain, covariance=chain.covariance * wide[:, None, None])
-    weights = np.ones(len(used))
+    weights = np.ones(count)
     for _ in range(ROUNDS):
         weighted = replace(chain, covariance=chain.covariance / weights[:, None, None])
         linear = settled(weighted, reduced, linear.poses, STEPS, TOLERANCE)
         _, chi2 = gaussian(linear.loop_residual[rows], linear.loop_covariance[rows] * weights[rows, None, None])
+        before = weights[rows]
         weights[rows] = (FREEDOM + len(chain.axes)) / (FREEDOM + chi2)
+        if np.abs(weights[rows] - before).max() < SAME_WEIGHT:
+            break
     return linear, np.sqrt(wide / weights)
 
 

@@ -30,8 +30,6 @@ LOOPS_AT_A_STEP, AGREEING = 0.5, 0.05
 agree with each other says that the backbone is wrong. Fewer loops may be groups that take one place for another; among
 random ones hardly any agree.
 """
-MOST_UNKNOWNS = 1500
-"""In a dense matrix: a lattice of loops, in which no edge needs to be trusted, has more."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
     if trust == AUTO and tested_steps(chain, chain.poses()).sum() > TESTED * steps.sum():
         return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
-    inferred = infer_bridged(chain, always, MOST_UNKNOWNS if trust == AUTO else None)
+    inferred = infer_bridged(chain, always, trust != AUTO or not _many_loops(chain, steps))
     if inferred is None:
         return None
     chain, found = inferred
@@ -119,8 +117,12 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
 
 def _loops_agree(chain: Chain, steps: Bools) -> bool:
     """Whether many loops agree with each other, though none with the backbone: it is what is wrong then."""
-    many = len(chain.loop_edge) > LOOPS_AT_A_STEP * steps.sum()
-    return many and bool(tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum())
+    return _many_loops(chain, steps) and bool(tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum())
+
+
+def _many_loops(chain: Chain, steps: Bools) -> bool:
+    """As in a lattice, in which no edge needs to be trusted."""
+    return bool(len(chain.loop_edge) > LOOPS_AT_A_STEP * steps.sum())
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
