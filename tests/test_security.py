@@ -113,13 +113,27 @@ def test_set_says_what_to_give_instead(change: str, key: str) -> None:
     assert "--dask ADDRESS" in str(refused.value)
 
 
-@pytest.mark.parametrize("command", ["solve", "diagnose", "record", "run"])
-def test_a_run_folder_reaches_no_cluster(run_folder: Path, stranger: Stranger, command: str) -> None:
+def names_a_cluster(run_folder: Path, address: str) -> Path:
+    """The recipe of a run, which now names a cluster."""
     recipe = run_folder / "recipe.yaml"
     text = recipe.read_text()
     assert LOCAL in text
-    theirs = f"executor:\n  stage: dask\n  address: {stranger.address}\n  workers: 2\n  retries: 2\n  timeout_s: 5.0\n"
+    theirs = f"executor:\n  stage: dask\n  address: {address}\n  workers: 2\n  retries: 2\n  timeout_s: 5.0\n"
     recipe.write_text(text.replace(LOCAL, theirs))
+    return recipe
+
+
+@pytest.mark.parametrize("command", [["diagnose"], ["record", "--level", "summary"]])
+def test_what_only_reads_a_run_leaves_its_cluster_out(run_folder: Path, stranger: Stranger, command: list[str]) -> None:
+    names_a_cluster(run_folder, stranger.address)
+    done = CliRunner().invoke(app, [*command, str(run_folder)])
+    assert done.exit_code == 0, done.output
+    assert not stranger.calls
+
+
+@pytest.mark.parametrize("command", ["solve", "run"])
+def test_a_run_folder_reaches_no_cluster(run_folder: Path, stranger: Stranger, command: str) -> None:
+    recipe = names_a_cluster(run_folder, stranger.address)
     arguments = ["run", recipe, "--out", run_folder] if command == "run" else [command, run_folder]
     said = one_line_of(*arguments)
     assert said.startswith(f"{recipe}:")

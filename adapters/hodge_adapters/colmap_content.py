@@ -30,6 +30,7 @@ REFUSALS = (
     ),
     (r"__n \(which is (\d+)\)", "the track of a point names observation {0} of an image that has fewer"),
     (r"Image with ID (-?\d+) does not", "the track of a point, or a frame, names image {0}, which is not there"),
+    (r"as image (\d+) in frame (\d+) does not exist", "frame {1} names image {0}, which is not there"),
     (r"rigs_\.emplace", "a rig is given twice"),
     (r"Sensor \((\w+, \d+)\) is inserted twice", "a rig has a sensor twice ({0})"),
     (r"Rig with ID (\d+) does not exist", "a frame is of rig {0}, which is not there"),
@@ -93,6 +94,8 @@ def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks
         raise SourceError(f"{where}: the name of an image is no UTF-8: {REMEDY}") from error
     except OverflowError as error:
         raise SourceError(f"{where}: the id of a point is beyond 2^63: {REMEDY}") from error
+    except (ValueError, IndexError) as error:
+        raise SourceError(f"{where}: {_reason(str(error))}: {REMEDY}") from error
     except RuntimeError as error:
         raise SourceError(f"{where}: an image is of a sensor whose place on its rig is not known: {REMEDY}") from error
     _check(content, where)

@@ -136,11 +136,14 @@ def _swap_lines(contents: bytes, rng: random.Random) -> bytes:
 def check_sound(source: Source) -> int:
     """How many images were refused, after asserting that what was opened and read is sound."""
     refused = 0
-    assert len(source.frames) or source.trajectory is not None or source.graph is not None, "nothing, silently"
+    held = (source.trajectory, source.graph, source.positions)
+    assert len(source.frames) or any(one is not None for one in held), "nothing, silently"
     if source.trajectory is not None:
         check_trajectory(source.trajectory)
     if source.graph is not None:
         check_view_graph(source.graph)
+    if source.positions is not None:
+        assert np.isfinite(source.positions.points).all()
     assert len({frame.frame_id for frame in source.frames}) == len(source.frames), "frame ids repeat"
     for frame in source.frames[:4]:
         assert np.isfinite(frame.stamp_s)
