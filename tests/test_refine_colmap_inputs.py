@@ -117,7 +117,7 @@ def test_without_a_scale_nothing_is_in_metres(tmp_path: Path, monkeypatch: pytes
     set_label = Axis.set_label_text
     monkeypatch.setattr(Axis, "set_label_text", lambda *a, **k: (labels.append(a[1]), set_label(*a, **k))[1])
     sets = [text for option in FREE for text in ("--set", option)]
-    found = CliRunner().invoke(app, ["refine", "colmap", str(start), "--out", str(out), *sets])
+    found = CliRunner().invoke(app, ["refine", "colmap", str(start), "--out", str(out), "--verbose", *sets])
     assert found.exit_code == 0, found.output
     page = re.sub(r"<[^>]*>", " ", (out / "report.html").read_text("utf-8"))
     for text in (found.output, page, *labels):

@@ -13,7 +13,7 @@ import typer
 from benchmarks.paper import tables as paper_tables
 from benchmarks.paper.sequences import Found, find_sequences, peer_poses
 from benchmarks.paper.tables import NAN, Measured, Results
-from hodge_pipeline.cli.console import Terminal
+from hodge_pipeline.cli.console import ProgressBars
 from hodge_pipeline.cli.options import Dask
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError
 from hodge_pipeline.evaluation.scores import GRAPH_KINDS, GraphKind, score_table
@@ -104,7 +104,7 @@ def _run(sequence: Found, kind: GraphKind, out: Path, overrides: list[str], dask
     fixed = [reader, f"outer_iterations={OUTER_ITERATIONS}", "recording.level=off", "fusion=[]"]
     recipe = load_recipe(f"paper-{kind}", [*fixed, *overrides], sequence.folder)
     begin = time.perf_counter()
-    with Terminal(quiet=False) as terminal:
+    with ProgressBars(quiet=False) as terminal:
         terminal.say(f"{sequence.name}, {kind} graph: {sequence.folder}")
         run = run_pipeline(recipe, out / f"{sequence.name}-{kind}", overwrite=True, watcher=terminal, dask=dask)
     return run, time.perf_counter() - begin

@@ -112,7 +112,7 @@ def _empty_file(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDA
     """An array to be filled that is the file; an empty array cannot be mapped, and is written as it is."""
     if shape[0]:
         mapped: NDArray[Any] = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
-        with path.open("r+b") as file:
+        with path.open("ab") as file:
             artifacts.reserve(file, path.stat().st_size)
         return mapped
     np.save(path, np.zeros(shape, dtype))
