@@ -91,7 +91,7 @@ def turns_deg(report: Report) -> dict[str, Floats]:
 def _unit(report: Report, offsets: Sequence[Floats]) -> tuple[str, float]:
     """The unit that suits these offsets, and how many of them a metre has."""
     if not report.has_metres:
-        return "the source's unit", 1.0
+        return "units", 1.0
     largest = max(float(np.nanmax(np.abs(each), initial=0.0)) for each in offsets)
     return ("mm", 1000.0) if largest < 0.02 else ("cm", 100.0) if largest < 1 else ("m", 1.0)
 

@@ -150,7 +150,7 @@ WORDING: dict[str, tuple[Rank, str]] = {
     ),
     "no metres": (
         Rank.LOOK,
-        "There is no depth that tells the scale: lengths are in the model's own unit, called metres here.",
+        "There is no depth that tells the scale: lengths are in the model's own unit.",
     ),
 }
 """Each kind's rank, and its sentence: `{count}` and `{detail}` are the note's."""
