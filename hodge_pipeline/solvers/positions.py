@@ -12,6 +12,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import by_size
+from hodge_pipeline.complex.judging import chi2_by_information
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.setup import NO_ROWS
@@ -135,43 +136,32 @@ def place(
     return Placed(solved, by_size(np.where(placed, component.max(initial=0) + 1, component)), fit)
 
 
-def align_positions(
-    found: Floats, known: Floats, sigma: Floats, up: Floats | None = None, *, with_scale: bool = False
-) -> tuple[Floats, Bools]:
+def align_positions(found: Floats, known: Floats, sigma: Floats, up: Floats) -> tuple[Floats, Bools]:
     """The motion (4, 4) that lays points (P, 3) on known ones, by least median of squares, and which (P,) it fits.
 
-    With a scale its rotation part is multiplied by it. `up (3,)` is what points up among the found ones: it settles
-    what points on a line leave open.
+    `up (3,)` is what points up among the found ones: it settles what points on a line leave open.
     """
     rng = np.random.default_rng(0)
     count = len(found)
     chosen = np.stack([rng.choice(count, FEWEST, replace=False) for _ in range(TRIALS)])
     chosen = chosen if count > FEWEST else np.arange(FEWEST)[None]
     tie = np.median(sigma) ** 2
-    trials = [_similarity(found[rows], known[rows], tie, up, with_scale) for rows in chosen]
+    trials = [_motion(found[rows], known[rows], tie, up) for rows in chosen]
     middle = [np.median(np.linalg.norm(known - se3.transform(trial, found), axis=1)) for trial in trials]
     best = trials[int(np.argmin(middle))]
     inliers = np.ones(count, bool)
     for _ in range(3):
         misfit = np.linalg.norm(known - se3.transform(best, found), axis=1)
         inliers = misfit <= GROSS * np.maximum(np.median(misfit), sigma)
-        best = _similarity(found[inliers], known[inliers], tie, up, with_scale)
+        best = _motion(found[inliers], known[inliers], tie, up)
     return best, inliers
 
 
-def _similarity(found: Floats, known: Floats, tie_m2: float, up: Floats | None, with_scale: bool) -> Floats:
-    """The least-squares motion or similarity (Umeyama 1991); where positions are within the noise, up stays up."""
-    x, y = found - found.mean(axis=0), known - known.mean(axis=0)
-    covariance = y.T @ x / len(x)
-    if up is not None:
-        covariance = covariance + tie_m2 * np.outer([0.0, 0.0, 1.0], up)
-    rotation = se3.project_to_so3(covariance)
-    spread = float((x**2).sum() / len(x))
-    scale = float(np.trace(rotation.T @ covariance)) / spread if with_scale and spread > 0 else 1.0
-    out = np.eye(4)
-    out[:3, :3] = scale * rotation
-    out[:3, 3] = known.mean(axis=0) - out[:3, :3] @ found.mean(axis=0)
-    return out
+def _motion(found: Floats, known: Floats, tie_m2: float, up: Floats) -> Floats:
+    """The least-squares motion (Arun 1987); where positions are within the noise, up stays up."""
+    moment = (known - known.mean(axis=0)).T @ (found - found.mean(axis=0)) / len(found)
+    rotation = se3.project_to_so3(moment + tie_m2 * np.outer([0.0, 0.0, 1.0], up))
+    return se3.from_parts(rotation, known.mean(axis=0) - rotation @ found.mean(axis=0))
 
 
 def _sigma(fixes: Fixes) -> Floats:
@@ -217,7 +207,7 @@ def _settled(
     """
     information = graph.information * weights[:, None, None]
     alone = replace(graph, information=information, priors=None, fixed=NO_ROWS)
-    at_rest = _chi2(alone, solve(alone, start=poses, initial="given", fixed=NO_ROWS).world_from_cam)
+    at_rest = chi2_by_information(alone, solve(alone, start=poses, initial="given", fixed=NO_ROWS).world_from_cam)
     edge_factor, fix_factor = LOOSE, 1.0
     for _ in range(MOST_ROUNDS):
         priors = fixes.select(used).priors(poses, fix_factor)
@@ -226,7 +216,7 @@ def _settled(
         share, distance = _tested(whole, poses, fixes, used, reached, fix_factor)
         found = _Settled(poses, used, distance, edge_factor, fix_factor)
         told = float(share[used].sum())
-        chi2 = _chi2(alone, poses)
+        chi2 = chi2_by_information(alone, poses)
         most = GROSS**2 * np.median(chi2[weights > 0])  # a jump tears a few edges far
         bent = np.minimum(chi2, most).sum() - np.minimum(at_rest, most).sum()
         edge_factor = _factor(edge_factor, max(bent, 0.0), told - gauges)
@@ -244,12 +234,6 @@ def _factor(before: float, chi2: float, freedom: float) -> float:
     """The factor on sigma with which chi2 is as large as its degrees of freedom; that of before counts as some."""
     factor = np.sqrt((chi2 + INERTIA * before**2) / (max(freedom, 0.0) + INERTIA))
     return float(np.clip(factor, 1 / MOST_FACTOR, MOST_FACTOR))
-
-
-def _chi2(graph: ViewGraph, poses: Floats) -> Floats:
-    i, j = graph.edges.T
-    left = se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(poses[i]) @ poses[j])
-    return np.asarray(np.einsum("ei,eij,ej->e", left, graph.information, left))
 
 
 def _whitened(fixes: Fixes, vectors: Floats) -> Floats:
