@@ -376,9 +376,7 @@ class ModelReader(Protocol):
     """Opens models that track points, and joins several of one scene."""
 
     def open_models(self, source: Path | Sequence[Any]) -> Sequence[TrackedModel]:
-        """The model at a path, or all the models that one scene fell into; or models that the format's own library
-        holds in memory. Raises `SourceError`.
-        """
+        """The models at a path, or those that the format's own library holds in memory. Raises `SourceError`."""
         ...
 
     def join(self, models: Sequence[TrackedModel]) -> Sequence[TrackedModel]:
@@ -391,10 +389,8 @@ class PoseRewriter(Protocol):
     """Writes poses back into the form of the file they came from; it has the name of the reader of that form."""
 
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
-        """`refined.<suffix>` in the folder: the original with the trajectory's poses in place of its own.
-
-        The trajectory has the stamps that the reader gave; stamps, order, comments and further columns stay as they
-        are. Gives the path.
+        """The path of `refined.<suffix>` in the folder: the original with the trajectory's poses in place of its own;
+        stamps, as the reader gave them, order, comments and further columns stay as they are.
         """
         ...
 

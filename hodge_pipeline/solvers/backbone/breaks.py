@@ -25,6 +25,10 @@ PLATEAU = 12.0
 """Nats: a step at which the loops' evidence is lower by more is not where the chain is broken."""
 TAIL = 0.1
 """Share of the most unusual steps, whose sizes tell how often one is larger still (Hill 1975)."""
+MOST_UNUSUAL = 3
+"""Steps that are tried by their own size alone: a limit on cost."""
+ROUNDS, LEAST = 10, 1e-6
+"""Of the fit of usual steps; and the share of a variance that is added to it."""
 
 
 @dataclass(frozen=True)
@@ -160,10 +164,6 @@ class Usual:
         return cls(chain.exp(centre[None])[0], covariance, unusual)
 
 
-ROUNDS, LEAST = 10, 1e-6
-"""Of the fit; and of a variance, what is added to it."""
-
-
 def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:
     """The likeliest break that each of the loops that others agree with asks for, the likeliest first."""
     chain, poses = told.chain, told.linear.poses
@@ -215,6 +215,3 @@ def unusual_breaks(usual: Usual) -> list[Break]:
     """
     rows = np.argsort(-usual.unusual)
     return [Break(int(at), usual.centre, usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
-
-
-MOST_UNUSUAL = 3
