@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -41,21 +43,23 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
     """
     chain = joined(chain)
-    found = infer(chain, always, thin)
+    wrong = Wrong.of(chain, chain.poses())  # one for all trials: evidence is against all loops being wrong
+    judge = partial(infer, wrong=wrong, always=always, thin=thin)
+    found = judge(chain)
     for _ in range(MOST_BREAKS):
-        better = None if found is None else _better(chain, found, always, thin)
+        better = None if found is None else _better(chain, found, judge)
         if better is None:
             break
         chain, found = better
     return None if found is None else (chain, found)
 
 
-def _better(chain: Chain, found: Inferred, always: Bools, thin: bool) -> tuple[Chain, Inferred] | None:
+def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> tuple[Chain, Inferred] | None:
     """The chain with one more step bridged, and its loops judged; None where it has none that is broken."""
     for broken, least in _candidates(chain, found):
         tried = bridged(chain, broken)
         for scales in (None, found.scales):  # as learned anew, and so that nothing but the step differs
-            other = infer(tried, always, thin, scales)
+            other = judge(tried, scales=scales)
             if other is not None and other.log_evidence > found.log_evidence + least:
                 return tried, other
     return None

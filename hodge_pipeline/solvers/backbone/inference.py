@@ -53,14 +53,15 @@ class Inferred:
     confirmed: bool
 
 
-def infer(chain: Chain, always: Bools, thin: bool = True, scales: Scales | None = None) -> Inferred | None:
+def infer(
+    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None
+) -> Inferred | None:
     """Judge the loops of a chain; those of `always (M,)` count whatever they say. Where they would leave more than
     `MOST_UNKNOWNS`, all are judged at the poses of some of the right ones, or None comes back without `thin`.
 
     `scales`: of the errors; learned from the loops where none are given.
     """
     poses = chain.poses()
-    wrong = Wrong.of(chain, poses)
     scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
     chain = scales.applied(chain)
     linear = start = linearise(chain, poses)
@@ -75,6 +76,7 @@ def infer(chain: Chain, always: Bools, thin: bool = True, scales: Scales | None 
         linear = settled_globally(chain, reduced, linear.poses)
         judged = _judge(chain, linear, reduced, shares, wrong)
         shares, likelihood = mixture(judged.log_density)
+        likelihood -= float(judged.log_density[1].sum())
         if number >= SETTLING and likelihood > top:
             best, top = (judged, linear), likelihood
         limit = limit / 2 if number < SETTLING else 0.0
