@@ -23,6 +23,12 @@ STEPS_OF_PLACE, FEWEST_PLACES = 20, 50
 """Steps that a place has at the least, however large the errors of steps are; places that a path has, however small."""
 PLATEAU = 12.0
 """Nats: a step at which the loops' evidence is lower by more is not where the chain is broken."""
+CARRIED = 40.0
+"""Nats that speak against a step which is as no usual step is: loops of three places together say as much. Where one
+corridor is mistaken for another, loops of up to that many places agree, and no usual step explains them; a step that is
+measured wrong was a usual one. Of simulated breaks of 5 m and 30° all have a usual step, of corridors of 30 to 60 steps
+that were mistaken none.
+"""
 TAIL = 0.1
 """Share of the most unusual steps, whose sizes tell how often one is larger still (Hill 1975)."""
 MOST_UNUSUAL = 3
@@ -186,7 +192,7 @@ def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:
         score = _over(chain, rows, told.gains(seed, rows, factor))[at]
         at, score = at[score > score.max() - PLATEAU], score[score > score.max() - PLATEAU]
         fits = _fits(told, usual, np.full(len(at), seed), at) - told.away[seed]
-        score = score + np.maximum(fits, 0.0) - told.explained[seed] + usual.unusual[at]
+        score = score + np.where(fits > 0, fits, -CARRIED) - told.explained[seed] + usual.unusual[at]
         out.append(_break(told, usual, seed, at, score))
     return sorted(out, key=lambda each: -each.log_evidence)
 
@@ -233,8 +239,10 @@ def strained_break(chain: Chain, used: Reduced, linear: Linear, usual: Usual) ->
     """
     low, high = used.ends[used.runs].T
     residual, total, prior = without_run(used, linear)
+    chi2, size = student(residual, total)[1], residual.shape[1]
+    tense = max(1.0, float(np.median(chi2)) / size)  # as if the steps' scale were too small by the usual run
+    total, prior = tense * total, tense * prior
     log_density, chi2 = student(residual, total)
-    size = residual.shape[1]
     strained = np.flatnonzero(0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM) > STRAIN)
     if not len(strained):
         return None
