@@ -182,7 +182,7 @@ class Usual:
 
 def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:
     """The likeliest break that each of the loops that others agree with asks for, the likeliest first."""
-    chain, poses = told.chain, told.linear.poses
+    chain = told.chain
     rows = np.flatnonzero(chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])
     out = []
     for seed in told.seeds(rows[~told.used[rows]]):

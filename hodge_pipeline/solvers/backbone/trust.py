@@ -119,7 +119,9 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
 
 def _loops_agree(chain: Chain, steps: Bools) -> bool:
     """Whether many loops agree with each other, though none with the backbone: it is what is wrong then."""
-    return len(chain.loop_edge) > steps.sum() and bool(tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum())
+    return len(chain.loop_edge) > steps.sum() and bool(
+        tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum()
+    )
 
 
 def _many_loops(chain: Chain, steps: Bools) -> bool:
