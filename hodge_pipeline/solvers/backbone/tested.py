@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -33,14 +32,11 @@ def tested_steps(chain: Chain, poses: Floats) -> Bools:
 
 
 def tested_by_pairs(chain: Chain, poses: Floats) -> Bools:
-    """Steps (n,) in cycles of two loops and the steps between neighbouring ends of them that close: of the largest
-    cluster of loops that such cycles join. Groups of loops that are wrong alike are many clusters.
-    """
+    """Steps (n,) in cycles of two loops and the steps between neighbouring ends of them that close."""
     out = np.zeros(chain.size, bool)
     low, high = chain.ends.T
     keys = low * chain.size + high
     order, path, gate = np.argsort(keys, kind="stable"), chain.path, _gate(chain)
-    joined = []
     for down, up in ((0, 1), (1, 0), (1, 1), (1, -1)) if len(keys) else ():
         moved = low + down, high + up
         at = np.minimum(np.searchsorted(keys, moved[0] * chain.size + moved[1], sorter=order), len(keys) - 1)
@@ -49,14 +45,11 @@ def tested_by_pairs(chain: Chain, poses: Floats) -> Bools:
         first = np.flatnonzero(fits & (path[low] == path[low[other]]) & (path[high] == path[high[other]]))
         second = other[first]
         before, after = _between(poses, low[first], low[second]), _between(poses, high[second], high[first])
-        good = _closes(chain.motion[first], before @ chain.motion[second] @ after, gate)
-        joined.append(np.stack([first, second], axis=1)[good])
-    if sum(map(len, joined)):
-        pairs = np.concatenate(joined)
-        cluster = connected_components(pairs, len(keys))[pairs[:, 0]]
-        pairs = pairs[cluster == np.argmax(np.bincount(cluster))]
-        for ends in (low[pairs], high[pairs]):
-            out[ends.max(axis=1)[ends[:, 0] != ends[:, 1]]] = True
+        good = first[_closes(chain.motion[first], before @ chain.motion[second] @ after, gate)]
+        if down:
+            out[low[good] + 1] = True
+        if up:
+            out[high[good] + (1 if up > 0 else 0)] = True
     return out
 
 

@@ -28,9 +28,9 @@ TESTED = 0.3
 LOOPS_AT_A_STEP = 0.5
 """From there on loops may make a lattice, in which no edge needs to be trusted."""
 AGREEING = 0.05
-"""Where loops are more than steps and no backbone confirms any, so large a share of the steps between loops of one
-cluster, which agree with each other, says that the backbone is wrong. Fewer loops may be groups that take one place for
-another; among random ones hardly any agree. In the graph of the garage .11 are.
+"""Where loops are more than steps and no backbone confirms any, so large a share of the steps between loops that agree
+with each other says that the backbone is wrong. Fewer loops may be groups that take one place for another; among random
+ones hardly any agree.
 """
 
 
