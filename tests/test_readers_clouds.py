@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters import point_columns
-from hodge_adapters.clouds import CloudFolderReader, PlyWriter
-from hodge_adapters.kitti_scans import read_bin
-from hodge_adapters.log_text import read_log_file
-from hodge_adapters.pcd_points import expand_lzf, read_pcd
-from hodge_adapters.ply_points import read_ply, write_ply
+from hodge_adapters.clouds import columns as point_columns
+from hodge_adapters.clouds.kitti import read_bin
+from hodge_adapters.clouds.pcd import expand_lzf, read_pcd
+from hodge_adapters.clouds.ply import read_ply, write_ply
+from hodge_adapters.clouds.reader import CloudFolderReader, PlyWriter
+from hodge_adapters.trajectories.log import read_log_file
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.measured_edges import GraphFile, MeasuredOptions, measured_edges
