@@ -54,7 +54,7 @@ def cg_first(problem: Problem) -> bool:
 def step_solver(problem: Problem) -> DirectSolver | IterativeSolver:
     """What solves for the steps of all unknowns, by the problem's back end."""
     structure = problem.structure
-    return structure.iterative or DirectSolver(structure.elimination, structure.backend, cg_first(problem))
+    return structure.iterative or DirectSolver(structure.elimination, cg_first(problem))
 
 
 @dataclass(frozen=True)

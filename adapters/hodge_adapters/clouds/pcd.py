@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hodge_adapters.clouds.columns import number_rows, parts_of, points_of_parts
+from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PointCloud
 from hodge_pipeline.types.input_files import read_input
@@ -45,10 +46,8 @@ def read_pcd(path: Path) -> PointCloud:
 
     Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
     """
-    try:
+    with reading(path):
         contents = read_input(path)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
     header = _read_header(path, contents)
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}[header.kind]
     return points_of_parts(path, map(_unpacked, read(path, contents, header)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -16,7 +15,6 @@ MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "den
 PARENTS = 3
 LOOKED_AT = 60
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
-_DIGITS = re.compile(r"(\d+)")
 
 
 def find_model(path: Path) -> Path | None:
@@ -71,12 +69,6 @@ def find_database(model: Path) -> Path | None:
     """The database beside or above the model."""
     above = [model, *model.absolute().parents[:PARENTS]]
     return next((place / "database.db" for place in above if (place / "database.db").is_file()), None)
-
-
-def natural(name: str) -> tuple[tuple[int, int, str], ...]:
-    """A sort key that takes digits for numbers."""
-    parts = (part for part in _DIGITS.split(name) if part)
-    return tuple((0, int(part[:18]), part) if part.isascii() and part.isdecimal() else (1, 0, part) for part in parts)
 
 
 def parent_of(name: str) -> str:

@@ -12,7 +12,7 @@ from mcap.records import Channel, Schema
 
 from hodge_adapters.mcap.complaints import Complaints
 from hodge_adapters.mcap.records import MAX_MESSAGE_BYTES, Place
-from hodge_pipeline.errors import SourceError
+from hodge_adapters.text_rows import reading
 from hodge_pipeline.types.input_files import open_input
 
 MAX_EXPANSION, ALWAYS_EXPANDED_BYTES = 200, 1 << 31
@@ -64,12 +64,8 @@ class MessageFile(ABC):
 
     def messages(self) -> Iterator[Logged]:
         """The wanted messages. Raises `SourceError` for a file of another format; all else is complained of."""
-        try:
-            with open_input(self.path) as file:
-                yield from self._messages(file)
-        except OSError as error:
-            remedy = "restore the file or its permissions"
-            raise SourceError(f"{self.path}: cannot be read ({error.strerror}): {remedy}") from error
+        with reading(self.path), open_input(self.path) as file:
+            yield from self._messages(file)
 
     @abstractmethod
     def _messages(self, file: IO[bytes]) -> Iterator[Logged]:
