@@ -5,7 +5,7 @@ COLMAP puts 0, 0 at the outer corner of the first pixel; here whole numbers are 
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -96,8 +96,3 @@ def read_undistorted_colour(path: Path, *, record: CameraRecord, size: tuple[int
         colour = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
     columns, rows = undistortion(record, size)
     return np.asarray(cv2.remap(colour, columns, rows, cv2.INTER_LINEAR, borderValue=(0, 0, 0)), np.uint8)
-
-
-def colour_reader(path: Path, record: CameraRecord, size: tuple[int, int]) -> partial[Bytes]:
-    """The lazy colour image of a frame."""
-    return partial(read_undistorted_colour, path, record=record, size=size)
