@@ -38,7 +38,7 @@ def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floa
     kept = np.array([row for row, line in enumerate(lines) if np.isfinite(line).all()], np.int64)
     left = se3.log(loop_products(chosen, graph.i_from_j))
     angle, shift_m = np.linalg.norm(left[:, :3], axis=1), np.linalg.norm(left[:, 3:], axis=1)
-    size = np.hypot(shift_m, shapes.RESIDUAL_ARM_M * angle)[kept]
+    size = np.hypot(shift_m, se3.ARM_M * angle)[kept]
     strips = rr.LineStrips3D(
         [lines[row] for row in kept],
         colors=_loop_colours(size),
