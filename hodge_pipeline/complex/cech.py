@@ -112,8 +112,8 @@ def orient_edges(edges: Ints, vertex_count: int) -> OrientedEdges:
 def flag_complex(edges: Ints, vertex_count: int, dimension: int = 2, most: int = MOST_SIMPLICES) -> SimplicialComplex:
     """Every clique of up to `dimension + 1` vertices (Section 4). Parallel edges count once, self-loops not at all.
 
-    Raises `GraphError` before a dimension would list more than `most` simplices; `clique_counts` says how many. The last
-    complexes are kept: the stages of a round, which ask for that of the same graph, share one.
+    Raises `GraphError` before a dimension would list more than `most` simplices; `clique_counts` says how many.
+    The last complexes are kept: the stages of a round, which ask for that of the same graph, share one.
     """
     if dimension < 1:
         raise GraphError(f"a complex of dimension {dimension} has no edges: ask for 1 or more")

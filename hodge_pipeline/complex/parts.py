@@ -62,7 +62,7 @@ class OneForm:
 
 
 def one_form(graph: ViewGraph, world_from_cam: Floats, component: Ints | None = None) -> OneForm:
-    """ω of a graph's edges at poses (V, 4, 4) (Section 3.3); its own components where no other `component (V,)` is given."""
+    """ω of a graph's edges at poses (V, 4, 4) (Section 3.3); `component (V,)`: by default the graph's own."""
     if component is None:
         component = connected_components(graph.edges, graph.vertex_count)
     centred = shifted(world_from_cam, -centroids(world_from_cam, component))

@@ -9,7 +9,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.curl import vertices_along
 from hodge_pipeline.recording.stream import log_notes
 from hodge_pipeline.types import Bytes, Floats, Ints, ViewGraph
