@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hodge_adapters.colmap_refining import ColmapModels
-from hodge_adapters.poses_text import TumWriter, parse_tum
-from hodge_adapters.rewriting import TumRewriter
-from hodge_adapters.trajectory_files import TumPosesReader
+from hodge_adapters.colmap.models import ColmapModels
+from hodge_adapters.trajectories.readers import TumPosesReader
+from hodge_adapters.trajectories.rewriting import TumRewriter
+from hodge_adapters.trajectories.text import TumWriter, parse_tum
 from hodge_pipeline import se3, testing
 from hodge_pipeline.errors import SourceError, WorkerError
 from hodge_pipeline.executors.local import InProcess, LocalExecutor
