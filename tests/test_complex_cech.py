@@ -74,7 +74,7 @@ def test_the_exact_rank_is_the_numerical_one(graph: tuple[Ints, int]) -> None:
 
 def test_a_complete_graph_is_counted_before_it_is_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert clique_counts(complete(60), 60) == (60, comb(60, 2), comb(60, 3))
-    monkeypatch.setattr(cech, "MOST_TRIANGLES", 1000)
+    monkeypatch.setattr(cech, "MOST_LISTED", 1000)
     with pytest.raises(GraphError, match="more than 1000 triangles"):
         flag_complex(complete(60), 60)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -17,7 +18,7 @@ from hodge_pipeline.types import CloudSet, Floats, Ints
 
 CANDIDATES_AT_ONCE = 2_000_000
 SIMPLICES_AT_ONCE = 2_000
-MOST_TRIANGLES = 50_000_000
+MOST_LISTED = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -106,18 +107,26 @@ def flag_complex(edges: Ints, vertex_count: int) -> SimplicialComplex:
     """Every clique of up to three vertices (Section 4). Parallel edges count once, self-loops not at all.
 
     Raises `GraphError` before it would list more than 50 million triangles; `clique_counts` says how many.
+    The last complexes are kept: the stages of a round, which ask for that of the same graph, share one.
     """
-    simple = orient_edges(edges, vertex_count).edges
+    return _cliques(orient_edges(edges, vertex_count).edges.tobytes(), vertex_count)
+
+
+@lru_cache(maxsize=2)
+def _cliques(pairs: bytes, vertex_count: int) -> SimplicialComplex:
+    simple = np.frombuffer(pairs, np.int64).reshape(-1, 2)
     search = _TriangleSearch(simple, vertex_count)
     parts, found = [np.zeros((0, 3), np.int64)], 0
     for part in search.triangles():
         found += len(part)
-        if found > MOST_TRIANGLES:
-            raise GraphError(f"the graph has more than {MOST_TRIANGLES} triangles: thin out its edges")
+        if found > MOST_LISTED:
+            raise GraphError(f"the graph has more than {MOST_LISTED} triangles: thin out its edges")
         parts.append(part)
     triangles = np.sort(search.vertex_of_rank[np.concatenate(parts)], axis=1)
+    triangles = triangles[np.lexsort(triangles.T[::-1])]
     vertices = np.arange(vertex_count, dtype=np.int64)[:, None]
-    return SimplicialComplex((vertices, simple, triangles[np.lexsort(triangles.T[::-1])]))
+    vertices.flags.writeable = triangles.flags.writeable = False
+    return SimplicialComplex((vertices, simple, triangles))
 
 
 def clique_counts(edges: Ints, vertex_count: int) -> tuple[int, int, int]:

@@ -1,8 +1,9 @@
-"""KITTI's LiDAR scans: `.bin` files of float32 columns, and the poses that lie beside them."""
+"""LiDAR scans in `.bin` files of float32 columns (KITTI, nuScenes), and the poses that lie beside them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,32 +18,52 @@ from hodge_pipeline.types.input_files import read_input
 
 POSES, CALIBRATION, TO_CAMERA = "poses.txt", "calib.txt", "Tr:"
 MAX_REFLECTANCE = 255
+MAX_BEAM = 255
+WIDTHS = (3, 4, 5)
+"""Columns: x, y, z; with a reflectance; with the number of the beam as well."""
+_NUMBERED = re.compile(r"\d(\.pcd)?\.bin$")
 
 
 def is_scan(name: str) -> bool:
-    """Whether a file is called as KITTI's scans are, by a number: other `.bin` files are COLMAP's."""
-    return Path(name).suffix == ".bin" and Path(name).stem.isdecimal()
+    """Whether a `.bin` file's name ends in a number, as those of scans do: others are COLMAP's."""
+    return _NUMBERED.search(name) is not None
 
 
 def read_bin(path: Path) -> PointCloud:
-    """The points of a scan of three columns (x, y, z) or four (and reflectance), told apart by what they then are.
+    """The points of a scan of three to five columns (`WIDTHS`), told apart by what they then are.
 
-    Raises `SourceError` where it is neither.
+    Raises `SourceError` where it has none of these.
     """
     with reading(path):
         values = np.frombuffer(read_input(path), np.uint8)
-    tables = [values.view("<f4").reshape(-1, width) for width in (3, 4) if len(values) % (4 * width) == 0]
+    tables = {width: values.view("<f4").reshape(-1, width) for width in WIDTHS if len(values) % (4 * width) == 0}
     if not tables:
-        raise SourceError(f"{path}: {len(values)} bytes are no float32 rows of three or four columns: copy it again")
-    table = tables[0] if len(tables) == 1 or not _has_reflectance(tables[1]) else tables[1]
+        raise SourceError(f"{path}: {len(values)} bytes are no float32 rows of three to five columns: copy it again")
+    table = _likeliest(tables)
     found = points_of_columns(path, dict(zip("xyz", table.T[:3], strict=True)))
     if len(table) and not len(found):
         raise SourceError(f"{path}: holds no finite coordinates: is it a scan of float32 x y z?")
     return found
 
 
+def _likeliest(tables: Mapping[int, Floats32]) -> Floats32:
+    """The table of most columns that mean what they should, else that of fewest."""
+    if 5 in tables and _has_reflectance(tables[5]) and _has_beams(tables[5]):
+        return tables[5]
+    if 4 in tables and _has_reflectance(tables[4]):
+        return tables[4]
+    return tables[min(tables)]
+
+
+def _has_beams(table: Floats32) -> bool:
+    """Whether the last column is the number of a beam."""
+    with np.errstate(invalid="ignore"):
+        last = table[:, -1]
+        return bool(((last >= 0) & (last <= MAX_BEAM) & (last == np.round(last))).all())
+
+
 def _has_reflectance(table: Floats32) -> bool:
-    """Whether the fourth of four columns is a reflectance: in [0, 1], or a whole number up to 255, or up to 255 with
+    """Whether the fourth column is a reflectance: in [0, 1], or a whole number up to 255, or up to 255 with
     points that follow each other nearer than as three columns.
     """
     with np.errstate(invalid="ignore"):
@@ -50,6 +71,8 @@ def _has_reflectance(table: Floats32) -> bool:
         if not ((last >= 0) & (last <= MAX_REFLECTANCE)).all():
             return False
         if (last <= 1).all() or (last == np.round(last)).all():
+            return True
+        if table.size % 3:
             return True
         return bool(_median_step(table[:, :3]) < _median_step(table.reshape(-1, 3)))
 
