@@ -59,7 +59,7 @@ class PaperSurface:
 
     def shares(self, omega_on_surface: Floats) -> Mapping[str, float]:
         """The share of each Hodge part in the energy of ω, rotation and translation apart (Theorem 4)."""
-        parts = hodge_decomposition(self.d0, self.surface.d1, omega_on_surface, self.weights).shares()
+        parts = hodge_decomposition(self.d0, self.surface.d1, omega_on_surface, self.weights).energies().shares
         named = {}
         for name, (rotation, translation) in parts.items():
             named[f"share_{name}_rotation"], named[f"share_{name}_translation"] = rotation, translation
