@@ -15,10 +15,10 @@ from hodge_adapters.colmap.depth import read_depth_map
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import CameraRecord
 from hodge_adapters.images import pixels
+from hodge_adapters.images.lens_models import HALF_PIXEL
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32
 
-HALF_PIXEL = 0.5
 UNDISTORTED = ("SIMPLE_PINHOLE", "PINHOLE")
 
 
