@@ -29,7 +29,7 @@ from clock import Times, timed
 from peers import g2o_seconds, gnc_weights, gtsam_seconds
 from pose_graphs import SHAPES, synthetic, with_wrong_edges
 
-from hodge_adapters.g2o import information_for_file, load_g2o, write_g2o
+from hodge_adapters.pose_graphs.g2o import information_for_file, load_g2o, write_g2o
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.robust import solve_robust
 from hodge_pipeline.solvers.setup import relative_gradient

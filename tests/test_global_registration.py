@@ -265,8 +265,8 @@ def test_violation_is_the_worse_of_the_two_views() -> None:
 
 
 def test_real_fragments_are_registered_with_no_guess(data_dir: Path) -> None:
-    from hodge_adapters.log_text import read_log_file
-    from hodge_adapters.ply_points import read_ply
+    from hodge_adapters.clouds.ply import read_ply
+    from hodge_adapters.trajectories.log import read_log_file
 
     fragments = data_dir / "fragments"
     truth = read_log_file(fragments / "pair_estimates/7-scenes-redkitchen-evaluation/gt.log")

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from hodge_adapters.colmap_database import database_names
-from hodge_adapters.mcap_records import MAGIC
-from hodge_adapters.pcd_points import MAX_EXPANDED_BYTES, read_pcd
-from hodge_adapters.ply_points import read_ply
+from hodge_adapters.clouds.pcd import MAX_EXPANDED_BYTES, read_pcd
+from hodge_adapters.clouds.ply import read_ply
+from hodge_adapters.colmap.database import database_names
+from hodge_adapters.mcap.records import MAGIC
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types.input_files import beginning, open_input, read_input, read_input_text
 from reading_targets import TARGETS
@@ -175,8 +175,8 @@ def _zstd_bomb(count: int, size: int) -> bytes:
 
 
 def test_the_chunks_of_a_recording_expand_to_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hodge_adapters import mcap_log
-    from hodge_adapters.mcap import McapReader
+    from hodge_adapters.mcap import log as mcap_log
+    from hodge_adapters.mcap.reader import McapReader
 
     expanded = list[int]()
     expand: Callable[..., bytes] = mcap_log.expand
@@ -192,7 +192,7 @@ def test_the_chunks_of_a_recording_expand_to_a_limit(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize("word", [b"<!DOCTYPE", b"<!ENTITY"])
 def test_the_xml_of_an_e57_defines_nothing(word: bytes, tmp_path: Path) -> None:
-    from hodge_adapters.scan_files import e57_scans
+    from hodge_adapters.clouds.scan_files import e57_scans
 
     pytest.importorskip("pye57")
     good = TARGETS["e57"].make(tmp_path)

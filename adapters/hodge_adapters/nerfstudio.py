@@ -13,9 +13,9 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters import images
+from hodge_adapters.images import pixels
+from hodge_adapters.images.lens_models import FISHEYE, PERSPECTIVE, named
 from hodge_adapters.json_files import first_text, motion, number, objects, read_json, whole, write_json
-from hodge_adapters.lens_models import FISHEYE, PERSPECTIVE, named
 from hodge_adapters.posed import trajectory_of, written
 from hodge_adapters.text_rows import inside, listed, write_bytes_atomically
 from hodge_pipeline.errors import SourceError, not_written
@@ -84,15 +84,15 @@ class NerfstudioReader:
         if unit <= 0:
             raise SourceError(f"{file}: depth_unit_scale_factor is {unit:g}: it is metres per stored unit")
         size = (camera.width, camera.height) if camera else None
-        read = partial(images.read_depth, units_per_metre=1 / unit, no_depth=self.no_depth, size=size)
+        read = partial(pixels.read_depth, units_per_metre=1 / unit, no_depth=self.no_depth, size=size)
         return Frame(
             frame_id=name,
             stamp_s=float(row),
             camera=camera,
             read_depth=partial(read, depth) if depth and camera else None,
-            read_colour=partial(images.read_colour, colour, size=size) if colour else None,
-            encoded_depth=partial(images.encoded_depth, depth, units_per_metre=1 / unit) if depth and camera else None,
-            encoded_colour=partial(images.encoded_colour, colour) if colour else None,
+            read_colour=partial(pixels.read_colour, colour, size=size) if colour else None,
+            encoded_depth=partial(pixels.encoded_depth, depth, units_per_metre=1 / unit) if depth and camera else None,
+            encoded_colour=partial(pixels.encoded_colour, colour) if colour else None,
             image=_image_file(colour, camera, {**content, **entry}) if colour and camera else None,
             world_from_cam=pose,
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -112,10 +113,16 @@ def flag_complex(edges: Ints, vertex_count: int, dimension: int = 2, most: int =
     """Every clique of up to `dimension + 1` vertices (Section 4). Parallel edges count once, self-loops not at all.
 
     Raises `GraphError` before a dimension would list more than `most` simplices; `clique_counts` says how many.
+    The last complexes are kept: the stages of a round, which ask for that of the same graph, share one.
     """
     if dimension < 1:
         raise GraphError(f"a complex of dimension {dimension} has no edges: ask for 1 or more")
-    simple = orient_edges(edges, vertex_count).edges
+    return _cliques(orient_edges(edges, vertex_count).edges.tobytes(), vertex_count, dimension, most)
+
+
+@lru_cache(maxsize=2)
+def _cliques(pairs: bytes, vertex_count: int, dimension: int, most: int) -> SimplicialComplex:
+    simple = np.frombuffer(pairs, np.int64).reshape(-1, 2)
     search = _CliqueSearch(simple, vertex_count)
     levels = [np.arange(vertex_count, dtype=np.int64)[:, None], simple]
     ranked = search.ranked_edges
@@ -131,6 +138,8 @@ def flag_complex(edges: Ints, vertex_count: int, dimension: int = 2, most: int =
             parts.append(part)
         ranked = np.concatenate(parts)
         levels.append(_in_order(np.sort(search.vertex_of_rank[ranked], axis=1), vertex_count))
+    for level in levels:
+        level.flags.writeable = False
     return SimplicialComplex(tuple(levels))
 
 

@@ -20,7 +20,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.decomposition import HodgeDecomposition, hodge_decomposition
 from hodge_pipeline.complex.one_form import centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.types import CloudSet, Floats, ViewGraph
+from hodge_pipeline.types import CloudSet, Floats, Ints, ViewGraph
 
 MOST_TRIANGLES = 200_000
 """Of a graph with more the parts are not computed: a cost, some seconds of conjugate gradients."""
@@ -39,10 +39,15 @@ class ComplexOptions:
 
     def of(self, graph: ViewGraph, clouds: CloudSet, world_from_cam: Floats) -> SimplicialComplex:
         """Vertices, edges, triangles of a graph under poses (V, 4, 4). Raises `GraphError` for too many triangles."""
-        if (count := clique_counts(graph.edges, graph.vertex_count)[2]) > MOST_TRIANGLES:
-            raise GraphError(f"its complex has {count} triangles, more than {MOST_TRIANGLES}")
-        flag = flag_complex(graph.edges, graph.vertex_count)
+        flag = flag_of(graph)
         return nerve(flag, voxel_occupancy(clouds, world_from_cam, self.voxel_m)) if self.nerve else flag
+
+
+def flag_of(graph: ViewGraph) -> SimplicialComplex:
+    """The flag complex of a graph. Raises `GraphError` for more than MOST_TRIANGLES triangles."""
+    if (count := clique_counts(graph.edges, graph.vertex_count)[2]) > MOST_TRIANGLES:
+        raise GraphError(f"its complex has {count} triangles, more than {MOST_TRIANGLES}")
+    return flag_complex(graph.edges, graph.vertex_count)
 
 
 @dataclass(frozen=True)
@@ -56,9 +61,10 @@ class OneForm:
     weights: Floats
 
 
-def one_form(graph: ViewGraph, world_from_cam: Floats) -> OneForm:
-    """ω of a graph's edges at poses (V, 4, 4) (Section 3.3)."""
-    component = connected_components(graph.edges, graph.vertex_count)
+def one_form(graph: ViewGraph, world_from_cam: Floats, component: Ints | None = None) -> OneForm:
+    """ω of a graph's edges at poses (V, 4, 4) (Section 3.3); `component (V,)`: by default the graph's own."""
+    if component is None:
+        component = connected_components(graph.edges, graph.vertex_count)
     centred = shifted(world_from_cam, -centroids(world_from_cam, component))
     omega = residual_form(graph.edges, graph.i_from_j, centred)
     return OneForm(*orient_edges(graph.edges, graph.vertex_count).pooled(omega, np.ones(graph.edge_count)))
