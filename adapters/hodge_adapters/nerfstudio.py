@@ -15,9 +15,9 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.images import pixels
 from hodge_adapters.images.lens_models import FISHEYE, HALF_PIXEL, PERSPECTIVE, image_file, named, pinhole_params
-from hodge_adapters.json_files import first_text, motion, number, objects, read_json, whole, write_json
+from hodge_adapters.json_files import motion, number, objects, read_json, whole, write_json
 from hodge_adapters.posed import trajectory_of, written
-from hodge_adapters.text_rows import inside, listed, write_bytes_atomically
+from hodge_adapters.text_rows import first_text, inside, listed, write_bytes_atomically
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, Frame, ImageFile, Source, Trajectory

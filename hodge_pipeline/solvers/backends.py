@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from hodge_pipeline.solvers.cg import truncated_cg
+from hodge_pipeline.solvers.cg import solved_columns
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
 from hodge_pipeline.solvers.linear import Factor, factorise, fill_reducing_order
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioning, multigrid
@@ -102,14 +102,9 @@ def _conjugate_gradients(matrix: csr_matrix, precondition: Preconditioning) -> F
     apply = precondition(blocks, Modes())
 
     def solve(rhs: Floats) -> Floats:
-        found = truncated_cg(
-            lambda x: np.asarray(matrix @ x.reshape(rhs.shape)).reshape(-1),
-            lambda r: apply(blocks, r.reshape(rhs.shape)).reshape(-1),
-            -rhs.reshape(-1),
-            SCALAR_TOLERANCE,
-            MAX_SCALAR_STEPS,
+        return solved_columns(
+            lambda x: np.asarray(matrix @ x), lambda r: apply(blocks, r), rhs, SCALAR_TOLERANCE, MAX_SCALAR_STEPS
         )
-        return found.x.reshape(rhs.shape)
 
     return Factor(int(matrix.shape[0]), solve)
 
