@@ -89,8 +89,8 @@ class NerfstudioReader:
             camera=camera,
             read_depth=partial(read, depth) if depth and camera else None,
             read_colour=partial(pixels.read_colour, colour, size=size) if colour else None,
-            encoded_depth=partial(pixels.encoded_depth, depth, units_per_metre=1 / unit) if depth and camera else None,
-            encoded_colour=partial(pixels.encoded_colour, colour) if colour else None,
+            encoded_depth=partial(pixels.encoded, depth, units_per_metre=1 / unit) if depth and camera else None,
+            encoded_colour=partial(pixels.encoded, colour) if colour else None,
             image=_image_file(colour, camera, {**content, **entry}) if colour and camera else None,
             world_from_cam=pose,
         )

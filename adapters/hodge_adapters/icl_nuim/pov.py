@@ -51,7 +51,7 @@ def pov_frames(
                 camera=camera,
                 read_depth=partial(read_ray_lengths, path, camera=camera, units_per_metre=units_per_metre),
                 read_colour=partial(pixels.read_colour, colour, size=size) if has_colour else None,
-                encoded_colour=partial(pixels.encoded_colour, colour) if has_colour else None,
+                encoded_colour=partial(pixels.encoded, colour) if has_colour else None,
                 world_from_cam=pose,
                 true_world_from_cam=pose,
             )
