@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +31,8 @@ def bodies_of(reconstruction: pycolmap.Reconstruction, image_ids: Sequence[int])
     frame_ids = list(dict.fromkeys(image.frame_id for image in images))
     row = {frame_id: number for number, frame_id in enumerate(frame_ids)}
     body_of_image = np.array([row[image.frame_id] for image in images], np.int64)
-    poses = [reconstruction.frames[key].rig_from_world for key in frame_ids]
-    world_from_body = np.array([matrix_of(pose.inverse()) for pose in poses if pose is not None])
+    poses: list[Any] = [reconstruction.frames[key].rig_from_world for key in frame_ids]
+    world_from_body = np.array([matrix_of(pose.inverse()) for pose in poses])
     world_from_cam = np.array([matrix_of(image.cam_from_world().inverse()) for image in images])
     first = np.unique(body_of_image, return_index=True)[1]
     return Bodies(
