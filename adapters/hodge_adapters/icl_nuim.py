@@ -109,7 +109,9 @@ class IclNuimReader:
         notes = ["no associations.txt: images are paired by the numbers in their names"]
         found = list_images(path, notes)
         delays_s = np.zeros(len(found.numbers))
-        listing = StampedImages(np.array(found.numbers, float), found.depth, found.colour, delays_s, ())
+        listing = StampedImages(
+            np.array(found.numbers, float), found.depth, found.colour, delays_s, (), np.zeros(len(delays_s), np.int64)
+        )
         return self._numbered(path, listing, notes)
 
     def _numbered(self, path: Path, listing: StampedImages, notes: list[str]) -> Source:

@@ -55,6 +55,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
     ),
+    "slid": (
+        Rank.LOOK,
+        "odometry slid unnoticed at {count} frames ({detail}): the pairs over these steps agree on where they lead, "
+        "and count in its place",
+    ),
     "sweeps untimed": (
         Rank.FACT,
         "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an instant",
