@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.registration import odometry as tracking
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.gaps import has_gap
+from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.registration.odometry import Odometry, OdometryOptions
 from hodge_pipeline.registration.odometry_path import drift_of
 from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
@@ -49,7 +49,7 @@ class OdometryStart(OdometryOptions):
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """Every frame of the source with its cloud and its pose by odometry."""
         sequences, stamps = tuple(sequences_of(source).values()), _stamps(source)
-        options = self.cloud_options(clouds, len(sequences) > 1 or has_gap(sequences, stamps))
+        options = self.cloud_options(clouds, len(sequences) > 1 or len(gaps(sequences, stamps)) > 0)
         made = make_clouds(source, options, steps, workers)
         found = steps.step(
             chain, made, sequences, stamps, self.odometry, title="odometry", total=len(stamps), workers=workers

@@ -51,6 +51,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
     ),
+    "holes": (
+        Rank.LOOK,
+        "the recording stops at {count} places ({detail}): what the frames on both sides share tells the motion there",
+    ),
     "path broken": (
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
