@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.edge_scores import PairTruth, area_under_roc, pose_recall, precision_and_recall, right_edges
-from hodge_adapters.pair_log import PairLogReader
+from hodge_adapters.pose_graphs.pair_log import PairLogReader
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import UNTESTABLE
