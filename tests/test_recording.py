@@ -119,7 +119,7 @@ def rgb(packed: list[int]) -> np.ndarray:
 
 
 def record(folder: Path, **options: Any) -> Recorder:
-    return Recorder(folder, "run-1", "test", RecordingOptions(**options))
+    return Recorder(folder, "run-1", RecordingOptions(**options))
 
 
 def record_all(recorder: Recorder) -> None:
@@ -230,7 +230,7 @@ def test_edges_coloured_by_residual(tmp_path: Path) -> None:
     poses = circle()
     graph = ring_graph(poses)
     failed = Edges.of([[0, 5], [1, 6]]).put(slice(None), why="too little overlap")
-    record(tmp_path).edges(1, graph, poses, verdicts=["fine"] * graph.edge_count, rejected=failed)
+    record(tmp_path).edges(1, graph, poses, failed)
     part = tmp_path / "010-edges-1.rrd"
     (lines,) = rows(part, layout.edges(1), "LineStrips3D:strips")
     (colours,) = rows(part, layout.edges(1), "LineStrips3D:colors")
@@ -238,7 +238,7 @@ def test_edges_coloured_by_residual(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.float32(lines), np.float32(poses[graph.edges, :3, 3]))
     expected = shapes.residual_colours(shapes.residuals_m(graph, poses), RecordingOptions().residual_scale_m)
     np.testing.assert_array_equal(rgb(colours), expected)
-    assert labels[0].startswith("0 – 1: given, ") and labels[0].endswith("fine")
+    assert labels[0].startswith("0 – 1: given, ") and labels[0].endswith(" mm")
     (grey,) = rows(part, layout.rejected(1), "LineStrips3D:strips")
     np.testing.assert_array_equal(np.float32(grey), np.float32(poses[failed.pairs, :3, 3]))
     (text,) = rows(part, layout.graph_text(1), "TextDocument:text")
@@ -379,7 +379,7 @@ def test_levels(tmp_path: Path) -> None:
     assert not chunks(tmp_path / "summary/000-frames.rrd", layout.COLOUR)
     assert not chunks(tmp_path / "summary/011-solution-1.rrd", layout.FILM_EDGES)
     assert chunks(tmp_path / "summary/011-solution-1.rrd", layout.solved_edges(1))
-    thinned = Recorder(tmp_path / "full", "run-1", "test", RecordingOptions(level="full", image_every=5))
+    thinned = Recorder(tmp_path / "full", "run-1", RecordingOptions(level="full", image_every=5))
     thinned.frames("circle", make_frames())
     assert len(rows(tmp_path / "full/000-frames.rrd", layout.COLOUR, layout.FRAME)) == 12
 
@@ -424,7 +424,7 @@ def test_a_recording_without_room_is_one_line_and_never_waits_for_ever(tmp_path:
         streams.TURN_S, streams.STALLED_S = 0.2, 0.6
         resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
         try:
-            with streams.writing(Path(sys.argv[1]) / "000-frames.rrd", "test", "test") as stream:
+            with streams.writing(Path(sys.argv[1]) / "000-frames.rrd", "test") as stream:
                 for _ in range(10):
                     stream.log("points", rr.Points3D(np.random.default_rng(0).random((20_000, 3))))
                     if {flushes}:

@@ -55,18 +55,16 @@ def log_edges(
     outer: int,
     graph: ViewGraph,
     world_from_cam: Floats,
-    residual_m: Floats | None,
-    verdicts: Sequence[str] | None,
     rejected: Edges | None,
     options: RecordingOptions,
     max_bytes: float,
 ) -> tuple[str, ...]:
     """What was thinned, in words; the edges coloured by residual, with their reason, and the pairs that failed."""
-    residual_m = shapes.residuals_m(graph, world_from_cam) if residual_m is None else np.asarray(residual_m, float)
+    residual_m = shapes.residuals_m(graph, world_from_cam)
     colours = shapes.residual_colours(residual_m, options.residual_scale_m)
     kept = options.count(options.edge_lines, graph.edge_count, LINE_BYTES + LABEL_BYTES, max_bytes / 2)
     rows = shapes.evenly(graph.edge_count, kept)
-    labels = [_label(graph, int(row), residual_m, verdicts) for row in rows]
+    labels = [_label(graph, int(row), residual_m) for row in rows]
     _log_lines(stream, layout.edges(outer), world_from_cam, graph.edges[rows], colours[rows], labels)
     if rejected is not None:
         kept = options.count(options.edge_lines, len(rejected.pairs), LINE_BYTES, max_bytes / 4)
@@ -210,11 +208,10 @@ def _log_lines(
     stream.log(path, strips, static=True)
 
 
-def _label(graph: ViewGraph, row: int, residual_m: Floats, verdicts: Sequence[str] | None) -> str:
+def _label(graph: ViewGraph, row: int, residual_m: Floats) -> str:
     i, j = (graph.vertex_ids[k] for k in graph.edges[row])
-    verdict = f", {verdicts[row]}" if verdicts is not None else ""
     fitness = "" if np.isnan(graph.fitness[row]) else f", fitness {graph.fitness[row]:.2f}"
-    return f"{i} – {j}: {graph.source[row]}, {1000 * residual_m[row]:.1f} mm{fitness}{verdict}"
+    return f"{i} – {j}: {graph.source[row]}, {1000 * residual_m[row]:.1f} mm{fitness}"
 
 
 def _thinning(what: str, kept: int, available: int, outer: int) -> tuple[str, ...]:

@@ -32,8 +32,8 @@ START_S = 60.0
 class Live:
     """A viewer that is shown the parts of one recording, in the order in which they are done."""
 
-    def __init__(self, address: str, application_id: str, recording_id: str) -> None:
-        self._stream = open_stream(application_id, recording_id)
+    def __init__(self, address: str, recording_id: str) -> None:
+        self._stream = open_stream(recording_id)
         self._stream.connect_grpc(address)
         self._sent: set[Path] = set()
 
