@@ -37,6 +37,7 @@ from hodge_pipeline.types import (
     SolverIteration,
     ViewGraph,
 )
+from hodge_pipeline.types.arrays import evenly
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0)
 
@@ -340,7 +341,7 @@ def test_mesh_thinned_by_clustering() -> None:
 
 @given(st.integers(0, 500), st.integers(0, 500))
 def test_evenly_spread(available: int, kept: int) -> None:
-    picked = shapes.evenly(available, kept)
+    picked = evenly(available, kept)
     assert len(picked) == min(available, kept)
     if len(picked) > 1:
         assert picked[0] == 0 and picked[-1] == available - 1

@@ -17,24 +17,24 @@ from hodge_pipeline.evaluation.difference import MEASURABLE, length, percent, si
 from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.evaluation.scores import GraphScores, ScoreTable
 from hodge_pipeline.report.brief import all_notes, brief
-from hodge_pipeline.report.contents import RefinementSummary, WrongEdges
-from hodge_pipeline.report.run_page import document
-from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows, weigh_wrong, worst_edges
-from hodge_pipeline.report.tables import score_tables
-from hodge_pipeline.report.verdict import judge, suspicions
-from hodge_pipeline.report.write import (
+from hodge_pipeline.report.contents import (
     EdgeRow,
     LoopRow,
     Path3D,
     Pictures,
+    RefinementSummary,
     Report,
     Residuals,
     SourceSummary,
     StageRow,
     TrajectoryRow,
-    as_json,
-    write_report,
+    WrongEdges,
 )
+from hodge_pipeline.report.run_page import document
+from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows, weigh_wrong, worst_edges
+from hodge_pipeline.report.tables import score_tables
+from hodge_pipeline.report.verdict import judge, suspicions
+from hodge_pipeline.report.write import as_json, write_report
 from hodge_pipeline.scene import Round
 from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver
 from hodge_pipeline.stages import Step, no_progress

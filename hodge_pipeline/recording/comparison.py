@@ -13,9 +13,10 @@ from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import BACKGROUND, without_panels
 from hodge_pipeline.recording.results import log_model
-from hodge_pipeline.recording.shapes import evenly, frustum_lines
+from hodge_pipeline.recording.shapes import frustum_lines
 from hodge_pipeline.recording.stream import log_markdown, writing
 from hodge_pipeline.types import Floats, Model
+from hodge_pipeline.types.arrays import evenly
 
 COLOURS = {"a": (230, 130, 0), "b": (86, 180, 233)}
 """Orange and sky blue of Okabe and Ito's set."""

@@ -9,6 +9,7 @@ from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.stream import log_markdown, log_notes
 from hodge_pipeline.types import Edges, Floats, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 COLOURS = {
     "consistent": (60, 115, 225),
@@ -37,7 +38,7 @@ def log_diagnosis(
     for name in sorted(set(edges.verdict.tolist()) | set(COLOURS)):
         rows = np.flatnonzero((edges.verdict == name) & drawable)
         kept = options.count(options.edge_lines, len(rows), BYTES_EACH, options.max_bytes("solver") / 2)
-        rows, available = rows[shapes.evenly(len(rows), kept)], len(rows)
+        rows, available = rows[evenly(len(rows), kept)], len(rows)
         labels = [_label(graph, edges, int(row)) for row in rows]
         colour, radius = COLOURS.get(name, shapes.RESULT_COLOUR), RADII.get(name, -0.8)
         strips = rr.LineStrips3D(lines[rows], colors=[colour], radii=[radius], labels=labels, show_labels=False)

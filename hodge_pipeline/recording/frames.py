@@ -10,9 +10,9 @@ import rerun as rr
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.shapes import evenly
 from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes
 from hodge_pipeline.types import Camera, CloudSet, EncodedImage, Floats, Frame, Ints
+from hodge_pipeline.types.arrays import evenly
 
 CHUNK_BYTES = 4_000_000
 """Images go in chunks of this size: few enough to be quick, small enough for a viewer to fetch one."""

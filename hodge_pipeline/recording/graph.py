@@ -12,6 +12,7 @@ from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_columns
 from hodge_pipeline.types import Edges, Floats, Frame, Ints, Solution, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 LINE_BYTES = 40
 """One edge of the film: two points, a colour, two list offsets."""
@@ -35,7 +36,7 @@ def log_poses(
         lines, colors=[colour], radii=[TRAJECTORY_RADIUS], labels=[name] * len(lines), show_labels=False
     )
     stream.log(layout.trajectory(name), line, static=True)
-    picked = drawable[shapes.evenly(len(drawable), options.frusta)]
+    picked = drawable[evenly(len(drawable), options.frusta)]
     frusta = rr.LineStrips3D(shapes.frustum_lines(world_from_cam[picked]), colors=[colour], radii=[FRUSTUM_RADIUS])
     stream.log(layout.frusta(name), frusta, static=True)
     stream.send_columns(
@@ -63,14 +64,14 @@ def log_edges(
     residual_m = shapes.residuals_m(graph, world_from_cam)
     colours = shapes.residual_colours(residual_m, options.residual_scale_m)
     kept = options.count(options.edge_lines, graph.edge_count, LINE_BYTES + LABEL_BYTES, max_bytes / 2)
-    rows = shapes.evenly(graph.edge_count, kept)
+    rows = evenly(graph.edge_count, kept)
     labels = [_label(graph, int(row), residual_m) for row in rows]
     _log_lines(stream, layout.edges(outer), world_from_cam, graph.edges[rows], colours[rows], labels)
     if rejected is not None:
         kept = options.count(options.edge_lines, len(rejected.pairs), LINE_BYTES, max_bytes / 4)
-        pairs = rejected.pairs[shapes.evenly(len(rejected.pairs), kept)]
+        pairs = rejected.pairs[evenly(len(rejected.pairs), kept)]
         grey = np.full((len(pairs), 3), shapes.REJECTED_COLOUR, np.uint8)
-        why = rejected.why[shapes.evenly(len(rejected.pairs), kept)]
+        why = rejected.why[evenly(len(rejected.pairs), kept)]
         named = zip(graph.vertex_ids[pairs[:, 0]], graph.vertex_ids[pairs[:, 1]], why, strict=True)
         labels = [f"{i} – {j}: rejected, {reason}" for i, j, reason in named]
         _log_lines(stream, layout.rejected(outer), world_from_cam, pairs, grey, labels)
@@ -100,9 +101,7 @@ def log_solution(
         notes += _log_film(stream, outer, graph, states, residuals, first_iteration, options, max_bytes / 2)
     colours = shapes.residual_colours(residuals[-1], options.residual_scale_m)
     colours[solution.weights == 0] = shapes.IGNORED_COLOUR
-    lines = shapes.evenly(
-        graph.edge_count, options.count(options.edge_lines, graph.edge_count, LINE_BYTES, max_bytes / 4)
-    )
+    lines = evenly(graph.edge_count, options.count(options.edge_lines, graph.edge_count, LINE_BYTES, max_bytes / 4))
     final = solution.world_from_cam
     _log_lines(stream, layout.solved_edges(outer), final, graph.edges[lines], colours[lines], None)
     log_notes(stream, outer, solution.notes)
@@ -173,9 +172,9 @@ def _log_film(
     has_ends = np.isin(graph.edges, drawn).all(axis=1)
     available = int(np.count_nonzero(has_ends))
     steps = options.count(options.film_steps, len(states), STEP_LINES * LINE_BYTES, max_bytes)
-    rows = shapes.evenly(len(states), max(steps, 2))
+    rows = evenly(len(states), max(steps, 2))
     kept = options.count(options.edge_lines, available, LINE_BYTES * len(rows), max_bytes)
-    lines = np.flatnonzero(has_ends)[shapes.evenly(available, kept)]
+    lines = np.flatnonzero(has_ends)[evenly(available, kept)]
     indexes = iteration_columns(outer, len(states), first_iteration, rows)
     if len(lines):
         strips = np.concatenate([shapes.segments(states[row], graph.edges[lines]) for row in rows])

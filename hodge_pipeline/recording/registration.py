@@ -10,9 +10,9 @@ import rerun as rr
 from hodge_pipeline import se3
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.shapes import evenly
 from hodge_pipeline.recording.stream import log_markdown
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32
+from hodge_pipeline.types.arrays import evenly
 
 POINTS_SHOWN = 6_000
 TARGET_COLOUR, BEFORE_COLOUR, AFTER_COLOUR = (86, 180, 233), (230, 130, 0), (240, 228, 66)

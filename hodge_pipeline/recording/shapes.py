@@ -7,6 +7,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.types import Bytes, Floats, Floats32, Ints, Model, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 RESIDUAL_COLOURS = np.array([[60, 115, 225], [130, 145, 170], [190, 180, 120], [255, 225, 50]], float)
 """Blue to yellow, ever brighter: legible without red and green, and in grey; the worst edges stand out."""
@@ -19,12 +20,6 @@ TRAJECTORY_COLOURS = {"truth": (0, 200, 140), "odometry": (230, 130, 0), "start"
 FRUSTUM_DEPTH_M = 0.06
 _CORNERS = np.array([[-0.8, -0.6, 1.0], [0.8, -0.6, 1.0], [0.8, 0.6, 1.0], [-0.8, 0.6, 1.0]]) * FRUSTUM_DEPTH_M
 _FRUSTUM = np.vstack([_CORNERS, np.zeros((1, 3))])[[0, 4, 1, 2, 4, 3, 0, 1, 2, 3]]
-
-
-def evenly(available: int, kept: int) -> Ints:
-    """Rows (kept,) of `available`, evenly spread, the first and the last among them."""
-    kept = max(min(kept, available), 0)
-    return np.unique(np.linspace(0, available - 1, kept).round().astype(np.int64)) if kept else np.zeros(0, np.int64)
 
 
 def residuals_m(graph: ViewGraph, world_from_cam: Floats) -> Floats:
