@@ -29,12 +29,12 @@ class Contents:
     pairs: tuple[str, ...] = ()
 
 
-def make_blueprint(contents: Contents, room: Eye | None, graph: Eye | None) -> rrb.Blueprint:
+def make_blueprint(contents: Contents, room: Eye | None, graph: Eye | None, active_tab: int = 0) -> rrb.Blueprint:
     """The default blueprint: a tab for each part of the run that is there, the story first.
 
     `room` sees the model, `graph` the cameras alone.
     """
-    return without_panels(rrb.Tabs(*make_tabs(contents, room, graph), active_tab=0), layout.STORY)
+    return without_panels(rrb.Tabs(*make_tabs(contents, room, graph), active_tab=active_tab), layout.STORY)
 
 
 def without_panels(root: rrb.Container, timeline: str) -> rrb.Blueprint:

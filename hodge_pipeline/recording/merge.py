@@ -27,8 +27,8 @@ class Merged:
     notes: tuple[str, ...] = ()
 
 
-def merge(parts: Iterable[Path], out: Path, recording_id: str) -> Merged:
-    """One file of these parts, in the order of the run that their names say; it opens on the story.
+def merge(parts: Iterable[Path], out: Path, recording_id: str, *, active_tab: int = 0) -> Merged:
+    """One file of these parts, in the order of the run that their names say; it opens on a tab, the story.
 
     A damaged part is mended as far as it can be read; the others are not touched by it.
     """
@@ -41,7 +41,7 @@ def merge(parts: Iterable[Path], out: Path, recording_id: str) -> Merged:
         poses = layout.poses(contents.trajectory)
         room = look_at(_chunks(readers, layout.MODEL), _chunks(readers, poses))
         graph = look_at((), _chunks(readers, poses))
-        with writing(out, recording_id, make_blueprint(contents, room, graph)) as stream:
+        with writing(out, recording_id, make_blueprint(contents, room, graph, active_tab)) as stream:
             for _, reader in readers:
                 send(stream, reader, poses)
             log_notes(stream, 0, notes, level="WARN")
