@@ -133,7 +133,7 @@ def test_stages_without_anything_to_show(tmp_path: Path) -> None:
     recorder.frames("nothing", [])
     recorder.clouds([], CloudSet.from_clouds([]))
     recorder.poses("truth", np.zeros((0, 4, 4)))
-    recorder.evaluation()
+    recorder.evaluation((), {}, {}, {})
     recorder.text("", [])
     merged = recorder.finish(tmp_path / "recording.rrd")
     assert merged is not None and merged.notes == ()
