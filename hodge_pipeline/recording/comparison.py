@@ -1,4 +1,4 @@
-"""Two runs in one recording: their trajectories and models, B laid onto A."""
+"""Recording of two runs for comparison: trajectories and models, B aligned to A."""
 
 from __future__ import annotations
 

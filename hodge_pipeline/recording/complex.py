@@ -1,4 +1,4 @@
-"""The complex that the viewing graph spans: its triangles, coloured by what the motions round each leave over."""
+"""Log the complex of a round: triangles coloured by curl, and the energies of the parts of the 1-form."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def log_complex(
     options: RecordingOptions,
     max_bytes: float,
 ) -> tuple[str, ...]:
-    """What was thinned, in words; the triangles by curl, and the energy of the 1-form before and after the solve."""
+    """Log triangles by curl, and the 1-form's energy before and after the solve; gives notes of what was thinned."""
     try:
         complex_ = flag_of(graph)
     except GraphError as error:

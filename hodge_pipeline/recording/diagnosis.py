@@ -1,4 +1,4 @@
-"""The verdicts on the edges, each with an entity of its own, so that one kind can be shown alone."""
+"""Log the edges by verdict, an entity for each verdict so that the viewer can show one alone."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def log_diagnosis(
     edges: Edges,
     options: RecordingOptions,
 ) -> tuple[str, ...]:
-    """What was thinned, in words; of the edges that are drawn those with a bad verdict come first."""
+    """Log the edges by verdict, with probability and reason as label; gives notes of what was thinned."""
     notes: tuple[str, ...] = ()
     log_markdown(stream, layout.DIAGNOSIS, summary(graph, edges))
     lines = shapes.segments(world_from_cam, graph.edges)

@@ -1,4 +1,4 @@
-"""`diagnosis.rrd`: a graph's edges by verdict, its triangles by curl, its harmonic loops, without a run around it."""
+"""`diagnosis.rrd` of `hodge diagnose`: edges by verdict, triangles by curl, harmonic loops."""
 
 from __future__ import annotations
 

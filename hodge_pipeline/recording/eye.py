@@ -1,4 +1,4 @@
-"""Where the story is looked at from: outside the room, above it, from the side where the camera was."""
+"""Initial viewpoint of the 3-D views: above and behind the cameras."""
 
 from __future__ import annotations
 

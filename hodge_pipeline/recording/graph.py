@@ -1,4 +1,4 @@
-"""Trajectories, the viewing graph, and the solve."""
+"""Log trajectories, the viewing graph and the iterations of a solve."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TRAJECTORY_RADIUS, FRUSTUM_RADIUS, EDGE_RADIUS, CENTRE_RADIUS = -1.6, -0.5, -0.6
 def log_poses(
     stream: rr.RecordingStream, name: str, world_from_cam: Floats, frames: Sequence[Frame], options: RecordingOptions
 ) -> tuple[str, ...]:
-    """What was left out, in words; a trajectory as a line, as frusta, and as one transform for each frame."""
+    """Log a trajectory as a line, as frusta and as transforms; gives notes of what was left out."""
     drawable = np.flatnonzero(shapes.is_drawable(world_from_cam))
     sequences = np.array([frame.sequence for frame in frames] or [""] * len(world_from_cam), dtype=np.str_)
     colour = shapes.TRAJECTORY_COLOURS.get(name, shapes.RESULT_COLOUR)
@@ -60,7 +60,7 @@ def log_edges(
     options: RecordingOptions,
     max_bytes: float,
 ) -> tuple[str, ...]:
-    """What was thinned, in words; the edges coloured by residual, with their reason, and the pairs that failed."""
+    """Log edges coloured by residual, and rejected pairs with the reason; gives notes of what was thinned."""
     residual_m = shapes.residuals_m(graph, world_from_cam)
     colours = shapes.residual_colours(residual_m, options.residual_scale_m)
     kept = options.count(options.edge_lines, graph.edge_count, LINE_BYTES + LABEL_BYTES, max_bytes / 2)
@@ -89,7 +89,7 @@ def log_solution(
     options: RecordingOptions,
     max_bytes: float,
 ) -> tuple[str, ...]:
-    """What was thinned, in words; the film of the solve, its scalars, and the edges under its result."""
+    """Log the iterations of a solve, its scalars and the edges at its result; gives notes of what was thinned."""
     states = [start, *(step.world_from_cam for step in solution.history)]
     states += [solution.world_from_cam] if not solution.history else []
     residuals = np.array([shapes.residuals_m(graph, poses) for poses in states]).reshape(len(states), graph.edge_count)
@@ -109,7 +109,7 @@ def log_solution(
 
 
 def solver_series(states: Sequence[Floats], residuals: Floats, solution: Solution) -> Mapping[str, tuple[Ints, Floats]]:
-    """Rows and values of each scalar: 0 is the start, which has no objective and no step."""
+    """Rows and values of each scalar over the iterations; row 0 is the start, without objective and step."""
     count = len(states)
     series: dict[str, tuple[Ints, Floats]] = {}
     known = np.isfinite(residuals).any(axis=1) if residuals.size else np.zeros(count, bool)
@@ -167,7 +167,7 @@ def _log_film(
     options: RecordingOptions,
     max_bytes: float,
 ) -> list[str]:
-    """Edges and camera centres after each inner iteration, evenly thinned: rather lines than iterations."""
+    """Log edges and camera centres after each inner iteration; edges are thinned before iterations are."""
     drawn = np.flatnonzero(np.all([shapes.is_drawable(poses) for poses in states], axis=0))
     has_ends = np.isin(graph.edges, drawn).all(axis=1)
     available = int(np.count_nonzero(has_ends))

@@ -1,4 +1,4 @@
-"""All parts of a run as one recording, with the blueprint that opens on the story."""
+"""Merge the parts of a run into one recording with its blueprint; damaged parts are repaired."""
 
 from __future__ import annotations
 

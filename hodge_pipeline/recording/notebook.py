@@ -1,4 +1,4 @@
-"""A recording in a notebook's cell, by Rerun's own widget."""
+"""Show a recording in a notebook cell by Rerun's widget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The recorder: one method for each stage of a run, one part file for each call, `finish` to merge them."""
+"""`Recorder`: one method and one part file for each stage of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What registration found: its numbers for every pair, and chosen pairs before and after."""
+"""Log registrations: statistics of all pairs, and clouds of chosen pairs before and after."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def log_registration(
     clouds: CloudSet,
     options: RecordingOptions,
 ) -> tuple[str, ...]:
-    """Nothing to remark; histograms and columns of all pairs (P,), the clouds of the chosen ones in i's axes.
+    """Log histograms and columns of all pairs (P,), and the clouds of chosen ones in i's axes; nothing is left out.
 
     `guesses (P, 4, 4)` is `i_from_j` as registration began.
     """

@@ -1,4 +1,4 @@
-"""A run's artifacts into its recording: each stage's part as soon as the stage is done, merged at the end."""
+"""Record a run: each stage's part when the stage is done, all parts merged at the end."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def merge_recording(
 
 
 def _record_reference(recorder: Recorder, source: Source, rounds: Sequence[Round]) -> Notes:
-    """True and given poses, laid onto the last ones, so that they are seen to differ and nothing else."""
+    """Record true and given poses, aligned to the last ones."""
     if not rounds:
         return ()
     named = {"truth": true_poses(source)} if has_truth(source) else {}

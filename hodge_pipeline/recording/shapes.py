@@ -1,4 +1,4 @@
-"""Lines, colours and thinning: plain arrays, no Rerun."""
+"""Line segments, frusta, colours and thinned models as plain arrays, without Rerun."""
 
 from __future__ import annotations
 

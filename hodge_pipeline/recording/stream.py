@@ -1,4 +1,4 @@
-"""One file, one explicit recording stream: written under a temporary name, renamed when complete."""
+"""Recording streams into files, written under a temporary name and renamed when complete."""
 
 from __future__ import annotations
 

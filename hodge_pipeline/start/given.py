@@ -1,4 +1,4 @@
-"""First poses that another program made: matched to the frames, between sparse ones carried by odometry."""
+"""Initial poses from another program: associated with the frames; odometry fills the gaps between sparse ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes folded onto themselves: places that look alike lie on each other, until free space says that they cannot.
+"""Unfold scenes in which look-alike places were merged: free space in depth images shows that they are distinct.
 
 Each edge of a fold may be flawless, and all of them agree; but frames that no edge joins are brought together too, and
 one camera then sees through what the other saw.

@@ -1,4 +1,4 @@
-"""The depth image of every frame, made small and kept in files: what free space is judged by."""
+"""Small depth images of all frames on disk, for free-space tests."""
 
 from __future__ import annotations
 
