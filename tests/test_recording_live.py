@@ -11,7 +11,7 @@ import pytest
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import binary, layout, live
 from hodge_pipeline.recording.merge import find_parts
-from test_recording import circle, record, record_all, rows
+from recording_data import circle, record, record_all, rows
 from test_recording_run import entities
 
 TRIES = 120

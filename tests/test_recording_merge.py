@@ -16,7 +16,7 @@ from hodge_pipeline.recording import binary, layout, shapes
 from hodge_pipeline.recording.eye import look_at
 from hodge_pipeline.recording.merge import contents_of, find_parts, merge
 from hodge_pipeline.types import CloudSet
-from test_recording import circle, make_frames, record, record_all, ring_graph, rows
+from recording_data import circle, make_frames, record, record_all, ring_graph, rows
 from tools.recording_pictures import picture
 
 KILLED_WRITER = """

@@ -17,7 +17,7 @@ from hodge_pipeline.recording.growth import first_frame
 from hodge_pipeline.recording.merge import find_parts, with_pairs
 from hodge_pipeline.recording.registration import chosen_pairs, moved_m
 from hodge_pipeline.types import CloudSet, Edges, Model, PointCloud, ViewGraph
-from test_recording import circle, make_solution, record, rgb, ring_graph, rows
+from recording_data import circle, make_solution, record, rgb, ring_graph, rows
 
 
 def registered(count: int = 4) -> tuple[Edges, np.ndarray]:
