@@ -14,22 +14,17 @@ from hodge_pipeline.pairs.sequential import SequentialEdges
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.global_landmarks import LandmarkConsensus
 from hodge_pipeline.testing.writers import whole_source
-from spoiled_stages import 
-from spoiled_writers import 
-
+from spoiled_stages import (
     Builder,
     Changeable,
     Executor,
     Fuser,
-    Models,
     NeedsFinite,
     Once,
     Refiner,
-    Rewriter,
     Spoiled,
     Start,
     Unhashable,
-    Writer,
     always_converged,
     as_guessed,
     lopsided,
@@ -41,6 +36,7 @@ from spoiled_writers import
     unchanged,
     without_guess,
 )
+from spoiled_writers import Models, Rewriter, Writer
 from test_readers_colmap import synthetic
 
 SPOILED = [
