@@ -59,6 +59,19 @@ def frustum_lines(world_from_cam: Floats) -> Floats32:
     return np.asarray(se3.transform(world_from_cam, _FRUSTUM), np.float32)
 
 
+def up_and_ahead(world_from_cam: Floats) -> tuple[Floats, Floats]:
+    """Unit vectors (3,): the cameras' mean up direction, and their mean view direction across it."""
+    up = unit(-world_from_cam[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
+    ahead = world_from_cam[:, :3, 2].mean(axis=0)
+    return up, unit(ahead - (ahead @ up) * up, unit(np.cross(up, [1.0, 0.3, 0.2]), up))
+
+
+def unit(vector: Floats, fallback: Floats) -> Floats:
+    """The vector (3,) at length 1; the fallback where it has hardly any length."""
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-3 else fallback
+
+
 def thin_model(model: Model, kept: int) -> Model:
     """The model with about `kept` points at most: points left out evenly, a mesh clustered in voxels."""
     if len(model.points_in_world) <= kept:
