@@ -31,8 +31,9 @@ from pose_graphs import SHAPES, synthetic, with_wrong_edges
 
 from hodge_adapters.pose_graphs.g2o import information_for_file, load_g2o, write_g2o
 from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.solvers.objective import gradient, residuals
 from hodge_pipeline.solvers.robust import solve_robust
-from hodge_pipeline.solvers.setup import relative_gradient
+from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import Solution, ViewGraph
 
 CERTIFIED_OPTIMA = {
@@ -85,7 +86,7 @@ def row(task: tuple[str, str | int, int]) -> list[str]:
             isotropic = graph if graph.dimension == 2 else dataclasses.replace(graph, information=raw)
         plain_s, plain = timed(lambda: solve(isotropic, objective="isotropic"), repeats)
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-        gradient = relative_gradient(isotropic, plain.world_from_cam)
+        slope = relative_gradient(isotropic, plain.world_from_cam)
         certified_s, certified = None, plain
         if graph.vertex_count <= MOST_CERTIFIED:
             certified_s, certified = timed(lambda: solve(isotropic, objective="isotropic", certificate=True), repeats)
@@ -105,7 +106,7 @@ def row(task: tuple[str, str | int, int]) -> list[str]:
         "" if optimum is None else f"{cost / optimum - 1:+.1e}",
         f"{plain_s.cpu_s:.3f}",
         f"{plain_s.wall_s:.3f}",
-        f"{gradient:.0e}",
+        f"{slope:.0e}",
         {True: "yes", False: "no"}.get(certified.certified, ""),
         seconds(certified_s),
         "" if full_s is None else chi2_cell(full),
@@ -125,6 +126,16 @@ def normalised(path: Path, folder: Path) -> Path:
     copy = folder / path.name
     write_g2o(copy, source.graph, None if source.trajectory is None else source.trajectory.world_from_cam)
     return copy
+
+
+def relative_gradient(graph: ViewGraph, world_from_cam: np.ndarray) -> float:
+    """The norm of F's gradient at these poses (V, 4, 4) over that at the start which `solve` would choose."""
+    setup = prepare(graph, world_from_cam)
+
+    def norm(rotations: np.ndarray, translations: np.ndarray) -> float:
+        return float(np.linalg.norm(gradient(setup.problem, residuals(setup.problem, rotations, translations))))
+
+    return norm(*setup.initial("given")) / max(norm(*setup.initial("chordal")), 1e-300)
 
 
 def seconds(times: Times | None) -> str:

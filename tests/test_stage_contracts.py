@@ -20,6 +20,11 @@ PROPERTIES = {kind: check.properties for kind, check in testing.CHECKS.items() i
 OPTIONS: dict[str, dict[str, Any]] = {
     "start: given": {"poses": "frames"},
     "executors: local": {"workers": 2},
+    "edges: place": {
+        "reach": 1,
+        "min_similarity": 0.5,
+        "thinned": 1,
+    },  # the room's frames are few, and follow each other
     "edges: combined": {"builders": tuple(registry.load("edges", name)() for name in ("sequential", "overlap"))},
 }
 LACKS = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,18 +32,6 @@ class StampedImages:
     colour: list[Path | None]
     colour_delays_s: Floats
     files: tuple[Path, ...]
-
-
-@dataclass
-class Notes:
-    """Collects what was left out, by reason, so that each reason makes one line."""
-
-    lines: list[str] = field(default_factory=list)
-
-    def leave_out(self, where: str, reason: str, items: list[int]) -> None:
-        """Note the items, if any."""
-        if items:
-            self.lines.append(f"{where}: {len(items)} lines {reason} left out: {listed(items)}")
 
 
 def find_association_file(folder: Path) -> Path | None:
@@ -135,9 +123,7 @@ def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path]]:
             outside.append(row.line)
         else:
             found.append((stamp_s, image))
-    collected = Notes(notes)
-    collected.leave_out(path.name, "that are not `stamp file`", unreadable)
-    collected.leave_out(path.name, "that point out of the folder", outside)
+    notes += _left_out(path.name, "`stamp file`", unreadable, outside)
     stamps_s, rows = _in_order(np.array([stamp for stamp, _ in found]), path.name, notes)
     return stamps_s, [found[row][1] for row in rows]
 
@@ -160,9 +146,7 @@ def _from_association(path: Path, notes: list[str]) -> StampedImages:
         else:
             delay_s = colour_stamp_s - stamp_s
             found.append((stamp_s, depth, colour, delay_s if abs(delay_s) <= LONGEST_DELAY_S else 0.0))
-    collected = Notes(notes)
-    collected.leave_out(path.name, "that are not `stamp file stamp file`", unreadable)
-    collected.leave_out(path.name, "that point out of the folder", outside)
+    notes += _left_out(path.name, "`stamp file stamp file`", unreadable, outside)
     if not found:
         raise SourceError(f"{path}: no line `stamp file stamp file` that can be used in it: mend or remove the file")
     stamps_s, order = _in_order(np.array([stamp for stamp, *_ in found]), path.name, notes)
@@ -170,6 +154,12 @@ def _from_association(path: Path, notes: list[str]) -> StampedImages:
     return StampedImages(
         stamps_s, [found[row][1] for row in order], [found[row][2] for row in order], delays_s, (path,)
     )
+
+
+def _left_out(name: str, expected: str, unreadable: list[int], outside: list[int]) -> list[str]:
+    """A line for each reason why lines were left out."""
+    reasons = ((f"that are not {expected}", unreadable), ("that point out of the folder", outside))
+    return [f"{name}: {len(lines)} lines {why} left out: {listed(lines)}" for why, lines in reasons if lines]
 
 
 def _depth_column(rows: list[Row], path: Path) -> int:
