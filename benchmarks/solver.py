@@ -30,9 +30,9 @@ from peers import g2o_seconds, gnc_weights, gtsam_seconds
 from pose_graphs import SHAPES, synthetic, with_wrong_edges
 
 from hodge_adapters.pose_graphs.g2o import information_for_file, load_g2o, write_g2o
+from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.objective import gradient, residuals
-from hodge_pipeline.solvers.robust import solve_robust
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import Solution, ViewGraph
 
@@ -156,7 +156,7 @@ def robust_rows(count: int, share: float) -> Iterator[list[str]]:
     """A cylinder with wrong edges: this solver, which trusts no edge, and GTSAM's GNC, which is told whom to trust."""
     graph, wrong = with_wrong_edges(synthetic("cylinder", count), share)
     own_s, solution = timed(lambda: solve_robust(graph), 1)
-    yield robust_row("robust", graph, wrong, solution.weights > 0.5, own_s)
+    yield robust_row("robust", graph, wrong, solution.weights > 0, own_s)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cylinder.g2o"
         write_g2o(path, graph)

@@ -1,4 +1,4 @@
-"""First poses of long sequences: key frames are registered, all other frames follow them."""
+"""Initial poses of long sequences: optical flow tracks every frame, and only key frames enter the pose graph."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def is_video(source: Source) -> bool:
 
 
 def followers(source: Source, tracked: Tracked) -> KeyFrames:
-    """How all frames of the source move with the key frames."""
+    """The `KeyFrames` of a tracked source: how poses of all frames follow from those of the key frames."""
     return KeyFrames(
         rows=tracked.key_rows,
         first=tracked.world_from_key[tracked.anchors] @ tracked.key_from_frame,
@@ -188,7 +188,7 @@ def _renumbered(rows: Ints, key_of_row: dict[int, int]) -> Ints:
 
 
 def _anchored(parts: list[BlockRows], cut: list[FrameBlock], key_of_row: dict[int, int]) -> dict[str, Any]:
-    """What each row of the whole was registered to; a row that two blocks share belongs to the earlier one."""
+    """Key frame, relative motion and success of each frame; a row that two blocks share belongs to the earlier one."""
     fresh = [slice(int(block.warm_up), None) for block in cut]
     rows = np.concatenate([part.rows[keep] for part, keep in zip(parts, fresh, strict=True)])
     anchors = np.concatenate([part.anchors[keep] for part, keep in zip(parts, fresh, strict=True)])
@@ -203,7 +203,7 @@ def _anchored(parts: list[BlockRows], cut: list[FrameBlock], key_of_row: dict[in
 
 
 def _without_lonely(tracked: Tracked) -> Tracked:
-    """A key frame that no step holds, and its followers, were not found, as frames in the dark are not."""
+    """Mark a key frame without any odometry edge, and the frames tracked from it, as not found."""
     lonely = np.bincount(tracked.piece)[tracked.piece] == 1
     return tracked if lonely.all() else replace(tracked, found=tracked.found & ~lonely[tracked.anchors])
 

@@ -1,4 +1,4 @@
-"""First poses from consecutive frames, every frame registered to the one before it."""
+"""Initial poses by frame-to-frame odometry, its parts joined by global registration where asked for."""
 
 from __future__ import annotations
 

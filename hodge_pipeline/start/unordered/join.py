@@ -1,4 +1,4 @@
-"""First poses without a guess: of frames in no order, or of the parts that odometry left apart."""
+"""The start `unordered`, and the joining of parts that odometry left disconnected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses from nothing, on one screen: describe, propose, match, weigh, and let the diagnosis say what to trust."""
+"""Global registration of all frames: describe, propose pairs, match, verify, and keep what the diagnosis trusts."""
 
 from __future__ import annotations
 
