@@ -14,6 +14,8 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats
 
 SMALL_ANGLE = 1e-4
+ARM_M = 1.0
+"""Metres: a rotation counts as the displacement that it causes at this distance, about that of a room's walls."""
 
 
 def hat(v: Floats) -> Floats:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from hodge_adapters.tum import TumReader
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo import sequence
 from hodge_pipeline.demo.noise import RANGE_M, measured_depth, photographed

@@ -10,8 +10,8 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.colmap_refining import ColmapModels
-from hodge_adapters.colmap_ties import Ties, similarity
+from hodge_adapters.colmap.models import ColmapModels
+from hodge_adapters.colmap.ties import Ties, similarity
 from hodge_pipeline import se3
 from hodge_pipeline.refine.model_solve import calibrated
 from test_refine_colmap import FREE

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.poses_text import parse_tum
+from hodge_adapters.trajectories.text import parse_tum
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError, WorkspaceError
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.run_folder import Run

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from rerun.chunk import Chunk, RrdReader
 
-from hodge_adapters.seven_scenes import SevenScenesReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline import se3
 from hodge_pipeline.recipe.recording_options import SHARES, RecordingOptions
 from hodge_pipeline.recording import layout, shapes

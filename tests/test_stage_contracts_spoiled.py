@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hodge_adapters.colmap_refining import ColmapModels
-from hodge_adapters.poses_text import TumWriter, parse_tum
-from hodge_adapters.rewriting import TumRewriter
-from hodge_adapters.trajectory_files import TumPosesReader
+from hodge_adapters.colmap.models import ColmapModels
+from hodge_adapters.trajectories.readers import TumPosesReader
+from hodge_adapters.trajectories.rewriting import TumRewriter
+from hodge_adapters.trajectories.text import TumWriter, parse_tum
 from hodge_pipeline import se3, testing
 from hodge_pipeline.errors import SourceError, WorkerError
 from hodge_pipeline.executors.local import InProcess, LocalExecutor
@@ -581,17 +581,8 @@ def test_a_reader_of_models_that_breaks_its_contract_is_noticed(
 
 
 def test_each_property_has_a_stage_that_breaks_it() -> None:
-    tables = {
-        "edges": testing.EDGE_BUILDER_PROPERTIES,
-        "registration": testing.REGISTRAR_PROPERTIES,
-        "global_registration": testing.GLOBAL_REGISTRAR_PROPERTIES,
-        "executors": testing.EXECUTOR_PROPERTIES,
-        "refiners": testing.REFINER_PROPERTIES,
-        "fusion": testing.FUSER_PROPERTIES,
-        "start": testing.START_PROPERTIES,
-    }
-    for kind, table in tables.items():
-        assert {what for name, _, what, _ in SPOILED if name == kind} == {*table}, kind
+    for kind in ("edges", "registration", "global_registration", "executors", "refiners", "fusion", "start"):
+        assert {what for name, _, what, _ in SPOILED if name == kind} == {*testing.CHECKS[kind].properties}, kind
 
 
 def test_what_is_declared_as_lacking_must_be_lacking() -> None:

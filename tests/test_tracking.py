@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.poses_text import parse_tum
-from hodge_adapters.tum import TumReader
+from hodge_adapters.trajectories.text import parse_tum
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.executors.local import InProcess

@@ -36,7 +36,7 @@ def triangle_curl_m(graph: ViewGraph, triangles: Ints) -> Floats:
     ab, bc, ca = (_motions(graph, triangles[:, k], triangles[:, (k + 1) % 3]) for k in range(3))
     around = ab @ bc @ ca
     angle_rad = se3.rotation_angle(around)
-    return np.asarray(np.hypot(np.linalg.norm(around[:, :3, 3], axis=1), shapes.RESIDUAL_ARM_M * angle_rad))
+    return np.asarray(np.hypot(np.linalg.norm(around[:, :3, 3], axis=1), se3.ARM_M * angle_rad))
 
 
 def _motions(graph: ViewGraph, a: Ints, b: Ints) -> Floats:

@@ -8,9 +8,6 @@ from hodge_pipeline import se3
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.types import Bytes, Floats, Floats32, Ints, Model, ViewGraph
 
-RESIDUAL_ARM_M = 1.0
-"""A residual rotation counts as its arc at this distance, about that of the walls in a room."""
-
 RESIDUAL_COLOURS = np.array([[60, 115, 225], [130, 145, 170], [190, 180, 120], [255, 225, 50]], float)
 """Blue to yellow, ever brighter: legible without red and green, and in grey; the worst edges stand out."""
 IGNORED_COLOUR = (230, 60, 160)
@@ -33,7 +30,7 @@ def evenly(available: int, kept: int) -> Ints:
 def residuals_m(graph: ViewGraph, world_from_cam: Floats) -> Floats:
     """Residual (E,) of each edge in metres, `√(|t|² + (1 m · angle)²)`; NaN where a pose is not known."""
     translation_m, angle_rad = edge_residuals(graph, world_from_cam)
-    return np.asarray(np.hypot(translation_m, RESIDUAL_ARM_M * angle_rad))
+    return np.asarray(np.hypot(translation_m, se3.ARM_M * angle_rad))
 
 
 def residual_colours(residual_m: Floats, scale_m: float) -> Bytes:

@@ -10,8 +10,6 @@ from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Bools, Edges, Floats
 from hodge_pipeline.types.edges import HELD_OUT, MEASURED, REJECTED, USED
 
-ARM_M = 1.0
-"""A rotation counts as the displacement that it causes at this distance."""
 MIN_PATH_M = 0.05
 """Added to the length of every path: frames of a camera at rest differ by the error of a registration."""
 
@@ -52,11 +50,11 @@ def contradicts_odometry(registered: Edges, drift: Drift, scale: float = 1.0) ->
     """
     world_from_cam, part = drift.world_from_cam, drift.part
     i, j = registered.pairs.T
-    steps = _displacement_m(se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:], ARM_M * scale)
+    steps = _displacement_m(se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:], se3.ARM_M * scale)
     path_m = np.concatenate([[0.0], np.cumsum(steps)])
     moved = se3.inverse(se3.inverse(world_from_cam[i]) @ world_from_cam[j]) @ registered.i_from_j
     allowed = drift.largest * (MIN_PATH_M * scale + np.abs(path_m[j] - path_m[i]))
-    return np.asarray((part[i] == part[j]) & (_displacement_m(moved, ARM_M * scale) > allowed))
+    return np.asarray((part[i] == part[j]) & (_displacement_m(moved, se3.ARM_M * scale) > allowed))
 
 
 def _displacement_m(motions: Floats, arm_m: float) -> Floats:

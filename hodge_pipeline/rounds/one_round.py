@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.parts import Energies
+from hodge_pipeline.complex.decomposition import Energies
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.evaluation.residuals import with_residuals
@@ -125,7 +125,7 @@ class Work:
 
     def solve(self, registered: Registered, graph: ViewGraph, found: Energies | None) -> Round:
         """The round of these edges, and the poses consistent with them, of which `graph` holds those that count."""
-        up = up_of(self.scene, registered.start)
+        up = None if self.fixes is None else up_of(self.scene, registered.start)
         return self.steps.step(
             solve_edges, registered, graph, self.recipe.solver, found, self.fixes, up, title=registered.title
         )
@@ -189,18 +189,18 @@ def solve_edges(
     solver: ConsistencySolver,
     found: Energies | None,
     fixes: Fixes | None,
-    up: Floats,
+    up: Floats | None,
     *,
     step: Step,
 ) -> Round:
-    """Step: the round of these edges and the poses consistent with them, and with known positions where there are any;
-    `found` of ω at its start is kept.
+    """Step: the round of these edges and the poses consistent with them, and with known positions where there are any,
+    `up (3,)` being what points up; `found` of ω at its start is kept.
     """
     edges, solution = registered.edges, solver.solve(graph, registered.start)
     if registered.right is not None:
         solution = with_right(graph, solution, registered.right[edges.counts])
     placed: Placed | None = None
-    if fixes is not None:
+    if fixes is not None and up is not None:
         placed = place(graph, solution.world_from_cam, solution.component, solution.weights, fixes, up)
         solution = replace(solution, world_from_cam=placed.world_from_cam, component=placed.component)
     weights = np.zeros(len(edges))

@@ -64,7 +64,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     notes = [] if by_image or scene.given is not None else [*check_scans(clouds, scene.vertex_ids)]
     pairs = propose(scene, clouds, rows, scratch / DESCRIBED, options)
     matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
-    views = Views.make(scene.frames, scratch / VIEWS, workers)
+    views = Views.make(scene.frames, clouds, rows, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
     if scene.drift is not None:
         counted = np.flatnonzero(hypotheses.counts)
@@ -95,17 +95,17 @@ def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
 
 
 def propose(scene: Frames, clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart) -> Ints:
-    """The pairs (P, 2) to match: all of a few frames, else each with those most similar, or near by drifted poses."""
+    """The pairs (P, 2) to match: all of a few frames, else each with the most similar ones, and loops."""
     if len(rows) <= options.all_pairs_up_to:
         return all_pairs(rows)
     pairs = np.zeros((0, 2), np.int64)
     if options.similar_per_frame:
         local = LocalDescriptors(described, clouds, options.similarity_voxel_m)
         pairs = similar_pairs(local, rows, options, scene.given is not None)
-    if options.drift is None or scene.drift is None:
+    if scene.drift is None:
         return pairs
-    near = options.drift.propose(scene.frames, clouds, scene.drift.world_from_cam).pairs
-    return np.unique(np.concatenate([pairs, near]), axis=0)
+    found = [loops.propose(scene.frames, clouds, scene.drift.world_from_cam).pairs for loops in options.loops]
+    return np.unique(np.concatenate([pairs, *found]), axis=0)
 
 
 def _tried(count: int, pairs: Ints, hypotheses: Edges) -> str:
