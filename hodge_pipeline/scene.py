@@ -125,13 +125,15 @@ class KeyFrames:
 
 @dataclass(frozen=True)
 class Drift:
-    """What odometry says of the way between two frames: its poses (K, 4, 4), the part (K,) of each that it held
-    together, and the share of the way that it may err by.
+    """What odometry says of the path between two frames: its poses (K, 4, 4), the part (K,) of each that it held
+    together, the `covariance (K, 6, 6)` of the path from the first row to each, in the world's axes, and the squared
+    Mahalanobis distance from which on a pair contradicts it.
     """
 
     world_from_cam: Floats
     part: Ints
-    largest: float
+    covariance: Floats
+    gate: float
 
 
 @dataclass(frozen=True)

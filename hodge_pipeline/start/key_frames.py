@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
@@ -229,6 +230,10 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
     back = [row for rows in sequences_of(source).values() for row in _where_the_clock_goes_back(source, rows)]
     if back:
         notes.append(Note("clock", len(back), in_runs(np.array(back), ids)))
+    holes, stamps = gaps(list(sequences_of(source).values()), stamps_of(source)), stamps_of(source)
+    if len(holes):
+        told = [f"{stamps[j] - stamps[i]:.1f} s before {ids[j]}" for i, j in holes[:NOTES_SHOWN].tolist()]
+        notes.append(Note("holes", len(holes), ", ".join(told) + ", …" * (len(holes) > NOTES_SHOWN)))
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
     sizes = np.bincount(tracked.piece)
