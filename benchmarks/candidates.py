@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.seven_scenes import SevenScenesReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.pairs.drift import DriftEdges
 from hodge_pipeline.pairs.overlap import OverlapEdges

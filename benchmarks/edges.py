@@ -24,7 +24,7 @@ import numpy as np
 from edge_scores import PairTruth, area_under_roc, pose_recall, precision_and_recall, right_edges
 from edges_peers import LEVER_M, Answer, Peer, installed_peers
 
-from hodge_adapters.pair_log import PairLogReader
+from hodge_adapters.pose_graphs.pair_log import PairLogReader
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.solvers.maximum_likelihood import solve

@@ -20,7 +20,7 @@ import numpy as np
 import open3d as o3d
 
 import hodge_pipeline
-from hodge_adapters.pcd_points import read_pcd
+from hodge_adapters.clouds.pcd import read_pcd
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import make_sequence
 from hodge_pipeline.demo.street import Road

@@ -35,7 +35,7 @@ def clouds(path: Path) -> str:
 
 
 def recording(path: Path) -> str:
-    from hodge_adapters.mcap import McapReader
+    from hodge_adapters.mcap.reader import McapReader
 
     frames = McapReader().open(path).frames
     for frame in frames:

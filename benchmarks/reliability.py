@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.edge_scores import PairTruth, right_edges
 from benchmarks.simulated_edges import several
-from hodge_adapters.pair_log import PairLogReader
+from hodge_adapters.pose_graphs.pair_log import PairLogReader
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.types import Bools, Floats
 

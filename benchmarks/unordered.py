@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.clouds import CloudFolderReader
-from hodge_adapters.log_text import read_log_file
+from hodge_adapters.clouds.reader import CloudFolderReader
+from hodge_adapters.trajectories.log import read_log_file
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.gicp import Gicp

@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image
 
 import hodge_pipeline
-from hodge_adapters.g2o import write_g2o
-from hodge_adapters.tum import TumReader
+from hodge_adapters.pose_graphs.g2o import write_g2o
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import demo_source
 from hodge_pipeline.diagnosis.result import WRONG

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.parts import Energies
+from hodge_pipeline.complex.decomposition import Energies
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, Solution, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
@@ -124,13 +125,23 @@ class KeyFrames:
 
 @dataclass(frozen=True)
 class Drift:
-    """What odometry says of the way between two frames: its poses (K, 4, 4), the part (K,) of each that it held
-    together, and the share of the way that it may err by.
+    """What odometry says of the path between two frames: its poses (K, 4, 4), the part (K,) of each that it held
+    together, the `covariance (K, 6, 6)` of the path from the first row to each, in the world's axes, and the squared
+    Mahalanobis distance from which on a pair contradicts it.
     """
 
     world_from_cam: Floats
     part: Ints
-    largest: float
+    covariance: Floats
+    gate: float
+
+
+@dataclass(frozen=True)
+class Closed:
+    """The first poses (K, 4, 4), the loops along the path closed, and the pairs (P, 2) that closed them."""
+
+    world_from_cam: Floats
+    pairs: Ints
 
 
 @dataclass(frozen=True)
@@ -157,7 +168,8 @@ class Scene:
 
     `drift`: None where the first poses are not odometry's; `given`: the file that they come from, where there is one;
     `in_order`: whether frames that follow each other in the source do so in time; `sightings`: the folder of what
-    frames that are no key frames saw of these, where they were tracked.
+    frames that are no key frames saw of these, where they were tracked; `closed`: the first poses with
+    the loops along the path closed, None where nobody looked for any.
     """
 
     whole: Source
@@ -170,6 +182,7 @@ class Scene:
     given: GivenFile | None = None
     in_order: bool = True
     sightings: Path | None = None
+    closed: Closed | None = None
 
 
 def key_source(whole: Source, rows: Ints) -> Source:
@@ -205,6 +218,20 @@ def sequence_numbers(source: Source) -> Ints:
     for number, rows in enumerate(sequences_of(source).values()):
         numbers[rows] = number
     return numbers
+
+
+def own_trajectory(source: Source) -> Trajectory | None:
+    """The trajectory of a source, or the poses of its frames as one; None where it has neither.
+
+    Raises `SourceError` where frames of several sequences have stamps that repeat.
+    """
+    posed = [(frame.stamp_s, frame.world_from_cam) for frame in source.frames if frame.world_from_cam is not None]
+    if source.trajectory is not None or not posed:
+        return source.trajectory
+    stamps = np.array([stamp for stamp, _ in posed])
+    if (np.diff(stamps) <= 0).any():
+        raise SourceError(f"{source.path}: several sequences with stamps of their own: give one sequence's folder")
+    return Trajectory(stamps, np.array([pose for _, pose in posed]))
 
 
 def _filled(poses: Floats, found: Bools, times: Floats) -> Floats:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_adapters.ros_cdr import Field, parse_definition
+from hodge_adapters.mcap.ros_cdr import Field, parse_definition
 
 CDR, PROTOBUF, JSON = "cdr", "protobuf", "json"
 ENCODINGS = (CDR, PROTOBUF, JSON)

@@ -10,23 +10,23 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType
 
-from hodge_adapters.clouds import CloudFolderReader
-from hodge_adapters.colmap import ColmapReader
-from hodge_adapters.euroc import EurocReader, EurocWriter
-from hodge_adapters.g2o import G2oReader, G2oWriter
-from hodge_adapters.icl_nuim import IclNuimReader
-from hodge_adapters.log_text import LogReader, LogWriter
-from hodge_adapters.mcap import McapReader
+from hodge_adapters.clouds.ply import write_ply
+from hodge_adapters.clouds.reader import CloudFolderReader
+from hodge_adapters.colmap.reader import ColmapReader
+from hodge_adapters.icl_nuim.reader import IclNuimReader
+from hodge_adapters.mcap.reader import McapReader
 from hodge_adapters.nerfstudio import NerfstudioReader, NerfstudioWriter
 from hodge_adapters.open3d_json import Open3dPoseGraphWriter, Open3dReader, Open3dTrajectoryWriter
-from hodge_adapters.pair_log import PairLogReader
-from hodge_adapters.ply_points import write_ply
-from hodge_adapters.poses_text import KittiWriter, TumWriter
-from hodge_adapters.positions import PositionsReader
-from hodge_adapters.seven_scenes import SevenScenesReader
-from hodge_adapters.toro import ToroReader
-from hodge_adapters.trajectory_files import KittiPosesReader, TumPosesReader
-from hodge_adapters.tum import TumReader
+from hodge_adapters.pose_graphs.g2o import G2oReader, G2oWriter
+from hodge_adapters.pose_graphs.pair_log import PairLogReader
+from hodge_adapters.pose_graphs.toro import ToroReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
+from hodge_adapters.trajectories.euroc import EurocReader, EurocWriter
+from hodge_adapters.trajectories.log import LogReader, LogWriter
+from hodge_adapters.trajectories.positions import PositionsReader
+from hodge_adapters.trajectories.readers import KittiPosesReader, TumPosesReader
+from hodge_adapters.trajectories.text import KittiWriter, TumWriter
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.stages import FrameReader
 from hodge_pipeline.types import Camera, Frame, PointCloud, Source, Trajectory, ViewGraph

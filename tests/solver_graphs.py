@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from scipy.sparse import csc_matrix
 
-from hodge_adapters.g2o import information_for_file, load_g2o
+from hodge_adapters.pose_graphs.g2o import information_for_file, load_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 

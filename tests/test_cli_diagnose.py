@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 import hodge_pipeline
 from betti import betti_numbers
-from hodge_adapters.g2o import write_g2o
-from hodge_adapters.poses_text import parse_tum
+from hodge_adapters.pose_graphs.g2o import write_g2o
+from hodge_adapters.trajectories.text import parse_tum
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.complex.cech import flag_complex

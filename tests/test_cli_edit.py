@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
-from hodge_adapters.g2o import write_g2o
+from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError

@@ -147,7 +147,7 @@ def test_options_that_mean_nothing_are_refused(options: dict[str, Any]) -> None:
 
 
 def test_a_real_frame(data_dir: Path, tmp_path: Path) -> None:
-    from hodge_adapters.seven_scenes import SevenScenesReader
+    from hodge_adapters.seven_scenes.reader import SevenScenesReader
 
     path = data_dir / "seven_scenes" / "redkitchen"
     if not path.is_dir():

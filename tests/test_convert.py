@@ -9,9 +9,9 @@ import pycolmap
 import pytest
 from typer.testing import CliRunner
 
-from hodge_adapters.colmap_writer import ColmapWriter
-from hodge_adapters.poses_text import parse_tum
-from hodge_adapters.rewriting import TumRewriter
+from hodge_adapters.colmap.writer import ColmapWriter
+from hodge_adapters.trajectories.rewriting import TumRewriter
+from hodge_adapters.trajectories.text import parse_tum
 from hodge_pipeline import se3
 from hodge_pipeline.cli.convert import convert, writer_name
 from hodge_pipeline.cli.main import app

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from hodge_adapters.seven_scenes import SevenScenesReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.candidates import merge

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hodge_adapters.seven_scenes import SevenScenesReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.pairs.sift import SiftEdges
 from hodge_pipeline.pairs.sift_features import Features

@@ -14,7 +14,7 @@ from benchmarks.edge_scores import (
     precision_and_recall,
     right_edges,
 )
-from hodge_adapters.pair_log import PairLogReader
+from hodge_adapters.pose_graphs.pair_log import PairLogReader
 from hodge_pipeline import se3
 from hodge_pipeline.types import ViewGraph
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_adapters.tum import READOUT_S, TumReader
+from hodge_adapters.tum.reader import READOUT_S, TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.registration.flow import Corners, FlowImage, find_corners, flow_image, follow

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.ply_points import read_ply as read_points
+from hodge_adapters.clouds.ply import read_ply as read_points
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.store.artifacts import write_atomically
 from hodge_pipeline.types import Model

@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.g2o import (
+from hodge_adapters.pose_graphs.g2o import (
     G2oReader,
     information_for_file,
     information_of_file,
     load_g2o,
     write_g2o,
 )
-from hodge_adapters.toro import ToroReader, load_toro
+from hodge_adapters.pose_graphs.toro import ToroReader, load_toro
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.solvers.maximum_likelihood import solve

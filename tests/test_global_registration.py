@@ -12,8 +12,14 @@ from hypothesis import strategies as st
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.consensus import rigid_consensus
-from hodge_pipeline.registration.global_evidence import depth_view, free_directions, free_space, violation
-from hodge_pipeline.registration.global_features import describe, mutual_matches
+from hodge_pipeline.registration.global_evidence import (
+    depth_view,
+    free_directions,
+    free_space,
+    panorama,
+    violation,
+)
+from hodge_pipeline.registration.global_features import describe, mutual_matches, viewpoint
 from hodge_pipeline.registration.global_registrars import FpfhConsensus, FpfhFgr, FpfhRansac, KissMatcher
 from hodge_pipeline.stages import GlobalRegistrar
 from hodge_pipeline.start.unordered.hypotheses import LEAD_SIGMAS
@@ -222,6 +228,33 @@ def test_pixels_without_a_measurement_accuse_nobody() -> None:
     assert np.isnan(free_space(view, wall(1.0)).violation)
 
 
+def hall(half_m: float) -> Floats:
+    """The walls of a square hall of this half side round the origin, 2 m up and down."""
+    at, up = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, 400), np.linspace(-2, 2, 60)))
+    sides = [np.stack([np.full(at.size, side), at, up / half_m], axis=1) for side in (-1.0, 1.0)]
+    return half_m * np.concatenate([*sides, *(points[:, [1, 0, 2]] for points in sides)])
+
+
+def test_a_scanner_saw_through_what_stands_before_its_walls() -> None:
+    view = panorama(hall(5.0))
+    assert free_space(view, hall(5.0)).violation == 0.0
+    assert free_space(view, hall(4.0)).violation == 1.0
+    assert np.isnan(free_space(view, hall(6.0)).violation)  # behind the walls
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert free_space(view, hall(5.0) @ quarter.T).violation == 0.0
+    moved = hall(5.0) + np.array([2.0, 0.0, 0.0])
+    assert 0.15 < free_space(view, moved).violation < 0.5  # one wall of four, and the ends of two
+    assert not np.isfinite(view.nearest_m[:3]).any()  # nothing was measured overhead: it accuses nobody
+
+
+def test_a_scan_of_the_ground_is_seen_from_its_scanner() -> None:
+    beams, turn = np.radians(np.linspace(-24, -2, 32)), np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    up, round_ = (grid.ravel() for grid in np.meshgrid(beams, turn))
+    flat_m = -1.8 / np.tan(up)
+    ground = np.stack([flat_m * np.cos(round_), flat_m * np.sin(round_), np.full(up.size, -1.8)], axis=1)
+    assert not viewpoint(ground).any()
+
+
 def test_violation_is_the_worse_of_the_two_views() -> None:
     near, far = (
         depth_view(np.full((120, 160), 1.0, np.float32), CAMERA),
@@ -232,8 +265,8 @@ def test_violation_is_the_worse_of_the_two_views() -> None:
 
 
 def test_real_fragments_are_registered_with_no_guess(data_dir: Path) -> None:
-    from hodge_adapters.log_text import read_log_file
-    from hodge_adapters.ply_points import read_ply
+    from hodge_adapters.clouds.ply import read_ply
+    from hodge_adapters.trajectories.log import read_log_file
 
     fragments = data_dir / "fragments"
     truth = read_log_file(fragments / "pair_estimates/7-scenes-redkitchen-evaluation/gt.log")

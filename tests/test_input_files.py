@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from hodge_adapters.colmap_database import database_names
-from hodge_adapters.mcap_records import MAGIC
-from hodge_adapters.pcd_points import MAX_EXPANDED_BYTES, read_pcd
-from hodge_adapters.ply_points import read_ply
+from hodge_adapters.clouds.pcd import MAX_EXPANDED_BYTES, read_pcd
+from hodge_adapters.clouds.ply import read_ply
+from hodge_adapters.colmap.database import database_names
+from hodge_adapters.mcap.records import MAGIC
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types.input_files import beginning, open_input, read_input, read_input_text
 from reading_targets import TARGETS
@@ -175,24 +175,24 @@ def _zstd_bomb(count: int, size: int) -> bytes:
 
 
 def test_the_chunks_of_a_recording_expand_to_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hodge_adapters import mcap_log
-    from hodge_adapters.mcap import McapReader
+    from hodge_adapters.mcap import message_file
+    from hodge_adapters.mcap.reader import McapReader
 
     expanded = list[int]()
-    expand: Callable[..., bytes] = mcap_log.expand
-    monkeypatch.setattr(mcap_log, "expand", lambda *of: expanded.append(of[2]) or expand(*of))
-    monkeypatch.setattr(mcap_log, "ALWAYS_EXPANDED_BYTES", 1 << 24)
+    expand: Callable[..., bytes] = message_file.expand
+    monkeypatch.setattr(message_file, "expand", lambda *of: expanded.append(of[2]) or expand(*of))
+    monkeypatch.setattr(message_file, "ALWAYS_EXPANDED_BYTES", 1 << 24)
     path = tmp_path / "bomb.mcap"
     path.write_bytes(_zstd_bomb(40, 1 << 22))
     with pytest.raises(SourceError):
         McapReader().open(path)
-    assert 0 < sum(expanded) <= (1 << 24) + mcap_log.MAX_EXPANSION * path.stat().st_size
+    assert 0 < sum(expanded) <= (1 << 24) + message_file.MAX_EXPANSION * path.stat().st_size
     assert len(expanded) < 40
 
 
 @pytest.mark.parametrize("word", [b"<!DOCTYPE", b"<!ENTITY"])
 def test_the_xml_of_an_e57_defines_nothing(word: bytes, tmp_path: Path) -> None:
-    from hodge_adapters.scan_files import e57_scans
+    from hodge_adapters.clouds.scan_files import e57_scans
 
     pytest.importorskip("pye57")
     good = TARGETS["e57"].make(tmp_path)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_adapters.mcap import McapReader
-from hodge_adapters.positions import PositionsReader
+from hodge_adapters.mcap.reader import McapReader
+from hodge_adapters.trajectories.positions import PositionsReader
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import SourceError

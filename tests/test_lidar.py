@@ -12,10 +12,10 @@ from typing import cast
 import numpy as np
 import pytest
 
-from hodge_adapters.clouds import CloudFolderReader
-from hodge_adapters.pcd_points import read_pcd
-from hodge_adapters.ply_points import write_ply
-from hodge_adapters.point_columns import seconds_after_first
+from hodge_adapters.clouds.columns import seconds_after_first
+from hodge_adapters.clouds.pcd import read_pcd
+from hodge_adapters.clouds.ply import write_ply
+from hodge_adapters.clouds.reader import CloudFolderReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import make_sequence
 from hodge_pipeline.demo.street import HOUSES_M, Road, build_street

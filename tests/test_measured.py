@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.g2o import G2oWriter
 from hodge_adapters.open3d_json import Open3dPoseGraphWriter
-from hodge_adapters.tum import TumReader
+from hodge_adapters.pose_graphs.g2o import G2oWriter
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.schema import load_recipe

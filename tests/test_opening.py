@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from hodge_adapters.icl_nuim import IclNuimReader
-from hodge_adapters.seven_scenes import SevenScenesReader
-from hodge_adapters.tum import TumReader
+from hodge_adapters.icl_nuim.reader import IclNuimReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.recipe_file import recipe_names

@@ -14,10 +14,10 @@ import pytest
 
 import hodge_pipeline
 from bag_data import WRITERS, rosbag1, typesys, write_bag, write_db3
-from hodge_adapters import ros1_bag
-from hodge_adapters.mcap import McapReader
-from hodge_adapters.mcap_writer import McapWriter
-from hodge_adapters.ros_definitions import TYPES, definition
+from hodge_adapters.mcap import ros1_bag
+from hodge_adapters.mcap.reader import McapReader
+from hodge_adapters.mcap.ros_definitions import TYPES, definition
+from hodge_adapters.mcap.writer import McapWriter
 from hodge_pipeline import se3
 from hodge_pipeline.cli.convert import convert
 from hodge_pipeline.errors import SourceError

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hodge_adapters.camera_files import Intrinsics, read_intrinsics
+from hodge_adapters.images.camera_files import Intrinsics, read_intrinsics
 from hodge_pipeline.errors import SourceError
 
 PLAIN = Intrinsics(525.0, 524.0, 319.5, 239.5)

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters import point_columns
-from hodge_adapters.clouds import CloudFolderReader, PlyWriter
-from hodge_adapters.kitti_scans import read_bin
-from hodge_adapters.log_text import read_log_file
-from hodge_adapters.pcd_points import expand_lzf, read_pcd
-from hodge_adapters.ply_points import read_ply, write_ply
+from hodge_adapters.clouds import columns as point_columns
+from hodge_adapters.clouds.kitti import read_bin
+from hodge_adapters.clouds.pcd import expand_lzf, read_pcd
+from hodge_adapters.clouds.ply import read_ply, write_ply
+from hodge_adapters.clouds.reader import CloudFolderReader, PlyWriter
+from hodge_adapters.trajectories.log import read_log_file
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.measured_edges import GraphFile, MeasuredOptions, measured_edges
@@ -219,16 +219,27 @@ def columns_of_kitti(kind: str) -> np.ndarray:
             return np.column_stack([points, rng.uniform(0, 1, len(points)).astype("<f4")])
         case "whole":
             return np.column_stack([points, rng.integers(0, 256, len(points)).astype("<f4")])
+        case "beams":
+            return np.column_stack([points, rng.integers(0, 256, len(points)), np.arange(len(points)) % 32]).astype(
+                "<f4"
+            )
     return np.column_stack([points + np.float32(20), rng.uniform(0, 255, len(points)).astype("<f4")])
 
 
-@pytest.mark.parametrize("kind", ["three", "three, no coordinate below 0", "share", "whole", "up to 255"])
+@pytest.mark.parametrize("kind", ["three", "three, no coordinate below 0", "share", "whole", "up to 255", "beams"])
 def test_columns_of_kittis_scans_are_told_apart(tmp_path: Path, kind: str) -> None:
     """48 points of three columns have the bytes of 36 of four, and 48 of four those of 64 of three."""
     table = columns_of_kitti(kind)
     (tmp_path / "000000.bin").write_bytes(table.tobytes())
     found = read_bin(tmp_path / "000000.bin")
     np.testing.assert_array_equal(found.points_in_cam, table[:, :3])
+
+
+def test_scans_whose_names_end_in_a_number(tmp_path: Path) -> None:
+    names = ["planes_000010.bin", "scan__LIDAR_TOP__1532402927647951.pcd.bin"]
+    for seed, name in enumerate([*names, "points3D.bin", "frames.bin"]):
+        (tmp_path / name).write_bytes(lidar_scan(seed=seed).tobytes())
+    assert [frame.frame_id for frame in CloudFolderReader().open(tmp_path).frames] == names
 
 
 def test_a_folder_of_kitti_with_calibration_and_poses(tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hodge_adapters.colmap import ColmapReader
-from hodge_adapters.colmap_cameras import pinhole_camera, undistortion
-from hodge_adapters.colmap_records import CameraRecord
-from hodge_adapters.colmap_writer import ColmapWriter
+from hodge_adapters.colmap.cameras import pinhole_camera, undistortion
+from hodge_adapters.colmap.reader import ColmapReader
+from hodge_adapters.colmap.records import CameraRecord
+from hodge_adapters.colmap.writer import ColmapWriter
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
@@ -268,7 +268,7 @@ def test_red_kitchen_depth_beside_images(data_dir: Path, tmp_path: Path) -> None
 MUTATE = """
 import random, shutil, sys
 from pathlib import Path
-from hodge_adapters.colmap_content import read_model
+from hodge_adapters.colmap.content import read_model
 from hodge_pipeline.errors import SourceError
 
 model, work = Path(sys.argv[1]), Path(sys.argv[2])

@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hodge_adapters.colmap import ColmapReader
-from hodge_adapters.colmap_writer import ColmapWriter
+from hodge_adapters.colmap.reader import ColmapReader
+from hodge_adapters.colmap.writer import ColmapWriter
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader

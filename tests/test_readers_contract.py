@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_adapters.seven_scenes import SevenScenesReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Source, Trajectory

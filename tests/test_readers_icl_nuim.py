@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_adapters.icl_nuim import IclNuimReader
-from hodge_adapters.icl_pov import read_pose, read_ray_lengths
-from hodge_adapters.log_text import read_log_file
+from hodge_adapters.icl_nuim.pov import read_pose, read_ray_lengths
+from hodge_adapters.icl_nuim.reader import IclNuimReader
+from hodge_adapters.trajectories.log import read_log_file
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from hodge_adapters import images
+from hodge_adapters.images import pixels
 from hodge_pipeline.errors import SourceError
 from readers_data import HEIGHT, WIDTH, depth_values, write_colour, write_depth
 
 
 def test_depth_is_metres_and_zero_where_the_file_has_none(tmp_path: Path) -> None:
     values = np.array([[0, 1000, 65535], [1, 2500, 65534]], np.uint16)
-    depth = images.read_depth(
+    depth = pixels.read_depth(
         write_depth(tmp_path / "d.png", values), units_per_metre=1000.0, no_depth=(0, 65535), size=(3, 2)
     )
     assert depth.dtype == np.float32
@@ -26,26 +26,26 @@ def test_depth_is_metres_and_zero_where_the_file_has_none(tmp_path: Path) -> Non
 
 def test_only_the_given_values_mean_no_depth(tmp_path: Path) -> None:
     path = write_depth(tmp_path / "d.png", np.array([[65535, 5000]], np.uint16))
-    np.testing.assert_allclose(images.read_depth(path, units_per_metre=5000.0), [[13.107, 1.0]], rtol=1e-6)
+    np.testing.assert_allclose(pixels.read_depth(path, units_per_metre=5000.0), [[13.107, 1.0]], rtol=1e-6)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_colour_is_rgb(tmp_path: Path, suffix: str) -> None:
-    colour = images.read_colour(write_colour(tmp_path / f"c{suffix}", (200, 100, 50)), size=(WIDTH, HEIGHT))
+    colour = pixels.read_colour(write_colour(tmp_path / f"c{suffix}", (200, 100, 50)), size=(WIDTH, HEIGHT))
     assert colour.dtype == np.uint8 and colour.shape == (HEIGHT, WIDTH, 3)
     np.testing.assert_allclose(colour[2, 3], [200, 100, 50], atol=2)
 
 
 def test_encoded_images_are_the_bytes_of_the_file(tmp_path: Path) -> None:
     depth, colour = write_depth(tmp_path / "d.png", depth_values()), write_colour(tmp_path / "c.jpg")
-    encoded = images.encoded_depth(depth, units_per_metre=5000.0)
+    encoded = pixels.encoded(depth, units_per_metre=5000.0)
     assert (encoded.contents, encoded.media_type, encoded.units_per_metre) == (depth.read_bytes(), "image/png", 5000.0)
-    assert images.encoded_colour(colour).contents == colour.read_bytes()
-    assert images.encoded_colour(colour).media_type == "image/jpeg"
+    assert pixels.encoded(colour).contents == colour.read_bytes()
+    assert pixels.encoded(colour).media_type == "image/jpeg"
 
 
 def test_a_partial_pickles_and_reads_the_same(tmp_path: Path) -> None:
-    read = partial(images.read_depth, write_depth(tmp_path / "d.png", depth_values()), units_per_metre=1000.0)
+    read = partial(pixels.read_depth, write_depth(tmp_path / "d.png", depth_values()), units_per_metre=1000.0)
     np.testing.assert_array_equal(read(), pickle.loads(pickle.dumps(read))())
 
 
@@ -57,9 +57,9 @@ def test_every_truncation_is_found(tmp_path: Path, name: str) -> None:
     for length in range(len(whole)):
         path.write_bytes(whole[:length])
         with pytest.raises(SourceError, match=name):
-            images.read_colour(path)
+            pixels.read_colour(path)
     path.write_bytes(whole + b"trailing bytes are harmless")
-    assert images.read_colour(path).shape == rgb.shape
+    assert pixels.read_colour(path).shape == rgb.shape
 
 
 def test_a_flipped_bit_in_a_png_is_found(tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_a_flipped_bit_in_a_png_is_found(tmp_path: Path) -> None:
     damaged[len(damaged) // 2] ^= 1
     path.write_bytes(damaged)
     with pytest.raises(SourceError, match="damaged"):
-        images.read_depth(path, units_per_metre=1000.0)
+        pixels.read_depth(path, units_per_metre=1000.0)
 
 
 def test_a_thumbnail_does_not_make_a_truncated_jpeg_whole(tmp_path: Path) -> None:
@@ -77,10 +77,10 @@ def test_a_thumbnail_does_not_make_a_truncated_jpeg_whole(tmp_path: Path) -> Non
     with_thumbnail = whole[:2] + segment + whole[2:]
     path = tmp_path / "t.jpg"
     path.write_bytes(with_thumbnail)
-    assert images.read_colour(path).shape == (HEIGHT, WIDTH, 3)
+    assert pixels.read_colour(path).shape == (HEIGHT, WIDTH, 3)
     path.write_bytes(with_thumbnail[:-2])
     with pytest.raises(SourceError, match="truncated"):
-        images.read_colour(path)
+        pixels.read_colour(path)
 
 
 def test_a_size_that_only_the_header_claims_is_refused_before_decoding(tmp_path: Path) -> None:
@@ -88,13 +88,13 @@ def test_a_size_that_only_the_header_claims_is_refused_before_decoding(tmp_path:
     path = tmp_path / "bomb.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)))
     with pytest.raises(SourceError, match="1073741824x1073741824"):
-        images.read_depth(path, units_per_metre=1000.0)
+        pixels.read_depth(path, units_per_metre=1000.0)
 
 
 def test_another_size_than_the_camera_names_both(tmp_path: Path) -> None:
     path = write_depth(tmp_path / "d.png", depth_values())
     with pytest.raises(SourceError, match=r"d\.png.*8x6.*640x480"):
-        images.read_depth(path, units_per_metre=1000.0, size=(640, 480))
+        pixels.read_depth(path, units_per_metre=1000.0, size=(640, 480))
 
 
 @pytest.mark.parametrize(
@@ -104,27 +104,27 @@ def test_what_is_no_image_is_named(tmp_path: Path, contents: bytes, reason: str)
     path = tmp_path / "d.png"
     path.write_bytes(contents)
     with pytest.raises(SourceError, match=rf"d\.png.*{reason}"):
-        images.read_depth(path, units_per_metre=1000.0)
+        pixels.read_depth(path, units_per_metre=1000.0)
 
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
     for path in (tmp_path / "gone.png", tmp_path):
         with pytest.raises(SourceError, match=f"{path.name}: cannot be read"):
-            images.read_depth(path, units_per_metre=1000.0)
+            pixels.read_depth(path, units_per_metre=1000.0)
 
 
 def test_a_colour_image_is_no_depth(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="uint8 with 3 channel"):
-        images.read_depth(write_colour(tmp_path / "c.png"), units_per_metre=1000.0)
+        pixels.read_depth(write_colour(tmp_path / "c.png"), units_per_metre=1000.0)
 
 
 def test_the_common_size_survives_a_damaged_and_an_odd_image(tmp_path: Path) -> None:
     paths = [write_depth(tmp_path / f"{row}.png", depth_values()) for row in range(5)]
     paths[0].write_bytes(b"damaged")
     write_depth(paths[2], depth_values(shape=(3, 3)))
-    assert images.common_size(paths) == (WIDTH, HEIGHT)
+    assert pixels.common_size(paths) == (WIDTH, HEIGHT)
     with pytest.raises(SourceError, match="0.png"):
-        images.common_size(paths[:1])
+        pixels.common_size(paths[:1])
 
 
 def test_a_jpeg_that_was_overwritten_in_part_is_refused(tmp_path: Path) -> None:
@@ -133,8 +133,8 @@ def test_a_jpeg_that_was_overwritten_in_part_is_refused(tmp_path: Path) -> None:
         path = tmp_path / "image.jpg"
         contents = bytearray(cv2.imencode(".jpg", image, flags)[1].tobytes())
         path.write_bytes(contents + b"\xff\xd9 behind the end")
-        assert images.read_colour(path).shape == (120, 160, 3)
+        assert pixels.read_colour(path).shape == (120, 160, 3)
         contents[-3000:-1000] = np.random.default_rng(1).bytes(2000)
         path.write_bytes(contents)
         with pytest.raises(SourceError, match="truncated or damaged"):
-            images.read_colour(path)
+            pixels.read_colour(path)

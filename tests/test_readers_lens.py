@@ -6,9 +6,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hodge_adapters.camera_files import read_intrinsics
-from hodge_adapters.lens import Lens, encoded_straight_colour, encoded_straight_depth, straight_colour, straight_depth
-from hodge_adapters.tum import CAMERAS, TumReader
+from hodge_adapters.images.camera_files import read_intrinsics
+from hodge_adapters.images.lens import (
+    Lens,
+    encoded_straight_colour,
+    encoded_straight_depth,
+    straight_colour,
+    straight_depth,
+)
+from hodge_adapters.tum.reader import CAMERAS, TumReader
 from hodge_pipeline.types import Camera, Floats32
 
 CAMERA = Camera(640, 480, 517.3, 516.5, 318.6, 255.3)

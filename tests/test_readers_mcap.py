@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from hodge_adapters.mcap import McapReader
-from hodge_adapters.seven_scenes import SevenScenesReader
-from hodge_adapters.tum import TumReader
+from hodge_adapters.mcap.reader import McapReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Frame

@@ -17,9 +17,9 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 
-from hodge_adapters import mcap_records
-from hodge_adapters.mcap import McapReader
-from hodge_adapters.mcap_records import MAGIC
+from hodge_adapters.mcap import records as mcap_records
+from hodge_adapters.mcap.reader import McapReader
+from hodge_adapters.mcap.records import MAGIC
 from hodge_pipeline.errors import SourceError
 from mcap_data import (
     Log,

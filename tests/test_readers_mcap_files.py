@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType
 
-from hodge_adapters.mcap import McapReader
+from hodge_adapters.mcap.reader import McapReader
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera

@@ -17,7 +17,7 @@ MESSAGES = 733
 READ = r"""
 import re, sys
 from pathlib import Path
-from hodge_adapters.mcap import McapReader
+from hodge_adapters.mcap.reader import McapReader
 frames = McapReader().open(sys.argv[1]).frames
 depth = [float(frame.read_depth()[0, 0]) for frame in frames]
 assert len(set(depth)) > 100

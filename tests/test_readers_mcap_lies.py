@@ -12,8 +12,8 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from hodge_adapters.mcap import McapReader
-from hodge_adapters.mcap_records import MAGIC
+from hodge_adapters.mcap.reader import McapReader
+from hodge_adapters.mcap.records import MAGIC
 from hodge_pipeline.errors import SourceError
 from mcap_data import Log, compressed_depth, odometry, png, point_cloud, raw_image, read_all, resident_peak, ros_header
 from mcap_encoding import CDR, JSON, encode_cdr

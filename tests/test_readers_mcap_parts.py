@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.mcap import McapReader
-from hodge_adapters.mcap_protobuf import protobuf_decoder
-from hodge_adapters.mcap_records import Malformed
-from hodge_adapters.ros_cdr import ros_decoder
-from hodge_adapters.ros_rvl import decode_rvl
-from hodge_adapters.ros_tf import TransformTree
+from hodge_adapters.mcap.protobuf import protobuf_decoder
+from hodge_adapters.mcap.reader import McapReader
+from hodge_adapters.mcap.records import Malformed
+from hodge_adapters.mcap.ros_cdr import ros_decoder
+from hodge_adapters.mcap.ros_rvl import decode_rvl
+from hodge_adapters.mcap.ros_tf import TransformTree
 from hodge_pipeline import se3
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import PointCloud

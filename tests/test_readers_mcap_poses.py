@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_adapters.mcap import McapReader
+from hodge_adapters.mcap.reader import McapReader
 from hodge_pipeline import se3
 from hodge_pipeline.sources.inspect import inspect
 from hodge_pipeline.testing import check_reader

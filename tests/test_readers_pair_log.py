@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_adapters.log_text import LogWriter
-from hodge_adapters.pair_log import PairLogReader, read_information
+from hodge_adapters.pose_graphs.pair_log import PairLogReader, read_information
+from hodge_adapters.trajectories.log import LogWriter
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader

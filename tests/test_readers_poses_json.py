@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.euroc import EurocReader, EurocWriter
-from hodge_adapters.log_text import LogReader, LogWriter
 from hodge_adapters.nerfstudio import NerfstudioReader, NerfstudioWriter
 from hodge_adapters.open3d_json import Open3dPoseGraphWriter, Open3dReader, Open3dTrajectoryWriter
-from hodge_adapters.trajectory_files import KittiPosesReader, TumPosesReader
+from hodge_adapters.trajectories.euroc import EurocReader, EurocWriter
+from hodge_adapters.trajectories.log import LogReader, LogWriter
+from hodge_adapters.trajectories.readers import KittiPosesReader, TumPosesReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.poses_text import KittiWriter, TumWriter, parse_tum, read_kitti, write_kitti, write_tum
+from hodge_adapters.trajectories.text import KittiWriter, TumWriter, parse_tum, read_kitti, write_kitti, write_tum
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.stages import Writer

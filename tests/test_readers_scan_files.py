@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_adapters.clouds import CloudFolderReader
+from hodge_adapters.clouds.reader import CloudFolderReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_adapters.seven_scenes import SevenScenesReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader

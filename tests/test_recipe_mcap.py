@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.mcap import McapReader
-from hodge_adapters.poses_text import write_tum
-from hodge_adapters.seven_scenes import SevenScenesReader
-from hodge_adapters.tum import TumReader
+from hodge_adapters.mcap.reader import McapReader
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
+from hodge_adapters.trajectories.text import write_tum
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
-from hodge_adapters.colmap_refining import ColmapModels
-from hodge_adapters.colmap_tracked import ColmapModel
+from hodge_adapters.colmap.models import ColmapModels
+from hodge_adapters.colmap.tracked import ColmapModel
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import SourceError, WorkspaceError

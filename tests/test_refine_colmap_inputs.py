@@ -14,8 +14,8 @@ from matplotlib.axis import Axis
 from typer.testing import CliRunner
 
 import hodge_pipeline
-from hodge_adapters.colmap import ColmapReader
-from hodge_adapters.colmap_refining import ColmapModels
+from hodge_adapters.colmap.models import ColmapModels
+from hodge_adapters.colmap.reader import ColmapReader
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.store.edge_table import read_edges

@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.colmap_refining import ColmapModels
+from hodge_adapters.colmap.models import ColmapModels
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from readers_data import write_depth
@@ -208,7 +208,7 @@ def test_images_without_a_pose_stay_without(tmp_path: Path) -> None:
 def test_a_real_model_of_red_kitchen(data_dir: Path, tmp_path: Path) -> None:
     from make_colmap_model import colour_images, make_model
 
-    from hodge_adapters.colmap import ColmapReader
+    from hodge_adapters.colmap.reader import ColmapReader
 
     images = colour_images(data_dir / "seven_scenes/redkitchen/seq-01")[:40:5]
     assert make_model(images, tmp_path, (585, 585, 320, 240), features=1500) == 1

@@ -10,8 +10,8 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.colmap_priors import database_priors
-from hodge_adapters.colmap_refining import ColmapModels
+from hodge_adapters.colmap.models import ColmapModels
+from hodge_adapters.colmap.priors import database_priors
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats

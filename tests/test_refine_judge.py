@@ -10,8 +10,8 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.colmap_refining import ColmapModels
-from hodge_adapters.colmap_uncertainty import standard_errors
+from hodge_adapters.colmap.models import ColmapModels
+from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
 from hodge_pipeline.refine.judge import best, costs
 from hodge_pipeline.types import ModelQuality

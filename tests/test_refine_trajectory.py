@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from hodge_adapters.poses_text import parse_tum, write_tum
-from hodge_adapters.tum import TumReader
+from hodge_adapters.trajectories.text import parse_tum, write_tum
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app, main
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence

@@ -9,9 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hodge_pipeline
-from hodge_adapters.log_text import read_log_file
-from hodge_adapters.rewriting import EurocRewriter, KittiRewriter, LogRewriter, SevenScenesRewriter, TumRewriter
-from hodge_adapters.tum import TumReader
+from hodge_adapters.trajectories.log import read_log_file
+from hodge_adapters.trajectories.rewriting import (
+    EurocRewriter,
+    KittiRewriter,
+    LogRewriter,
+    SevenScenesRewriter,
+    TumRewriter,
+)
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import registry, se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import GraphError, SourceError

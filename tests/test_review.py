@@ -13,7 +13,7 @@ import pytest
 
 import hodge_pipeline
 from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
-from hodge_adapters.g2o import write_g2o
+from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError, WorkspaceError
 from hodge_pipeline.pairs.edits import Edit, History, pair_names, read_history_file, write_history_file

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_adapters.pycolmap_import import pycolmap
+from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import align

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
-from hodge_adapters.poses_text import parse_tum, write_tum
-from hodge_adapters.tum import TumReader
+from hodge_adapters.trajectories.text import parse_tum, write_tum
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import HodgeError, WorkspaceError

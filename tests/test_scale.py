@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.ply_points import write_ply
+from hodge_adapters.clouds.ply import write_ply
 from hodge_pipeline import se3
 from hodge_pipeline.recipe.scale import measured_scale, scaled_recipe
 from hodge_pipeline.recipe.schema import load_recipe

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
-from hodge_adapters.g2o import write_g2o
+from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.complex.series import series_classes

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
-from hodge_adapters.g2o import load_g2o, write_g2o
+from hodge_adapters.pose_graphs.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError

@@ -10,7 +10,7 @@ import pytest
 
 from hodge_pipeline import registry, se3
 from hodge_pipeline.complex.checks import orthonormal
-from hodge_pipeline.testing import SOLVER_PROPERTIES, check_solver
+from hodge_pipeline.testing import check_solver
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 LACKS = {
@@ -21,7 +21,7 @@ LACKS = {
 
 
 @pytest.mark.parametrize("name", registry.names("solvers"))
-@pytest.mark.parametrize("what", SOLVER_PROPERTIES)
+@pytest.mark.parametrize("what", check_solver.properties)
 def test_every_solver_keeps_the_contract(name: str, what: str) -> None:
     check_solver(registry.load("solvers", name)(), lacks=LACKS.get(name, set()), properties=[what])
 

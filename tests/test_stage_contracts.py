@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +16,18 @@ from readers_data import seven_scenes_sequence
 from test_readers_colmap import synthetic
 
 OWN = "hodge-pipeline "
-PROPERTIES: dict[str, Mapping[str, Any]] = {
-    "start": testing.START_PROPERTIES,
-    "edges": testing.EDGE_BUILDER_PROPERTIES,
-    "registration": testing.REGISTRAR_PROPERTIES,
-    "global_registration": testing.GLOBAL_REGISTRAR_PROPERTIES,
-    "executors": testing.EXECUTOR_PROPERTIES,
-    "refiners": testing.REFINER_PROPERTIES,
-    "fusion": testing.FUSER_PROPERTIES,
-    "models": testing.MODEL_READER_PROPERTIES,
-    "writers": testing.WRITER_PROPERTIES,
-    "rewriters": testing.REWRITER_PROPERTIES,
-}
+PROPERTIES = {kind: check.properties for kind, check in testing.CHECKS.items() if kind != "readers"}
 OPTIONS: dict[str, dict[str, Any]] = {
     "start: given": {"poses": "frames"},
     "executors: local": {"workers": 2},
+    "edges: place": {
+        "reach": 1,
+        "min_similarity": 0.5,
+        "thinned": 1,
+    },  # the room's frames are few, and follow each other
     "edges: combined": {"builders": tuple(registry.load("edges", name)() for name in ("sequential", "overlap"))},
 }
 LACKS = {
-    "registration: rgbd": {"other axes"},  # landmarks are weighed by their depth: the axes must be the camera's
     "rewriters: seven_scenes": {"new poses"},  # it writes the poses alone, which without images are no sequence
 }
 FILES = {
@@ -122,7 +114,7 @@ def test_every_reader_of_models_keeps_its_contract(name: str, what: str, tmp_pat
 
 def test_every_kind_has_a_check() -> None:
     assert list(testing.CHECKS) == list(registry.KINDS)
-    assert {*PROPERTIES, "readers", "solvers"} == {*registry.KINDS}
+    assert {*PROPERTIES, "readers"} == {*registry.KINDS}
 
 
 @pytest.mark.parametrize("page", ["docs/examples/far_loops/test_far_loops.py", "tests/plugin_package/test_ring.py"])

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from hodge_adapters.colmap import ColmapReader
-from hodge_adapters.colmap_refining import ColmapModels
-from hodge_adapters.g2o import load_g2o
-from hodge_adapters.toro import load_toro
+from hodge_adapters.colmap.models import ColmapModels
+from hodge_adapters.colmap.reader import ColmapReader
+from hodge_adapters.pose_graphs.g2o import load_g2o
+from hodge_adapters.pose_graphs.toro import load_toro
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader, inspect
 from readers_data import tum_folder

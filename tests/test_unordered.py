@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
-from hodge_adapters.ply_points import write_ply
+from hodge_adapters.clouds.ply import write_ply
 from hodge_pipeline import se3
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.pairs.sequential import SequentialEdges
@@ -115,8 +115,8 @@ def test_pieces_lie_beside_each_other() -> None:
 
 
 def test_six_real_fragments_in_no_order(data_dir: Path, tmp_path: Path) -> None:
-    from hodge_adapters.clouds import CloudFolderReader
-    from hodge_adapters.log_text import read_log_file
+    from hodge_adapters.clouds.reader import CloudFolderReader
+    from hodge_adapters.trajectories.log import read_log_file
 
     fragments = data_dir / "fragments"
     frames = CloudFolderReader(log="").open(fragments / "redkitchen_3dmatch").frames

@@ -45,7 +45,7 @@ def hodge(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_holds_both_packages_and_the_recipes(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {"hodge_pipeline/recipes/demo.yaml", "hodge_pipeline/py.typed", "hodge_adapters/tum.py"} <= names
+    assert {"hodge_pipeline/recipes/demo.yaml", "hodge_pipeline/py.typed", "hodge_adapters/tum/reader.py"} <= names
     assert "hodge_pipeline/cli/plugin_template/registration.py.j2" in names
     assert not [name for name in names if name.startswith(("tests/", "adapters/", "benchmarks/"))]
 

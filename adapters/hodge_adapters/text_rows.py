@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -10,8 +11,10 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from hodge_pipeline.errors import SourceError, not_written
-from hodge_pipeline.types.input_files import read_input_text
+from hodge_pipeline.types.input_files import beginning, read_input_text
 
+_DIGITS = re.compile(r"(\d+)")
+SNIFFED_BYTES = 4096
 SHOWN = 5
 """How many records a note names before it only counts them."""
 
@@ -24,12 +27,32 @@ class Row:
     fields: list[str]
 
 
-def read_text(path: Path) -> str:
-    """The text of a file, whatever its bytes; raises `SourceError` where it cannot be read."""
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """While a file is read: what the system refuses becomes a `SourceError` that names it."""
     try:
-        return read_input_text(path, errors="replace")
+        yield
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
+
+
+def names_in(folder: Path) -> list[str]:
+    """The names in a folder, ascending; raises `SourceError` where it cannot be listed."""
+    try:
+        return sorted(os.listdir(folder))
+    except OSError as error:
+        raise SourceError(f"{folder}: cannot be listed ({error.strerror}): give a folder that can be read") from error
+
+
+def first_text(path: Path, size: int = SNIFFED_BYTES) -> str:
+    """The first characters of a file, empty where it cannot be read."""
+    return beginning(path, size).decode("utf-8-sig", "replace")
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, whatever its bytes; raises `SourceError` where it cannot be read."""
+    with reading(path):
+        return read_input_text(path, errors="replace")
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -56,6 +79,12 @@ def listed(items: Sequence[object]) -> str:
 def counted(count: int, noun: str) -> str:
     """A count with its noun: `1 image`, `2 images`."""
     return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def natural(name: str) -> tuple[tuple[int, int, str], ...]:
+    """A sort key that takes digits for numbers."""
+    parts = (part for part in _DIGITS.split(name) if part)
+    return tuple((0, int(part[:18]), part) if part.isascii() and part.isdecimal() else (1, 0, part) for part in parts)
 
 
 def inside(folder: Path, name: str) -> Path | None:

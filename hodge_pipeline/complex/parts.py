@@ -17,10 +17,10 @@ from hodge_pipeline.complex.cech import (
     voxel_occupancy,
 )
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.decomposition import HodgeDecomposition, hodge_decomposition
+from hodge_pipeline.complex.decomposition import Energies, HodgeDecomposition, hodge_decomposition
 from hodge_pipeline.complex.one_form import centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.types import CloudSet, Floats, ViewGraph
+from hodge_pipeline.types import CloudSet, Floats, Ints, ViewGraph
 
 MOST_TRIANGLES = 200_000
 """Of a graph with more the parts are not computed: a cost, some seconds of conjugate gradients."""
@@ -39,10 +39,15 @@ class ComplexOptions:
 
     def of(self, graph: ViewGraph, clouds: CloudSet, world_from_cam: Floats) -> SimplicialComplex:
         """Vertices, edges, triangles of a graph under poses (V, 4, 4). Raises `GraphError` for too many triangles."""
-        if (count := clique_counts(graph.edges, graph.vertex_count)[2]) > MOST_TRIANGLES:
-            raise GraphError(f"its complex has {count} triangles, more than {MOST_TRIANGLES}")
-        flag = flag_complex(graph.edges, graph.vertex_count)
+        flag = flag_of(graph)
         return nerve(flag, voxel_occupancy(clouds, world_from_cam, self.voxel_m)) if self.nerve else flag
+
+
+def flag_of(graph: ViewGraph) -> SimplicialComplex:
+    """The flag complex of a graph. Raises `GraphError` for more than MOST_TRIANGLES triangles."""
+    if (count := clique_counts(graph.edges, graph.vertex_count)[2]) > MOST_TRIANGLES:
+        raise GraphError(f"its complex has {count} triangles, more than {MOST_TRIANGLES}")
+    return flag_complex(graph.edges, graph.vertex_count)
 
 
 @dataclass(frozen=True)
@@ -56,33 +61,13 @@ class OneForm:
     weights: Floats
 
 
-def one_form(graph: ViewGraph, world_from_cam: Floats) -> OneForm:
-    """ω of a graph's edges at poses (V, 4, 4) (Section 3.3)."""
-    component = connected_components(graph.edges, graph.vertex_count)
+def one_form(graph: ViewGraph, world_from_cam: Floats, component: Ints | None = None) -> OneForm:
+    """ω of a graph's edges at poses (V, 4, 4) (Section 3.3); `component (V,)`: by default the graph's own."""
+    if component is None:
+        component = connected_components(graph.edges, graph.vertex_count)
     centred = shifted(world_from_cam, -centroids(world_from_cam, component))
     omega = residual_form(graph.edges, graph.i_from_j, centred)
     return OneForm(*orient_edges(graph.edges, graph.vertex_count).pooled(omega, np.ones(graph.edge_count)))
-
-
-@dataclass(frozen=True)
-class Energies:
-    """Energy Σ w|ω|² of the parts of a 1-form, (rotation in rad², translation in m²) each, on so many simplices.
-
-    Exact: what moving the poses takes away; co-exact: the curl of triangles; harmonic: loops that no triangle fills.
-    """
-
-    simplices: tuple[int, ...]
-    exact: tuple[float, float]
-    coexact: tuple[float, float]
-    harmonic: tuple[float, float]
-
-    @property
-    def shares(self) -> dict[str, tuple[float, float]]:
-        """The share of each part in the rotation's and the translation's energy; 0 where there is none at all."""
-        parts = {"exact": self.exact, "coexact": self.coexact, "harmonic": self.harmonic}
-        total = np.sum(list(parts.values()), axis=0)
-        scale = np.where(total > 0, total, 1.0)
-        return {name: (float(part[0] / scale[0]), float(part[1] / scale[1])) for name, part in parts.items()}
 
 
 def decompose(complex_: SimplicialComplex, omega: OneForm) -> HodgeDecomposition:
@@ -92,5 +77,4 @@ def decompose(complex_: SimplicialComplex, omega: OneForm) -> HodgeDecomposition
 
 def energies(complex_: SimplicialComplex, parts: HodgeDecomposition) -> Energies:
     """How much of ω each part holds."""
-    found = parts.energies()
-    return Energies(complex_.counts, found["exact"], found["coexact"], found["harmonic"])
+    return parts.energies(complex_.counts)

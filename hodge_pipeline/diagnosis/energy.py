@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.complex.cech import clique_counts, flag_complex, orient_edges
-from hodge_pipeline.complex.coboundary import coboundary_0
-from hodge_pipeline.complex.decomposition import hodge_decomposition
-from hodge_pipeline.complex.one_form import centroids, residual_form, shifted
+from hodge_pipeline.complex.cech import orient_edges
+from hodge_pipeline.complex.parts import decompose, flag_of, one_form
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -19,7 +17,7 @@ PARTS = ("exact", "co-exact", "harmonic")
 ALL_EDGES = "all edges"
 BEFORE, AFTER = "before", "after"
 MOST_PIECES = 8
-MOST_TRIANGLES, MOST_EDGES = 200_000, 50_000
+MOST_EDGES = 50_000
 CAVEAT = (
     "energy shares are of ω = log(T_i Z_ij T_j⁻¹) at the robust poses, unit weights, world origin at the centroid of "
     "each piece; where residual motions are large ω is only their linearisation, and wrong edges dominate it"
@@ -67,9 +65,8 @@ def energy_rows(
     inside &= graph.edges[:, 0] != graph.edges[:, 1]
     rows: list[EnergyRow] = []
     try:
-        centred = shifted(world_from_cam, -centroids(world_from_cam, piece))
         for when, chosen in ((BEFORE, inside), (AFTER, inside & kept)):
-            rows += _rows(graph.select(np.flatnonzero(chosen)), centred, piece, when)
+            rows += _rows(graph.select(np.flatnonzero(chosen)), world_from_cam, piece, when)
     except GraphError as error:
         return (), (f"energy shares are left out: {error}",)
     return tuple(sorted(rows, key=lambda row: _place(row.group))), ()
@@ -103,16 +100,10 @@ def _rows(graph: ViewGraph, world_from_cam: Floats, piece: Ints, when: str) -> I
         return
     if graph.edge_count > MOST_EDGES:
         raise GraphError(f"there are more than {MOST_EDGES} edges")
-    if clique_counts(graph.edges, graph.vertex_count)[2] > MOST_TRIANGLES:
-        raise GraphError(f"there are more than {MOST_TRIANGLES} triangles")
-    omega = residual_form(graph.edges, graph.i_from_j, world_from_cam)
-    oriented = orient_edges(graph.edges, graph.vertex_count)
-    form, weights = oriented.pooled(omega, np.ones(graph.edge_count))
-    complex_ = flag_complex(graph.edges, graph.vertex_count)
-    d0 = coboundary_0(complex_.simplices[1], graph.vertex_count)
-    found = hodge_decomposition(d0, complex_.coboundary(1), form, weights)
-    energy = np.stack([weights[:, None] * part**2 for part in (found.exact, found.coexact, found.harmonic)])
-    source = np.full(len(form), "", graph.source.dtype)
+    omega, oriented = one_form(graph, world_from_cam, piece), orient_edges(graph.edges, graph.vertex_count)
+    found = decompose(flag_of(graph), omega)
+    energy = np.stack([omega.weights[:, None] * part**2 for part in (found.exact, found.coexact, found.harmonic)])
+    source = np.full(len(oriented.edges), "", graph.source.dtype)
     source[oriented.row[::-1]] = graph.source[::-1]
     for group, chosen in _groups(piece[oriented.edges[:, 0]], source):
         picked = energy[:, chosen]

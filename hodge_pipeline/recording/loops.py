@@ -1,4 +1,4 @@
-"""The loops of the viewing graph that no triangles fill, drawn as loops."""
+"""Log harmonic loops: cycles of the viewing graph that no triangles fill."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.curl import vertices_along
 from hodge_pipeline.recording.stream import log_notes
 from hodge_pipeline.types import Bytes, Floats, Ints, ViewGraph
@@ -23,7 +23,7 @@ BRIGHT_MEDIANS = 4.0
 
 
 def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats) -> tuple[str, ...]:
-    """What was left out, in words; each hole's loop as a closed line, its label how far the motions around it close."""
+    """Log one closed line for each hole, labelled with its closure error; gives notes of what was left out."""
     notes: tuple[str, ...] = ()
     try:
         holes = unfilled_loops(graph.edges, graph.vertex_count, most_loops=MOST_LOOPS)
@@ -38,7 +38,7 @@ def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floa
     kept = np.array([row for row, line in enumerate(lines) if np.isfinite(line).all()], np.int64)
     left = se3.log(loop_products(chosen, graph.i_from_j))
     angle, shift_m = np.linalg.norm(left[:, :3], axis=1), np.linalg.norm(left[:, 3:], axis=1)
-    size = np.hypot(shift_m, shapes.RESIDUAL_ARM_M * angle)[kept]
+    size = np.hypot(shift_m, se3.ARM_M * angle)[kept]
     strips = rr.LineStrips3D(
         [lines[row] for row in kept],
         colors=_loop_colours(size),

@@ -9,7 +9,7 @@ from scipy.ndimage import minimum_filter
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.free_directions import named_direction
-from hodge_pipeline.types import Camera, Floats, Floats32
+from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Ints
 
 SLIPPAGE = 0.015
 """Eigenvalue of the mean normal matrix: normals that differ by less than 7° are one plane."""
@@ -18,15 +18,35 @@ VIEW_WIDTH = 160
 MARGIN_M, MARGIN_PER_M2 = 0.06, 0.006
 """Depth noise of structured light grows with the square of the distance; a match is off by centimetres."""
 NEAREST_M = 0.1
+PANORAMA_STEP = np.radians(3.0)
+"""Side of a panorama's cell: that of a scan's voxels at 6 m in a room."""
 
 
 @dataclass(frozen=True)
 class DepthView:
-    """A depth image made small: the nearest surface around each kept pixel in metres, ∞ where nothing was measured."""
+    """A depth image made small: the nearest surface around each kept pixel in metres, ∞ where nothing was measured.
+
+    Without a camera it is a panorama: rows are elevations from −90°, columns azimuths about z, lengths are ranges.
+    """
 
     nearest_m: Floats32
     stride: int
-    camera: Camera
+    camera: Camera | None
+
+    def project(self, points: Floats, nearest_m: float) -> tuple[Ints, Ints, Floats]:
+        """Row, column and depth in metres of those points (N, 3) in the view's frame that lie in the image."""
+        if self.camera is None:
+            ranges = np.linalg.norm(points, axis=1)
+            far = ranges > nearest_m
+            return *_cells(points[far], ranges[far]), ranges[far]
+        front = points[points[:, 2] > nearest_m]
+        z = front[:, 2]
+        with np.errstate(over="ignore", invalid="ignore"):
+            column = np.rint((self.camera.fx * front[:, 0] / z + self.camera.cx) / self.stride)
+            row = np.rint((self.camera.fy * front[:, 1] / z + self.camera.cy) / self.stride)
+        height, width = self.nearest_m.shape
+        inside: Bools = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        return row[inside].astype(np.int64), column[inside].astype(np.int64), z[inside]
 
 
 def depth_view(depth: Floats32, camera: Camera) -> DepthView:
@@ -35,6 +55,23 @@ def depth_view(depth: Floats32, camera: Camera) -> DepthView:
     small = depth[::stride, ::stride]
     open_ended = np.where(small > 0, small, np.float32(np.inf)).astype(np.float32)
     return DepthView(minimum_filter(open_ended, 3, mode="nearest"), stride, camera)
+
+
+def panorama(points: Floats) -> DepthView:
+    """What a scanner at the origin of a scan (N, 3) saw: the nearest point in and around each cell of directions."""
+    ranges = np.linalg.norm(points, axis=1)
+    nearest = np.full((round(np.pi / PANORAMA_STEP), round(2 * np.pi / PANORAMA_STEP)), np.inf, np.float32)
+    np.minimum.at(nearest, _cells(points, ranges), ranges.astype(np.float32))
+    return DepthView(minimum_filter(nearest, 3, mode=("nearest", "wrap")), 1, None)
+
+
+def _cells(points: Floats, ranges: Floats) -> tuple[Ints, Ints]:
+    """Row and column in a panorama of points (N, 3) at these ranges."""
+    rows, columns = round(np.pi / PANORAMA_STEP), round(2 * np.pi / PANORAMA_STEP)
+    up = np.arcsin(np.clip(points[:, 2] / np.maximum(ranges, 1e-12), -1, 1)) + np.pi / 2
+    turn = np.arctan2(points[:, 1], points[:, 0]) + np.pi
+    row, column = ((angle / PANORAMA_STEP).astype(np.int64) for angle in (up, turn))
+    return np.minimum(row, rows - 1), column % columns
 
 
 @dataclass(frozen=True)
@@ -56,16 +93,8 @@ def free_space(view: DepthView, points_in_view: Floats, scale: float = 1.0) -> F
 
     `scale` multiplies lengths that are for rooms.
     """
-    z = points_in_view[:, 2]
-    front = points_in_view[z > NEAREST_M * scale]
-    camera, z = view.camera, front[:, 2]
-    with np.errstate(over="ignore", invalid="ignore"):
-        column = np.rint((camera.fx * front[:, 0] / z + camera.cx) / view.stride)
-        row = np.rint((camera.fy * front[:, 1] / z + camera.cy) / view.stride)
-    height, width = view.nearest_m.shape
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    z = z[inside]
-    surface = view.nearest_m[row[inside].astype(np.int64), column[inside].astype(np.int64)]
+    row, column, z = view.project(points_in_view, NEAREST_M * scale)
+    surface = view.nearest_m[row, column]
     margin = MARGIN_M * scale + MARGIN_PER_M2 / scale * z**2
     measured = np.isfinite(surface)
     before = measured & (z < surface - margin)

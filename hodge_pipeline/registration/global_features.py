@@ -16,8 +16,9 @@ FEWEST_POINTS = 20
 BLOCK_ENTRIES = 4_000_000
 DIRECTION_STEP = 0.06
 """Side of a cell of directions, radians."""
-DEEPER = 1.3
-"""What lies further behind the nearest point of its cell is hidden; a slanted surface is not."""
+DEEPER, LEVEL = 1.3, 1e-3
+"""What lies further behind the nearest point of its cell is hidden; a slanted surface is not, nor a floor, which goes
+farther within a cell the more level the view, in radians."""
 SEEN_FROM_ORIGIN = 0.75
 FAR_RADII = 3.0
 
@@ -78,12 +79,16 @@ def viewpoint(points: Floats) -> Floats:
     middle = points.mean(axis=0)
     if np.linalg.norm(middle) > FAR_RADII * np.sqrt(((points - middle) ** 2).sum(axis=1).mean()):
         return np.asarray(middle)
-    ranges = np.linalg.norm(points, axis=1)
-    directions = points / np.maximum(ranges, 1e-9)[:, None]
-    _, cell = np.unique(np.floor(directions / DIRECTION_STEP).astype(np.int64), axis=0, return_inverse=True)
+    ranges = np.maximum(np.linalg.norm(points, axis=1), 1e-9)
+    up = np.arcsin(np.clip(points[:, 2] / ranges, -1, 1))
+    turn = np.arctan2(points[:, 1], points[:, 0])
+    cells = np.floor(np.stack([up, turn], axis=1) / DIRECTION_STEP).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
     nearest = np.full(int(cell.max()) + 1, np.inf)
     np.minimum.at(nearest, cell.reshape(-1), ranges)
-    seen = ranges <= nearest[cell.reshape(-1)] * DEEPER
+    low = np.maximum(np.abs(up), LEVEL)
+    floor_ratio = np.sin(np.minimum(low + DIRECTION_STEP, np.pi / 2)) / np.sin(low)  # a floor over one cell
+    seen = ranges <= nearest[cell.reshape(-1)] * np.maximum(DEEPER, floor_ratio)
     return np.zeros(3) if seen.mean() >= SEEN_FROM_ORIGIN else np.asarray(middle)
 
 

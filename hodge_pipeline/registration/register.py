@@ -15,8 +15,6 @@ from hodge_pipeline.types.edges import HELD_OUT, MEASURED, USED
 
 REUSE_WITHIN_M = 0.01
 """Between a registration and where the poses now put its pair: nearer than any registrar's start must be."""
-ARM_M = 1.0
-"""A rotation counts as the displacement that it causes at this distance."""
 
 
 def register_edges(
@@ -67,6 +65,6 @@ def _reusable(candidates: Edges, guesses: Floats, earlier: Edges | None, scale: 
     both = [(row, by_pair[a, b]) for row, (a, b) in enumerate(candidates.pairs.tolist()) if (a, b) in by_pair]
     rows, known = np.array(both, np.int64).reshape(-1, 2).T
     apart = se3.log(se3.inverse(earlier.i_from_j[known]) @ guesses[rows])
-    moved = np.linalg.norm(apart[:, 3:], axis=1) + ARM_M * scale * np.linalg.norm(apart[:, :3], axis=1)
+    moved = np.linalg.norm(apart[:, 3:], axis=1) + se3.ARM_M * scale * np.linalg.norm(apart[:, :3], axis=1)
     near = moved < REUSE_WITHIN_M * scale
     return rows[near], known[near]

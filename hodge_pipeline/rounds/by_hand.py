@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.evaluation.residuals import edge_residuals
@@ -20,8 +21,6 @@ from hodge_pipeline.types import Bools, Edges, Floats, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, HELD_OUT, REJECTED, USED
 from hodge_pipeline.types.notes import Note
 
-ARM_M = 1.0
-"""A residual rotation counts as its arc at this distance."""
 BY_HAND = "by_hand"
 UNKNOWN = np.full((4, 4), np.nan)
 NEXT = "hodge edit --list shows them, hodge edit --undo takes the last back"
@@ -62,7 +61,7 @@ def _start(work: Work, graph: ViewGraph, rounds: Sequence[Round]) -> Floats:
 
     def distance(one: Round) -> float:
         translation_m, angle_rad = edge_residuals(graph, one.world_from_cam)
-        known = np.hypot(translation_m, ARM_M * float(work.recipe.scale) * angle_rad)
+        known = np.hypot(translation_m, se3.ARM_M * float(work.recipe.scale) * angle_rad)
         return float(np.nanmean(known)) if np.isfinite(known).any() else np.inf
 
     apart = connected_components(rounds[-1].graph.edges, graph.vertex_count)

@@ -96,15 +96,14 @@ def _without_guess(
     step: Step,
 ) -> Edges:
     """Those of the pairs (P, 2) whose match is good enough to be judged with the other edges."""
-    by_image = uses_images(CloudSet.open(clouds), options)
+    opened = CloudSet.open(clouds)
+    by_image = uses_images(opened, options)
     matcher = options.images if by_image else options.registrar
     rows = np.unique(pairs)
     describe_clouds(clouds, matcher, rows, scratch, workers)
     matches = match_pairs(scratch, matcher, pairs, workers)
-    views = Views.make([source.frames[row] for row in rows], scratch / "views", workers)
-    found = weigh(
-        clouds, matches, lambda row: views(int(np.searchsorted(rows, row))), registrar, options.limits, workers
-    )
+    views = Views.make(source.frames, opened, rows, scratch / "views", workers)
+    found = weigh(clouds, matches, views, registrar, options.limits, workers)
     shutil.rmtree(scratch, ignore_errors=True)
     if not found.counts.all():
         refused = ", ".join(f"{count} {reason}" for reason, count in found.rejected_counts.items())

@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.parts import Energies
+from hodge_pipeline.complex.components import connected_components, in_runs
+from hodge_pipeline.complex.decomposition import Energies
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.pairs.candidates import merge
 from hodge_pipeline.pairs.held_out import HeldOut
+from hodge_pipeline.pairs.revisits import REVISIT
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.registration.acceptance import accepted, with_odometry
 from hodge_pipeline.registration.register import register_edges
@@ -26,7 +27,7 @@ from hodge_pipeline.start.known_positions import up_of
 from hodge_pipeline.start.unordered.tour import propose_along_tour
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, ViewGraph
 from hodge_pipeline.types.edges import HELD_OUT
-from hodge_pipeline.types.notes import notes_of
+from hodge_pipeline.types.notes import Note, notes_of
 
 LEFT_OUT = 1e-3
 """A weight below which a robust solver has left an edge out, whether or not it keeps a rest."""
@@ -71,13 +72,17 @@ class Work:
     fixes: Fixes | None = None
 
     def placed_first(self) -> Round:
-        """The first round, its poses in the world of known positions where there are any: loops are then near."""
+        """The first round, its loops closed along the path, its poses in the world of known positions where there are
+        any: pairs that close loops are then near.
+        """
         scene = self.scene
+        closed = scene.closed
+        first = scene.first if closed is None else replace(scene.first, world_from_cam=closed.world_from_cam)
         if self.fixes is None or scene.is_given:
-            return scene.first
-        up = up_of(scene, scene.first.world_from_cam)
-        found = self.steps.step(place_first, scene.first, self.fixes, up, title="known positions")
-        return replace(scene.first, world_from_cam=found)
+            return first
+        up = up_of(scene, first.world_from_cam)
+        found = self.steps.step(place_first, first, self.fixes, up, title="known positions")
+        return replace(first, world_from_cam=found)
 
     def propose(self, number: int, before: Round) -> Edges:
         """The pairs to register in round `number` from the poses of the one before."""
@@ -87,6 +92,8 @@ class Work:
             propose_edges, recipe.edges, scene.source, scene.clouds, before.world_from_cam, self.measured, held_out,
             scene.in_order, self.scale, title=f"edges, round {number}",
         )  # fmt: skip
+        if scene.closed is not None:
+            proposed = merge([proposed, Edges.proposed(scene.closed.pairs, REVISIT)])[0]
         return with_start_edges(proposed, scene.first)
 
     def register(self, number: int, edges: Edges, before: Round) -> Registered:
@@ -104,7 +111,9 @@ class Work:
         """The table with the status of every registered pair; one that odometry measured, and that was registered to
         somewhere else, keeps odometry's measurement.
         """
-        found = accepted(edges, self.recipe.acceptance, self.scene.drift, self.scale)
+        found, slid = accepted(edges, self.recipe.acceptance, self.scene.drift)
+        if len(slid):
+            self.steps.note(Note("slid", len(slid), in_runs(slid, self.scene.first.vertex_ids)))
         return found if self.scene.drift is None else with_odometry(found, self.scene.first.edges)
 
     @property
@@ -118,7 +127,7 @@ class Work:
 
     def solve(self, registered: Registered, graph: ViewGraph, found: Energies | None) -> Round:
         """The round of these edges, and the poses consistent with them, of which `graph` holds those that count."""
-        up = up_of(self.scene, registered.start)
+        up = None if self.fixes is None else up_of(self.scene, registered.start)
         return self.steps.step(
             solve_edges, registered, graph, self.recipe.solver, found, self.fixes, up, title=registered.title
         )
@@ -182,18 +191,18 @@ def solve_edges(
     solver: ConsistencySolver,
     found: Energies | None,
     fixes: Fixes | None,
-    up: Floats,
+    up: Floats | None,
     *,
     step: Step,
 ) -> Round:
-    """Step: the round of these edges and the poses consistent with them, and with known positions where there are any;
-    `found` of ω at its start is kept.
+    """Step: the round of these edges and the poses consistent with them, and with known positions where there are any,
+    `up (3,)` being what points up; `found` of ω at its start is kept.
     """
     edges, solution = registered.edges, solver.solve(graph, registered.start)
     if registered.right is not None:
         solution = with_right(graph, solution, registered.right[edges.counts])
     placed: Placed | None = None
-    if fixes is not None:
+    if fixes is not None and up is not None:
         placed = place(graph, solution.world_from_cam, solution.component, solution.weights, fixes, up)
         solution = replace(solution, world_from_cam=placed.world_from_cam, component=placed.component)
     weights = np.zeros(len(edges))

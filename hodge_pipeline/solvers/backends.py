@@ -1,30 +1,25 @@
-"""Linear back ends behind one small interface: which library factorises, or preconditions, and on which graph.
+"""The two ways to solve a graph's linear systems, and which is cheaper on which graph.
 
-A direct one factorises; an iterative one preconditions conjugate gradients, at a cost that grows with the graph alone
-and not with its fill.
+SuperLU factorises; multigrid preconditions conjugate gradients, at a cost that grows with the graph alone and not with
+its fill. (CHOLMOD was tried in SuperLU's place: after the block elimination it is no faster on any graph.)
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.cg import truncated_cg
+from hodge_pipeline.solvers.cg import solved_columns
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
-from hodge_pipeline.solvers.linear import Factor, factorise, factorise_blocks, fill_reducing_order
+from hodge_pipeline.solvers.linear import Factor, factorise, fill_reducing_order
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioning, multigrid
 from hodge_pipeline.types import Floats, Ints
 
-BackendName: TypeAlias = Literal["auto", "superlu", "cholmod", "multigrid"]
+BackendName: TypeAlias = Literal["auto", "superlu", "multigrid"]
 ITERATIVE_FROM = 15_000
 """Vertices: below, a factorisation and a hundred solves cost less than the hierarchies."""
 CHAIN_EDGES_PER_VERTEX = 1.5
@@ -39,76 +34,24 @@ JOINT_SIZE = 6
 SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
 
 
-@dataclass(frozen=True)
-class Backend:
-    """How linear systems of a graph are solved: by factors, or, with `precondition`, by conjugate gradients.
-
-    `factorise_core` gives what solves with a matrix in the order of elimination; None is SuperLU, which can do so in
-    single precision. `precondition` gives an approximate inverse, symmetric and positive definite, of a block matrix.
-    """
-
-    name: BackendName
-    factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]] | None = None
-    precondition: Preconditioning | None = None
-
-    @property
-    def iterative(self) -> bool:
-        """Whether it makes no factors."""
-        return self.precondition is not None
-
-    def factorise(self, laplacian: csc_matrix) -> Factor:
-        """What solves with a scalar Laplacian (n, n) in the order of elimination, to the rounding of a factor."""
-        size = int(laplacian.shape[0])
-        if size and self.precondition is not None:
-            return _conjugate_gradients(csr_matrix(laplacian), self.precondition)
-        if size and self.factorise_core is not None:
-            return Factor(size, self.factorise_core(laplacian))
-        return factorise(laplacian, "NATURAL")
-
-    def factorise_blocks(self, plan: Elimination, matrix: bsr_matrix, single: bool = False) -> Factor:
-        """The factor of a block matrix in the order of elimination; `single`: in float32, where there is a choice.
-
-        An iterative back end leaves it to SuperLU. Raises `GraphError` where the matrix is singular.
-        """
-        return factorise_blocks(plan, matrix, single and self.factorise_core is None, self.factorise_core)
-
-
-def backend(name: BackendName) -> Backend:
-    """The back end of this name, not `auto`. Raises `GraphError` where its library is not installed."""
-    if name == "cholmod":
-        if not cholmod_installed():
-            raise GraphError("back end cholmod is not installed: pip install scikit-sparse, or take backend auto")
-        return Backend(name, factorise_core=_cholmod)
-    return Backend(name, precondition=_multigrid()) if name == "multigrid" else Backend("superlu")
-
-
-@cache
-def cholmod_installed() -> bool:
-    """Whether scikit-sparse can be imported: looked up once, since a search of the path takes as long as a twentieth
-    of a solve for a thousand poses.
-    """
-    try:
-        return importlib.util.find_spec("sksparse.cholmod") is not None
-    except ModuleNotFoundError:
-        return False
-
-
-def choose(name: BackendName, tail: Ints, head: Ints, count: int, direct: bool = False) -> tuple[Backend, Elimination]:
-    """The back end for a graph, and its plan of elimination; edges (tail, head), `count` vertices that are not pinned.
+def choose(
+    name: BackendName, tail: Ints, head: Ints, count: int, direct: bool = False
+) -> tuple[Preconditioning | None, Elimination]:
+    """What preconditions linear systems of a graph, None where they are factorised, and its plan of elimination; edges
+    (tail, head), `count` vertices that are not pinned.
 
     `auto` is the cheaper of a factorisation, whose fill is foretold, and multigrid; where one will be needed
     (`direct`), it is a factorisation.
     """
-    factors = backend("cholmod" if cholmod_installed() else "superlu") if name == "auto" else backend(name)
-    if factors.iterative:
-        return factors, unordered(count)
+    if name == "multigrid":
+        return _multigrid(), unordered(count)
     if name != "auto" or direct or count <= ITERATIVE_FROM:
-        return factors, plan_elimination(tail, head, count, fill_reducing_order)
+        return None, plan_elimination(tail, head, count, fill_reducing_order)
     if len(tail) < CHAIN_EDGES_PER_VERTEX * count:
         plan = plan_elimination(tail, head, count, _order_of_narrow)
         if SECONDS_A_PRODUCT * JOINT_SIZE**3 * plan.work < SECONDS_A_BLOCK * (count + 2 * len(tail)):
-            return factors, plan
-    return backend("multigrid"), unordered(count)
+            return None, plan
+    return _multigrid(), unordered(count)
 
 
 def _order_of_narrow(core: csc_matrix) -> Ordering:
@@ -127,19 +70,18 @@ def _width(core: csc_matrix) -> float:
     return float(np.median(np.maximum.reduceat(reach, core.indptr[:-1])))
 
 
-def _conjugate_gradients(matrix: csr_matrix, precondition: Preconditioning) -> Factor:
+def laplacian_factor(laplacian: csc_matrix, precondition: Preconditioning | None) -> Factor:
+    """What solves with a scalar Laplacian (n, n) in the order of elimination, to the rounding of a factor."""
+    if precondition is None or not laplacian.shape[0]:
+        return factorise(laplacian, "NATURAL")
+    matrix = csr_matrix(laplacian)
     blocks = matrix.tobsr((1, 1))
     apply = precondition(blocks, Modes())
 
     def solve(rhs: Floats) -> Floats:
-        found = truncated_cg(
-            lambda x: np.asarray(matrix @ x.reshape(rhs.shape)).reshape(-1),
-            lambda r: apply(blocks, r.reshape(rhs.shape)).reshape(-1),
-            -rhs.reshape(-1),
-            SCALAR_TOLERANCE,
-            MAX_SCALAR_STEPS,
+        return solved_columns(
+            lambda x: np.asarray(matrix @ x), lambda r: apply(blocks, r), rhs, SCALAR_TOLERANCE, MAX_SCALAR_STEPS
         )
-        return found.x.reshape(rhs.shape)
 
     return Factor(int(matrix.shape[0]), solve)
 
@@ -148,13 +90,3 @@ def _multigrid() -> Preconditioning:
     """Multigrid for matrices that share their patterns, as those of one problem do."""
     coarsening = Coarsening()
     return lambda matrix, modes: multigrid(matrix, modes, lambda coarse: factorise(coarse).solve, coarsening).cycle
-
-
-def _cholmod(matrix: csc_matrix) -> Callable[[Floats], Floats]:
-    from sksparse.cholmod import CholmodError, cholesky
-
-    try:
-        factor = cholesky(csc_matrix(matrix, dtype=float), ordering_method="natural")
-    except CholmodError as error:
-        raise GraphError(f"a linear system of {matrix.shape[0]} unknowns is singular: {error}") from error
-    return lambda rhs: np.asarray(factor(rhs))

@@ -18,7 +18,7 @@ from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
 from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Limits, Point
-from hodge_pipeline.solvers.options import check_choice, check_positive
+from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.priors import with_world, without_world
 from hodge_pipeline.solvers.setup import InitialName, Setup, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, SolverIteration, ViewGraph
@@ -51,8 +51,8 @@ def solve(
       indefinite information matrix is solved as isotropic, and a note says so.
     - `start (V, 4, 4)` sets the gauge of each component; with `initial="given"` the descent begins there, else at
       the chordal rotations, which need no start.
-    - `backend` of linear systems: `superlu` and `cholmod` factorise, `multigrid` preconditions conjugate gradients, at
-      a cost that does not depend on the fill; `auto` takes what will be cheaper on this graph.
+    - `backend` of linear systems: `superlu` factorises, `multigrid` preconditions conjugate gradients, at a cost that
+      does not depend on the fill; `auto` takes what will be cheaper on this graph.
     - `dimension`: 2 for a graph in the plane; None takes the graph's, and 2 where every edge lies in the plane.
     - `fixed`: rows of vertices that stay at their start; None takes the graph's.
     - `priors`: unary pose priors; all poses that have one share the world's gauge. None takes the graph's.
@@ -62,12 +62,13 @@ def solve(
         graph = ViewGraph.from_edges(np.arange(4), edges, i_from_j, information)
         world_from_cam = solve(graph).world_from_cam
 
-    Raises `GraphError` for motions that are not finite and rigid, edges and fixed rows that name no vertex, unknown
-    options, and a back end not installed.
+    Raises `GraphError` for motions that are not finite and rigid, edges and fixed rows that name no vertex, and
+    unknown options.
     """
     check_choice("objective", objective, ObjectiveName)
     check_choice("initial", initial, InitialName)
-    check_positive("time_limit_s", time_limit_s, "seconds")
+    if not time_limit_s > 0:
+        raise GraphError(f"time_limit_s is {time_limit_s:g}: expected seconds above zero")
     check_rows(graph.fixed if fixed is None else np.asarray(fixed), graph.vertex_count, "fixed")
     start = None if start is None else np.asarray(start, float)
     if start is None and (initial == "given" or (fixed is not None and len(fixed))):
@@ -157,8 +158,8 @@ class MaximumLikelihoodSolver:
     )
     backend: BackendName = Field(
         "auto",
-        description="of linear systems: superlu and cholmod (scikit-sparse) factorise; multigrid "
-        "preconditions conjugate gradients, whatever the fill; auto: what will be cheapest here and is installed",
+        description="of linear systems: superlu factorises; multigrid preconditions conjugate gradients, whatever the "
+        "fill; auto: what will be cheapest here",
     )
     certificate: bool = Field(False, description="test whether the isotropic minimum is the global one")
     max_iterations: int = Field(100, gt=0, description="Newton steps; real graphs need 3 to 12")

@@ -1,4 +1,4 @@
-"""First poses of a spinning LiDAR: sweeps are deskewed and tracked against a map, key frames registered."""
+"""Initial poses of a spinning LiDAR: scan-to-map tracking of deskewed sweeps; only key frames enter the pose graph."""
 
 from __future__ import annotations
 

@@ -7,17 +7,17 @@ path of data that is known to be good.
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from hodge_pipeline.testing.edge_builders import EDGE_BUILDER_PROPERTIES, check_edge_builder
-from hodge_pipeline.testing.executors import EXECUTOR_PROPERTIES, check_executor
-from hodge_pipeline.testing.fusers import FUSER_PROPERTIES, check_fuser
-from hodge_pipeline.testing.global_registrars import GLOBAL_REGISTRAR_PROPERTIES, check_global_registrar
-from hodge_pipeline.testing.models import MODEL_READER_PROPERTIES, check_model_reader
+from hodge_pipeline.testing.edge_builders import check_edge_builder
+from hodge_pipeline.testing.executors import check_executor
+from hodge_pipeline.testing.fusers import check_fuser
+from hodge_pipeline.testing.global_registrars import check_global_registrar
+from hodge_pipeline.testing.models import check_model_reader
 from hodge_pipeline.testing.readers import check_frames, check_reader, check_trajectory, check_view_graph
-from hodge_pipeline.testing.refiners import REFINER_PROPERTIES, check_refiner
-from hodge_pipeline.testing.registrars import REGISTRAR_PROPERTIES, check_registrar
-from hodge_pipeline.testing.solvers import SOLVER_PROPERTIES, check_solver
-from hodge_pipeline.testing.starts import START_PROPERTIES, check_start
-from hodge_pipeline.testing.writers import REWRITER_PROPERTIES, WRITER_PROPERTIES, check_rewriter, check_writer
+from hodge_pipeline.testing.refiners import check_refiner
+from hodge_pipeline.testing.registrars import check_registrar
+from hodge_pipeline.testing.solvers import check_solver
+from hodge_pipeline.testing.starts import check_start
+from hodge_pipeline.testing.writers import check_rewriter, check_writer
 
 CHECKS: Mapping[str, Callable[..., Any]] = {
     "readers": check_reader,
@@ -36,10 +36,7 @@ CHECKS: Mapping[str, Callable[..., Any]] = {
 """The check of each kind of `registry.KINDS`."""
 
 __all__ = [
-    "CHECKS", "EDGE_BUILDER_PROPERTIES", "EXECUTOR_PROPERTIES", "FUSER_PROPERTIES", "GLOBAL_REGISTRAR_PROPERTIES",
-    "MODEL_READER_PROPERTIES", "REFINER_PROPERTIES", "REGISTRAR_PROPERTIES", "REWRITER_PROPERTIES",
-    "SOLVER_PROPERTIES", "START_PROPERTIES", "WRITER_PROPERTIES", "check_edge_builder", "check_executor",
-    "check_frames", "check_fuser", "check_global_registrar", "check_model_reader", "check_reader", "check_refiner",
-    "check_registrar", "check_rewriter", "check_solver", "check_start", "check_trajectory", "check_view_graph",
-    "check_writer",
+    "CHECKS", "check_edge_builder", "check_executor", "check_frames", "check_fuser", "check_global_registrar",
+    "check_model_reader", "check_reader", "check_refiner", "check_registrar", "check_rewriter", "check_solver",
+    "check_start", "check_trajectory", "check_view_graph", "check_writer",
 ]  # fmt: skip

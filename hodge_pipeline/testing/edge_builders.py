@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hodge_pipeline.stages import EdgeBuilder
 from hodge_pipeline.testing.data import room, without_points
-from hodge_pipeline.testing.stage import check_kind, check_properties
+from hodge_pipeline.testing.stage import Contract
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame
 from hodge_pipeline.types.edges import CANDIDATE
 
 EMPTY_ROWS = (3, 7)
-
-
-def check_edge_builder(
-    builder: EdgeBuilder, *, lacks: Collection[str] = (), properties: Collection[str] | None = None
-) -> None:
-    """Check an edge builder's properties, those of `EDGE_BUILDER_PROPERTIES` unless some are named, in a small room.
-
-    A property that a builder does not have by its nature is declared in `lacks`, and must then fail. Raises
-    `AssertionError` that says which property does not hold, and why.
-    """
-    check_properties(EDGE_BUILDER_PROPERTIES, builder, lacks, properties)
 
 
 def _proposed(builder: EdgeBuilder, frames: Sequence[Frame], clouds: CloudSet, poses: Floats) -> Edges:
@@ -44,10 +33,6 @@ def _proposed(builder: EdgeBuilder, frames: Sequence[Frame], clouds: CloudSet, p
     assert (edges.proposed_by != "").all(), "a pair without a reason in `proposed_by`"
     assert (np.isnan(edges.overlap) | ((edges.overlap >= 0) & (edges.overlap <= 1))).all(), "overlap is not in [0, 1]"
     return edges
-
-
-def _is_a_stage(builder: EdgeBuilder) -> None:
-    check_kind(builder, EdgeBuilder)
 
 
 def _proposes_pairs(builder: EdgeBuilder) -> None:
@@ -92,13 +77,15 @@ def _proposes_nothing_of_one_frame(builder: EdgeBuilder) -> None:
         assert not len(edges), f"{count} frames give {len(edges)} pairs"
 
 
-EDGE_BUILDER_PROPERTIES: dict[str, Callable[[EdgeBuilder], None]] = {
-    "is a stage": _is_a_stage,
-    "candidates": _proposes_pairs,
-    "the same pairs again": _repeats_itself,
-    "frames without points": _passes_over_empty_frames,
-    "rows, not names": _knows_frames_by_their_rows,
-    "no look at the truth": _needs_no_truth,
-    "one frame": _proposes_nothing_of_one_frame,
-}
-"""What an edge builder is checked for, by name."""
+check_edge_builder = Contract(
+    EdgeBuilder,
+    {
+        "candidates": _proposes_pairs,
+        "the same pairs again": _repeats_itself,
+        "frames without points": _passes_over_empty_frames,
+        "rows, not names": _knows_frames_by_their_rows,
+        "no look at the truth": _needs_no_truth,
+        "one frame": _proposes_nothing_of_one_frame,
+    },
+)
+"""Checks an edge builder on a small room."""

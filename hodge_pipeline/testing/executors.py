@@ -4,26 +4,14 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 
 from hodge_pipeline.errors import WorkerError
 from hodge_pipeline.stages import Executor
-from hodge_pipeline.testing.stage import check_kind, check_properties, raises
+from hodge_pipeline.testing.stage import Contract, raises
 
 BLOCKS = tuple(range(7))
-
-
-def check_executor(
-    executor: Executor, *, lacks: Collection[str] = (), properties: Collection[str] | None = None
-) -> None:
-    """Check an executor's properties, those of `EXECUTOR_PROPERTIES` unless some are named.
-
-    A property that an executor does not have by its nature is declared in `lacks`, and must then fail. Raises
-    `AssertionError` that says which property does not hold, and why.
-    """
-    check_properties(EXECUTOR_PROPERTIES, executor, lacks, properties)
 
 
 def square(block: int) -> int:
@@ -46,10 +34,6 @@ def die(folder: Path, own: int, times: int, block: int) -> int:
             (folder / str(tries)).touch()
             os._exit(1)
     return block
-
-
-def _is_a_stage(executor: Executor) -> None:
-    check_kind(executor, Executor)
 
 
 def _does_every_block_once(executor: Executor) -> None:
@@ -90,12 +74,14 @@ def _gives_up_on_a_block_that_kills(executor: Executor) -> None:
         assert lost is not None or not died, "a block that kills every worker must raise WorkerError"
 
 
-EXECUTOR_PROPERTIES: dict[str, Callable[[Executor], None]] = {
-    "is a stage": _is_a_stage,
-    "every block once": _does_every_block_once,
-    "errors of tasks": _passes_errors_on,
-    "left early": _can_be_left_early,
-    "a worker that dies": _survives_a_worker,
-    "a block that kills": _gives_up_on_a_block_that_kills,
-}
-"""What an executor is checked for, by name."""
+check_executor = Contract(
+    Executor,
+    {
+        "every block once": _does_every_block_once,
+        "errors of tasks": _passes_errors_on,
+        "left early": _can_be_left_early,
+        "a worker that dies": _survives_a_worker,
+        "a block that kills": _gives_up_on_a_block_that_kills,
+    },
+)
+"""Checks an executor on seven blocks."""

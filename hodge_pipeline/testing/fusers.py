@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -13,21 +13,12 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Fuser
 from hodge_pipeline.testing.data import room
-from hodge_pipeline.testing.stage import check_kind, check_properties, raises
+from hodge_pipeline.testing.stage import Contract, raises
 from hodge_pipeline.types import Floats, Floats32, Frame, Model
 
 WALL_M, TOLERANCE_M = 2.0, 0.02
 """Metres to a wall that cameras side by side see, and what its points may be off: the side of a voxel."""
 WORLD = se3.exp(np.array([0.3, -0.5, 0.8, 1.0, -2.0, 3.0]))
-
-
-def check_fuser(fuser: Fuser, *, lacks: Collection[str] = (), properties: Collection[str] | None = None) -> None:
-    """Check a fuser's properties, those of `FUSER_PROPERTIES` unless some are named, on views of a wall and a room.
-
-    A property that a fuser does not have by its nature is declared in `lacks`, and must then fail. Raises
-    `AssertionError` that says which property does not hold, and why.
-    """
-    check_properties(FUSER_PROPERTIES, fuser, lacks, properties)
 
 
 def _fused(fuser: Fuser, frames: Sequence[Frame], poses: Floats) -> Model:
@@ -57,10 +48,6 @@ def _wall() -> tuple[list[Frame], Floats]:
     frames = [Frame(row, float(row), camera, read_depth=partial(np.array, depth_m)) for row in range(6)]
     shifts = se3.from_parts(np.tile(np.eye(3), (6, 1, 1)), np.arange(6)[:, None] * np.array([0.05, 0, 0]))
     return frames, WORLD @ shifts
-
-
-def _is_a_stage(fuser: Fuser) -> None:
-    check_kind(fuser, Fuser)
 
 
 def _lies_on_the_surface(fuser: Fuser) -> None:
@@ -108,12 +95,14 @@ def _refuses_frames_without_geometry(fuser: Fuser) -> None:
     assert message is not None, "frames without depth and points must raise SourceError"
 
 
-FUSER_PROPERTIES: dict[str, Callable[[Fuser], None]] = {
-    "is a stage": _is_a_stage,
-    "surface": _lies_on_the_surface,
-    "the same bits again": _repeats_itself,
-    "colours": _shows_colours,
-    "frames left out": _tells_what_it_leaves_out,
-    "no geometry": _refuses_frames_without_geometry,
-}
-"""What a fuser is checked for, by name."""
+check_fuser = Contract(
+    Fuser,
+    {
+        "surface": _lies_on_the_surface,
+        "the same bits again": _repeats_itself,
+        "colours": _shows_colours,
+        "frames left out": _tells_what_it_leaves_out,
+        "no geometry": _refuses_frames_without_geometry,
+    },
+)
+"""Checks a fuser on views of a wall and of a room."""

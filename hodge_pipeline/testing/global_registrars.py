@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Collection
 
 import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.stages import GlobalRegistrar
 from hodge_pipeline.testing.data import nothing, off_by, room, seen_from
-from hodge_pipeline.testing.stage import check_kind, check_properties
+from hodge_pipeline.testing.stage import Contract
 from hodge_pipeline.types import Match, PointCloud
 
 PAIR = (2, 4)
 ROUGH = 0.05, 0.1
 """Radians and metres from which every registrar finds the motion."""
 TURNED = se3.exp(np.array([0.4, 1.1, -2.0, 3.0, -1.0, 2.0]))
-
-
-def check_global_registrar(
-    registrar: GlobalRegistrar, *, lacks: Collection[str] = (), properties: Collection[str] | None = None
-) -> None:
-    """Check a global registrar's properties, those of `GLOBAL_REGISTRAR_PROPERTIES` unless some are named.
-
-    A property that it does not have by its nature is declared in `lacks`, and must then fail. Raises
-    `AssertionError` that says which property does not hold, and why.
-    """
-    check_properties(GLOBAL_REGISTRAR_PROPERTIES, registrar, lacks, properties)
 
 
 def _matched(registrar: GlobalRegistrar, target: PointCloud, source: PointCloud) -> Match:
@@ -40,10 +28,6 @@ def _matched(registrar: GlobalRegistrar, target: PointCloud, source: PointCloud)
     assert se3.is_motion(found.i_from_j, 1e-6), "i_from_j is not a rigid motion"
     assert 0 <= found.inliers <= found.matches, f"{found.inliers} inliers of {found.matches} matches"
     return found
-
-
-def _is_a_stage(registrar: GlobalRegistrar) -> None:
-    check_kind(registrar, GlobalRegistrar)
 
 
 def _finds_the_motion(registrar: GlobalRegistrar) -> None:
@@ -80,11 +64,13 @@ def _finds_nothing_in_nothing(registrar: GlobalRegistrar) -> None:
             assert np.array_equal(found.i_from_j, np.eye(4)), f"{what}: the motion is not the identity"
 
 
-GLOBAL_REGISTRAR_PROPERTIES: dict[str, Callable[[GlobalRegistrar], None]] = {
-    "is a stage": _is_a_stage,
-    "known motion": _finds_the_motion,
-    "the same answer again": _repeats_itself,
-    "stored descriptions": _describes_in_what_can_be_stored,
-    "nothing in common": _finds_nothing_in_nothing,
-}
-"""What a global registrar is checked for, by name."""
+check_global_registrar = Contract(
+    GlobalRegistrar,
+    {
+        "known motion": _finds_the_motion,
+        "the same answer again": _repeats_itself,
+        "stored descriptions": _describes_in_what_can_be_stored,
+        "nothing in common": _finds_nothing_in_nothing,
+    },
+)
+"""Checks a global registrar on two views of a room."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import ModelReader, TrackedModel
 from hodge_pipeline.testing.readers import check_view_graph
-from hodge_pipeline.testing.stage import check_kind, check_properties, raises
+from hodge_pipeline.testing.stage import Contract, raises
 from hodge_pipeline.types import Floats
 
 NEAR = 1e-6
@@ -26,25 +25,10 @@ class _Case:
     path: Path
 
 
-def check_model_reader(
-    reader: ModelReader, path: Path, *, lacks: Collection[str] = (), properties: Collection[str] | None = None
-) -> None:
-    """Check the properties of a reader of models, those of `MODEL_READER_PROPERTIES` unless some are named, on a model.
-
-    A property that it does not have by its nature is declared in `lacks`, and must then fail. Raises `AssertionError`
-    that says which property does not hold, and why.
-    """
-    check_properties(MODEL_READER_PROPERTIES, _Case(reader, path), lacks, properties)
-
-
 def _model(case: _Case) -> TrackedModel:
     models = case.reader.open_models(case.path)
     assert len(models), "it opens no model: raise SourceError instead"
     return models[0]
-
-
-def _is_a_stage(case: _Case) -> None:
-    check_kind(case.reader, ModelReader)
 
 
 def _refuses_what_is_not_there(case: _Case) -> None:
@@ -116,14 +100,17 @@ def _assert_near(found: Floats, wanted: Floats, what: str) -> None:
     assert off <= NEAR * max(1.0, float(np.abs(wanted).max(initial=0.0))), f"{what}: off by {off:.2g}"
 
 
-MODEL_READER_PROPERTIES: dict[str, Callable[[_Case], None]] = {
-    "is a stage": _is_a_stage,
-    "no such path": _refuses_what_is_not_there,
-    "bodies and frames": _fits_together,
-    "measured": _measures,
-    "seen points": _sees_points,
-    "another unit": _is_scaled,
-    "moved": _is_moved,
-    "read back": _is_read_back,
-}
-"""What a reader of models is checked for, by name."""
+check_model_reader = Contract(
+    ModelReader,
+    {
+        "no such path": _refuses_what_is_not_there,
+        "bodies and frames": _fits_together,
+        "measured": _measures,
+        "seen points": _sees_points,
+        "another unit": _is_scaled,
+        "moved": _is_moved,
+        "read back": _is_read_back,
+    },
+    _Case,
+)
+"""Checks a reader of models on the model at a path: `check_model_reader(reader, path)`."""

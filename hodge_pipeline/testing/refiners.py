@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-
 import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.stages import Refiner
 from hodge_pipeline.testing.data import room
-from hodge_pipeline.testing.stage import check_kind, check_properties
+from hodge_pipeline.testing.stage import Contract
 from hodge_pipeline.types import Floats
-
-
-def check_refiner(refiner: Refiner, *, lacks: Collection[str] = (), properties: Collection[str] | None = None) -> None:
-    """Check a refiner's properties, those of `REFINER_PROPERTIES` unless some are named, on twelve frames of a room.
-
-    A property that a refiner does not have by its nature is declared in `lacks`, and must then fail. Raises
-    `AssertionError` that says which property does not hold, and why.
-    """
-    check_properties(REFINER_PROPERTIES, refiner, lacks, properties)
 
 
 def _refined(refiner: Refiner, given: Floats) -> Floats:
@@ -31,10 +20,6 @@ def _refined(refiner: Refiner, given: Floats) -> Floats:
     assert poses.shape == given.shape and poses.dtype == np.float64, f"poses are {poses.dtype} {poses.shape}"
     assert se3.is_motion(poses, 1e-6).all(), "a pose is not a rigid motion"
     return poses
-
-
-def _is_a_stage(refiner: Refiner) -> None:
-    check_kind(refiner, Refiner)
 
 
 def _repeats_itself(refiner: Refiner) -> None:
@@ -56,9 +41,11 @@ def _error(poses: Floats, truth: Floats) -> float:
     return float(np.sqrt(np.mean(se3.log(se3.inverse(true_steps) @ steps) ** 2)))
 
 
-REFINER_PROPERTIES: dict[str, Callable[[Refiner], None]] = {
-    "is a stage": _is_a_stage,
-    "the same bits again": _repeats_itself,
-    "no harm": _does_no_harm,
-}
-"""What a refiner is checked for, by name."""
+check_refiner = Contract(
+    Refiner,
+    {
+        "the same bits again": _repeats_itself,
+        "no harm": _does_no_harm,
+    },
+)
+"""Checks a refiner on twelve frames of a room."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 
@@ -13,27 +12,16 @@ from hodge_pipeline import se3
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.stages import Registrar
 from hodge_pipeline.testing.data import nothing, off_by, room, seen_from
-from hodge_pipeline.testing.stage import check_kind, check_properties
+from hodge_pipeline.testing.stage import Contract
 from hodge_pipeline.types import Floats, PointCloud, Registration
 
 PAIR = (2, 4)
 """Two views of the room 10 cm and 5 degrees apart, as far as every registrar's guess may be off."""
-EXACT = 0.01, 0.025
-"""Radians and metres that two clouds of a 4 cm grid leave; the guess is off by more than three times as much."""
+EXACT = 0.003, 0.01
+"""Radians and metres that two clouds of a 4 cm grid leave; the guess is off by ten times as much."""
 TURNED = se3.exp(np.array([0.4, 1.1, -2.0, 3.0, -1.0, 2.0]))
 SLIDES = 0.02
 """The weakest direction's share of the information on translation, below which acceptance rejects a pair."""
-
-
-def check_registrar(
-    registrar: Registrar, *, lacks: Collection[str] = (), properties: Collection[str] | None = None
-) -> None:
-    """Check a registrar's properties, those of `REGISTRAR_PROPERTIES` unless some are named, on two views of a room.
-
-    A property that a registrar does not have by its nature is declared in `lacks`, and must then fail. Raises
-    `AssertionError` that says which property does not hold, and why.
-    """
-    check_properties(REGISTRAR_PROPERTIES, registrar, lacks, properties)
 
 
 def _pair() -> tuple[PointCloud, PointCloud, Floats]:
@@ -67,10 +55,6 @@ def _assert_near(found: Registration, truth: Floats, what: str) -> None:
     angle, distance_m = off_by(found.i_from_j, truth)
     assert angle <= EXACT[0] and distance_m <= EXACT[1], f"{what}: off by {angle:.2g} rad and {distance_m:.2g} m"
     assert found.converged and found.correspondences > 0, f"{what}: found, but called not converged"
-
-
-def _is_a_stage(registrar: Registrar) -> None:
-    check_kind(registrar, Registrar)
 
 
 def _finds_the_motion(registrar: Registrar) -> None:
@@ -154,14 +138,16 @@ def _knows_that_a_wall_slides(registrar: Registrar) -> None:
     assert values[0] <= SLIDES * values.sum(), "a bare wall is said to be held in every direction"
 
 
-REGISTRAR_PROPERTIES: dict[str, Callable[[Registrar], None]] = {
-    "is a stage": _is_a_stage,
-    "known motion": _finds_the_motion,
-    "other axes": _starts_at_the_guess,
-    "the same bits again": _repeats_itself,
-    "prepared once": _keeps_nothing_of_a_pair,
-    "points not finite": _passes_over_points_that_are_not_finite,
-    "nothing in common": _says_where_nothing_is_shared,
-    "a bare wall": _knows_that_a_wall_slides,
-}
-"""What a registrar is checked for, by name."""
+check_registrar = Contract(
+    Registrar,
+    {
+        "known motion": _finds_the_motion,
+        "other axes": _starts_at_the_guess,
+        "the same bits again": _repeats_itself,
+        "prepared once": _keeps_nothing_of_a_pair,
+        "points not finite": _passes_over_points_that_are_not_finite,
+        "nothing in common": _says_where_nothing_is_shared,
+        "a bare wall": _knows_that_a_wall_slides,
+    },
+)
+"""Checks a registrar on two views of a room."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.testing.stage import check_kind, check_properties
+from hodge_pipeline.testing.stage import Contract
 from hodge_pipeline.types import Floats, Priors, Solution, ViewGraph
 
 SIGMA, START_OFF = 1e-3, 0.02
@@ -19,18 +19,6 @@ SIGMA, START_OFF = 1e-3, 0.02
 EXACT, NO_CHANGE = 1e-3, 1e-5
 """Radians and metres: what solvers of a few steps leave of the start's errors where edges are exact; and differences a
 hundredth of the edges' errors, as terms of second order make."""
-
-
-def check_solver(
-    solver: ConsistencySolver, *, lacks: Collection[str] = (), properties: Collection[str] | None = None
-) -> None:
-    """Check a solver's properties, those of `SOLVER_PROPERTIES` unless some are named, on a small ring of poses.
-
-    A property that a solver does not have by its nature is declared in `lacks`, and must then fail. Fixed vertices and
-    priors may be refused by a `GraphError` that names them, but not ignored. Raises `AssertionError` that says which
-    property does not hold, and why.
-    """
-    check_properties(SOLVER_PROPERTIES, solver, lacks, properties)
 
 
 def _ring(noise: float = SIGMA, count: int = 12) -> tuple[ViewGraph, Floats, Floats]:
@@ -84,10 +72,6 @@ def _refuses(solver: ConsistencySolver, graph: ViewGraph, start: Floats, words: 
     except GraphError as error:
         return all(word in str(error) for word in words)
     return False
-
-
-def _is_a_stage(solver: ConsistencySolver) -> None:
-    check_kind(solver, ConsistencySolver)
 
 
 def _gives_back_exact_poses(solver: ConsistencySolver) -> None:
@@ -230,20 +214,23 @@ def _solves_components_apart(solver: ConsistencySolver) -> None:
     assert any("pieces" in note for note in solution.notes), "no note tells of the pieces"
 
 
-SOLVER_PROPERTIES: dict[str, Callable[[ConsistencySolver], None]] = {
-    "is a stage": _is_a_stage,
-    "exact edges": _gives_back_exact_poses,
-    "the same bits again": _repeats_itself,
-    "empty graph": _refuses_an_empty_graph,
-    "no edges": _keeps_poses_without_edges,
-    "zero information": _ignores_edges_without_information,
-    "motions not rigid": _refuses_motions_that_are_not_rigid,
-    "fixed vertices": _holds_fixed_vertices,
-    "priors": _heeds_priors,
-    "reversed edges": _does_not_mind_the_directions,
-    "units x 1000": _does_not_mind_the_unit,
-    "order of parallel edges": _does_not_mind_the_order_of_copies,
-    "wrong copy of an edge": _leaves_out_a_wrong_copy,
-    "disconnected graph": _solves_components_apart,
-}
-"""What a solver is checked for, by name."""
+check_solver = Contract(
+    ConsistencySolver,
+    {
+        "exact edges": _gives_back_exact_poses,
+        "the same bits again": _repeats_itself,
+        "empty graph": _refuses_an_empty_graph,
+        "no edges": _keeps_poses_without_edges,
+        "zero information": _ignores_edges_without_information,
+        "motions not rigid": _refuses_motions_that_are_not_rigid,
+        "fixed vertices": _holds_fixed_vertices,
+        "priors": _heeds_priors,
+        "reversed edges": _does_not_mind_the_directions,
+        "units x 1000": _does_not_mind_the_unit,
+        "order of parallel edges": _does_not_mind_the_order_of_copies,
+        "wrong copy of an edge": _leaves_out_a_wrong_copy,
+        "disconnected graph": _solves_components_apart,
+    },
+)
+"""Checks a solver on a small ring of poses. It may refuse fixed vertices and priors by a `GraphError` that names them,
+but not ignore them."""

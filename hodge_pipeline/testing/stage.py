@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
-Stage = TypeVar("Stage")
+Case = TypeVar("Case")
+IS_A_STAGE = "is a stage"
 
 
 def check_stage(stage: object) -> None:
@@ -30,28 +32,41 @@ def check_kind(stage: object, protocol: type) -> None:
         raise AssertionError(f"the stage has no hash, by which workers know it: {error}") from error
 
 
-def check_properties(
-    table: Mapping[str, Callable[[Stage], None]],
-    stage: Stage,
-    lacks: Collection[str],
-    properties: Collection[str] | None,
-) -> None:
-    """Check the properties of a table, or those that are named, on one stage.
-
-    Those that a stage does not have by its nature are declared in `lacks`, and must then fail. Raises
-    `AssertionError` that says which property does not hold, and why.
+@dataclass(frozen=True)
+class Contract(Generic[Case]):
+    """The check of one kind of stage: called with a stage, and what else `case` takes, it asserts each of `promises`,
+    and first that the stage has the methods of its `protocol`, pickles, is hashable and cannot be changed.
     """
-    unknown = {*lacks, *(properties or ())} - {*table}
-    assert not unknown, f"no such property: {sorted(unknown)}; there are {list(table)}"
-    for name in table if properties is None else properties:
-        try:
-            table[name](stage)
-        except Exception as error:
-            if name in lacks:
-                continue
-            why = str(error) if isinstance(error, AssertionError) else f"raises {type(error).__name__}: {error}"
-            raise AssertionError(f"{name}: {why}") from error
-        assert name not in lacks, f"{name}: declared as lacking, but it holds: take it out of `lacks`"
+
+    protocol: type
+    promises: Mapping[str, Callable[[Case], None]]
+    case: Callable[..., Case] = lambda stage: stage  # noqa: E731
+
+    @property
+    def properties(self) -> tuple[str, ...]:
+        """What is checked, by name."""
+        return (IS_A_STAGE, *self.promises)
+
+    def __call__(
+        self, stage: object, *given: Any, lacks: Collection[str] = (), properties: Collection[str] | None = None
+    ) -> None:
+        """Check all properties, or those that are named. One that the stage does not have by its nature is declared in
+        `lacks`, and must then fail. Raises `AssertionError` that says which property does not hold, and why.
+        """
+        unknown = {*lacks, *(properties or ())} - {*self.properties}
+        assert not unknown, f"no such property: {sorted(unknown)}; there are {list(self.properties)}"
+        for name in self.properties if properties is None else properties:
+            try:
+                if name == IS_A_STAGE:
+                    check_kind(stage, self.protocol)
+                else:
+                    self.promises[name](self.case(stage, *given))
+            except Exception as error:
+                if name in lacks:
+                    continue
+                why = str(error) if isinstance(error, AssertionError) else f"raises {type(error).__name__}: {error}"
+                raise AssertionError(f"{name}: {why}") from error
+            assert name not in lacks, f"{name}: declared as lacking, but it holds: take it out of `lacks`"
 
 
 def raises(error: type[Exception], call: Callable[[], Any]) -> str | None:

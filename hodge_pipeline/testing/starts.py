@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,22 +18,12 @@ from hodge_pipeline.scene import Scene
 from hodge_pipeline.stages import Start
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.testing.data import CLOUD_VOXEL_M, off_by, room
-from hodge_pipeline.testing.stage import check_kind, check_properties
+from hodge_pipeline.testing.stage import Contract
 from hodge_pipeline.types import Source
 
 CLOUDS = CloudOptions(stride=1, voxel_m=CLOUD_VOXEL_M)
 NEAR = 0.1, 0.1
 """Radians and metres that first poses may be off at the end of half a metre's way."""
-
-
-def check_start(start: Start, *, lacks: Collection[str] = (), properties: Collection[str] | None = None) -> None:
-    """Check a start's properties, those of `START_PROPERTIES` unless some are named, on twelve frames of a room.
-
-    The frames have poses of their own, for a start that takes them. A property that a start does not have by its
-    nature is declared in `lacks`, and must then fail. Raises `AssertionError` that says which property does not hold,
-    and why.
-    """
-    check_properties(START_PROPERTIES, start, lacks, properties)
 
 
 def _begun(start: Start, source: Source, folder: Path) -> Scene:
@@ -59,10 +48,6 @@ def _begun(start: Start, source: Source, folder: Path) -> Scene:
     every = keys.expand(first.world_from_cam)
     assert every.shape == (count, 4, 4) and se3.is_motion(every, 1e-6).all(), "not every frame follows the key frames"
     return scene
-
-
-def _is_a_stage(start: Start) -> None:
-    check_kind(start, Start)
 
 
 def _finds_poses(start: Start) -> None:
@@ -121,12 +106,14 @@ def _refuses_a_source_without_points(start: Start) -> None:
         raise AssertionError("a source without a point must raise SourceError")
 
 
-START_PROPERTIES: dict[str, Callable[[Start], None]] = {
-    "is a stage": _is_a_stage,
-    "first poses": _finds_poses,
-    "the same bits again": _repeats_itself,
-    "computed once": _computes_once,
-    "a frame without points": _reports_frames_without_points,
-    "no points at all": _refuses_a_source_without_points,
-}
-"""What a start is checked for, by name."""
+check_start = Contract(
+    Start,
+    {
+        "first poses": _finds_poses,
+        "the same bits again": _repeats_itself,
+        "computed once": _computes_once,
+        "a frame without points": _reports_frames_without_points,
+        "no points at all": _refuses_a_source_without_points,
+    },
+)
+"""Checks a start on twelve frames of a room, which have poses of their own for a start that takes them."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -13,9 +13,10 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import HodgeError, SourceError
+from hodge_pipeline.scene import own_trajectory
 from hodge_pipeline.stages import FrameReader, PoseRewriter, Writer
 from hodge_pipeline.testing.data import room
-from hodge_pipeline.testing.stage import check_kind, check_properties, raises
+from hodge_pipeline.testing.stage import Contract, raises
 from hodge_pipeline.types import Floats, Source, Trajectory, ViewGraph
 
 READ_BACK = 1e-5
@@ -26,24 +27,7 @@ READ_BACK = 1e-5
 class _Case:
     writer: Writer
     name: str
-    reader: FrameReader | None
-
-
-def check_writer(
-    writer: Writer,
-    name: str,
-    reader: FrameReader | None = None,
-    *,
-    lacks: Collection[str] = (),
-    properties: Collection[str] | None = None,
-) -> None:
-    """Check a writer's properties, those of `WRITER_PROPERTIES` unless some are named, on a small source.
-
-    `name` is what a file, or folder, of its format may be called; what is written is read back by `reader`, where one
-    is given. A property that a writer does not have by its nature is declared in `lacks`, and must then fail. Raises
-    `AssertionError` that says which property does not hold, and why.
-    """
-    check_properties(WRITER_PROPERTIES, _Case(writer, name, reader), lacks, properties)
+    reader: FrameReader | None = None
 
 
 def whole_source() -> Source:
@@ -79,10 +63,6 @@ def _folder() -> Iterator[Path]:
 
 def _contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def _is_a_stage(case: _Case) -> None:
-    check_kind(case.writer, Writer)
 
 
 def _writes_or_refuses(case: _Case) -> None:
@@ -164,15 +144,19 @@ def _assert_near(read: Floats, written: Floats, what: str) -> None:
     assert off <= READ_BACK, f"{what} are off by {off:.2g} when read back"
 
 
-WRITER_PROPERTIES: dict[str, Callable[[_Case], None]] = {
-    "is a stage": _is_a_stage,
-    "written or refused": _writes_or_refuses,
-    "the same bytes again": _writes_the_same_again,
-    "replaced": _replaces_what_is_there,
-    "no place to write": _tells_where_it_cannot_write,
-    "read back": _is_read_back,
-}
-"""What a writer is checked for, by name."""
+check_writer = Contract(
+    Writer,
+    {
+        "written or refused": _writes_or_refuses,
+        "the same bytes again": _writes_the_same_again,
+        "replaced": _replaces_what_is_there,
+        "no place to write": _tells_where_it_cannot_write,
+        "read back": _is_read_back,
+    },
+    _Case,
+)
+"""Checks a writer on a small source: `check_writer(writer, name, reader)`, the name being what a file or folder of its
+format may be called; what is written is read back by `reader`, where one is given."""
 
 
 @dataclass(frozen=True)
@@ -182,32 +166,10 @@ class _Rewriting:
     reader: FrameReader
 
 
-def check_rewriter(
-    rewriter: PoseRewriter,
-    original: Path,
-    reader: FrameReader,
-    *,
-    lacks: Collection[str] = (),
-    properties: Collection[str] | None = None,
-) -> None:
-    """Check a rewriter's properties, those of `REWRITER_PROPERTIES` unless some are named, on a file that the reader
-    opens as frames or a trajectory.
-
-    A property that a rewriter does not have by its nature is declared in `lacks`, and must then fail. Raises
-    `AssertionError` that says which property does not hold, and why.
-    """
-    check_properties(REWRITER_PROPERTIES, _Rewriting(rewriter, original, reader), lacks, properties)
-
-
 def _poses_of(source: Source) -> Trajectory:
-    if source.trajectory is not None:
-        return source.trajectory
-    posed = [(frame.stamp_s, frame.world_from_cam) for frame in source.frames if frame.world_from_cam is not None]
-    return Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed]))
-
-
-def _rewriter_is_a_stage(case: _Rewriting) -> None:
-    check_kind(case.rewriter, PoseRewriter)
+    found = own_trajectory(source)
+    assert found is not None, "the original has no poses"
+    return found
 
 
 def _writes_the_new_poses(case: _Rewriting) -> None:
@@ -240,10 +202,13 @@ def _bytes(path: Path) -> list[bytes]:
     return list(_contents(path).values()) if path.is_dir() else [path.read_bytes()]
 
 
-REWRITER_PROPERTIES: dict[str, Callable[[_Rewriting], None]] = {
-    "is a stage": _rewriter_is_a_stage,
-    "new poses": _writes_the_new_poses,
-    "copy": _copies_every_byte,
-    "original": _leaves_the_original,
-}
-"""What a rewriter is checked for, by name."""
+check_rewriter = Contract(
+    PoseRewriter,
+    {
+        "new poses": _writes_the_new_poses,
+        "copy": _copies_every_byte,
+        "original": _leaves_the_original,
+    },
+    _Rewriting,
+)
+"""Checks a rewriter on a file of poses: `check_rewriter(rewriter, path, reader)`."""

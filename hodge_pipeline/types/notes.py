@@ -51,9 +51,18 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
     ),
+    "holes": (
+        Rank.LOOK,
+        "the recording stops at {count} places ({detail}): what the frames on both sides share tells the motion there",
+    ),
     "path broken": (
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
+    ),
+    "slid": (
+        Rank.LOOK,
+        "odometry slid unnoticed at {count} frames ({detail}): the pairs over these steps agree on where they lead, "
+        "and count in its place",
     ),
     "sweeps untimed": (
         Rank.FACT,
@@ -66,6 +75,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "truth": (Rank.FACT, "{count} of {detail} frames have a true pose, by the truth that was named"),
     "no truth near": (Rank.LOOK, "{detail}: no pose has a true one near in time: its error is not measured"),
     "carried": (Rank.LOOK, "{count} frames without a given pose are carried from the nearest ones by odometry"),
+    "revisits": (
+        Rank.FACT,
+        "{count} pairs close loops along the path, before the first round: odometry's poses move by up to {detail}",
+    ),
     "left apart": (Rank.LOOK, "nothing joins what tracking left apart: it starts where the guessed motion puts it"),
     "positions of no frame": (
         Rank.FACT,

@@ -1,6 +1,6 @@
 """PLY files: their header, binary vertices read in parts and no further than the file is long, models written and read.
 
-The one codec of the project: fused models, and points of any other program (see `hodge_adapters.ply_points`).
+The one codec of the project: fused models, and points of any other program (see `hodge_adapters.clouds.ply`).
 """
 
 from __future__ import annotations

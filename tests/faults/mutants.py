@@ -54,7 +54,7 @@ MUTANTS = {
         "crash/run/0100",
     ),
     "lost lines without a note": (
-        "adapters/hodge_adapters/euroc.py",
+        "adapters/hodge_adapters/trajectories/euroc.py",
         "                bad.append(row.line)",
         "                pass",
         "reading/euroc/0/0/400",

@@ -14,7 +14,7 @@ from pathlib import Path
 from small_run import made, recipe
 
 import hodge_pipeline
-from hodge_adapters.tum import TumReader
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline.errors import HodgeError
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.store.workspace import holding

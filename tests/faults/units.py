@@ -11,7 +11,7 @@ import numpy as np
 from small_run import made, recipe
 
 import hodge_pipeline
-from hodge_adapters.tum import TumReader
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import registry, se3
 from hodge_pipeline.errors import HodgeError
 from hodge_pipeline.run_folder import Run

@@ -1,4 +1,4 @@
-"""How poses are found from nothing."""
+"""Options of global registration for initial poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hodge_pipeline.pairs.drift import DriftEdges
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.global_landmarks import LandmarkConsensus
 from hodge_pipeline.registration.global_registrars import FpfhConsensus
-from hodge_pipeline.stages import GlobalRegistrar, Registrar
+from hodge_pipeline.stages import EdgeBuilder, GlobalRegistrar, Registrar
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -78,10 +78,10 @@ class GlobalStart:
         description="frames: after odometry, of so many consecutive ones only the most similar is matched, and none so "
         "near, since odometry has joined them",
     )
-    drift: DriftEdges | None = Field(
-        default=DriftEdges(),
-        description="after odometry, which pairs are matched as well: those whose poses bring them together with a "
-        "tolerance that grows along the trajectory; null: none",
+    loops: tuple[EdgeBuilder, ...] = Field(
+        default=(DriftEdges(),),
+        description="after odometry, who names further pairs to match: drift, what poses bring together with a "
+        "tolerance that grows along the trajectory; place, scans that look alike, wherever the poses have drifted to",
     )
     landmarks: int = Field(
         default=1000, ge=15, description="landmarks of a frame, where `clouds.landmarks` leaves it to the start; 60 ms"

@@ -1,4 +1,4 @@
-"""Poses from nothing, on one screen: describe, propose, match, weigh, and let the diagnosis say what to trust."""
+"""Global registration of all frames: describe, propose pairs, match, verify, and keep what the diagnosis trusts."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.registration.acceptance import contradicts_odometry
+from hodge_pipeline.registration.acceptance import CONTRADICTS
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
+from hodge_pipeline.registration.odometry_path import contradicts_odometry
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
@@ -66,15 +67,15 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     if options.similar_per_frame:
         describe(rows, advance=advance)
     pairs = propose(scene, clouds, rows, scratch / DESCRIBED, options)
-    if not options.similar_per_frame:  # poses alone propose: what they pair needs a description, no other
+    if not options.similar_per_frame:  # only what the loops pair needs a description
         describe(np.unique(pairs), advance=advance)
     matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
-    views = Views.make(scene.frames, scratch / VIEWS, workers)
+    views = Views.make(scene.frames, clouds, rows, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
     if scene.drift is not None:
         counted = np.flatnonzero(hypotheses.counts)
         far = counted[contradicts_odometry(hypotheses.select(counted), scene.drift)]
-        hypotheses = hypotheses.put(far, status=REJECTED, why="farther off than odometry drifts")
+        hypotheses = hypotheses.put(far, status=REJECTED, why=CONTRADICTS)
     notes.append(_tried(len(rows), pairs, hypotheses))
     labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
     measured = labelled.select(labelled.counts).as_graph(scene.vertex_ids)
@@ -100,17 +101,17 @@ def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
 
 
 def propose(scene: Frames, clouds: CloudSet, rows: Ints, described: Path, options: GlobalStart) -> Ints:
-    """The pairs (P, 2) to match: all of a few frames, else each with those most similar, or near by drifted poses."""
+    """The pairs (P, 2) to match: all of a few frames, else each with the most similar ones, and loops."""
     if len(rows) <= options.all_pairs_up_to:
         return all_pairs(rows)
     pairs = np.zeros((0, 2), np.int64)
     if options.similar_per_frame:
         local = LocalDescriptors(described, clouds, options.similarity_voxel_m)
         pairs = similar_pairs(local, rows, options, scene.given is not None)
-    if options.drift is None or scene.drift is None:
+    if scene.drift is None:
         return pairs
-    near = options.drift.propose(scene.frames, clouds, scene.drift.world_from_cam).pairs
-    return np.unique(np.concatenate([pairs, near]), axis=0)
+    found = [loops.propose(scene.frames, clouds, scene.drift.world_from_cam).pairs for loops in options.loops]
+    return np.unique(np.concatenate([pairs, *found]), axis=0)
 
 
 def _tried(count: int, pairs: Ints, hypotheses: Edges) -> str:

@@ -1,0 +1,1 @@
+"""Folders of point clouds, one module for each kind of file."""

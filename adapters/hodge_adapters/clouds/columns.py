@@ -1,0 +1,153 @@
+"""A point cloud of named columns, as point-cloud files hold them: taken in parts, so that memory holds little twice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Bools, Bytes, Floats, Floats32, PointCloud
+
+NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
+COLOURS = ("red", "green", "blue")
+PACKED = ("rgb", "rgba")
+"""Colours of four bytes, 0xAARRGGBB, declared as a float by PCL's convention."""
+TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time")
+"""When a point was measured: Ouster, Velodyne, Hesai and Livox name it differently, and count in their own units."""
+REVOLUTION_S = (0.01, 2.0)
+"""A spinning scanner's: it tells seconds from milli-, micro- and nanoseconds."""
+MAX_METRES = 1e9
+ROWS_IN_PART, LINES_IN_PART = 1 << 20, 1 << 17
+Columns: TypeAlias = Mapping[str, Any]
+
+
+def points_of_columns(path: Path, columns: Columns) -> PointCloud:
+    """The cloud of the points that are finite. Raises `SourceError` where x, y or z is missing."""
+    return points_of_parts(path, parts_of(columns))
+
+
+def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
+    """The cloud of columns that come in parts, at least one, all with the same names."""
+    points: list[Floats32] = []
+    normals: list[Floats32] = []
+    colours: list[NDArray[Any]] = []
+    times: list[Floats] = []
+    for columns in parts:
+        if not all(name in columns for name in "xyz"):
+            raise SourceError(f"{path}: no x, y and z among {', '.join(columns) or 'nothing'}: give a file of points")
+        found = _stack(columns, "xyz")
+        with np.errstate(invalid="ignore"):
+            finite: Bools = np.asarray((np.abs(found) < MAX_METRES).all(axis=1))
+        points.append(found[finite])
+        names = next((names for names in NORMALS if names[0] in columns), None)
+        if names:
+            normals.append(_unit(_stack(columns, names)[finite]))
+        if all(name in columns for name in COLOURS):
+            colours.append(_raw_colours(columns, finite))
+        time = next((name for name in TIMES if name in columns), None)
+        if time:
+            times.append(np.asarray(columns[time][finite], float))
+    return PointCloud(
+        _joined(points),
+        _joined(normals) if normals else None,
+        _eight_bits(_joined(colours)) if colours else None,
+        times_s=seconds_after_first(_joined(times)) if times else None,
+    )
+
+
+def unpacked(columns: dict[str, Any]) -> dict[str, Any]:
+    """The columns with those of packed colours unpacked, unless they have colours already."""
+    packed = next((name for name in PACKED if name in columns and columns[name].dtype.itemsize == 4), None)
+    if packed is None or all(name in columns for name in COLOURS):
+        return columns
+    words = np.ascontiguousarray(columns[packed])
+    words = words.view(np.dtype("u4").newbyteorder(words.dtype.byteorder))
+    return columns | {"red": words >> 16 & 255, "green": words >> 8 & 255, "blue": words & 255}
+
+
+def seconds_after_first(times: Floats) -> Floats32 | None:
+    """When each point (N,) was measured, seconds after the first, whatever unit a revolution is counted in; None where
+    no unit gives a revolution.
+    """
+    if not len(times) or not np.isfinite(times).all():
+        return None
+    after = times - times.min()
+    for unit in (1.0, 1e-3, 1e-6, 1e-9):
+        if REVOLUTION_S[0] <= after.max() * unit <= REVOLUTION_S[1]:
+            return np.asarray(after * unit, np.float32)
+    return None
+
+
+def number_rows(path: Path, lines: Iterable[bytes], count: int, width: int) -> Iterator[Floats]:
+    """The first `count` lines as tables (n, width) of numbers, in parts, at least one; `SourceError` where there are
+    fewer, or others.
+    """
+    left, found = iter(lines), 0
+    while found < count or not found:
+        wanted = min(LINES_IN_PART, count - found)
+        try:
+            table = np.array(b" ".join(islice(left, wanted)).split(), np.float64).reshape(-1, width or 1)
+        except ValueError as error:
+            raise SourceError(f"{path}: its points are no rows of {width} numbers: make it again") from error
+        found += len(table)
+        if len(table) != wanted:
+            raise SourceError(f"{path}: says {count} points, has {found}: copy it again")
+        yield table
+        if not count:
+            return
+
+
+def parts_of(columns: Columns) -> Iterator[dict[str, Any]]:
+    """Columns of any length, in parts, at least one."""
+    count = max((len(column) for column in columns.values()), default=0)
+    for start in range(0, max(count, 1), ROWS_IN_PART):
+        yield {name: column[start : start + ROWS_IN_PART] for name, column in columns.items()}
+
+
+def _joined(parts: list[Any]) -> Any:
+    """The parts one after the other; the list is emptied, so that their memory is free before more is taken."""
+    whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    parts.clear()
+    return whole
+
+
+def _stack(columns: Mapping[str, Any], names: str | tuple[str, ...]) -> Floats32:
+    out = np.zeros((len(columns[names[0]]), len(names)), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for at, name in enumerate(names):
+            if name in columns:
+                out[:, at] = columns[name]
+    return out
+
+
+def _unit(normals: Floats32) -> Floats32:
+    """Unit normals, zero where there is none."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        good = np.isfinite(length) & (length > 1e-6)
+        return np.where(good, normals / np.where(good, length, 1), np.float32(0)).astype(np.float32)
+
+
+def _raw_colours(columns: Columns, finite: Bools) -> NDArray[Any]:
+    """The colours of a part: what decides between fractions, 8 and 16 bits is the largest of all parts."""
+    values = np.column_stack([columns[name] for name in COLOURS])[finite]
+    if values.dtype.kind == "f":
+        return values.astype(np.float32)
+    return values if values.dtype == np.uint16 else np.clip(values, 0, 255).astype(np.uint8)
+
+
+def _eight_bits(values: NDArray[Any]) -> Bytes:
+    if values.dtype == np.uint8:
+        return values
+    largest = np.nanmax(values) if values.size else 0
+    if values.dtype == np.uint16 and largest > 255:
+        values = values // 257
+    elif values.dtype.kind == "f" and largest <= 1:
+        values = values * np.float32(255)
+    colours: Bytes = np.nan_to_num(np.clip(values, 0, 255)).astype(np.uint8)
+    return colours

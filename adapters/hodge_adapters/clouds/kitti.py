@@ -1,0 +1,112 @@
+"""LiDAR scans in `.bin` files of float32 columns (KITTI, nuScenes), and the poses that lie beside them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hodge_adapters.clouds.columns import points_of_columns
+from hodge_adapters.text_rows import read_rows, reading, to_floats
+from hodge_adapters.trajectories.text import read_kitti
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats, Floats32, PointCloud
+from hodge_pipeline.types.input_files import read_input
+
+POSES, CALIBRATION, TO_CAMERA = "poses.txt", "calib.txt", "Tr:"
+MAX_REFLECTANCE = 255
+MAX_BEAM = 255
+WIDTHS = (3, 4, 5)
+"""Columns: x, y, z; with a reflectance; with the number of the beam as well."""
+_NUMBERED = re.compile(r"\d(\.pcd)?\.bin$")
+
+
+def is_scan(name: str) -> bool:
+    """Whether a `.bin` file's name ends in a number, as those of scans do: others are COLMAP's."""
+    return _NUMBERED.search(name) is not None
+
+
+def read_bin(path: Path) -> PointCloud:
+    """The points of a scan of three to five columns (`WIDTHS`), told apart by what they then are.
+
+    Raises `SourceError` where it has none of these.
+    """
+    with reading(path):
+        values = np.frombuffer(read_input(path), np.uint8)
+    tables = {width: values.view("<f4").reshape(-1, width) for width in WIDTHS if len(values) % (4 * width) == 0}
+    if not tables:
+        raise SourceError(f"{path}: {len(values)} bytes are no float32 rows of three to five columns: copy it again")
+    table = _likeliest(tables)
+    found = points_of_columns(path, dict(zip("xyz", table.T[:3], strict=True)))
+    if len(table) and not len(found):
+        raise SourceError(f"{path}: holds no finite coordinates: is it a scan of float32 x y z?")
+    return found
+
+
+def _likeliest(tables: Mapping[int, Floats32]) -> Floats32:
+    """The table of most columns that mean what they should, else that of fewest."""
+    if 5 in tables and _has_reflectance(tables[5]) and _has_beams(tables[5]):
+        return tables[5]
+    if 4 in tables and _has_reflectance(tables[4]):
+        return tables[4]
+    return tables[min(tables)]
+
+
+def _has_beams(table: Floats32) -> bool:
+    """Whether the last column is the number of a beam."""
+    with np.errstate(invalid="ignore"):
+        last = table[:, -1]
+        return bool(((last >= 0) & (last <= MAX_BEAM) & (last == np.round(last))).all())
+
+
+def _has_reflectance(table: Floats32) -> bool:
+    """Whether the fourth column is a reflectance: in [0, 1], or a whole number up to 255, or up to 255 with
+    points that follow each other nearer than as three columns.
+    """
+    with np.errstate(invalid="ignore"):
+        last = table[:, 3]
+        if not ((last >= 0) & (last <= MAX_REFLECTANCE)).all():
+            return False
+        if (last <= 1).all() or (last == np.round(last)).all():
+            return True
+        if table.size % 3:
+            return True
+        return bool(_median_step(table[:, :3]) < _median_step(table.reshape(-1, 3)))
+
+
+def _median_step(points: Floats32) -> float:
+    return float(np.median(np.linalg.norm(np.diff(points.astype(float), axis=0), axis=1))) if len(points) > 1 else 0.0
+
+
+def scan_poses(folder: Path, numbers: Sequence[int], notes: list[str]) -> tuple[dict[int, Floats], tuple[Path, ...]]:
+    """The poses world_from_scan of the scans by their numbers, which are rows of `poses.txt` in their folder or the one
+    above, and the files read: where `calib.txt` lies beside it these are poses of the camera that it places.
+    """
+    place = next((place for place in (folder, folder.parent) if (place / POSES).is_file()), None)
+    if place is None:
+        return {}, ()
+    poses = read_kitti(place / POSES).world_from_cam
+    calibration = place / CALIBRATION
+    files: tuple[Path, ...] = (place / POSES,)
+    if calibration.is_file():
+        poses, files = poses @ _camera_from_scan(calibration), (*files, calibration)
+    else:
+        notes.append(f"no {CALIBRATION} beside {POSES}: its poses are taken as the scanner's own, not a camera's")
+    return {number: poses[number] for number in numbers if number < len(poses)}, files
+
+
+def _camera_from_scan(path: Path) -> Floats:
+    row = next((row for row in read_rows(path) if row.fields[0] == TO_CAMERA), None)
+    values = None if row is None else to_floats(row.fields[1:])
+    pose = np.eye(4)
+    if values is not None and len(values) == 12:
+        pose[:3] = np.reshape(values, (3, 4))
+    if values is None or len(values) != 12 or not se3.is_motion(pose[None]).all():
+        raise SourceError(
+            f"{path}: no line `{TO_CAMERA}` of twelve numbers, from the scanner to the camera: restore it"
+        )
+    pose[:3, :3] = se3.project_to_so3(pose[:3, :3])
+    return pose

@@ -1,0 +1,54 @@
+"""Points of PLY files (ascii, binary of either byte order), and written; the codec is `hodge_pipeline.types.ply`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from hodge_adapters.clouds.columns import number_rows, points_of_parts
+from hodge_adapters.text_rows import reading, write_bytes_atomically
+from hodge_pipeline.types import Model, PointCloud
+from hodge_pipeline.types.input_files import open_input
+from hodge_pipeline.types.ply import PlyHeader, model_parts, read_header, vertex_parts
+
+COLOURS = {
+    "diffuse_red": "red",
+    "diffuse_green": "green",
+    "diffuse_blue": "blue",
+    "r": "red",
+    "g": "green",
+    "b": "blue",
+}
+
+
+def read_ply(path: Path) -> PointCloud:
+    """The vertices, with normals and colours where they have them; points that are not finite are left out.
+
+    Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
+    """
+    with reading(path), open_input(path) as file:
+        header = read_header(path, file)
+        parts = _binary_parts if header.order else _ascii_parts
+        return points_of_parts(path, parts(path, file, header))
+
+
+def write_ply(path: Path, cloud: PointCloud) -> None:
+    """A binary PLY of float32 points, with normals and colours where the cloud has them; written atomically."""
+    model = Model("", cloud.points_in_cam, cloud.normals_in_cam, cloud.colours)
+    write_bytes_atomically(path, b"".join(model_parts(model)))
+
+
+def _binary_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dict[str, Any]]:
+    for records in vertex_parts(path, file, header):
+        yield {COLOURS.get(name, name): records[name] for name, _ in header.properties}
+
+
+def _ascii_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dict[str, Any]]:
+    file.seek(header.start)
+    for _ in islice(file, header.lines):
+        pass
+    names = [COLOURS.get(name, name) for name, _ in header.properties]
+    for table in number_rows(path, file, header.count, len(names)):
+        yield dict(zip(names, table.T, strict=True))

@@ -1,0 +1,261 @@
+"""A folder of point-cloud fragments, PLY or PCD, in sequence, with an optional Redwood `.log` of poses or pairs."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_adapters.clouds.kitti import is_scan, read_bin, scan_poses
+from hodge_adapters.clouds.pcd import read_pcd
+from hodge_adapters.clouds.ply import read_ply, write_ply
+from hodge_adapters.clouds.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
+from hodge_adapters.posed import posed_frames, written
+from hodge_adapters.text_rows import listed, natural
+from hodge_adapters.trajectories.log import read_log_file
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.stages import Sniff
+from hodge_pipeline.types import Floats, Frame, PointCloud, Source, ViewGraph
+
+OTHER_SCANS = frozenset((".xyz", ".pts", ".ptx", ".asc", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
+_NUMBER = re.compile(r"(\d{1,15})\D*$")
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class CloudFolderReader:
+    """Reads a folder of fragments, or one file; each is a frame with points and no images."""
+
+    pattern: str = Field("*", description="which files of the folder, such as cloud_bin_*.ply")
+    log: str = Field(
+        "auto",
+        description="Redwood .log in the folder: blocks `i i n` are poses, `i j n` measured pairs; auto: the only one "
+        "there; empty: none",
+    )
+    units_per_metre: float = Field(1.0, gt=0, description="stored units per metre; 1000 for millimetres")
+    every: int = Field(1, ge=1, description="take every n-th fragment")
+
+    def sniff(self, path: Path) -> Sniff:
+        """By the endings of the files."""
+        path = Path(path)
+        try:
+            names = [path.name] if path.is_file() else os.listdir(path)
+        except OSError:
+            return Sniff(0.0, "not a folder that can be read")
+        count = sum(_is_scan(name) for name in names)
+        if not count:
+            return Sniff(0.0, f"no {', '.join(READERS)}")
+        return Sniff(0.8 if count * 2 > len(names) else 0.4, f"{count} point clouds among {len(names)} files")
+
+    def open(self, path: Path) -> Source:
+        """Fragments in natural order of their names. Ids are the names of the files, `a.e57/3` one scan of several;
+        stamps are the last numbers in the names, else the rows.
+        """
+        path = Path(path)
+        notes: list[str] = []
+        files = [path] if path.is_file() else self._files(path, notes)
+        for file in files:
+            _require(file)
+        fragments = _fragments(files, notes)
+        scanners = _scanners([fragment.path for fragment in fragments])
+        if scanners:
+            counts = ", ".join(f"{name} {scanners.count(name)}" for name in dict.fromkeys(scanners))
+            notes.append(f"several scanners, by the names of the files ({counts}): each is a sequence of its own")
+        stems = [f"{f.path.stem}" if f.row is None else f"{f.path.stem} {f.row}" for f in fragments]
+        numbers = list(range(len(stems))) if scanners else _numbers(stems, notes)
+        order = np.argsort(numbers, kind="stable")
+        fragments, numbers = [fragments[row] for row in order], [numbers[row] for row in order]
+        log = self._log(path if path.is_dir() else path.parent) if path.is_dir() or self.log != "auto" else None
+        parsed = read_log_file(log) if log else None
+        poses, beside = parsed.poses if parsed else {}, tuple(filter(None, [log]))
+        if not poses and is_scan(fragments[0].path.name):
+            poses, beside = scan_poses(fragments[0].path.parent, numbers, notes)
+        names = {number: fragment.name for number, fragment in zip(numbers, fragments, strict=True)}
+        without = [name for number, name in names.items() if number not in poses]
+        if poses and without:
+            notes.append(f"{len(without)} of {len(numbers)} fragments have no pose: {listed(without)}")
+        frames = tuple(
+            Frame(
+                frame_id=fragment.name,
+                stamp_s=float(number),
+                read_points=partial(read_fragment, fragment, units_per_metre=self.units_per_metre),
+                world_from_cam=poses.get(number, fragment.in_metres(self.units_per_metre)),
+                sequence=scanner,
+            )
+            for number, fragment, scanner in zip(numbers, fragments, scanners or [""] * len(fragments), strict=True)
+        )
+        graph = _graph(names, parsed.pairs, parsed.i_from_j, notes) if parsed and len(parsed.pairs) else None
+        every = frames[:: self.every]
+        read = (*files, *beside)
+        return Source(path.resolve().name, path, every, posed_frames(frames), graph, tuple(notes), read)
+
+    def _files(self, path: Path, notes: list[str]) -> list[Path]:
+        try:
+            listing = [file for file in path.glob(self.pattern) if not file.name.startswith(".")]
+        except (OSError, ValueError, NotImplementedError) as error:
+            raise SourceError(f"{path}: cannot be listed with pattern {self.pattern!r}: {error}") from error
+        found = [file for file in listing if _is_scan(file.name) and file.is_file()]
+        if not found:
+            raise SourceError(
+                f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it: give a folder of fragments"
+            )
+        others = sorted(file.name for file in listing if file.suffix.lower() in OTHER_SCANS)
+        if others:
+            notes.append(f"{len(others)} files are scans of another format, left out: {listed(others)}: convert to PLY")
+        return sorted(found, key=lambda file: natural(file.name))
+
+    def _log(self, folder: Path) -> Path | None:
+        if not self.log:
+            return None
+        if self.log != "auto":
+            return folder / self.log
+        logs = sorted(folder.glob("*.log"))
+        return logs[0] if len(logs) == 1 else None
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class PlyWriter:
+    """Writes the points of all frames as one PLY in the world frame."""
+
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
+        """One file, atomically. Frames need points; those without a pose are refused where there are several."""
+        frames = [frame for frame in source.frames if frame.read_points is not None]
+        if not frames:
+            raise SourceError(
+                f"{source.path}: no frame with points: PLY holds points; fuse depth images with `hodge run`"
+            )
+        if len(frames) > 1 and any(frame.world_from_cam is None for frame in frames):
+            raise SourceError(f"{source.path}: fragments without poses cannot become one cloud: register them first")
+        clouds = [(frame.read_points(), frame.world_from_cam) for frame in frames if frame.read_points]
+        coloured = all(cloud.colours is not None for cloud, _ in clouds)
+        points = [
+            se3.transform(np.eye(4) if pose is None else pose, cloud.points_in_cam.astype(float))
+            for cloud, pose in clouds
+        ]
+        colours = (
+            np.concatenate([cloud.colours for cloud, _ in clouds if cloud.colours is not None]) if coloured else None
+        )
+        write_ply(path, PointCloud(np.concatenate(points).astype(np.float32), None, colours))
+        count = sum(map(len, points))
+        return written(f"{count} points of {len(frames)} clouds as one", source, {"point clouds"})
+
+
+@plain_dataclass(frozen=True)
+class Fragment:
+    """A file of points, or one scan (`row`) of a file with several; `corner` is where LAS coordinates count from."""
+
+    path: Path
+    row: int | None = None
+    corner: tuple[float, float, float] | None = None
+    world_from_scan: tuple[float, ...] | None = None
+
+    @property
+    def name(self) -> str:
+        """What a person calls it."""
+        return self.path.name if self.row is None else f"{self.path.name}/{self.row}"
+
+    def in_metres(self, units_per_metre: float) -> Floats | None:
+        """`world_from_scan` (4, 4) in metres, None where the file gives none."""
+        if self.world_from_scan is None:
+            return None
+        pose = np.array(self.world_from_scan).reshape(4, 4)
+        pose[:3, 3] /= units_per_metre
+        return pose
+
+
+def read_fragment(fragment: Fragment, *, units_per_metre: float) -> PointCloud:
+    """The points of a fragment in metres, by the ending of its file."""
+    if fragment.row is not None:
+        cloud = read_e57(fragment.path, fragment.row)
+    elif fragment.corner is not None:
+        cloud = read_las(fragment.path, fragment.corner)
+    else:
+        cloud = READERS[fragment.path.suffix.lower()](fragment.path)
+    if units_per_metre == 1.0:
+        return cloud
+    return replace(cloud, points_in_cam=cloud.points_in_cam / np.float32(units_per_metre))
+
+
+def _fragments(files: list[Path], notes: list[str]) -> list[Fragment]:
+    """The fragments of the files: each scan of an E57 file is one; LAS files share the corner that they count from."""
+    las = [file for file in files if LIBRARIES.get(file.suffix.lower()) == "laspy"]
+    corner = las_corner(las) if las else None
+    if corner is not None:
+        words = " ".join(f"{value:.3f}" for value in corner)
+        notes.append(f"coordinates of {len(las)} LAS files are counted from their common lower corner {words}")
+    found: list[Fragment] = []
+    for file in files:
+        if file.suffix.lower() == ".e57":
+            for scan in e57_scans(file):
+                pose = None if scan.world_from_scan is None else tuple(scan.world_from_scan.ravel().tolist())
+                found.append(Fragment(file, scan.row, world_from_scan=pose))
+        else:
+            found.append(Fragment(file, corner=corner if file in las else None))
+    return found
+
+
+READERS: Mapping[str, Callable[[Path], PointCloud]] = {
+    ".ply": read_ply,
+    ".pcd": read_pcd,
+    ".las": read_las,
+    ".laz": read_las,
+    ".e57": read_e57,
+    ".bin": read_bin,
+}
+
+
+def _is_scan(name: str) -> bool:
+    return Path(name).suffix.lower() in READERS and (Path(name).suffix != ".bin" or is_scan(name))
+
+
+def _require(path: Path) -> None:
+    """Raise `SourceError` early where a file's library is not there, or its ending unknown."""
+    ending = path.suffix.lower()
+    if ending not in READERS:
+        raise SourceError(f"{path}: not one of {', '.join(READERS)}: convert it to PLY")
+    if ending in LIBRARIES:
+        library(LIBRARIES[ending], path)
+
+
+def _scanners(paths: list[Path]) -> list[str]:
+    """The names of the files with a * in place of the last number, where the same numbers come with several names; else
+    nothing.
+    """
+    found = [_NUMBER.search(path.stem) for path in paths]
+    numbers = [int(match[1]) for match in found if match]
+    names = [
+        f"{path.stem[: match.start(1)]}*{path.stem[match.end(1) :]}{path.suffix}"
+        for path, match in zip(paths, found, strict=True)
+        if match
+    ]
+    each = set(zip(names, numbers, strict=True))
+    return names if len(set(numbers)) < len(numbers) == len(each) == len(paths) else []
+
+
+def _numbers(stems: list[str], notes: list[str]) -> list[int]:
+    """The last number in each name, or the rows where one has none or two have the same."""
+    found = [_NUMBER.search(stem) for stem in stems]
+    numbers = [int(match[1]) for match in found if match]
+    if len(numbers) == len(stems) == len(set(numbers)):
+        return numbers
+    if len(stems) > 1:
+        notes.append("names without a number of their own: fragments are numbered in the order of their names")
+    return list(range(len(stems)))
+
+
+def _graph(names: Mapping[int, str], pairs: Any, i_from_j: Any, notes: list[str]) -> ViewGraph:
+    row_of = {number: row for row, number in enumerate(names)}
+    known = np.array([int(i) in row_of and int(j) in row_of for i, j in pairs], bool)
+    if not known.all():
+        notes.append(f"{int((~known).sum())} pairs of the log name fragments that are not there: left out")
+    edges = np.array([(row_of[int(i)], row_of[int(j)]) for i, j in pairs[known]], np.int64).reshape(-1, 2)
+    return ViewGraph.from_edges(np.array(list(names.values())), edges, i_from_j[known], source="log")

@@ -1,0 +1,1 @@
+"""COLMAP models and databases: read, refined and written."""

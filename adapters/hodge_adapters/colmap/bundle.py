@@ -1,0 +1,121 @@
+"""Bundle adjustment by pycolmap: poses and points, intrinsics where that is asked for, with rigs as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from hodge_adapters.colmap.bodies import Bodies
+from hodge_adapters.colmap.pycolmap_import import pycolmap
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import PositionPriors
+
+Intrinsics: TypeAlias = Literal["none", "focal", "all"]
+"""What of each camera is adjusted: nothing; its focal lengths; these, its principal point and its distortion."""
+
+
+def adjust(
+    reconstruction: pycolmap.Reconstruction,
+    behind: Sequence[tuple[int, int]],
+    bodies: Bodies,
+    priors: PositionPriors | None,
+    *,
+    move_bodies: bool = True,
+    refine: Intrinsics = "none",
+) -> set[int]:
+    """Adjust it in place with COLMAP's own options; the points alone where bodies are not to move.
+
+    As in COLMAP, observations (image, keypoint) of points `behind` their camera take no part; gives the points whose
+    place is therefore not adjusted to their whole track. Without priors the gauge is that of two images; with them the
+    model keeps to theirs. Raises `SourceError` where the adjustment fails.
+    """
+    part = pycolmap.Reconstruction(reconstruction)
+    loose = {key for key, point in reconstruction.points3D.items() if point.track.length() < 2}
+    for key in loose:  # they tell nothing; real models have such, and COLMAP refuses to adjust a model with them
+        part.delete_point3D(key)
+    for image_id, column in behind:
+        seen = part.images[image_id].points2D[column]
+        if seen.has_point3D():
+            loose.add(seen.point3D_id)
+            part.delete_observation(image_id, column)
+    if not part.num_points3D():
+        raise SourceError("no point was seen by two images: nothing ties the poses: triangulate points first")
+    _solve(_adjuster(part, bodies, priors, move_bodies, refine))
+    for frame_id in bodies.frame_ids:
+        reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
+    for camera_id, camera in part.cameras.items():
+        reconstruction.cameras[camera_id].params = camera.params
+    for key, point in part.points3D.items():
+        reconstruction.points3D[key].xyz = point.xyz
+    return loose
+
+
+def _adjuster(
+    reconstruction: pycolmap.Reconstruction,
+    bodies: Bodies,
+    priors: PositionPriors | None,
+    move_bodies: bool,
+    refine: Intrinsics,
+) -> pycolmap.BundleAdjuster:
+    options, config = _options(refine), pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    if not move_bodies:
+        for frame_id in bodies.frame_ids:
+            config.set_constant_rig_from_world_pose(frame_id)
+    elif priors is None:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if priors is None:
+        return pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    # what tracks and priors make of each other must not hang on a few bad tracks
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    known = _pose_priors(reconstruction, bodies, priors)
+    return pycolmap.create_pose_prior_bundle_adjuster(options, _prior_options(), config, known, reconstruction)
+
+
+def _options(refine: Intrinsics) -> pycolmap.BundleAdjustmentOptions:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = refine != "none"
+    options.refine_principal_point = options.refine_extra_params = refine == "all"
+    options.refine_sensor_from_rig = False
+    return options
+
+
+def _prior_options() -> pycolmap.PosePriorBundleAdjustmentOptions:
+    options = pycolmap.PosePriorBundleAdjustmentOptions()
+    options.alignment_ransac.random_seed = 0
+    options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    return options
+
+
+def _pose_priors(
+    reconstruction: pycolmap.Reconstruction, bodies: Bodies, priors: PositionPriors
+) -> list[pycolmap.PosePrior]:
+    """A prior for one image of each body that has one: the image that the rig is reckoned from."""
+    chosen: dict[int, pycolmap.Image] = {}
+    for image_id in reconstruction.reg_image_ids():
+        image = reconstruction.images[image_id]
+        if image.is_ref_in_frame():
+            chosen[image.frame_id] = image
+    out = []
+    for row, frame_id in enumerate(bodies.frame_ids):
+        known = np.isfinite(priors.positions[row]).all() and np.isfinite(priors.covariances[row]).all()
+        if known and frame_id in chosen:
+            prior = pycolmap.PosePrior()
+            prior.position, prior.position_covariance = priors.positions[row], priors.covariances[row]
+            prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+            prior.corr_data_id = chosen[frame_id].data_id
+            out.append(prior)
+    return out
+
+
+def _solve(adjuster: pycolmap.BundleAdjuster) -> None:
+    try:
+        summary = adjuster.solve()
+    except (ValueError, RuntimeError, IndexError) as error:  # what its C++ checks raise
+        raise SourceError(f"bundle adjustment failed ({error}): does COLMAP itself open the model?") from error
+    if not summary.is_solution_usable():
+        raise SourceError(f"bundle adjustment failed ({summary.brief_report()}): the model's points do not fit it")

@@ -1,0 +1,209 @@
+"""COLMAP models through pycolmap: files read after a check, what pycolmap refuses with a reason, content as arrays."""
+
+from __future__ import annotations
+
+import re
+import struct
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hodge_adapters.colmap.check import REMEDY, check_files, check_words
+from hodge_adapters.colmap.files import MODEL_FILES, model_ending
+from hodge_adapters.colmap.pycolmap_import import pycolmap
+from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, Points, matrix_of
+from hodge_adapters.text_rows import natural
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats
+
+MOST_PIXELS = 1 << 16
+"""Across an image: wider ones are no photographs, and buffers of that size would be asked for."""
+OFF_UNIT = 1e-6
+"""How far from 1 the length of a quaternion may be: pycolmap leaves zero as it is and divides all others by theirs."""
+REFUSALS = (
+    (
+        r"point2D\.point3D_id == point3D_id \((\d+) vs\. (\d+)\)",
+        "the track of point {1} names what point {0} was seen at",
+    ),
+    (r"__n \(which is (\d+)\)", "the track of a point names observation {0} of an image that has fewer"),
+    (r"Image with ID (-?\d+) does not", "the track of a point, or a frame, names image {0}, which is not there"),
+    (r"as image (\d+) in frame (\d+) does not exist", "frame {1} names image {0}, which is not there"),
+    (r"rigs_\.emplace", "a rig is given twice"),
+    (r"Sensor \((\w+, \d+)\) is inserted twice", "a rig has a sensor twice ({0})"),
+    (r"Rig with ID (\d+) does not exist", "a frame is of rig {0}, which is not there"),
+    (r"HasSensor", "a frame has an image of a camera which its rig has not"),
+    (r"Camera (?:with ID )?(\d+) .*(?:not found|does not exist)", "camera {0} is used, which is not there"),
+    (r"image_to_frame|\.cc:463\]", "an image is in two frames"),
+    (r"images_\.emplace|image_ids", "an image is given twice"),
+    (r"points3D_\.emplace", "a point is given twice"),
+    (r"HasDataId|unordered_map::at", "an image is in no frame, or of a camera that is not there"),
+)
+"""What pycolmap says of files that contradict each other, and what that means."""
+
+
+def read_model(folder: Path, tracks: bool = True) -> tuple[pycolmap.Reconstruction, Model]:
+    """The model of a folder, and its content.
+
+    Without `tracks` neither points nor what saw them. Raises `SourceError` with the file, or what contradicts what.
+    """
+    ending = model_ending(folder) or ".bin"
+    rigs = _rig_files(folder, ending)
+    paths = [folder / f"{name}{ending}" for name in MODEL_FILES[:3]]
+    has_points = tracks and paths[2].is_file()
+    files = (*(paths if has_points else paths[:2]), *rigs)
+    check_files(files)
+    try:
+        model = read_reconstruction(folder) if has_points else _without_points(files, ending)
+    except SourceError:
+        if ending == ".txt":
+            check_words(files)
+        raise
+    content = checked_content(model, folder, has_points)
+    several = sum(rig.num_sensors() > 1 for rig in model.rigs.values())
+    notes = [f"{several} of {len(model.rigs)} rigs have more than one sensor: {len(model.frames)} frames of rigs"]
+    return model, replace(content, files=files, notes=tuple(notes[:several]))
+
+
+def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
+    """The model of a folder whose files have the right sizes. Raises `SourceError` with a reason."""
+    try:
+        return pycolmap.Reconstruction(folder)
+    except Exception as error:  # pycolmap raises what its C++ checks raise: RuntimeError, ValueError, IndexError
+        raise SourceError(f"{folder}: {_reason(str(error) or type(error).__name__)}: {REMEDY}") from error
+
+
+def content_of(reconstruction: pycolmap.Reconstruction, tracks: bool = True) -> Model:
+    """The posed images in natural order of their names, their cameras, and the points with their tracks."""
+    posed = (reconstruction.images[image_id] for image_id in reconstruction.reg_image_ids())
+    images = [_image(image, tracks) for image in sorted(posed, key=lambda image: natural(image.name))]
+    cameras = {
+        key: CameraRecord(key, camera.model.name, camera.width, camera.height, tuple(camera.params))
+        for key, camera in reconstruction.cameras.items()
+    }
+    return Model(cameras, images, _points(reconstruction, {image.image_id for image in images}))
+
+
+def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks: bool = True) -> Model:
+    """The content, if its numbers can be a model's. Raises `SourceError`."""
+    try:
+        content = content_of(reconstruction, tracks)
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{where}: the name of an image is no UTF-8: {REMEDY}") from error
+    except OverflowError as error:
+        raise SourceError(f"{where}: the id of a point is beyond 2^63: {REMEDY}") from error
+    except (ValueError, IndexError) as error:
+        raise SourceError(f"{where}: {_reason(str(error))}: {REMEDY}") from error
+    except RuntimeError as error:
+        raise SourceError(f"{where}: an image is of a sensor whose place on its rig is not known: {REMEDY}") from error
+    _check(content, where)
+    for image in content.images:
+        turn = reconstruction.images[image.image_id].cam_from_world().rotation.quat
+        if not abs(float(np.linalg.norm(turn)) - 1.0) < OFF_UNIT or not np.isfinite(image.world_from_cam).all():
+            raise SourceError(f"{where}: image {image.name!r}: its pose is not finite, or its quaternion is zero")
+    return content
+
+
+def refreshed(model: Model, reconstruction: pycolmap.Reconstruction) -> Model:
+    """The content with the poses and positions of a reconstruction of the same images and points.
+
+    A point that the reconstruction lost stays where it was.
+    """
+    points3d = reconstruction.points3D
+    xyz = model.points.xyz.copy()
+    for row, point_id in enumerate(model.points.ids.tolist()):
+        if point_id in points3d:
+            xyz[row] = points3d[point_id].xyz
+    images = [replace(image, world_from_cam=_pose(reconstruction.images[image.image_id])) for image in model.images]
+    cameras = {
+        key: replace(record, params=tuple(reconstruction.cameras[key].params)) for key, record in model.cameras.items()
+    }
+    return replace(model, cameras=cameras, images=images, points=replace(model.points, xyz=xyz))
+
+
+def _rig_files(folder: Path, ending: str) -> tuple[Path, ...]:
+    """`rigs` and `frames` of a model, empty where it is of the older kind that has neither."""
+    paths = tuple(folder / f"{name}{ending}" for name in MODEL_FILES[3:])
+    there = [path for path in paths if path.is_file()]
+    if len(there) == 1:
+        lost = next(path for path in paths if path not in there)
+        raise SourceError(f"{lost}: is not there, but {there[0].name} is: copy both, or move {there[0].name} away")
+    return paths if there else ()
+
+
+def _without_points(files: Sequence[Path], ending: str) -> pycolmap.Reconstruction:
+    with tempfile.TemporaryDirectory(prefix="hodge-colmap-") as scratch:
+        for file in files:
+            (Path(scratch) / file.name).symlink_to(file.absolute())
+        (Path(scratch) / f"points3D{ending}").write_bytes(b"" if ending == ".txt" else struct.pack("<Q", 0))
+        try:
+            return read_reconstruction(Path(scratch))
+        except SourceError as error:
+            raise SourceError(str(error).replace(scratch, str(files[0].parent))) from error
+
+
+def _reason(said: str) -> str:
+    for pattern, meaning in REFUSALS:
+        found = re.search(pattern, said)
+        if found:
+            return meaning.format(*found.groups())
+    return f"COLMAP itself cannot read this model ({said.strip().splitlines()[-1][-200:]})"
+
+
+def _check(model: Model, where: Path) -> None:
+    if not model.images:
+        raise SourceError(f"{where}: the model has no image with a pose: give one that was reconstructed")
+    for camera in model.cameras.values():
+        wide = max(camera.width, camera.height) >= MOST_PIXELS or min(camera.width, camera.height) < 1
+        if wide or not np.isfinite(camera.params).all():
+            raise SourceError(
+                f"{where}: camera {camera.camera_id} of {camera.width}x{camera.height} has no sound numbers: mend it"
+            )
+    if len({image.name for image in model.images}) < len(model.images):
+        raise SourceError(f"{where}: two images have the same name: {REMEDY}")
+    known = np.append(model.points.ids, NO_POINT)
+    for image in model.images:
+        if not np.isfinite(image.pixels).all():
+            raise SourceError(f"{where}: image {image.name!r}: an observation is not finite: {REMEDY}")
+        lost = image.point_ids[~np.isin(image.point_ids, known)]
+        if lost.size:
+            raise SourceError(f"{where}: image {image.name!r} observes point {lost[0]}, which is not there: {REMEDY}")
+    wrong = ~np.isfinite(model.points.xyz).all(axis=1)
+    if wrong.any():
+        raise SourceError(f"{where}: point {model.points.ids[wrong][0]} is not finite: {REMEDY}")
+
+
+def _pose(image: pycolmap.Image) -> Floats:
+    """COLMAP's `cam_from_world`, inverted: the one place where this is done."""
+    return se3.inverse(matrix_of(image.cam_from_world()))
+
+
+def _image(image: pycolmap.Image, tracks: bool) -> ImageRecord:
+    invalid = pycolmap.INVALID_POINT3D_ID
+    points = list(image.points2D) if tracks else []
+    pixels = np.array([(point.x(), point.y()) for point in points], np.float64).reshape(-1, 2)
+    ids = (point.point3D_id for point in points)
+    point_ids = np.fromiter((NO_POINT if one == invalid else one for one in ids), np.int64, len(points))
+    return ImageRecord(image.image_id, _pose(image), image.camera_id, image.name, pixels, point_ids)
+
+
+def _points(reconstruction: pycolmap.Reconstruction, posed: set[int]) -> Points:
+    """The points; what an image without a pose saw of them tells nothing."""
+    ids, xyz, counts, image_ids, columns = [], [], [], [], []
+    for key, point in sorted(reconstruction.points3D.items()):
+        ids.append(key)
+        xyz.append(point.xyz)
+        seen = [(one.image_id, one.point2D_idx) for one in point.track.elements if one.image_id in posed]
+        counts.append(len(seen))
+        image_ids += [one for one, _ in seen]
+        columns += [one for _, one in seen]
+    return Points(
+        ids=np.array(ids, np.int64),
+        xyz=np.array(xyz, np.float64).reshape(-1, 3),
+        offsets=np.concatenate([[0], np.cumsum(np.array(counts, np.int64))]).astype(np.int64),
+        image_ids=np.array(image_ids, np.int64),
+        columns=np.array(columns, np.int64),
+    )

@@ -1,0 +1,95 @@
+"""Where the parts of a COLMAP project lie: the model, its images, its depth, its database."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+
+from hodge_adapters.colmap.check import image_count
+from hodge_adapters.text_rows import counted
+from hodge_pipeline.errors import SourceError
+
+MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
+PARENTS = 3
+LOOKED_AT = 60
+MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
+
+
+def find_model(path: Path) -> Path | None:
+    """The folder with the cameras and images of a model: the path itself, or its usual places below."""
+    return next((path / place for place in MODEL_PLACES if model_ending(path / place)), None)
+
+
+def part_of_model(path: Path) -> str:
+    """What to give instead of a file of COLMAP's, empty for any other."""
+    if path.suffix == ".db" and path.is_file():
+        return "a database of COLMAP's has matches, no poses: give the folder of a model, with --database for this one"
+    if path.stem in MODEL_FILES and path.suffix in (".bin", ".txt") and model_ending(path.parent):
+        return f"one file of a COLMAP model: give its folder {path.parent}"
+    return ""
+
+
+def no_model(path: Path) -> SourceError:
+    """The error for a path without a model: what to give instead where a part of one is named, or one lies below."""
+    if not path.exists():
+        return SourceError(f"{path}: no such file or folder")
+    advice = part_of_model(path) or "no COLMAP model: give the folder with cameras.bin and images.bin, or .txt"
+    for place in ("*", "*/*", "*/*/*") if path.is_dir() else ():
+        below = sorted({found.parent for found in islice(path.glob(f"{place}/cameras.*"), LOOKED_AT)})
+        models = [folder for folder in below if model_ending(folder)]
+        if models:
+            return SourceError(f"{path}: no COLMAP model itself, but holds some below: give {models[0]}")
+    return SourceError(f"{path}: {advice}")
+
+
+def model_ending(folder: Path) -> str | None:
+    """`.bin` or `.txt` where the folder holds a model; COLMAP itself prefers the binary one."""
+    for ending in (".bin", ".txt"):
+        if all((folder / f"{name}{ending}").is_file() for name in ("cameras", "images")):
+            return ending
+    return None
+
+
+def find_folder(model: Path, given: str, usual: Sequence[str]) -> Path | None:
+    """The folder of an option: a path of its own, or relative to the model; `auto` looks beside and above the model."""
+    if given == "none":
+        return None
+    if given != "auto":
+        found = next((place for place in (model / given, Path(given)) if place.is_dir()), None)
+        if found is None:
+            raise SourceError(f"{model / given}: no such folder: give one that is there, or auto")
+        return found
+    above = [model, *model.absolute().parents[:PARENTS]]
+    return next((place / name for place in above for name in usual if (place / name).is_dir()), None)
+
+
+def find_database(model: Path) -> Path | None:
+    """The database beside or above the model."""
+    above = [model, *model.absolute().parents[:PARENTS]]
+    return next((place / "database.db" for place in above if (place / "database.db").is_file()), None)
+
+
+def find_models(path: Path) -> list[Path]:
+    """The folders of all models of one scene: the path itself, or `0`, `1`, … in it or in its `sparse`."""
+    if model_ending(path):
+        return [path]
+    for place in (path, path / "sparse"):
+        below = [entry for entry in place.iterdir() if entry.is_dir()] if place.is_dir() else []
+        numbered = sorted((folder for folder in below if folder.name.isdecimal()), key=lambda folder: int(folder.name))
+        found = [folder for folder in numbered if model_ending(folder)]
+        if found:
+            return found
+    single = find_model(path)
+    return [single] if single else []
+
+
+def largest_model(folders: Sequence[Path]) -> tuple[Path, str]:
+    """The model with most images, and a line that names all of them, empty for one alone. Raises `SourceError`."""
+    if len(folders) == 1:
+        return folders[0], ""
+    counts = [image_count(folder / f"images{model_ending(folder)}") for folder in folders]
+    named = ", ".join(
+        f"{folder.name} ({counted(count, 'image')})" for folder, count in zip(folders, counts, strict=True)
+    )
+    return folders[counts.index(max(counts))], f"{len(folders)} models in {folders[0].parent}: {named}"

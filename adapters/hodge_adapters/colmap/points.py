@@ -1,0 +1,88 @@
+"""Points where the rays of their tracks meet, for all tracks at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_adapters.colmap.cameras import colmap_camera
+from hodge_adapters.colmap.records import Model
+from hodge_pipeline import se3
+from hodge_pipeline.types import Floats, Ints
+
+LEAST_PARALLAX = 1e-4
+"""Smallest eigenvalue over the number of rays, below which they are parallel: an angle of about a degree."""
+
+
+def points_of_rays(model: Model, world_from_cam: Floats) -> Floats:
+    """Positions (P, 3) of the points with the images at the poses (N, 4, 4).
+
+    Each is where it was, or where its images carry it along, or the point nearest to its rays: whichever is nearest to
+    the observations. Rays that are parallel have no nearest point.
+    """
+    points = model.points
+    count = len(points.ids)
+    if not count:
+        return np.zeros((0, 3))
+    image, centre, ray, owner = _rays(model, world_from_cam)
+    old = np.array([one.world_from_cam for one in model.images])
+    moves = world_from_cam @ se3.inverse(old)
+    carried = _mean(se3.transform(moves[image], points.xyz[owner][:, None])[:, 0], owner, count)
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    normal = _sum(across.reshape(-1, 9), owner, count).reshape(-1, 3, 3)
+    right = _sum(np.einsum("nij,nj->ni", across, centre), owner, count)
+    fixed = np.linalg.eigvalsh(normal)[:, 0] > LEAST_PARALLAX * np.maximum(np.bincount(owner, minlength=count), 1)
+    normal[~fixed] = np.eye(3)
+    met = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], np.float64)
+    choices = np.stack([points.xyz, carried, np.where(fixed[:, None], met, carried)])
+    best = np.argmin([_off(xyz, centre, ray, owner) for xyz in choices], axis=0)
+    return np.asarray(choices[best, np.arange(count)])
+
+
+def parallaxes(model: Model) -> Floats:
+    """The angle (P,) in degrees between the rays to each point: twice that of the widest to their mean."""
+    centres = np.array([image.world_from_cam[:3, 3] for image in model.images]).reshape(-1, 3)
+    points, owner = model.points, model.points.owners
+    ray = points.xyz[owner] - centres[model.image_rows]
+    ray = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-300)
+    mean = _sum(ray, owner, len(points.ids))
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
+    widest = np.zeros(len(points.ids))
+    np.maximum.at(widest, owner, np.linalg.norm(ray - mean[owner], axis=1))
+    return np.asarray(np.degrees(4.0 * np.arcsin(np.minimum(widest / 2.0, 1.0))))
+
+
+def _off(xyz: Floats, centre: Floats, ray: Floats, owner: Ints) -> Floats:
+    """The mean of the sines between the rays and the directions to the points (P,); 1 for one that is behind.
+
+    No squares: one image at a wrong pose must not draw a point away from all others.
+    """
+    to_point = xyz[owner] - centre
+    length = np.maximum(np.linalg.norm(to_point, axis=1), 1e-300)
+    cosine = np.einsum("ni,ni->n", ray, to_point) / length
+    sine = np.linalg.norm(np.cross(ray, to_point), axis=1) / length
+    return _mean(np.where(cosine > 0, sine, 1.0)[:, None], owner, len(xyz))[:, 0]
+
+
+def _rays(model: Model, world_from_cam: Floats) -> tuple[Ints, Floats, Floats, Ints]:
+    """For each observation of a track: the row of its image, the camera's centre, the unit ray, its point's row."""
+    points = model.points
+    row, owner = model.image_rows, points.owners
+    rays = np.zeros((len(row), 3))
+    for number, image in enumerate(model.images):
+        here = np.flatnonzero(row == number)
+        if len(here):
+            camera = colmap_camera(model.cameras[image.camera_id])
+            plane = np.asarray(camera.cam_from_img(image.pixels[points.columns[here]]))
+            rays[here] = np.column_stack([plane, np.ones(len(plane))])
+    usable = np.isfinite(rays).all(axis=1)
+    row, owner, rays = row[usable], owner[usable], rays[usable]
+    rays = np.einsum("nij,nj->ni", world_from_cam[row, :3, :3], rays)
+    return row, world_from_cam[row, :3, 3], rays / np.linalg.norm(rays, axis=1, keepdims=True), owner
+
+
+def _sum(values: Floats, owner: Ints, count: int) -> Floats:
+    return np.stack([np.bincount(owner, column, minlength=count) for column in values.T], axis=1).astype(float)
+
+
+def _mean(values: Floats, owner: Ints, count: int) -> Floats:
+    return _sum(values, owner, count) / np.maximum(np.bincount(owner, minlength=count), 1)[:, None]

@@ -1,0 +1,77 @@
+"""What a COLMAP model holds, as plain arrays: of all its images and points at once, which pycolmap gives one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hodge_pipeline.types import Floats, Ints
+
+NO_POINT = -1
+
+
+def matrix_of(motion: Any) -> Floats:
+    """The motion (4, 4) of one of pycolmap's `Rigid3d`."""
+    return np.vstack([motion.matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class CameraRecord:
+    """One camera: its model by name, its size and parameters in COLMAP's pixels (the corner of the image is 0, 0)."""
+
+    camera_id: int
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """One posed image; `pixels (N, 2)` are its observations, `point_ids (N,)` their points or `NO_POINT`."""
+
+    image_id: int
+    world_from_cam: Floats
+    camera_id: int
+    name: str
+    pixels: Floats
+    point_ids: Ints
+
+
+@dataclass(frozen=True)
+class Points:
+    """The model's points: `ids (P,)`, `xyz (P, 3)`, and each one's track as `image_ids`, `columns` cut by `offsets`."""
+
+    ids: Ints
+    xyz: Floats
+    offsets: Ints
+    image_ids: Ints
+    columns: Ints
+
+    @cached_property
+    def owners(self) -> Ints:
+        """The row (T,) of the point that each entry of a track belongs to."""
+        return np.repeat(np.arange(len(self.ids)), np.diff(self.offsets))
+
+
+@dataclass(frozen=True)
+class Model:
+    """A COLMAP model: cameras by id, images in the order of their names, points; `files` it was read from, `notes`."""
+
+    cameras: Mapping[int, CameraRecord]
+    images: Sequence[ImageRecord]
+    points: Points
+    files: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def image_rows(self) -> Ints:
+        """The row (T,) of the image that each entry of a track names."""
+        ids = np.array([image.image_id for image in self.images], np.int64)
+        order = np.argsort(ids)
+        return np.asarray(order[np.searchsorted(ids[order], self.points.image_ids)], np.int64)

@@ -1,0 +1,331 @@
+"""A COLMAP model to be refined: bodies that move, points that follow them, bundle adjustment, and writing it again.
+
+pycolmap holds the model, so that rigs, cameras, names and colours come out as they went in. A body is one of COLMAP's
+frames: all cameras of a rig at one moment, or a single image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from hodge_adapters.colmap.bodies import Bodies, bodies_of, body_graph
+from hodge_adapters.colmap.bundle import Intrinsics, adjust
+from hodge_adapters.colmap.content import content_of, read_reconstruction, refreshed
+from hodge_adapters.colmap.database import database_pairs
+from hodge_adapters.colmap.edges import covisible_pairs, measured_graph
+from hodge_adapters.colmap.points import parallaxes, points_of_rays
+from hodge_adapters.colmap.priors import Known, body_priors, placing
+from hodge_adapters.colmap.pycolmap_import import pycolmap
+from hodge_adapters.colmap.records import Model
+from hodge_adapters.colmap.reprojection import reprojection_errors, update_errors
+from hodge_adapters.colmap.resection import resected
+from hodge_adapters.colmap.scale import depth_ratios
+from hodge_adapters.colmap.ties import held_apart, merge_matched_points
+from hodge_adapters.colmap.uncertainty import standard_errors
+from hodge_pipeline import se3
+from hodge_pipeline.types import (
+    Bools,
+    CloudSet,
+    Floats,
+    Frame,
+    Ints,
+    ModelQuality,
+    PointCloud,
+    PositionPriors,
+    ViewGraph,
+)
+
+LEAST_LEFT = 3
+"""Entries of a track: two would meet in a point wherever the images are."""
+
+
+FEW_BEHIND = 0.01
+"""Of the observations: where more are behind their cameras, these are wrong and not the points."""
+
+
+@dataclass(frozen=True)
+class DepthOptions:
+    """Depth beside the images: the file of each image by its name, and how to read it."""
+
+    files: dict[str, Path]
+    units_per_metre: float
+    no_depth: tuple[int, ...]
+    camera: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class EdgeOptions:
+    """Where the relative poses come from, and how many points they need."""
+
+    database: Path | None
+    min_shared: int
+    max_edges_per_image: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class PriorOptions:
+    """What is known of images by name beside their pixels, the file it comes from, and sigma where none is stated."""
+
+    images: Mapping[str, Known] = field(default_factory=dict)
+    file: Path | None = None
+    sigma_m: float = 1.0
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """See `stages.TrackedModel`. The reconstruction is never changed in place."""
+
+    name: str
+    reconstruction: pycolmap.Reconstruction
+    all_frames: dict[str, Frame]
+    depth: DepthOptions
+    edges: EdgeOptions
+    text: bool = False
+    files: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
+    refine: Intrinsics = "none"
+    known: PriorOptions = field(default_factory=PriorOptions)
+    placing: str = ""
+    """What gave the model its place in the world, empty where nothing did."""
+    tracks: Model | None = None
+    """The content of a model with the same tracks, from which this one differs by poses and positions alone."""
+
+    @property
+    def native(self) -> pycolmap.Reconstruction:
+        """The reconstruction itself."""
+        return self.reconstruction
+
+    @property
+    def measurements(self) -> tuple[Path, ...]:
+        """The database, known positions and the depth images."""
+        files = (self.edges.database, self.known.file, *self.depth.files.values())
+        return tuple(dict.fromkeys(file for file in files if file is not None))
+
+    @cached_property
+    def records(self) -> Model:
+        """The model as plain arrays, images in natural order of their names."""
+        return content_of(self.reconstruction) if self.tracks is None else refreshed(self.tracks, self.reconstruction)
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """The bodies, and which of them carries each image."""
+        return bodies_of(self.reconstruction, [image.image_id for image in self.records.images])
+
+    @cached_property
+    def frames(self) -> Sequence[Frame]:
+        """The posed images, with depth and colour where they are to be read."""
+        return tuple(
+            replace(self.all_frames[image.name], world_from_cam=image.world_from_cam) for image in self.records.images
+        )
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Each body by the name of its first image."""
+        return self.bodies.names
+
+    @property
+    def world_from_body(self) -> Floats:
+        """Poses (B, 4, 4)."""
+        return self.bodies.world_from_body
+
+    @property
+    def body_of_frame(self) -> Ints:
+        """The body (N,) of each image."""
+        return self.bodies.body_of_image
+
+    @property
+    def body_from_cam(self) -> Floats:
+        """Where (N, 4, 4) a body carries its image."""
+        return self.bodies.body_from_cam
+
+    @cached_property
+    def quality(self) -> ModelQuality:
+        """Errors are computed anew: what a file says of them may be older than its poses."""
+        records = self.records
+        keypoints, errors_px = reprojection_errors(records)
+        owners = records.points.owners
+        return ModelQuality(
+            images=self.reconstruction.num_reg_images(),
+            points=self.reconstruction.num_points3D(),
+            mean_track_length=float(self.reconstruction.compute_mean_track_length()),
+            image_names=tuple(image.name for image in records.images),
+            keypoints=keypoints,
+            errors_px=errors_px,
+            parallaxes_deg=parallaxes(records)[owners],
+            track_lengths=np.diff(records.points.offsets)[owners],
+        )
+
+    def depth_ratios(self) -> Sequence[Floats]:
+        """Sensor depth over model depth at the observations of each image with depth, of a few hundred evenly."""
+        depth = self.depth
+        files = {
+            row: depth.files[image.name] for row, image in enumerate(self.records.images) if image.name in depth.files
+        }
+        return depth_ratios(self.records, files, depth.units_per_metre, depth.no_depth, depth.camera)
+
+    def seen_points(self) -> CloudSet:
+        """The tracked points that each body's images see, in its axes; a point counts once for each body."""
+        points, known = self.records.points, self.reconstruction.points3D
+        colours = np.array([known[key].color for key in points.ids.tolist()], np.uint8).reshape(-1, 3)
+        body = self.bodies.body_of_image[self.records.image_rows]
+        seen = np.unique(np.stack([body, points.owners], axis=1), axis=0)
+        clouds = []
+        for row, pose in enumerate(se3.inverse(self.world_from_body)):
+            own = seen[seen[:, 0] == row, 1]
+            clouds.append(PointCloud(se3.transform(pose, points.xyz[own]).astype(np.float32), colours=colours[own]))
+        return CloudSet.from_clouds(clouds)
+
+    def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
+        """Edges of the database where there is one, else of covisible images."""
+        notes: list[str] = []
+        options, records = self.edges, self.records
+        if options.database is None:
+            pairs = covisible_pairs(records, options.min_shared, options.max_edges_per_image)
+        else:
+            pairs = database_pairs(options.database, records, options.min_shared, notes)
+        graph = measured_graph(records, pairs, options.min_shared // 2, options.seed, notes)
+        return body_graph(graph, self.bodies), tuple(notes)
+
+    @cached_property
+    def held_apart(self) -> int:
+        """Pairs of images that the database matches well and that share hardly a point."""
+        database = self.edges.database
+        return 0 if database is None else held_apart(self.reconstruction, database, self.edges.min_shared)
+
+    def resected(self, bodies: Bools | None = None) -> Floats:
+        """Poses (B, 4, 4): those of these bodies (B,), all by default, by the points; see `colmap_resection`."""
+        return resected(self.records, self.bodies, bodies)
+
+    @property
+    def known_positions(self) -> PositionPriors | None:
+        """Where bodies should be, of a model that was placed by known positions."""
+        names = [image.name for image in self.records.images]
+        return body_priors(names, self.bodies, self.known.images, self.known.sigma_m) if self.placing else None
+
+    def placed(self) -> ColmapModel:
+        """The model in the world of what is known of its images; as it is, with a note, where that does not tell."""
+        if not self.known.images:
+            return self
+        images = self.records.images
+        poses = np.array([image.world_from_cam for image in images])
+        found = placing([image.name for image in images], poses, self.known.images, self.known.sigma_m)
+        if isinstance(found, str):
+            return replace(self, notes=(*self.notes, found))
+        copy = self._copy()
+        copy.transform(found.world_from_model)
+        return replace(self, reconstruction=copy, files=(), tracks=self.records, placing=found.told)
+
+    def scaled(self, factor: float) -> ColmapModel:
+        """Positions times the factor."""
+        copy = self._copy()
+        copy.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
+        return replace(self, reconstruction=copy, files=(), tracks=self.records)
+
+    def moved(self, world_from_body: Floats) -> ColmapModel:
+        """Bodies at these poses, points where their rays meet; what the database matched is merged where it fits."""
+        before, copy = self.records, self._copy()
+        for frame_id, pose in zip(self.bodies.frame_ids, world_from_body, strict=True):
+            copy.frames[frame_id].rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(se3.inverse(pose)[:3]))
+        poses = world_from_body[self.bodies.body_of_image] @ self.bodies.body_from_cam
+        for point_id, xyz in zip(before.points.ids.tolist(), points_of_rays(before, poses), strict=True):
+            copy.points3D[point_id].xyz = xyz
+        update_errors(copy)
+        return replace(self, reconstruction=copy, files=(), tracks=before)
+
+    def merged(self) -> ColmapModel:
+        """What the database matched is one point where one position fits; this very model where nothing is merged."""
+        if not self.held_apart:
+            return self
+        assert self.edges.database is not None
+        copy = self._copy()
+        count = merge_matched_points(copy, self.edges.database, self.edges.min_shared)
+        if not count:
+            return self
+        update_errors(copy)
+        notes = (*self.notes, f"{count} pairs of points that a match calls one were merged")
+        return replace(self, reconstruction=copy, files=(), notes=notes, tracks=None)
+
+    def adjusted(self, priors: PositionPriors | None = None) -> ColmapModel:
+        """Bundle adjustment with rigs held, and intrinsics unless they are to be refined; see `colmap_bundle`.
+
+        Where it leaves a few points behind their cameras, those are placed anew and all is adjusted once more.
+        """
+        first = self._adjusted(priors)
+        behind = len(first._behind())
+        if not 0 < behind <= FEW_BEHIND * len(first.quality.errors_px):
+            return first
+        placed = first.moved(first.world_from_body)
+        return placed._adjusted(priors) if len(placed._behind()) < behind else first
+
+    def _adjusted(self, priors: PositionPriors | None) -> ColmapModel:
+        copy = self._copy()
+        loose = adjust(copy, self._behind(), self.bodies, priors, refine=self.refine)
+        if loose:
+            after = refreshed(self.records, copy)
+            poses = np.array([image.world_from_cam for image in after.images])
+            for point_id, xyz in zip(after.points.ids.tolist(), points_of_rays(after, poses), strict=True):
+                if point_id in loose:
+                    copy.points3D[point_id].xyz = xyz
+        update_errors(copy)
+        return replace(self, reconstruction=copy, files=(), tracks=self.records)
+
+    @property
+    def moves_intrinsics(self) -> bool:
+        """Whether bundle adjustment changes more than poses and points."""
+        return self.refine != "none"
+
+    def _behind(self) -> list[tuple[int, int]]:
+        """Image and keypoint of each observation whose point lies behind the camera."""
+        keypoints = self.quality.keypoints[np.isinf(self.quality.errors_px)]
+        return [(self.records.images[row].image_id, int(column)) for row, column in keypoints]
+
+    def standard_errors(self) -> Floats:
+        """Of each body's rotation and position (B, 2), radians and units; see `colmap_uncertainty`."""
+        return standard_errors(self.records, self.bodies)
+
+    def held_out_errors(self, entries: Bools, *, move_bodies: bool) -> Floats:
+        """Errors (H,) of these entries of tracks (T,) after an adjustment without them, of the points or of all.
+
+        An entry whose point too few others would place is left in, and out of the answer.
+        """
+        copy, records = self._copy(), self.records
+        left, held = np.diff(records.points.offsets), []
+        for at in np.flatnonzero(entries):
+            owner = records.points.owners[at]
+            if left[owner] > LEAST_LEFT:
+                left[owner] -= 1
+                held.append(at)
+                image = records.images[records.image_rows[at]]
+                copy.delete_observation(image.image_id, int(records.points.columns[at]))
+        adjust(copy, [], self.bodies, None, move_bodies=move_bodies)
+        return reprojection_errors(refreshed(records, copy))[1][held]
+
+    def write(self, folder: Path) -> None:
+        """Five files, binary or text as the model was."""
+        (self.reconstruction.write_text if self.text else self.reconstruction.write_binary)(folder)
+
+    def read_back(self, folder: Path, notes: tuple[str, ...]) -> ColmapModel:
+        """The model of that folder with the frames, depth and database of this one."""
+        back = read_reconstruction(folder)
+        return replace(self, reconstruction=back, files=(), notes=(*notes, *self._refined_cameras(back)), tracks=None)
+
+    def _refined_cameras(self, after: pycolmap.Reconstruction) -> tuple[str, ...]:
+        """A line on how the adjustment to another model changed focal lengths."""
+        if not self.moves_intrinsics:
+            return ()
+        cameras = self.reconstruction.cameras
+        pairs = [(cameras[key].mean_focal_length(), new.mean_focal_length()) for key, new in after.cameras.items()]
+        ratios: Floats = np.array([new / old for old, new in pairs])
+        if len(ratios) == 1:
+            return (f"focal length {pairs[0][0]:.6g} -> {pairs[0][1]:.6g} px",)
+        low, middle, high = 100 * (np.percentile(ratios, [0, 50, 100]) - 1)
+        return (f"focal lengths of {len(ratios)} cameras changed by {middle:+.3g} % ({low:+.3g} to {high:+.3g} %)",)
+
+    def _copy(self) -> pycolmap.Reconstruction:
+        return pycolmap.Reconstruction(self.reconstruction)

@@ -1,0 +1,1 @@
+"""ICL-NUIM and Redwood sequences."""

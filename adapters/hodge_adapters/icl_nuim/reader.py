@@ -1,0 +1,179 @@
+"""ICL-NUIM in its three layouts: TUM-like PNG folders, POV-Ray files, and Redwood's re-renderings of its rooms.
+
+The first two have y pointing up, so fy = −480; the world is the files' own.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_adapters.association import interpolated_poses
+from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
+from hodge_adapters.icl_nuim.redwood import find_log, is_redwood, list_images
+from hodge_adapters.images import pixels
+from hodge_adapters.images.camera_files import Intrinsics, checked
+from hodge_adapters.images.frames import image_frame
+from hodge_adapters.posed import posed_frames
+from hodge_adapters.text_rows import first_text
+from hodge_adapters.trajectories.log import read_log_file
+from hodge_adapters.trajectories.text import parse_tum
+from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs
+from hodge_adapters.tum.reader import frame_ids
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.stages import Sniff
+from hodge_pipeline.types import Floats, Frame, Source
+
+ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
+REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
+TRUTH_PATTERN = "*.gt.freiburg*"
+MAX_GAP_FRAMES = 1.0
+SNIFFED_BYTES = 1 << 16
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class IclNuimReader:
+    """Reads a folder of any of the three layouts, or a `.gt.freiburg` file alone."""
+
+    intrinsics: tuple[float, float, float, float] | None = Field(
+        None,
+        description="fx fy cx cy in pixels; none: 481.2 -480 319.5 239.5, for Redwood's layout 525 525 319.5 239.5",
+    )
+    units_per_metre: float | None = Field(
+        None,
+        gt=0,
+        description="stored units per metre; none: 5000 (TUM-like), 1 (POV-Ray, positions too), 1000 (Redwood)",
+    )
+    every: int = Field(1, ge=1, description="take every n-th frame")
+
+    def sniff(self, path: Path) -> Sniff:
+        """Sure of POV-Ray files and of a `.gt.freiburg` beside image lists, less sure of Redwood's folders and of
+        lists that number their images.
+        """
+        path = Path(path)
+        try:
+            if path.is_file():
+                truth_alone = ".gt.freiburg" in path.name
+                return Sniff(0.9, "a .gt.freiburg file") if truth_alone else Sniff(0.0, "not a folder")
+            if _find_truth(path) and (find_association_file(path) or (path / "depth.txt").is_file()):
+                return Sniff(0.95, "a .gt.freiburg file beside image lists")
+            if _find_truth(path) and is_redwood(path):
+                return Sniff(0.9, "a .gt.freiburg file beside depth/ and rgb/")
+            if list_pov(path):
+                return Sniff(0.95, "scene_00_0000.depth files")
+            if is_redwood(path):
+                return Sniff(0.7, "depth/ and image/ or color/ without lists of stamps")
+            association = find_association_file(path)
+            if association and _is_numbered(association):
+                return Sniff(0.5, f"{association.name} with frame numbers for stamps")
+        except (OSError, SourceError):
+            return Sniff(0.0, "not a folder that can be read")
+        return Sniff(0.0, "no .gt.freiburg, no scene_00_0000.depth, no depth/ beside image/ or color/")
+
+    def open(self, path: Path) -> Source:
+        """Frames with the number in the file name (or the list's stamp) as id and stamp, and the truth as trajectory.
+
+        Redwood's `trajectory.log` is an estimate: its poses are given to the frames with a note that says so, and
+        there is no reference trajectory.
+        """
+        path = Path(path)
+        if path.is_file():
+            parsed = parse_tum(path)
+            return Source(path.name, path, trajectory=parsed.trajectory, notes=parsed.notes, files=(path,))
+        if not path.is_dir():
+            raise SourceError(f"{path}: not there: give a folder of ICL-NUIM, or a .gt.freiburg file")
+        pov = list_pov(path)
+        if pov:
+            return self._open_pov(path, pov)
+        if find_association_file(path) or (path / "depth.txt").is_file():
+            return self._open_lists(path)
+        if is_redwood(path):
+            return self._open_unlisted(path) if _find_truth(path) else self._open_redwood(path)
+        raise SourceError(
+            f"{path}: no associations.txt, no scene_00_0000.depth, no depth/ beside image/ or color/ in it"
+        )
+
+    def _camera(self, default: Intrinsics) -> Intrinsics:
+        return checked(Intrinsics(*self.intrinsics), "option intrinsics") if self.intrinsics else default
+
+    def _open_lists(self, path: Path) -> Source:
+        notes: list[str] = []
+        listing = read_pairs(path, 0.0, notes)
+        return self._numbered(path, listing, notes)
+
+    def _open_unlisted(self, path: Path) -> Source:
+        """The TUM-like layout without its list: images are paired by the numbers in their names."""
+        notes = ["no associations.txt: images are paired by the numbers in their names"]
+        return self._numbered(path, list_images(path, notes), notes)
+
+    def _numbered(self, path: Path, listing: StampedImages, notes: list[str]) -> Source:
+        truth = _find_truth(path)
+        trajectory, poses = None, np.full((len(listing.depth), 4, 4), np.nan)
+        if truth:
+            parsed = parse_tum(truth)
+            trajectory = parsed.trajectory
+            notes.extend(parsed.notes)
+            poses = interpolated_poses(trajectory, listing.stamps_s, MAX_GAP_FRAMES)
+        without = int(np.isnan(poses[:, 0, 0]).sum())
+        if without:
+            notes.append(f"{without} of {len(poses)} frames have no truth")
+        frames = self._frames(listing, ICL, poses, 5000.0, is_true=True)
+        files = (*listing.files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour))
+        return Source(path.resolve().name, path, frames, trajectory, notes=tuple(notes), files=files)
+
+    def _frames(
+        self, listing: StampedImages, default: Intrinsics, poses: Floats, units_per_metre: float, *, is_true: bool
+    ) -> tuple[Frame, ...]:
+        camera = self._camera(default).camera(pixels.common_size(listing.depth))
+        ids = frame_ids(listing.stamps_s)
+        return tuple(
+            image_frame(
+                ids[row],
+                listing.stamps_s[row],
+                camera,
+                listing.depth[row],
+                listing.colour[row],
+                units_per_metre=self.units_per_metre or units_per_metre,
+                world_from_cam=poses[row],
+                is_true=is_true,
+            )
+            for row in range(0, len(ids), self.every)
+        )
+
+    def _open_pov(self, path: Path, pov: dict[int, Path]) -> Source:
+        notes: list[str] = []
+        colours = [file for file in (depth.with_suffix(".png") for depth in pov.values()) if file.is_file()]
+        camera = self._camera(ICL).camera(pixels.common_size(colours) if colours else (640, 480))
+        frames, files = pov_frames(pov, camera, self.units_per_metre or 1.0, notes)
+        every = tuple(frames[:: self.every])
+        return Source(path.resolve().name, path, every, posed_frames(frames), notes=tuple(notes), files=files)
+
+    def _open_redwood(self, path: Path) -> Source:
+        notes: list[str] = []
+        listing = list_images(path, notes)
+        log = find_log(path)
+        estimates = read_log_file(log).poses if log else {}
+        if log:
+            notes.append(f"poses from {log.relative_to(path)}: an estimate of another program, not the truth")
+        none = np.full((4, 4), np.nan)
+        poses = np.array([estimates.get(number, none) for number in frame_ids(listing.stamps_s)])
+        without = int(np.isnan(poses[:, 0, 0]).sum())
+        if log and without:
+            notes.append(f"{without} of {len(poses)} frames have no pose in it")
+        frames = self._frames(listing, REDWOOD, poses, 1000.0, is_true=False)
+        files = (*filter(None, [log]), *listing.depth, *filter(None, listing.colour))
+        return Source(path.resolve().name, path, frames, notes=tuple(notes), files=files)
+
+
+def _find_truth(folder: Path) -> Path | None:
+    return next(iter(sorted(folder.glob(TRUTH_PATTERN))), None)
+
+
+def _is_numbered(association: Path) -> bool:
+    """Whether its first row has a frame number where TUM has a time."""
+    lines = first_text(association, SNIFFED_BYTES).splitlines()
+    row = next((line.split() for line in lines if line.strip() and not line.startswith("#")), [""])
+    return row[0].isdigit()

@@ -1,0 +1,1 @@
+"""Images, cameras and lenses, as several formats need them."""

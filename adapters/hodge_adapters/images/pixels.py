@@ -1,0 +1,103 @@
+"""Depth and colour images from files that are not trusted: size and damage are looked for before decoding.
+
+All functions are module-level, so that partials of them pickle by reference and a worker process can call them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hodge_adapters.images.headers import is_complete, parse_header
+from hodge_adapters.text_rows import reading
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Bytes, EncodedImage, Floats32
+from hodge_pipeline.types.input_files import open_input, read_input
+
+HEADER_BYTES = 1 << 16
+"""Where an image's size is looked for: room for the thumbnail that may precede it."""
+MAX_IMAGE_BYTES = 1 << 29
+"""Twice what 64 megapixels of 16-bit depth and their rows' heads take uncompressed."""
+
+
+def read_depth(
+    path: Path,
+    *,
+    units_per_metre: float,
+    no_depth: tuple[int, ...] = (0,),
+    size: tuple[int, int] | None = None,
+) -> Floats32:
+    """Depth (H, W) in float32 metres, 0 where the file holds one of the `no_depth` values.
+
+    `size` is the camera's (width, height). Raises `SourceError` for a missing or damaged file, for one that is not
+    single-channel 16 bit, and for one of another size.
+    """
+    stored = _decoded(path, size, cv2.IMREAD_UNCHANGED)
+    if stored.ndim != 2 or stored.dtype != np.uint16:
+        kind = f"{stored.dtype} with {1 if stored.ndim == 2 else stored.shape[2]} channel(s)"
+        raise SourceError(f"{path}: depth must be uint16 with one channel, this is {kind}: is it a colour image?")
+    depth_m: Floats32 = stored.astype(np.float32)
+    depth_m *= np.float32(1.0 / units_per_metre)
+    for value in no_depth:
+        if value:
+            depth_m[stored == value] = 0.0
+    return depth_m
+
+
+def read_colour(path: Path, *, size: tuple[int, int] | None = None) -> Bytes:
+    """Colour (H, W, 3) uint8 RGB. Raises `SourceError` as `read_depth` does."""
+    return np.asarray(cv2.cvtColor(_decoded(path, size, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _decoded(path: Path, size: tuple[int, int] | None, how: int) -> Any:
+    stored = cv2.imdecode(np.frombuffer(read_whole_image(path, size), np.uint8), how)
+    if stored is None:
+        raise SourceError(f"{path}: the image cannot be decoded: copy it again from its source")
+    return stored
+
+
+def encoded(path: Path, *, units_per_metre: float | None = None) -> EncodedImage:
+    """The file's bytes untouched, after the same checks as before decoding; of depth with its units."""
+    contents = read_whole_image(path)
+    return EncodedImage(contents, parse_header(contents, path).media_type, units_per_metre)
+
+
+def read_whole_image(path: Path, size: tuple[int, int] | None = None) -> bytes:
+    """The bytes of a PNG or JPEG file that is complete, of this (width, height) and not absurdly large."""
+    with reading(path):
+        contents = read_input(path, MAX_IMAGE_BYTES)
+    header = parse_header(contents, path)
+    if size is not None and (header.width, header.height) != size:
+        raise SourceError(
+            f"{path}: the image is {header.width}x{header.height}, the camera {size[0]}x{size[1]}: "
+            "give the intrinsics of this image, or leave the frame out"
+        )
+    if not is_complete(contents, header):
+        raise SourceError(f"{path}: the image is truncated or damaged: copy it again from its source")
+    return contents
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the header alone; raises `SourceError` where there is none."""
+    with reading(path), open_input(path) as file:
+        header = parse_header(file.read(HEADER_BYTES), path)
+    return header.width, header.height
+
+
+def common_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int]:
+    """The (width, height) that most of a few evenly spaced images have, so that one odd image does not set it."""
+    sizes: Counter[tuple[int, int]] = Counter()
+    problem: SourceError | None = None
+    for row in np.unique(np.linspace(0, len(paths) - 1, samples).round().astype(int)):
+        try:
+            sizes[image_size(paths[row])] += 1
+        except SourceError as error:
+            problem = error
+    if not sizes:
+        raise problem or SourceError("no image to take the size from: give a folder with frames")
+    return sizes.most_common(1)[0][0]

@@ -1,0 +1,1 @@
+"""Recordings: MCAP, and ROS bags of both generations."""

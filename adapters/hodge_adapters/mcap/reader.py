@@ -1,0 +1,260 @@
+"""Recordings: ROS 2 bags (MCAP, SQLite), ROS 1 bags, Foxglove logs with depth images, point clouds and poses.
+
+A recording is gone through once when opened, without decoding an image; frames know where their bytes lie.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from hodge_adapters.association import nearest_pairs
+from hodge_adapters.images.camera_files import Intrinsics, checked
+from hodge_adapters.mcap.clouds import read_points
+from hodge_adapters.mcap.files import find_files, sniff_recording
+from hodge_adapters.mcap.fixes import positions_of
+from hodge_adapters.mcap.images import ImageLayout, encoded_image, read_colour, read_depth
+from hodge_adapters.mcap.poses import PoseOptions, find_poses
+from hodge_adapters.mcap.recording import A_MESSAGE_WITH, NO_PINHOLE, Recording, Seen
+from hodge_adapters.mcap.ros_tf import TransformTree
+from hodge_adapters.mcap.topics import (
+    ImageTopics,
+    best_colour,
+    best_depth,
+    find_camera,
+    named_topic,
+    one_per_stamp,
+    split_depth,
+)
+from hodge_adapters.text_rows import listed
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.stages import Sniff
+from hodge_pipeline.types import Camera, EncodedImage, Floats, Frame, Source
+
+Layout = TypeVar("Layout")
+UNITS_PER_METRE = 1000.0
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class McapReader:
+    """Reads an MCAP file, a `.db3` or a `.bag`, or a folder with the files of a split recording."""
+
+    frames: Literal["auto", "depth", "points", "colour"] = Field(
+        "auto", description="what makes a frame; auto: depth images if there are any, else point clouds, else colour"
+    )
+    depth_topic: str = Field("", description="topic of the depth images; empty: found by type, registered depth first")
+    colour_topic: str = Field("", description="topic of the colour images; empty: found by type, on the depth's grid")
+    points_topic: str = Field("", description="topic of the point clouds; empty: that with most messages")
+    calibration_topic: str = Field("", description="topic of the calibration; empty: the one beside the images")
+    camera: tuple[float, float, float, float] | None = Field(
+        None, description="fx fy cx cy in pixels, for recordings without a calibration"
+    )
+    depth_scale: float = Field(
+        UNITS_PER_METRE, gt=0, description="units per metre of 16-bit depth; ROS (REP 118) has millimetres"
+    )
+    no_depth: tuple[int, ...] = Field((0, 65535), description="16-bit values that mean no depth; 65535 is the largest")
+    max_difference_s: float = Field(
+        0.02, ge=0, description="seconds between the stamps of a depth image and its colour image, as for TUM"
+    )
+    pose_topic: str = Field("", description="topic of odometry or poses; empty: odometry first, else transforms")
+    pose_child: str = Field("", description="coordinate frame that the pose topic moves; empty: as its messages say")
+    world_frame: str = Field("", description="take poses from the transforms to this frame; empty: odometry's frame")
+    max_gap_s: float = Field(
+        0.2, ge=0, description="seconds to the neighbours that a pose is interpolated from; odometry often has 10 Hz"
+    )
+    every: int = Field(1, ge=1, description="take every n-th frame")
+
+    def sniff(self, path: Path) -> Sniff:
+        """Sure where the file starts as a recording does, or the folder has some beside `metadata.yaml`."""
+        return sniff_recording(Path(path))
+
+    def open(self, path: Path) -> Source:
+        """Frames in order of their header stamps, and odometry (moved to the camera where possible) as trajectory.
+
+        `frame_id` is the row among the frames before `every`.
+        """
+        path = Path(path)
+        notes: list[str] = []
+        listing = find_files(path, notes)
+        recording = Recording(TransformTree(self.max_gap_s))
+        for file in listing.logs:
+            recording.read_file(file)
+        notes += recording.complaints.notes()
+        notes += filter(None, [recording.clock_note()])
+        if recording.transforms.other_parents:
+            notes.append(f"{recording.transforms.other_parents} transforms of frames with two parents left out")
+        frames, camera_frame = self._frames(path, recording, notes)
+        frames = frames[:: self.every]
+        stamps_s = np.array([frame.stamp_s for frame in frames], float)
+        options = PoseOptions(self.pose_topic, self.pose_child, self.world_frame, self.max_gap_s)
+        poses = find_poses(recording, camera_frame, stamps_s, options, notes)
+        positions = positions_of(recording.fixes, notes)
+        if not frames and poses.trajectory is None and positions is None:
+            raise _nothing(path, recording, notes)
+        return Source(
+            name=path.stem if path.is_file() else path.resolve().name,
+            path=path,
+            frames=tuple(_with_pose(frame, pose) for frame, pose in zip(frames, poses.of_frames, strict=True)),
+            trajectory=poses.trajectory,
+            notes=tuple(notes),
+            files=listing.all,
+            contents=recording.contents(),
+            positions=positions,
+        )
+
+    def _frames(self, path: Path, recording: Recording, notes: list[str]) -> tuple[list[Frame], str]:
+        """All frames, and the coordinate frame of their camera."""
+        depth, colour = split_depth(recording.images, notes)
+        kind = self.frames
+        if kind == "auto":
+            kind = "depth" if depth else "points" if recording.clouds else "colour"
+            if depth and recording.clouds:
+                notes.append(f"point clouds of {listed(sorted(recording.clouds))} not taken: see option frames")
+        if kind == "depth" and depth:
+            return self._depth_frames(path, recording, depth, colour, notes)
+        if kind == "points" and recording.clouds:
+            return self._cloud_frames(recording, notes)
+        if kind == "colour" and colour:
+            return self._colour_frames(recording, colour, notes)
+        if self.frames != "auto":
+            raise SourceError(f"{path}: no {kind} in it (option frames): it has {_topics(recording)}")
+        return [], ""
+
+    def _depth_frames(
+        self, path: Path, recording: Recording, depth: ImageTopics, colour: ImageTopics, notes: list[str]
+    ) -> tuple[list[Frame], str]:
+        named = named_topic(depth, self.depth_topic, "depth_topic")[0] if self.depth_topic else ""
+        topic = named or best_depth(depth, colour, notes)
+        images = one_per_stamp(topic, depth[topic], notes)
+        camera = self._camera(recording, topic, images[0], notes)
+        if camera is None:
+            why = "".join(f"; {note}" for note in recording.complaints.counted(A_MESSAGE_WITH + NO_PINHOLE))
+            raise SourceError(f"{path}: no calibration for {topic}{why}: give option camera (fx fy cx cy)")
+        if self.colour_topic:
+            colour = dict([named_topic(colour, self.colour_topic, "colour_topic")])
+        colour_topic = best_colour(colour, topic, images[0], notes)
+        coloured = self._associated(topic, images, colour_topic, colour, notes)
+        units = self.depth_scale
+        frames = []
+        for row, (image, other) in enumerate(zip(images, coloured, strict=True)):
+            is_plain_png = image.layout.coding == "png" and image.layout.quantisation is None
+            frames.append(
+                Frame(
+                    frame_id=row,
+                    stamp_s=image.stamp_s,
+                    camera=camera,
+                    read_depth=partial(
+                        read_depth, image.payload, image.layout, units_per_metre=units, no_depth=self.no_depth
+                    ),
+                    encoded_depth=partial(encoded_image, image.payload, image.layout, units) if is_plain_png else None,
+                    read_colour=partial(read_colour, other.payload, other.layout) if other else None,
+                    encoded_colour=_encoded_colour(other),
+                )
+            )
+        return frames, _coordinate_frame(topic, images, notes)
+
+    def _associated(
+        self,
+        topic: str,
+        images: Sequence[Seen[ImageLayout]],
+        colour_topic: str | None,
+        colour: ImageTopics,
+        notes: list[str],
+    ) -> list[Seen[ImageLayout] | None]:
+        """The colour image of each depth image by header stamp, None where none is near."""
+        if colour_topic is None:
+            if not colour:
+                notes.append("no colour images: frames have no colour")
+            return [None] * len(images)
+        others = one_per_stamp(colour_topic, colour[colour_topic], notes)
+        columns = nearest_pairs(_stamps(images), _stamps(others), self.max_difference_s)
+        without = int((columns < 0).sum())
+        if without:
+            hint = ": are they on another clock?" if without == len(images) else ""
+            limit = f"{self.max_difference_s:g} s by header stamp"
+            notes.append(f"{without} depth images of {topic} have no colour of {colour_topic} within {limit}{hint}")
+        if others[0].frame_id != images[0].frame_id:
+            frames = f"{images[0].frame_id or 'no frame'}, colour in {others[0].frame_id or 'no frame'}"
+            notes.append(f"depth is in {frames}: colour is off by as much as these differ")
+        return [others[column] if column >= 0 else None for column in columns.tolist()]
+
+    def _cloud_frames(self, recording: Recording, notes: list[str]) -> tuple[list[Frame], str]:
+        topic = self._pick(recording.clouds, self.points_topic, "points_topic", notes)
+        clouds = one_per_stamp(topic, recording.clouds[topic], notes)
+        frames = [
+            Frame(row, cloud.stamp_s, read_points=partial(read_points, cloud.payload, cloud.layout))
+            for row, cloud in enumerate(clouds)
+        ]
+        return frames, _coordinate_frame(topic, clouds, notes)
+
+    def _colour_frames(self, recording: Recording, colour: ImageTopics, notes: list[str]) -> tuple[list[Frame], str]:
+        topic = self._pick(colour, self.colour_topic, "colour_topic", notes)
+        images = one_per_stamp(topic, colour[topic], notes)
+        camera = self._camera(recording, topic, images[0], notes)
+        notes.append(f"frames are the images of {topic} alone: there is neither depth nor a point cloud")
+        frames = [
+            Frame(
+                row,
+                image.stamp_s,
+                camera,
+                read_colour=partial(read_colour, image.payload, image.layout),
+                encoded_colour=_encoded_colour(image),
+            )
+            for row, image in enumerate(images)
+        ]
+        return frames, _coordinate_frame(topic, images, notes)
+
+    def _camera(self, recording: Recording, topic: str, image: Seen[ImageLayout], notes: list[str]) -> Camera | None:
+        if self.camera is not None:
+            return checked(Intrinsics(*self.camera), "option camera").camera(image.layout.size)
+        return find_camera(recording, topic, image, self.calibration_topic, notes)
+
+    def _pick(self, topics: Mapping[str, Sequence[object]], name: str, what: str, notes: list[str]) -> str:
+        if name:
+            return named_topic(topics, name, what)[0]
+        ranked = sorted(topics, key=lambda topic: (-len(topics[topic]), topic))
+        if len(ranked) > 1:
+            notes.append(f"{ranked[0]} taken, not {listed(ranked[1:])}: see option {what}")
+        return ranked[0]
+
+
+def _stamps(seen: Sequence[Seen[Layout]]) -> Floats:
+    return np.array([item.stamp_s for item in seen], float)
+
+
+def _encoded_colour(image: Seen[ImageLayout] | None) -> Callable[[], EncodedImage] | None:
+    if image is None or image.layout.coding == "raw":
+        return None
+    return partial(encoded_image, image.payload, image.layout)
+
+
+def _coordinate_frame(topic: str, seen: Sequence[Seen[Layout]], notes: list[str]) -> str:
+    """The coordinate frame that most messages of a topic are in."""
+    (frame, count), *others = Counter(item.frame_id for item in seen).most_common()
+    if others:
+        notes.append(f"{topic}: {len(seen) - count} messages are not in {frame}: their poses are taken as if they were")
+    return frame
+
+
+def _with_pose(frame: Frame, world_from_cam: Floats) -> Frame:
+    return replace(frame, world_from_cam=world_from_cam) if np.isfinite(world_from_cam).all() else frame
+
+
+def _topics(recording: Recording) -> str:
+    return listed([f"{topic} ({name})" for topic, name in sorted(recording.topics.items())])
+
+
+def _nothing(path: Path, recording: Recording, notes: list[str]) -> SourceError:
+    why = "".join(f"; {note}" for note in recording.complaints.notes())
+    remedy = "record depth images, point clouds or odometry"
+    if not recording.topics:
+        return SourceError(f"{path}: holds no message{why}: {remedy}")
+    return SourceError(f"{path}: no depth, clouds, images or poses in {_topics(recording)}{why}: {remedy}")

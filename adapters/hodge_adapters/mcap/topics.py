@@ -1,0 +1,173 @@
+"""Which topics are the depth, its colour and its calibration: by what they hold, or as the options name them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+from hodge_adapters.images.camera_files import fit_note
+from hodge_adapters.mcap.images import ImageLayout
+from hodge_adapters.mcap.recording import Calibration, Recording, Seen
+from hodge_adapters.text_rows import listed
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Camera
+
+Item = TypeVar("Item")
+ImageTopics = Mapping[str, Sequence[Seen[ImageLayout]]]
+
+_TRANSPORTS = ("/compressedDepth", "/compressed", "/raw", "/zstd", "/ffmpeg", "/theora")
+_PINHOLE_MODELS = frozenset(
+    (
+        "", "none", "pinhole", "plumb_bob", "rational_polynomial", "brown_conrady", "modified_brown_conrady",
+        "inverse_brown_conrady", "equidistant", "fisheye", "fisheye62", "kannala_brandt", "kannala_brandt4",
+    )
+)  # fmt: skip
+
+
+def named_topic(topics: Mapping[str, Item], name: str, what: str) -> tuple[str, Item]:
+    """The topic that an option names; raises `SourceError` that lists those there are."""
+    found = next((topic for topic in topics if topic.strip("/") == name.strip("/")), None)
+    if found is None:
+        raise SourceError(
+            f"option {what}: no messages on {name}: there are {listed(sorted(topics)) or 'no such topics'}"
+        )
+    return found, topics[found]
+
+
+def split_depth(images: ImageTopics, notes: list[str]) -> tuple[ImageTopics, ImageTopics]:
+    """(depth topics, colour topics): a topic is what most of its images are, and the others are left out."""
+    depth: dict[str, Sequence[Seen[ImageLayout]]] = {}
+    colour: dict[str, Sequence[Seen[ImageLayout]]] = {}
+    for topic, seen in images.items():
+        is_depth = sum(image.layout.is_depth for image in seen) * 2 >= len(seen)
+        size = Counter(image.layout.size for image in seen if image.layout.is_depth == is_depth).most_common(1)[0][0]
+        kept = [image for image in seen if image.layout.is_depth == is_depth and image.layout.size == size]
+        if len(kept) < len(seen):
+            notes.append(f"{topic}: {len(seen) - len(kept)} images of another size or kind than most left out")
+        (depth if is_depth else colour)[topic] = kept
+    return depth, colour
+
+
+def best_depth(depth: ImageTopics, colour: ImageTopics, notes: list[str]) -> str:
+    """The depth topic that lies on a colour image's grid, else the one with most images."""
+
+    def rank(topic: str) -> tuple[bool, int, bool, str]:
+        first = depth[topic][0]
+        registered = any(_shares_grid(first, other[0]) for other in colour.values())
+        return not registered, -len(depth[topic]), first.layout.coding == "rvl", topic
+
+    ranked = sorted(depth, key=rank)
+    if len(ranked) > 1:
+        notes.append(f"depth of {ranked[0]} taken, not of {listed(ranked[1:])}: see option depth_topic")
+    return ranked[0]
+
+
+def best_colour(colour: ImageTopics, depth_topic: str, first: Seen[ImageLayout], notes: list[str]) -> str | None:
+    """The colour topic on the same pixel grid as the depth; None, with a note, where there is none."""
+    fitting = [topic for topic in colour if colour[topic][0].layout.size == first.layout.size]
+    if not fitting:
+        if colour:
+            sizes = [f"{topic} {_size(colour[topic][0].layout)}" for topic in sorted(colour)]
+            notes.append(
+                f"no colour: depth is {_size(first.layout)}, there is {listed(sizes)}: record registered depth"
+            )
+        return None
+
+    def rank(topic: str) -> tuple[bool, bool, int, int, str]:
+        image = colour[topic][0]
+        grey = image.layout.encoding in ("mono8", "8UC1")
+        shared = len(_common_start(topic, depth_topic))
+        return image.frame_id != first.frame_id, grey, -shared, -len(colour[topic]), topic
+
+    ranked = sorted(fitting, key=rank)
+    if len(ranked) > 1:
+        notes.append(f"colour of {ranked[0]} taken, not of {listed(ranked[1:])}: see option colour_topic")
+    return ranked[0]
+
+
+def find_camera(
+    recording: Recording, topic: str, image: Seen[ImageLayout], calibration_topic: str, notes: list[str]
+) -> Camera | None:
+    """The camera of an image topic by its calibration; None, with notes, where none fits."""
+    known = recording.calibrations
+    if calibration_topic:
+        chosen, calibration = named_topic(known, calibration_topic, "calibration_topic")
+        return _camera(chosen, calibration, topic, image.layout, notes)
+    for name in sorted(known):
+        if known[name].model.lower() not in _PINHOLE_MODELS:
+            notes.append(f"{name}: calibration left out: its model {known[name].model!r} is no pinhole camera")
+    size = image.layout.size
+    fitting = {
+        name: calibration
+        for name, calibration in known.items()
+        if calibration.model.lower() in _PINHOLE_MODELS and (calibration.width, calibration.height) in (size, (0, 0))
+    }
+    if not fitting:
+        if known:
+            sizes = [f"{name} {known[name].width}x{known[name].height}" for name in sorted(known)]
+            notes.append(f"no calibration fits the {_size(image.layout)} images of {topic}: there is {listed(sizes)}")
+        return None
+
+    def rank(name: str) -> tuple[bool, bool, int, str]:
+        beside = name.rpartition("/")[0] == image_base(topic).rpartition("/")[0]
+        return not beside, fitting[name].frame_id != image.frame_id, -len(_common_start(name, topic)), name
+
+    chosen = min(fitting, key=rank)
+    return _camera(chosen, fitting[chosen], topic, image.layout, notes)
+
+
+def image_base(topic: str) -> str:
+    """The topic without the name of its transport: `/camera/depth/image` of `/camera/depth/image/compressedDepth`."""
+    return next((topic.removesuffix(end) for end in _TRANSPORTS if topic.endswith(end)), topic)
+
+
+def _camera(name: str, calibration: Calibration, topic: str, layout: ImageLayout, notes: list[str]) -> Camera:
+    p, k = calibration.p, calibration.k
+    is_rectified = "rect" in image_base(topic).rpartition("/")[2] and bool(p) and p[0] > 0 and p[5] != 0
+    fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if is_rectified else (k[0], k[4], k[2], k[5])
+    size = f"{calibration.width}x{calibration.height}"
+    if (calibration.width, calibration.height) not in (layout.size, (0, 0)):
+        raise SourceError(f"{name}: calibrates {size} images, those of {topic} are {_size(layout)}: give option camera")
+    camera = Camera(layout.width, layout.height, fx, fy, cx, cy)
+    notes.append(f"{topic}: intrinsics from {name}{' (rectified: P)' if is_rectified else ''}")
+    if calibration.is_distorted and not is_rectified:
+        notes.append(f"{name}: has lens distortion, which is not corrected: images are taken as undistorted")
+    notes.extend(filter(None, [fit_note(camera)]))
+    return camera
+
+
+def one_per_stamp(topic: str, seen: Sequence[Seen[Item]], notes: list[str]) -> list[Seen[Item]]:
+    """The images or clouds of a topic by stamp, the first of those with the same stamp.
+
+    A topic whose stamps are all the same has none that mean anything: there the log's time is taken.
+    """
+    if len(seen) > 1 and len({item.stamp_s for item in seen}) == 1:
+        notes.append(f"{topic}: all {len(seen)} messages have the stamp {seen[0].stamp_s:.9g} s: log time is taken")
+        seen = [replace(item, stamp_s=item.log_s) for item in seen]
+    first: dict[float, Seen[Item]] = {}
+    for item in seen:
+        first.setdefault(item.stamp_s, item)
+    if len(first) < len(seen):
+        notes.append(f"{topic}: {len(seen) - len(first)} messages with the stamp of an earlier one left out")
+    return [first[stamp] for stamp in sorted(first)]
+
+
+def _shares_grid(a: Seen[ImageLayout], b: Seen[ImageLayout]) -> bool:
+    return a.frame_id == b.frame_id and a.layout.size == b.layout.size
+
+
+def _size(layout: ImageLayout) -> str:
+    return f"{layout.width}x{layout.height}"
+
+
+def _common_start(a: str, b: str) -> list[str]:
+    """The leading parts that two topics share."""
+    pairs = zip(a.strip("/").split("/"), b.strip("/").split("/"), strict=False)
+    shared: list[str] = []
+    for one, other in pairs:
+        if one != other:
+            break
+        shared.append(one)
+    return shared

@@ -1,0 +1,1 @@
+"""Pose graphs: g2o, TORO, and logs of pairs."""

@@ -1,0 +1,306 @@
+"""g2o pose graphs, 2-D and 3-D: vertices, edges, FIX, 64-bit keys. Its conventions are met here and nowhere else.
+
+A g2o information matrix is over (translation, q_vec): half an angle. Ours is over (rotation, translation) in radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass as stage
+
+from hodge_adapters.pose_graphs import g2o_priors
+from hodge_adapters.pose_graphs.text import LANDMARK_TAGS, Records, count_tags, read_records, write_lines
+from hodge_adapters.posed import length_notes, written
+from hodge_adapters.text_rows import write_text_atomically
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.stages import Sniff
+from hodge_pipeline.types import Floats, Ints, Source, Trajectory, ViewGraph
+
+HALF_ANGLE = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
+"""d(q_vec, t) / d(φ, ρ) at the identity."""
+PLANAR_TWIST = np.array([3, 4, 2])
+"""Where (x, y, θ) lie in (φ, ρ)."""
+SKIPPED_TAGS_SHOWN = 5
+
+
+def upper_triangle(values: Floats, size: int) -> Floats:
+    """Symmetric matrices (N, size, size) of their upper triangles (N, size (size + 1) / 2), row by row."""
+    rows, columns = np.triu_indices(size)
+    out = np.zeros((len(values), size, size))
+    out[:, rows, columns] = out[:, columns, rows] = values
+    return out
+
+
+def information_of_file(information: Floats) -> Floats:
+    """Matrices over ξ = (φ, ρ) (E, 6, 6) of a g2o file's over (t, q_vec): q_vec = φ / 2."""
+    swapped = np.roll(information, (3, 3), axis=(-2, -1))
+    return np.asarray(swapped * np.outer(HALF_ANGLE, HALF_ANGLE))
+
+
+def information_for_file(information: Floats) -> Floats:
+    """A g2o file's matrices over (t, q_vec) (E, 6, 6) of ours over ξ = (φ, ρ)."""
+    return np.roll(information / np.outer(HALF_ANGLE, HALF_ANGLE), (-3, -3), axis=(-2, -1))
+
+
+def lift_poses(poses: Floats) -> Floats:
+    """Motions (N, 4, 4) about z of planar poses (N, 3) = (x, y, θ)."""
+    rotation = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    rotation[:, 0, 0] = rotation[:, 1, 1] = cosine
+    rotation[:, 1, 0], rotation[:, 0, 1] = sine, -sine
+    return se3.from_parts(rotation, np.pad(poses[:, :2], ((0, 0), (0, 1))))
+
+
+def flatten_poses(motions: Floats) -> Floats:
+    """Planar poses (N, 3) = (x, y, θ) of motions about z (N, 4, 4)."""
+    angle = np.arctan2(motions[:, 1, 0], motions[:, 0, 0])
+    return np.column_stack([motions[:, :2, 3], angle])
+
+
+def lift_information(information: Floats) -> Floats:
+    """6x6 matrices over (φ, ρ) of planar ones (E, 3, 3) over (x, y, θ), zero out of the plane."""
+    out = np.zeros((len(information), 6, 6))
+    out[:, PLANAR_TWIST[:, None], PLANAR_TWIST] = information
+    return out
+
+
+def spatial_poses(records: Records) -> Floats:
+    """Motions (N, 4, 4) of x y z qx qy qz qw; a zero quaternion is refused with its line."""
+    quat = records.values[:, 3:7]
+    records.refuse(np.linalg.norm(quat, axis=1) < 1e-9, "its quaternion is zero")
+    return se3.from_quat_xyzw(records.values[:, :3], quat)
+
+
+@dataclass(frozen=True)
+class Half:
+    """The vertices and edges of one dimension."""
+
+    vertex_keys: Ints
+    poses: Floats
+    edge_keys: Ints
+    motions: Floats
+    information: Floats
+    prior_keys: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    prior_poses: Floats = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    prior_information: Floats = field(default_factory=lambda: np.zeros((0, 6, 6)))
+
+
+def _spatial(records: dict[str, Records]) -> Half:
+    vertices, edges = records["VERTEX_SE3:QUAT"], records["EDGE_SE3:QUAT"]
+    information = information_of_file(upper_triangle(edges.values[:, 7:], 6))
+    poses, motions = spatial_poses(vertices), spatial_poses(edges)
+    plain, levered = records[g2o_priors.SPATIAL], records[g2o_priors.SPATIAL_OFFSET]
+    parameters = records[g2o_priors.OFFSET]
+    offsets = g2o_priors.offsets_of(levered, parameters, spatial_poses(parameters))
+    known = [information_of_file(upper_triangle(prior.values[:, 7:], 6)) for prior in (plain, levered)]
+    moved, moved_information = g2o_priors.moved_to_body(spatial_poses(levered), known[1], offsets)
+    return Half(
+        vertices.keys[:, 0],
+        poses,
+        edges.keys,
+        motions,
+        information,
+        np.concatenate([plain.keys[:, 0], levered.keys[:, 0]]),
+        np.concatenate([spatial_poses(plain), moved]),
+        np.concatenate([known[0], moved_information]),
+    )
+
+
+def _planar(records: dict[str, Records]) -> Half:
+    vertices, edges = records["VERTEX_SE2"], records["EDGE_SE2"]
+    information = lift_information(upper_triangle(edges.values[:, 3:], 3))
+    poses, motions = lift_poses(vertices.values), lift_poses(edges.values[:, :3])
+    whole, position = records[g2o_priors.PLANAR], records[g2o_priors.PLANAR_POSITION]
+    anywhere = np.pad(position.values[:, :2], ((0, 0), (0, 1)))
+    on_position = np.pad(upper_triangle(position.values[:, 2:], 2), ((0, 0), (0, 1), (0, 1)))
+    return Half(
+        vertices.keys[:, 0],
+        poses,
+        edges.keys,
+        motions,
+        information,
+        np.concatenate([whole.keys[:, 0], position.keys[:, 0]]),
+        lift_poses(np.concatenate([whole.values[:, :3], anywhere])),
+        lift_information(np.concatenate([upper_triangle(whole.values[:, 3:], 3), on_position])),
+    )
+
+
+def rows_of_keys(path: Path, vertex_keys: Ints, edge_keys: Ints) -> tuple[Ints, Ints]:
+    """The vertex ids in the file's order, then those that only edges name, and the edges as rows of them (E, 2)."""
+    if len(np.unique(vertex_keys)) != len(vertex_keys):
+        keys, counts = np.unique(vertex_keys, return_counts=True)
+        raise SourceError(f"{path}: vertex {keys[counts > 1][0]} is given twice: remove one of its lines")
+    every = np.concatenate([vertex_keys, edge_keys.reshape(-1)])
+    unique, first, inverse = np.unique(every, return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")
+    rank = np.empty(len(unique), np.int64)
+    rank[order] = np.arange(len(unique))
+    return unique[order], rank[inverse.reshape(-1)[len(vertex_keys) :]].reshape(-1, 2)
+
+
+def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: int, notes: list[str]) -> Source:
+    """What the file holds: the graph, and the vertex poses as a trajectory whose stamps are row numbers, where every
+    vertex has one; notes what was incomplete.
+    """
+    ids, edges = rows_of_keys(path, half.vertex_keys, half.edge_keys)
+    named = len(half.vertex_keys)
+    if 0 < named < len(ids):
+        notes.append(f"{len(ids) - named} of {len(ids)} vertices are named by edges only: no initial poses")
+    fixed = np.flatnonzero(np.isin(ids, fixed_keys)).astype(np.int64)
+    if len(fixed):
+        notes.append(f"{len(fixed)} vertices are marked FIX")
+    motions, information = half.motions, half.information
+    if count := int((edges[:, 0] == edges[:, 1]).sum()):
+        notes.append(f"{count} edges join a vertex to itself: they say nothing of poses")
+    graph = ViewGraph.from_edges(ids, edges, motions, information, kind, dimension=dimension, fixed=fixed)
+    priors = g2o_priors.as_priors(half.prior_keys, half.prior_poses, half.prior_information, ids, str(path))
+    if priors is not None:
+        notes.append(f"{len(priors.vertices)} priors of single vertices are read")
+        graph = replace(graph, priors=priors)
+    trajectory = Trajectory(np.arange(named, dtype=float), half.poses) if named == len(ids) else None
+    return Source(path.stem, path, trajectory=trajectory, graph=graph, notes=tuple(notes), files=(path,))
+
+
+def skipped(other: dict[str, int]) -> list[str]:
+    """A note for each kind of line that is not read, with its count."""
+    shown = sorted(other.items(), key=lambda item: -item[1])
+    notes = [f"{count} lines of kind {tag} are not read{_meaning(tag)}" for tag, count in shown[:SKIPPED_TAGS_SHOWN]]
+    if len(shown) > SKIPPED_TAGS_SHOWN:
+        rest = shown[SKIPPED_TAGS_SHOWN:]
+        notes.append(f"{sum(count for _, count in rest)} lines of {len(rest)} more kinds are not read")
+    return notes
+
+
+def _meaning(tag: str) -> str:
+    return ": landmarks, where only edges between poses are solved" if tag in LANDMARK_TAGS else ""
+
+
+def refuse_landmarks_alone(path: Path, other: dict[str, int]) -> None:
+    """Raise `SourceError` for a file without poses that has landmarks."""
+    tags = sorted(LANDMARK_TAGS & set(other))
+    if tags:
+        raise SourceError(f"{path}: holds landmarks alone ({', '.join(tags)}): edges between poses are needed")
+
+
+KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1, **g2o_priors.KEYS}
+SPATIAL_TAGS = ("VERTEX_SE3:QUAT", g2o_priors.SPATIAL, g2o_priors.SPATIAL_OFFSET, g2o_priors.OFFSET)
+PLANAR_TAGS = ("VERTEX_SE2", g2o_priors.PLANAR, g2o_priors.PLANAR_POSITION)
+COLUMNS = {
+    "VERTEX_SE3:QUAT": (7,),
+    "EDGE_SE3:QUAT": (28,),
+    "VERTEX_SE2": (3,),
+    "EDGE_SE2": (9,),
+    "FIX": None,
+    **g2o_priors.COLUMNS,
+}
+
+
+def load_g2o(path: Path | str) -> Source:
+    """The pose graph of a g2o file, and its vertices as a trajectory where it has them all.
+
+    Raises `SourceError` with file and line where one is malformed.
+    """
+    path = Path(path)
+    records, other = read_records(path, KEYS, COLUMNS)
+    spatial, planar = len(records["EDGE_SE3:QUAT"]), len(records["EDGE_SE2"])
+    if spatial and planar:
+        raise SourceError(f"{path}: holds both EDGE_SE3:QUAT and EDGE_SE2: split it, one dimension to a file")
+    if not spatial and not planar and not len(records["VERTEX_SE3:QUAT"]) and not len(records["VERTEX_SE2"]):
+        refuse_landmarks_alone(path, other)
+        raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
+    more_planar = len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"])
+    dimension = 2 if planar or (not spatial and more_planar) else 3
+    half = _planar(records) if dimension == 2 else _spatial(records)
+    strange = {tag: len(records[tag]) for tag in (SPATIAL_TAGS if dimension == 2 else PLANAR_TAGS) if len(records[tag])}
+    notes = skipped({**other, **strange})
+    for tag, what in (("VERTEX_SE3:QUAT", "vertices"), ("EDGE_SE3:QUAT", "edges")):
+        notes += length_notes(records[tag].values[:, 3:7], what)
+    fixed_keys = records["FIX"].keys.reshape(-1)
+    absent = np.setdiff1d(fixed_keys, np.concatenate([half.vertex_keys, half.edge_keys.reshape(-1)]))
+    if len(absent):
+        if not any(tag.startswith("VERTEX") for tag in {**other, **strange}):
+            raise SourceError(
+                f"{path}: FIX names vertex {absent[0]}, which no vertex or edge line names: mend that line"
+            )
+        notes.append(f"{len(absent)} FIX lines name vertices that are not read, {absent[0]} first: ignored")
+    return as_source(path, half, "g2o", fixed_keys, dimension, notes)
+
+
+@stage(frozen=True, config=ConfigDict(extra="forbid"))
+class G2oReader:
+    """Opens a g2o file as a measured graph; 2-D graphs are lifted into the plane z = 0."""
+
+    def sniff(self, path: Path) -> Sniff:
+        """How sure it is: by the tags of the first lines."""
+        tags = count_tags(path)
+        known = [tag for tag in tags if tag in KEYS]
+        if known:
+            return Sniff(0.95, f"lines of kind {known[0]}")
+        landmarks = sorted(LANDMARK_TAGS & set(tags))
+        if landmarks:
+            return Sniff(0.5, f"landmarks: lines of kind {landmarks[0]}")
+        return Sniff(0.2 if path.suffix == ".g2o" else 0.0, "no g2o line at its beginning")
+
+    def open(self, path: Path) -> Source:
+        """The graph, and the vertices as a trajectory whose stamps are row numbers, where the file has them all."""
+        return load_g2o(path)
+
+
+def write_g2o(path: Path | str, graph: ViewGraph, world_from_vertex: Floats | None = None) -> None:
+    """One g2o file, written atomically: ids, order and values survive a round trip to the last bit of a float64.
+
+    A graph of dimension 2 becomes SE2 lines. Raises `SourceError` where ids are no integers.
+    """
+    dimension = graph.dimension
+    path = Path(path)
+    if not np.issubdtype(graph.vertex_ids.dtype, np.integer):
+        raise SourceError(f"{path}: g2o vertices need integer ids, not {graph.vertex_ids.dtype}: number them first")
+    ids = graph.vertex_ids.astype(np.int64)
+    lines: list[str] = []
+    vertex_tag, edge_tag = ("VERTEX_SE2", "EDGE_SE2") if dimension == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+    if world_from_vertex is not None:
+        write_lines(lines, vertex_tag, ids[:, None], _pose_columns(world_from_vertex, dimension))
+    write_lines(lines, "FIX", ids[graph.fixed][:, None], np.zeros((len(graph.fixed), 0)))
+    poses, information = _pose_columns(graph.i_from_j, dimension), _information_columns(graph.information, dimension)
+    write_lines(lines, edge_tag, ids[graph.edges], np.hstack([poses, information]))
+    if graph.priors is not None:
+        known = graph.priors
+        poses, information = _pose_columns(known.world_from_vertex, dimension), known.information
+        columns = _information_columns(information, dimension)
+        g2o_priors.write_priors(lines, dimension, ids[known.vertices], poses, columns)
+    write_text_atomically(path, "\n".join(lines) + "\n")
+
+
+@stage(frozen=True, config=ConfigDict(extra="forbid"))
+class G2oWriter:
+    """Writes a measured graph as g2o, 2-D or 3-D as it is, and the trajectory where it has a pose for each vertex."""
+
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
+        """One file, atomically; see `write_g2o`."""
+        if source.graph is None:
+            raise SourceError(f"{source.path}: has no graph to write: convert one that has edges")
+        poses = None if source.trajectory is None else source.trajectory.world_from_cam
+        complete = poses is not None and len(poses) == source.graph.vertex_count
+        write_g2o(path, source.graph, poses if complete else None)
+        graph = source.graph
+        return written(f"{graph.vertex_count} vertices, {graph.edge_count} edges", source, {"edges"})
+
+
+def _pose_columns(motions: Floats, dimension: int) -> Floats:
+    if dimension == 2:
+        return flatten_poses(motions)
+    return np.hstack([motions[:, :3, 3], se3.to_quat_xyzw(motions)]) if len(motions) else np.zeros((0, 7))
+
+
+def _information_columns(information: Floats, dimension: int) -> Floats:
+    if dimension == 2:
+        planar = information[:, PLANAR_TWIST[:, None], PLANAR_TWIST]
+        rows, columns = np.triu_indices(3)
+        return np.asarray(planar[:, rows, columns])
+    rows, columns = np.triu_indices(6)
+    return np.asarray(information_for_file(information)[:, rows, columns])

@@ -1,0 +1,201 @@
+"""7-Scenes, and 3DMatch's copies of it: `seq-01/frame-000000.{color,depth,pose}.*`, poses camera to world.
+
+Depth is uint16 millimetres, where both 0 and 65535 mean no depth. Depth and colour are, as the data set's authors say,
+not calibrated to each other: the depth camera's intrinsics are used for both, unless an option says otherwise.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field, field_validator
+from pydantic.dataclasses import dataclass
+
+from hodge_adapters.images import pixels
+from hodge_adapters.images.camera_files import Intrinsics, checked, fit_note, read_intrinsics
+from hodge_adapters.images.frames import image_frame
+from hodge_adapters.seven_scenes.colour_camera import KINECT_FOCAL, LIRIS, NOMINAL, ColourCamera, read_registered_colour
+from hodge_adapters.seven_scenes.files import (
+    FRAME_FILE,
+    FrameFiles,
+    packed_sequences,
+    read_poses,
+    sequence_folders,
+    sequence_number,
+    split_numbers,
+    with_depth,
+)
+from hodge_adapters.text_rows import listed
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.stages import Sniff
+from hodge_pipeline.types import Camera, Floats, Frame, Source, Trajectory
+
+UNITS_PER_METRE = 1000.0
+KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0, (640, 480))
+CAMERA_FILE = "camera-intrinsics.txt"
+IDENTITY = tuple(np.eye(4).ravel().tolist())
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SevenScenesReader:
+    """Reads a sequence folder (its frames inside) or a scene folder (sequences inside)."""
+
+    split: Literal["all", "train", "test"] = Field(
+        "all", description="which sequences of a scene: all, or those that TrainSplit.txt or TestSplit.txt lists"
+    )
+    sequences: tuple[str, ...] = Field((), description="names such as seq-01; empty: every sequence of the split")
+    every: int = Field(1, ge=1, description="take every n-th frame of each sequence")
+    intrinsics: tuple[float, float, float, float] | None = Field(
+        None,
+        description="fx fy cx cy in pixels; none: camera-intrinsics.txt in the folder or the one above it, "
+        "else 585 585 320 240, which the authors give for the depth camera",
+    )
+    no_depth: tuple[int, ...] = Field(
+        (0, 65535), description="stored values that mean no depth; 7-Scenes has 65535, its re-exports have 0 as well"
+    )
+    colour_camera: Literal["same", "kinect", "liris"] = Field(
+        "same",
+        description="where colour was seen from: same as depth, as if they were calibrated; kinect: 525 pixels and "
+        "2.5 cm beside, as the sensor is built; liris: a calibration of another Kinect that is much used for 7-Scenes. "
+        "On red kitchen the colour gradient at edges of depth is 1.3, 2.3 and 1.8 times that elsewhere",
+    )
+    colour_intrinsics: tuple[float, float, float, float] | None = Field(
+        None, description="fx fy cx cy of the colour camera, instead of those that colour_camera means"
+    )
+    colour_from_depth: tuple[float, ...] | None = Field(
+        None, description="4x4 by rows: depth's axes into the colour camera's, metres, instead of colour_camera's"
+    )
+
+    @field_validator("colour_from_depth")
+    @classmethod
+    def _check_motion(cls, values: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if values is not None and (len(values) != 16 or not se3.is_motion(np.reshape(values, (4, 4)))):
+            raise ValueError("expected the 16 numbers of a rigid motion")
+        return values
+
+    def sniff(self, path: Path) -> Sniff:
+        """Certain where a file named `frame-000000.depth.png` lies in the folder or in a sequence below it."""
+        try:
+            for folder in (path, *(folder for _, folder in sequence_folders(path))):
+                with os.scandir(folder) as entries:
+                    for entry in entries:
+                        match = FRAME_FILE.match(entry.name)
+                        if match and match[2].lower() == "depth":
+                            return Sniff(0.95, f"frame-*.depth.png in {folder.name}")
+        except (OSError, SourceError):
+            return Sniff(0.0, "not a folder that can be read")
+        packed = list(packed_sequences(path).values())
+        advice = f"its sequences are packed: unpack {listed(packed)} in it" if packed else ""
+        return Sniff(0.0, "no frame-000000.depth.png in it or in a folder seq-01", advice)
+
+    def open(self, path: Path) -> Source:
+        """The frames of all chosen sequences, in order; `frame_id` and `stamp_s` are the number in the file name.
+
+        With several sequences the id is `seq-01/000004`, and there is no trajectory, since stamps start again in each.
+        Frames without depth are left out, poses that are not finite or singular become None; `notes` count both.
+        """
+        path = Path(path)
+        notes: list[str] = []
+        usable = with_depth(path, self._chosen(path, notes), notes)
+        camera, camera_files = self._camera(path, usable, notes)
+        poses = read_poses(usable, notes)
+        several = len({files.sequence for files in usable}) > 1
+        taken = [row for row, files in enumerate(usable) if files.rank % self.every == 0]
+        return Source(
+            name=path.resolve().name,
+            path=path,
+            frames=tuple(self._frame(usable[row], camera, poses[row], several) for row in taken),
+            trajectory=None if several else _trajectory(usable, poses),
+            notes=tuple(notes),
+            files=(*camera_files, *(file for files in usable for file in sorted(files.paths.values()))),
+        )
+
+    def _chosen(self, path: Path, notes: list[str]) -> list[tuple[str, Path]]:
+        """Names and folders of the sequences to read; a folder without sequences is one itself."""
+        folders = sequence_folders(path)
+        if not folders:
+            if self.split != "all" or self.sequences:
+                raise SourceError(f"{path}: no sequences to choose from: give the scene's folder, with seq-01 in it")
+            return [(path.resolve().name, path)]
+        numbers = {name: sequence_number(name, str(path)) for name, _ in folders}
+        packed = packed_sequences(path)
+        by_name = {sequence_number(name, "the option sequences") for name in self.sequences}
+        by_split = split_numbers(path, self.split) if self.split != "all" else set()
+        absent = sorted((by_name | by_split) - set(numbers.values()) - set(packed))
+        if absent:
+            notes.append(f"sequences asked for but not there: {listed([f'seq-{number:02d}' for number in absent])}")
+        left = [name for number, name in packed.items() if number in (by_name or by_split or packed)]
+        if left:
+            notes.append(f"sequences that are still packed left out: {listed(left)}")
+        for wanted in filter(None, (by_name, by_split)):
+            folders = [(name, folder) for name, folder in folders if numbers[name] in wanted]
+        if not folders:
+            raise SourceError(
+                f"{path}: none of the sequences asked for is there: change the options split and sequences"
+            )
+        return folders
+
+    def _camera(self, path: Path, usable: Sequence[FrameFiles], notes: list[str]) -> tuple[Camera, tuple[Path, ...]]:
+        beside = [folder / CAMERA_FILE for folder in (path, path.resolve().parent) if (folder / CAMERA_FILE).is_file()]
+        if self.intrinsics:
+            beside, found = [], checked(Intrinsics(*self.intrinsics), "option intrinsics")
+        elif beside:
+            found = read_intrinsics(beside[0])
+        else:
+            found = KINECT
+            notes.append(f"no {CAMERA_FILE}: the depth camera's published 585 585 320 240 is used")
+        camera = found.camera(found.size or pixels.common_size([files.paths["depth"] for files in usable]))
+        notes.extend(filter(None, [fit_note(camera)]))
+        return camera, tuple(beside[:1])
+
+    def _frame(self, files: FrameFiles, camera: Camera, pose: Floats, several: bool) -> Frame:
+        frame = image_frame(
+            f"{files.sequence}/{files.number:06d}" if several else files.number,
+            files.number,
+            camera,
+            files.paths["depth"],
+            files.paths.get("color"),
+            units_per_metre=UNITS_PER_METRE,
+            no_depth=self.no_depth,
+            world_from_cam=pose,
+            is_true=True,
+            sequence=files.sequence,
+        )
+        colour = self._colour(camera)
+        if colour is None or "color" not in files.paths:
+            return frame
+        read = partial(
+            read_registered_colour,
+            files.paths["color"],
+            colour=colour,
+            depth_path=files.paths["depth"],
+            camera=camera,
+            units_per_metre=UNITS_PER_METRE,
+            no_depth=self.no_depth,
+        )
+        return replace(frame, read_colour=read, encoded_colour=None, image=None)
+
+    def _colour(self, camera: Camera) -> ColourCamera | None:
+        """The colour camera, None where it is taken to be the depth camera."""
+        if self.colour_camera == "same" and self.colour_from_depth is None and self.colour_intrinsics is None:
+            return None
+        fx, fy, cx, cy = self.colour_intrinsics or (
+            (camera.fx, camera.fy, camera.cx, camera.cy)
+            if self.colour_camera == "same"
+            else (KINECT_FOCAL, KINECT_FOCAL, camera.cx, camera.cy)
+        )
+        motion = self.colour_from_depth or {"kinect": NOMINAL, "liris": LIRIS, "same": IDENTITY}[self.colour_camera]
+        return ColourCamera(Camera(camera.width, camera.height, fx, fy, cx, cy), motion)
+
+
+def _trajectory(usable: Sequence[FrameFiles], poses: Floats) -> Trajectory | None:
+    good = np.isfinite(poses).all(axis=(1, 2))
+    stamps = np.array([files.number for files in usable], np.float64)
+    return Trajectory(stamps[good], poses[good]) if good.any() else None

@@ -1,0 +1,145 @@
+"""Trajectories as text: TUM (`stamp tx ty tz qx qy qz qw`) and KITTI (twelve numbers, the top of a 4x4 matrix)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass as plain_dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
+
+from hodge_adapters.posed import length_notes, trajectory_of, written
+from hodge_adapters.text_rows import Row, listed, read_rows, to_floats, write_text_atomically
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats, Source, Trajectory
+
+COLUMNS = (8, 9)
+"""Of a line of TUM's: RTAB-Map adds the number of the node."""
+
+
+@plain_dataclass(frozen=True)
+class ParsedTrajectory:
+    """A trajectory, and what had to be left out or put in order to read it, one line each."""
+
+    trajectory: Trajectory
+    notes: tuple[str, ...] = ()
+
+
+def parse_tum(path: Path) -> ParsedTrajectory:
+    """The trajectory in a TUM file, ascending by stamp; of poses with the same stamp the first is kept.
+
+    Lines that are no pose are left out and noted. Raises `SourceError` where no pose is left.
+    """
+    table, bad = _tum_table(read_rows(path))
+    if not len(table):
+        raise _unreadable(path, bad, "stamp tx ty tz qx qy qz qw")
+    parsed = ordered(table)
+    notes = [f"{path.name}: {note}" for note in parsed.notes]
+    if bad:
+        notes.append(f"{path.name}: {len(bad)} lines that are no pose left out: {listed([r.line for r in bad])}")
+    return ParsedTrajectory(parsed.trajectory, tuple(notes))
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """One line a pose, `stamp tx ty tz qx qy qz qw`, every number with the digits that restore it exactly."""
+    poses = trajectory.world_from_cam
+    table = np.column_stack([trajectory.stamps_s, poses[:, :3, 3], se3.to_quat_xyzw(poses)])
+    write_text_atomically(path, "# stamp tx ty tz qx qy qz qw\n" + _lines(table))
+
+
+def read_kitti(path: Path, times: Path | None = None) -> Trajectory:
+    """The trajectory in a KITTI file; its stamps are the row numbers, or those of a file with one stamp a line.
+
+    Rotations are projected to SO(3) (the files hold few digits). Raises `SourceError` with `file:line`.
+    """
+    rows = read_rows(path)
+    numbers = [to_floats(row.fields) for row in rows]
+    bad = [row for row, values in zip(rows, numbers, strict=True) if not values or len(values) != 12]
+    if bad or not rows:
+        raise _unreadable(path, bad, "twelve numbers, the first three rows of a 4x4 matrix")
+    poses = np.zeros((len(rows), 4, 4))
+    poses[:, :3] = np.array(numbers).reshape(-1, 3, 4)
+    poses[:, 3, 3] = 1.0
+    wrong = np.flatnonzero(~se3.is_motion(poses))
+    if len(wrong):
+        raise SourceError(f"{path}:{rows[wrong[0]].line}: not a rigid motion: is this a KITTI pose file?")
+    poses[:, :3, :3] = se3.project_to_so3(poses[:, :3, :3])
+    return Trajectory(_read_times(times, len(rows)) if times else np.arange(len(rows), dtype=float), poses)
+
+
+def write_kitti(path: Path, trajectory: Trajectory) -> None:
+    """One line a pose, twelve numbers. The stamps are lost: KITTI keeps them in another file."""
+    write_text_atomically(path, _lines(trajectory.world_from_cam[:, :3].reshape(-1, 12)))
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class TumWriter:
+    """Writes a trajectory as TUM text."""
+
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
+        """One file, atomically; see `write_tum`."""
+        trajectory = trajectory_of(source)
+        write_tum(path, trajectory)
+        return written(f"{len(trajectory)} poses", source, {"stamps"})
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class KittiWriter:
+    """Writes a trajectory as KITTI text."""
+
+    def write(self, path: Path, source: Source) -> tuple[str, ...]:
+        """One file, atomically; see `write_kitti`."""
+        trajectory = trajectory_of(source)
+        write_kitti(path, trajectory)
+        return written(f"{len(trajectory)} poses", source)
+
+
+def _lines(table: Floats) -> str:
+    # repr is the shortest text that reads back as the same double; adding 0 turns -0.0 into 0.0.
+    return "".join(" ".join(map(repr, row)) + "\n" for row in (table + 0.0).tolist())
+
+
+def _tum_table(rows: Sequence[Row]) -> tuple[Floats, list[Row]]:
+    """The poses (N, 8) in the file's order, and the rows that are none."""
+    good: list[list[float]] = []
+    bad: list[Row] = []
+    for row in rows:
+        values = to_floats(row.fields) or []
+        sound = len(values) in COLUMNS and all(map(math.isfinite, values))
+        if sound and 1e-100 < math.hypot(*values[4:8]) < 1e100:  # beyond these the square is no normal number
+            good.append(values[:8])
+        else:
+            bad.append(row)
+    return np.array(good, np.float64).reshape(-1, 8), bad
+
+
+def ordered(table: Floats) -> ParsedTrajectory:
+    """The trajectory of rows (N, 8) `stamp tx ty tz qx qy qz qw`, ascending; of equal stamps the first is kept."""
+    stamps, first = np.unique(table[:, 0], return_index=True)
+    notes = []
+    if len(stamps) < len(table):
+        notes.append(f"{len(table) - len(stamps)} poses with the stamp of an earlier one left out")
+    if (np.diff(table[:, 0]) < 0).any():
+        notes.append("poses were not in order of time: sorted")
+    notes += length_notes(table[:, 4:], "poses")
+    poses = se3.from_quat_xyzw(table[first, 1:4], table[first, 4:])
+    return ParsedTrajectory(Trajectory(stamps, poses), tuple(notes))
+
+
+def _read_times(path: Path, count: int) -> Floats:
+    rows = read_rows(path)
+    values = [to_floats(row.fields[:1]) for row in rows]
+    stamps = np.array([value[0] for value in values if value])
+    if len(stamps) != count or not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
+        raise SourceError(f"{path}: {len(stamps)} stamps for {count} poses, or not ascending: give one stamp a pose")
+    return stamps
+
+
+def _unreadable(path: Path, bad: Sequence[Row], expected: str) -> SourceError:
+    if not bad:
+        return SourceError(f"{path}: no pose in it: expected lines of {expected}")
+    return SourceError(f"{path}:{bad[0].line}: `{' '.join(bad[0].fields)[:80]}` is no pose: expected {expected}")

@@ -1,0 +1,1 @@
+"""TUM RGB-D sequences."""

@@ -1,0 +1,155 @@
+"""Which of several known cameras took a sequence: that under which its frames agree best on how the camera moved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hodge_adapters.images import pixels
+from hodge_adapters.images.camera_files import Intrinsics
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Bools, Bytes, Floats, Floats32
+
+PAIRS, SPAN_S, HOPS = 24, 0.35, 3
+"""Pairs of frames, evenly over the sequence; how far apart, followed over so many frames between them."""
+CORNERS, CORNER_QUALITY, CORNERS_APART_PX, BACKWARD_PX = 400, 0.005, 8.0, 0.7
+FEWEST_CORNERS, FEWEST_PAIRS = 60, 6
+RANGE_M, EDGE_STEP = (0.3, 5.0), 0.03
+LARGEST_PX, FOCAL_PX = 3.0, 525.0
+"""An error counts as this at most; errors of all cameras are measured in pixels of one focal length."""
+SURE = 2.5
+"""Standard errors of the mean over the pairs by which a camera must fit better."""
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Corners in two frames: pixels (n, 2), and depths (n,) in metres, NaN where there is none that is sound."""
+
+    first: Floats32
+    first_m: Floats
+    second: Floats32
+    second_m: Floats
+
+
+def fitting(
+    cameras: Mapping[str, Intrinsics],
+    standard: str,
+    depth: Sequence[Path],
+    colour: Sequence[Path | None],
+    stamps_s: Floats,
+    units_per_metre: float,
+) -> dict[str, float]:
+    """By how much (0.05: 5 %) each camera that surely fits better than the `standard` one does, the best first."""
+    found = [
+        [_misfit(camera, pair) for camera in cameras.values()]
+        for pair in _pairs(depth, colour, stamps_s, units_per_metre)
+    ]
+    errors = np.array(found).reshape(-1, len(cameras))
+    errors = np.log(errors[np.isfinite(errors).all(axis=1)])
+    if len(errors) < FEWEST_PAIRS:
+        return {}
+    names = list(cameras)
+    gain = errors[:, [names.index(standard)]] - errors
+    better = [k for k in range(len(names)) if _surely_positive(gain[:, k])]
+    better.sort(key=lambda k: -float(gain[:, k].mean()))
+    return {names[k]: float(-np.expm1(-gain[:, k].mean())) for k in better}
+
+
+def _surely_positive(values: Floats) -> bool:
+    return bool(values.mean() > SURE * values.std() / np.sqrt(len(values)))
+
+
+def _pairs(
+    depth: Sequence[Path], colour: Sequence[Path | None], stamps_s: Floats, units_per_metre: float
+) -> Iterator[Followed]:
+    usual_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 0.0
+    reach = int(np.clip(round(SPAN_S / usual_s), 1, 30)) if 0 < usual_s < 1 else 1
+    last = len(stamps_s) - 1 - reach
+    for first in np.unique(np.linspace(0, last, PAIRS).astype(int)).tolist() if last >= 0 else []:
+        between = np.unique(np.linspace(first, first + reach, HOPS + 1).astype(int)).tolist()
+        try:
+            followed = _followed(
+                [_grey(colour[row]) for row in between],
+                [pixels.read_depth(depth[row], units_per_metre=units_per_metre) for row in (first, between[-1])],
+            )
+        except (SourceError, OSError):
+            continue
+        if followed is not None:
+            yield followed
+
+
+def _grey(path: Path | None) -> Bytes:
+    if path is None:
+        raise SourceError("a depth image without a colour image")
+    return np.asarray(cv2.cvtColor(pixels.read_colour(path), cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def _followed(greys: Sequence[Bytes], depths: Sequence[Floats32]) -> Followed | None:
+    """Corners of the first image followed from image to image; None where few arrive."""
+    found = cv2.goodFeaturesToTrack(greys[0], CORNERS, CORNER_QUALITY, CORNERS_APART_PX)
+    if found is None:
+        return None
+    first = np.asarray(found, np.float32).reshape(-1, 2)
+    now, arrives = first, np.ones(len(first), bool)
+    for one, other in zip(greys[:-1], greys[1:], strict=True):
+        ends, there = _flow(one, other, now)
+        back, here = _flow(other, one, ends)
+        arrives &= there & here & (np.abs(back - now) < BACKWARD_PX).all(axis=1)
+        now = ends
+    if arrives.sum() < FEWEST_CORNERS:
+        return None
+    first, now = first[arrives], now[arrives]
+    return Followed(first, _depth_at(depths[0], first), now, _depth_at(depths[1], now))
+
+
+def _flow(one: Bytes, other: Bytes, pixels: Floats32) -> tuple[Floats32, Bools]:
+    start = pixels[:, None].copy()
+    ends, status, _ = cv2.calcOpticalFlowPyrLK(one, other, pixels[:, None], start, winSize=(21, 21), maxLevel=4)
+    return np.asarray(ends, np.float32).reshape(-1, 2), np.asarray(status).reshape(-1) == 1
+
+
+def _depth_at(depth: Floats32, pixels: Floats32) -> Floats:
+    u, v = np.clip(np.round(pixels).astype(int), 1, np.array(depth.shape[::-1]) - 2).T
+    window = np.stack([depth[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)], axis=1).astype(float)
+    middle, low, high = np.median(window, axis=1), window.min(axis=1), window.max(axis=1)
+    sound = (low >= RANGE_M[0]) & (high <= RANGE_M[1]) & (high - low <= EDGE_STEP * middle)
+    return np.where(sound, middle, np.nan)
+
+
+def _misfit(camera: Intrinsics, pair: Followed) -> float:
+    """RMS error in pixels of the corners under the best rigid motion, from either frame; NaN where there is none."""
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    lens = np.array(camera.distortion or np.zeros(5))
+    first, second = (
+        np.asarray(cv2.undistortPoints(pixels[:, None].astype(float), matrix, lens), float).reshape(-1, 2)
+        for pixels in (pair.first, pair.second)
+    )
+    errors = [_motion_error(first, pair.first_m, second), _motion_error(second, pair.second_m, first)]
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def _motion_error(slopes: Floats, depth_m: Floats, seen: Floats) -> float:
+    known = np.isfinite(depth_m)
+    if known.sum() < FEWEST_CORNERS // 2:
+        return float("nan")
+    points = np.column_stack([slopes[known], np.ones(known.sum())]) * depth_m[known, None]
+    seen, eye = seen[known], np.eye(3)
+    found, turn, shift, inliers = cv2.solvePnPRansac(
+        points, seen, eye, None, iterationsCount=300, reprojectionError=LARGEST_PX / FOCAL_PX, flags=cv2.SOLVEPNP_EPNP
+    )
+    if not found or inliers is None:
+        return float("nan")
+    rows = inliers.ravel()
+    errors = np.zeros(0)
+    for _ in range(3):
+        if len(rows) < FEWEST_CORNERS // 3:
+            return float("nan")
+        turn, shift = cv2.solvePnPRefineLM(points[rows], seen[rows], eye, None, turn, shift)
+        projected = cv2.projectPoints(points, turn, shift, eye, None)[0].reshape(-1, 2)
+        errors = FOCAL_PX * np.linalg.norm(projected - seen, axis=1)
+        rows = np.flatnonzero(errors < LARGEST_PX)
+    return float(np.sqrt(np.mean(np.minimum(errors, LARGEST_PX) ** 2)))
