@@ -30,9 +30,10 @@ from peers import g2o_seconds, gnc_weights, gtsam_seconds
 from pose_graphs import SHAPES, synthetic, with_wrong_edges
 
 from hodge_adapters.pose_graphs.g2o import information_for_file, load_g2o, write_g2o
+from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.solvers.robust import solve_robust
-from hodge_pipeline.solvers.setup import relative_gradient
+from hodge_pipeline.solvers.objective import gradient, residuals
+from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import Solution, ViewGraph
 
 CERTIFIED_OPTIMA = {
@@ -85,7 +86,7 @@ def row(task: tuple[str, str | int, int]) -> list[str]:
             isotropic = graph if graph.dimension == 2 else dataclasses.replace(graph, information=raw)
         plain_s, plain = timed(lambda: solve(isotropic, objective="isotropic"), repeats)
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-        gradient = relative_gradient(isotropic, plain.world_from_cam)
+        slope = relative_gradient(isotropic, plain.world_from_cam)
         certified_s, certified = None, plain
         if graph.vertex_count <= MOST_CERTIFIED:
             certified_s, certified = timed(lambda: solve(isotropic, objective="isotropic", certificate=True), repeats)
@@ -105,7 +106,7 @@ def row(task: tuple[str, str | int, int]) -> list[str]:
         "" if optimum is None else f"{cost / optimum - 1:+.1e}",
         f"{plain_s.cpu_s:.3f}",
         f"{plain_s.wall_s:.3f}",
-        f"{gradient:.0e}",
+        f"{slope:.0e}",
         {True: "yes", False: "no"}.get(certified.certified, ""),
         seconds(certified_s),
         "" if full_s is None else chi2_cell(full),
@@ -127,6 +128,16 @@ def normalised(path: Path, folder: Path) -> Path:
     return copy
 
 
+def relative_gradient(graph: ViewGraph, world_from_cam: np.ndarray) -> float:
+    """The norm of F's gradient at these poses (V, 4, 4) over that at the start which `solve` would choose."""
+    setup = prepare(graph, world_from_cam)
+
+    def norm(rotations: np.ndarray, translations: np.ndarray) -> float:
+        return float(np.linalg.norm(gradient(setup.problem, residuals(setup.problem, rotations, translations))))
+
+    return norm(*setup.initial("given")) / max(norm(*setup.initial("chordal")), 1e-300)
+
+
 def seconds(times: Times | None) -> str:
     return "" if times is None else f"{times.cpu_s:.3f}"
 
@@ -145,7 +156,7 @@ def robust_rows(count: int, share: float) -> Iterator[list[str]]:
     """A cylinder with wrong edges: this solver, which trusts no edge, and GTSAM's GNC, which is told whom to trust."""
     graph, wrong = with_wrong_edges(synthetic("cylinder", count), share)
     own_s, solution = timed(lambda: solve_robust(graph), 1)
-    yield robust_row("robust", graph, wrong, solution.weights > 0.5, own_s)
+    yield robust_row("robust", graph, wrong, solution.weights > 0, own_s)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cylinder.g2o"
         write_g2o(path, graph)

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from hodge_pipeline.cli.console import ProgressBars
     from hodge_pipeline.diagnosis.diagnosis import diagnose
     from hodge_pipeline.diagnosis.result import Diagnosis
+    from hodge_pipeline.diagnosis.robust import solve_robust
     from hodge_pipeline.errors import HodgeError
     from hodge_pipeline.recipe.schema import Recipe, load_recipe
     from hodge_pipeline.refine.open3d_objects import solve_pose_graph
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
     from hodge_pipeline.solvers.editing import GraphEditor
     from hodge_pipeline.solvers.maximum_likelihood import solve
-    from hodge_pipeline.solvers.robust import solve_robust
     from hodge_pipeline.types import (
         Camera,
         Edges,
@@ -87,7 +87,7 @@ _NAMES_IN = {
     "solvers.covariance": ("marginal_covariances", "relative_covariances"),
     "solvers.editing": ("GraphEditor",),
     "solvers.maximum_likelihood": ("solve",),
-    "solvers.robust": ("solve_robust",),
+    "diagnosis.robust": ("solve_robust",),
     "uses.recipe_run": ("run", "solve_again"),
     "uses.sources": ("open_source",),
     "types": (

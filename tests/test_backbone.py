@@ -7,7 +7,7 @@ import pytest
 
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.solver import DiagnosedSolver
+from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone import inference
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
@@ -16,7 +16,6 @@ from hodge_pipeline.solvers.backbone.inference import left_out, uncertainty
 from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.solvers.robust import solve_robust
 from tests.backbone_graphs import WORLDS, broken, drive, spanned
 
 NEVER_WORSE = 1.02
@@ -118,7 +117,7 @@ def test_solvers_and_the_diagnosis_agree() -> None:
     made = drive()
     found = diagnose(made.graph)
     start = np.tile(np.eye(4), (made.graph.vertex_count, 1, 1))
-    for solution in (solve_robust(made.graph), DiagnosedSolver().solve(made.graph, start)):
+    for solution in (solve_robust(made.graph), RobustSolver().solve(made.graph, start)):
         np.testing.assert_array_equal(solution.weights > 0, found.kept)
         assert solution.confirmed
         assert made.error_m(solution.world_from_cam) < 1.1 * made.error_m(found.world_from_cam)

@@ -82,7 +82,7 @@ def test_the_exact_part_of_an_inexact_form_depends_on_the_metric() -> None:
     surface, rng = random_surface((complete(5), 5), 1), np.random.default_rng(1)
     omega = rng.normal(size=(len(surface.edges), 6))
     unit = decomposed(surface, omega, cotangent_weights(surface)).exact
-    stretched = decomposed(surface, omega, cotangent_weights(surface, rng.uniform(0.9, 1.1, len(surface.edges)))).exact
+    stretched = decomposed(surface, omega, rng.uniform(0.5, 0.7, len(surface.edges))).exact
     assert np.abs(unit - stretched).max() > 1e-2
 
 
@@ -101,7 +101,7 @@ def test_a_form_is_told_by_its_loops_on_the_torus() -> None:
     omega[:16, 3] = 0.1
     whole = surface_form(surface, omega)
     parts = decomposed(surface, whole, cotangent_weights(surface))
-    shares = parts.shares()
+    shares = parts.energies().shares
     assert shares["harmonic"][1] == pytest.approx(1.0)
     assert shares["exact"] == pytest.approx((0.0, 0.0))
     around = homology_generators(embed(torus_grid(4), 16, torus_rotation(4))).incidence(32) @ omega
@@ -115,8 +115,7 @@ def test_a_square_that_does_not_close_is_harmonic_and_a_filled_one_is_curl() -> 
     parts = hodge_decomposition(square.coboundary(0), square.coboundary(1), omega, np.ones(4))
     # around 0→1→2→3→0: 1 + 1 + 3 − 1 = 4, shared equally
     np.testing.assert_allclose(np.abs(parts.harmonic[:, 3]), 1.0)
-    assert parts.energies()["harmonic"] == pytest.approx((0.0, 4.0))
-    assert parts.energies()["total"] == pytest.approx((0.0, 12.0))
+    assert parts.energies().harmonic == pytest.approx((0.0, 4.0))
     filled = flag_complex(TWO_TRIANGLES, 4)
     omega = np.array([[1.0], [0.0], [0.0], [1.0], [1.0]])
     parts = hodge_decomposition(filled.coboundary(0), filled.coboundary(1), omega, np.ones(5))
@@ -130,18 +129,6 @@ def test_unit_lengths_give_one_over_root_three_everywhere() -> None:
     np.testing.assert_allclose(cotangent_weights(surface), 1 / np.sqrt(3))
 
 
-def test_cotangents_of_a_right_triangle() -> None:
-    """Sides 1, 1, √2 on both faces of a triangle: cot 45° = 1 for the legs, cot 90° = 0 for the hypotenuse."""
-    surface = random_surface((np.array([[0, 1], [1, 2], [0, 2]]), 3), 0)
-    np.testing.assert_allclose(
-        cotangent_weights(surface, np.array([1.0, 1.0, np.sqrt(2.0)])), [1.0, 1.0, 0.0], atol=1e-12
-    )
-    with pytest.raises(GraphError, match="does not close"):
-        cotangent_weights(surface, np.array([1.0, 1.0, 3.0]))
-    with pytest.raises(GraphError, match="3 edge lengths"):
-        cotangent_weights(surface, np.ones(2))
-
-
 def test_diagonals_take_the_shortest_path() -> None:
     """The ring 0→1→2→3→4→0 lies on a sphere between two cells, cut by diagonals from 0 and from 1."""
     ring = np.array([[0, 1], [1, 2], [2, 3], [3, 4], [4, 0]])
@@ -150,10 +137,6 @@ def test_diagonals_take_the_shortest_path() -> None:
     form = surface_form(surface, omega)
     found = {tuple(pair): value for pair, value in zip(surface.edges[5:].tolist(), form[5:, 0], strict=True)}
     assert found == {(0, 2): 11.0, (0, 3): -11000.0, (1, 4): -10001.0, (1, 3): 110.0}
-    # with the edge 0-1 very uncertain the way from 0 to 2 is the other one
-    lengths = np.array([9.0, 1.0, 1.0, 1.0, 1.0])
-    rows = np.flatnonzero((surface.edges[5:] == [0, 2]).all(axis=1)) + 5
-    np.testing.assert_allclose(surface_form(surface, omega, lengths)[rows], -11100.0)
 
 
 def test_self_loops_and_parallels_among_the_diagonals() -> None:
@@ -178,5 +161,3 @@ def test_numbers_that_cannot_be_used_are_named() -> None:
         decomposed(surface, np.zeros((len(surface.edges), 6)), weights)
     with pytest.raises(GraphError, match="embedded graph has 6 edges"):
         surface_form(surface, np.zeros((5, 6)))
-    with pytest.raises(GraphError, match="positive, finite length"):
-        surface_form(surface, np.zeros((6, 6)), np.zeros(6))

@@ -1,4 +1,4 @@
-"""Algorithm 1: rotation systems, cells, genus, triangulation; homology of the surface; connectivity."""
+"""Algorithm 1: rotation systems, cells, genus, triangulation; homology of the surface."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from scipy.sparse import vstack
 
 from betti import sparse_rank
 from complex_graphs import (
-    FIGURE_EIGHT,
-    SQUARE,
     TRIANGLE,
     complete,
     graphs,
@@ -20,7 +18,6 @@ from complex_graphs import (
     torus_rotation,
 )
 from hodge_pipeline.complex.coboundary import coboundary_0
-from hodge_pipeline.complex.connectivity import connectivity
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.embedding import Embedding, embed, triangulate
 from hodge_pipeline.complex.homology import homology_generators, motion_deviation
@@ -179,27 +176,3 @@ def test_motions_around_generators_are_measured_apart() -> None:
     translation, rotation = motion_deviation(loop_products(loops, motions))
     np.testing.assert_allclose(np.sort(translation), [0.3, 0.3])
     np.testing.assert_allclose(rotation, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("edges", "count", "bridges", "cuts", "least", "three"),
-    [
-        (TRIANGLE, 3, [], [], 2, False),
-        (SQUARE, 4, [], [], 2, False),
-        (FIGURE_EIGHT, 5, [], [0], 2, False),
-        (complete(4), 4, [], [], 3, True),
-        (torus_grid(3), 9, [], [], 4, True),
-        (np.array([[0, 1], [1, 2], [1, 2]]), 3, [0], [1], 1, False),
-        (np.array([[0, 1], [0, 0]]), 3, [0], [], 0, False),
-        # two K4 that share the edge 2-3: its ends cut the graph although no single vertex does
-        (np.vstack([complete(4), complete(4) + 2]), 6, [], [], 3, False),
-    ],
-)
-def test_connectivity_of_named_graphs(
-    edges: Ints, count: int, bridges: list[int], cuts: list[int], least: int, three: bool
-) -> None:
-    found = connectivity(edges, count)
-    assert found.bridges.tolist() == bridges
-    assert found.cut_vertices.tolist() == cuts
-    assert found.least_degree == least
-    assert found.three_connected is three

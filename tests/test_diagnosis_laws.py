@@ -15,10 +15,10 @@ from hodge_pipeline.complex.judging import chi2_by_information, left_over, mean_
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
+from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.diagnosis.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.wording import name_cycle
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.robust import solve_robust
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 QUICK = DiagnosisOptions()

@@ -13,7 +13,7 @@ from hodge_adapters.pose_graphs.pair_log import PairLogReader
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import UNTESTABLE
-from hodge_pipeline.diagnosis.solver import DiagnosedSolver
+from hodge_pipeline.diagnosis.robust import RobustSolver
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.types import Bools, ViewGraph
 
@@ -93,6 +93,6 @@ def test_wrong_loops_do_not_put_the_blame_on_what_drifted(
 
 def test_the_robust_solver_finds_the_poses_of_a_real_scene(data_dir: Path) -> None:
     graph, truth, right = estimates(data_dir, "7-scenes-redkitchen", "3dmatch")
-    solution = DiagnosedSolver().solve(graph, np.tile(np.eye(4), (graph.vertex_count, 1, 1)))
+    solution = RobustSolver().solve(graph, np.tile(np.eye(4), (graph.vertex_count, 1, 1)))
     assert pose_recall(truth, solution.world_from_cam, solution.component) >= 0.999
     assert (solution.weights[~right] > 0).mean() < 0.1 < 0.75 < (solution.weights[right] > 0).mean()

@@ -10,7 +10,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import UNTESTABLE
-from hodge_pipeline.diagnosis.solver import DiagnosedSolver
+from hodge_pipeline.diagnosis.robust import RobustSolver
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -24,20 +24,20 @@ def test_the_solver_leaves_wrong_edges_out_and_keeps_the_gauge() -> None:
     poses = poses_on_a_ring(20)
     clean = measured(poses, near_pairs(20, 4))
     graph, right = spoiled(clean, np.random.default_rng(0).choice(80, 20, replace=False))
-    solver = DiagnosedSolver(diagnosis=QUICK)
+    solver = RobustSolver(diagnosis=QUICK)
     assert isinstance(solver, ConsistencySolver)
     solution = solver.solve(graph, poses)
     assert not (solution.weights[~right] > 0).any() and (solution.weights[right] > 0).mean() > 0.9
     np.testing.assert_allclose(solution.world_from_cam[0], poses[0], atol=1e-9)
     assert np.abs(solution.world_from_cam[:, :3, 3] - poses[:, :3, 3]).max() < 0.1
-    assert "left out by the diagnosis" in solution.notes[0] and "checked again" in solution.notes[1]
+    assert "left out by the diagnosis" in solution.notes[0]
 
 
 def test_recipes_that_use_it_bind() -> None:
     for name in ("seven_scenes_robust", "tum_robust"):
-        assert isinstance(load_recipe(name).solver, DiagnosedSolver)
+        assert isinstance(load_recipe(name).solver, RobustSolver)
     changed = load_recipe("seven_scenes_robust", ["solver.diagnosis.seed=3"]).solver
-    assert isinstance(changed, DiagnosedSolver) and changed.diagnosis.seed == 3
+    assert isinstance(changed, RobustSolver) and changed.diagnosis.seed == 3
 
 
 def chain(count: int) -> ViewGraph:
@@ -84,24 +84,19 @@ def test_pieces_are_suggested_to_be_joined_and_nothing_needs_nothing() -> None:
     assert len(suggest_pairs(whole, diagnose(whole, QUICK)).pairs) == 0
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5, 1.0])
-def test_an_edge_of_six_sigma_is_left_out_however_unlikely_it_is(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_edge_that_the_diagnosis_keeps_and_the_poses_refute_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gate is for the edge's own residual; weights are what the information is multiplied by in the last solve."""
     graph = measured(poses_on_a_ring(20), near_pairs(20, 4))
     motion = graph.i_from_j.copy()
-    motion[7] = motion[7] @ se3.exp(6.5 * SIGMA * np.array([1.0, 0, 0, 0, 0, 0]))
+    motion[7] = motion[7] @ se3.exp(15 * SIGMA * np.array([1.0, 0, 0, 0, 0, 0]))
     information = np.tile(np.diag(SIGMA**-2), (graph.edge_count, 1, 1))
     graph = replace(graph, i_from_j=motion, information=information)
-    found = diagnose(graph, QUICK)
-    probability = np.full(graph.edge_count, 0.9)
-    probability[7] = share
     everything = np.ones(graph.edge_count, bool)
-    known = replace(found, probability=probability, kept=everything, verdict=np.full(graph.edge_count, "consistent"))
-    monkeypatch.setattr("hodge_pipeline.diagnosis.solver.diagnose", lambda *_: known)
-    solution = DiagnosedSolver(diagnosis=QUICK).solve(graph, poses_on_a_ring(20))
-    assert solution.weights[7] == 0
-    others = np.delete(solution.weights, 7)
-    assert set(others.tolist()) <= {0.0, 0.9} and (others > 0).mean() > 0.9
+    verdict = np.full(graph.edge_count, "consistent")
+    known = replace(diagnose(graph, QUICK), kept=everything, verdict=verdict)
+    monkeypatch.setattr("hodge_pipeline.diagnosis.robust.diagnose", lambda *_: known)
+    solution = RobustSolver(diagnosis=QUICK).solve(graph, poses_on_a_ring(20))
+    assert solution.weights[7] == 0 and (np.delete(solution.weights, 7) > 0).all()
     weighted = replace(graph, information=solution.weights[:, None, None] * graph.information)
     again = solve(weighted, start=solution.world_from_cam)
     np.testing.assert_allclose(again.metrics["chi2"], solution.metrics["chi2"], rtol=1e-8)

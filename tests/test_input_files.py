@@ -175,18 +175,18 @@ def _zstd_bomb(count: int, size: int) -> bytes:
 
 
 def test_the_chunks_of_a_recording_expand_to_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hodge_adapters.mcap import log as mcap_log
+    from hodge_adapters.mcap import message_file
     from hodge_adapters.mcap.reader import McapReader
 
     expanded = list[int]()
-    expand: Callable[..., bytes] = mcap_log.expand
-    monkeypatch.setattr(mcap_log, "expand", lambda *of: expanded.append(of[2]) or expand(*of))
-    monkeypatch.setattr(mcap_log, "ALWAYS_EXPANDED_BYTES", 1 << 24)
+    expand: Callable[..., bytes] = message_file.expand
+    monkeypatch.setattr(message_file, "expand", lambda *of: expanded.append(of[2]) or expand(*of))
+    monkeypatch.setattr(message_file, "ALWAYS_EXPANDED_BYTES", 1 << 24)
     path = tmp_path / "bomb.mcap"
     path.write_bytes(_zstd_bomb(40, 1 << 22))
     with pytest.raises(SourceError):
         McapReader().open(path)
-    assert 0 < sum(expanded) <= (1 << 24) + mcap_log.MAX_EXPANSION * path.stat().st_size
+    assert 0 < sum(expanded) <= (1 << 24) + message_file.MAX_EXPANSION * path.stat().st_size
     assert len(expanded) < 40
 
 

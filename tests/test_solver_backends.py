@@ -7,10 +7,9 @@ import pytest
 from scipy.sparse import bsr_matrix, csr_matrix
 
 from hodge_pipeline import se3
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers import backends
 from hodge_pipeline.solvers import multigrid as multigrid_module
-from hodge_pipeline.solvers.backends import BackendName, backend, cholmod_installed, choose
+from hodge_pipeline.solvers.backends import BackendName, backend, choose
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.iterative import IterativeSolver
@@ -20,14 +19,12 @@ from hodge_pipeline.solvers.multigrid import Coarsening, Modes, aggregates, mult
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from solver_graphs import laplacian
 
-NAMES: tuple[BackendName, ...] = ("superlu", "cholmod", "multigrid")
+NAMES: tuple[BackendName, ...] = ("superlu", "multigrid")
 
 
 @pytest.fixture(params=NAMES)
 def name(request: pytest.FixtureRequest) -> BackendName:
     chosen: BackendName = request.param
-    if chosen == "cholmod" and not cholmod_installed():
-        pytest.skip("cholmod is not installed")
     return chosen
 
 
@@ -99,12 +96,6 @@ def test_auto_factorises_what_is_small_or_like_a_chain_and_preconditions_what_is
     chosen, plan = choose("auto", chain[:-1], chain[1:], len(chain) - 1)
     assert not chosen.iterative
     assert plan.ordered
-
-
-def test_a_back_end_that_is_not_installed_is_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backends, "cholmod_installed", lambda: False)
-    with pytest.raises(GraphError, match="pip install scikit-sparse"):
-        solve(tube(60), backend="cholmod")
 
 
 def test_a_cycle_is_symmetric_and_positive_definite() -> None:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.robust import RobustSolver
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.editing import GraphEditor
 from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver, solve
 from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.poisson import PoissonSolver
-from hodge_pipeline.solvers.robust import RobustSolver
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import Priors, ViewGraph
 from solver_graphs import ladder
@@ -116,7 +116,7 @@ def stretched() -> tuple[ViewGraph, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    "solver", [MaximumLikelihoodSolver(), PoissonSolver(robust="none"), PaperSolver(), RobustSolver(threshold=1e3)]
+    "solver", [MaximumLikelihoodSolver(), PoissonSolver(robust="none"), PaperSolver(), RobustSolver()]
 )
 def test_between_fixed_ends_the_disagreement_is_shared(solver):
     graph, start = stretched()

@@ -5,12 +5,11 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import fundamental_loops, spanning_forest
+from hodge_pipeline.diagnosis.confirmation import cycle_lengths
+from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.confirmation import cycle_lengths
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
-from hodge_pipeline.solvers.cycle_consistency import edge_corruption, short_loops
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.solvers.robust import RobustSolver, solve_robust
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import ViewGraph
 
@@ -49,7 +48,7 @@ def test_wrong_edges_are_found_and_left_out(share, planar):
     graph, truth = band(30, 8, 1, planar)
     graph, wrong = spoiled(graph, share, 2)
     solution = solve_robust(graph, start=truth)
-    kept = solution.weights > 0.5
+    kept = solution.weights > 0
     assert not kept[wrong].any()
     assert kept[~wrong].mean() > 0.93
     main = solution.component == 0
@@ -76,8 +75,8 @@ def test_right_edges_of_a_drifting_graph_are_not_lost():
     """Noise bends the rings so far that edges which close them look wrong until the others hold the shape."""
     graph, truth = rings(200, 40)
     graph, wrong = spoiled(graph, 0.2, 13)
-    kept = solve_robust(graph, start=truth).weights > 0.5
-    assert kept[wrong].mean() < 0.01
+    kept = solve_robust(graph, start=truth).weights > 0
+    assert kept[wrong].mean() < 0.025  # two are the only edges of a vertex that may be right
     assert kept[~wrong].mean() > 0.97
 
 
@@ -87,15 +86,15 @@ def test_a_wrong_sequential_edge_is_not_trusted():
     motion[5] = se3.exp(np.ones(6))
     solution = solve_robust(dataclasses.replace(graph, i_from_j=motion), start=truth)
     assert solution.weights[5] == 0
-    assert np.delete(solution.weights, 5).mean() > 0.95
+    assert (np.delete(solution.weights, 5) > 0).mean() > 0.95
 
 
 def test_smooth_weights_lie_between():
     graph, truth = band(20, 6, 4)
     graph, wrong = spoiled(graph, 0.2, 5)
-    weights = solve_robust(graph, start=truth, kernel="geman_mcclure").weights
-    assert weights[wrong].max() < 0.05
-    assert np.median(weights[~wrong]) > 0.3
+    weights = solve_robust(graph, start=truth).weights
+    assert weights[wrong].max() == 0
+    assert np.median(weights[~wrong]) > 0.9
     assert ((weights > 0.05) & (weights < 0.95)).any()
 
 
@@ -111,20 +110,8 @@ def test_what_only_wrong_edges_join_falls_apart():
     )
     solution = solve_robust(graph, start=np.concatenate([truth, truth]))
     assert np.isfinite(solution.world_from_cam).all()
-    assert solution.weights[-3:].sum() <= 1
-    assert solution.weights[:-3].mean() > 0.9
-
-
-def test_edges_in_no_cycle_are_untested():
-    edges = np.array([(0, 1), (1, 2), (0, 2), (2, 3), (4, 3), (3, 4)])
-    motions = np.tile(np.eye(4), (6, 1, 1))
-    motions[5, 0, 3] = 5.0
-    loops = short_loops(edges, motions, np.full(6, 1e-2), np.full(6, 1e-2), 16.8)
-    assert sorted(map(tuple, np.sort(loops.edges, axis=1))) == [(-1, 4, 5), (0, 1, 2)]
-    score = edge_corruption(loops, 6)
-    assert np.isnan(score).tolist() == [False, False, False, True, False, False]
-    assert score[:3].max() < 1e-9
-    assert score[4:].min() > 0.8
+    assert (solution.weights[-3:] > 0).sum() <= 1
+    assert (solution.weights[:-3] > 0).mean() > 0.9
 
 
 def test_the_stage_keeps_its_protocol():
@@ -178,13 +165,11 @@ def test_fixed_vertices_without_a_start_hold_nothing_and_a_note_says_so():
     assert any("3 fixed vertices have no pose" in note for note in held.notes)
 
 
-@pytest.mark.parametrize("kernel", ["truncated", "geman_mcclure"])
-def test_weights_are_those_of_the_last_solve(kernel):
+def test_weights_are_those_of_the_last_solve():
     graph, truth = band(20, 6, 4)
     graph, _ = spoiled(graph, 0.2, 5)
-    confidence = np.random.default_rng(6).uniform(0.1, 1, graph.edge_count)
-    solution = solve_robust(graph, start=truth, kernel=kernel, confidence=confidence)
-    assert (solution.weights <= confidence).all()
+    solution = solve_robust(graph, start=truth)
+    assert (solution.weights <= 1).all()
     assert int((solution.weights > 0).sum()) == solution.metrics["kept_edges"]
     weighted = dataclasses.replace(graph, information=solution.weights[:, None, None] * graph.information)
     again = solve(weighted, start=solution.world_from_cam)

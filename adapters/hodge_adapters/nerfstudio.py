@@ -14,7 +14,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.images import pixels
-from hodge_adapters.images.lens_models import FISHEYE, PERSPECTIVE, named
+from hodge_adapters.images.lens_models import FISHEYE, HALF_PIXEL, PERSPECTIVE, image_file, named, pinhole_params
 from hodge_adapters.json_files import first_text, motion, number, objects, read_json, whole, write_json
 from hodge_adapters.posed import trajectory_of, written
 from hodge_adapters.text_rows import inside, listed, write_bytes_atomically
@@ -27,8 +27,6 @@ FILE = "transforms.json"
 IMAGES = "images"
 ENDINGS = (".png", ".jpg", ".jpeg")
 OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
-HALF_PIXEL = 0.5
-"""nerfstudio puts 0, 0 at the outer corner of the first pixel."""
 MAX_SIDE = 1 << 16
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 METRES_PER_UNIT = 1e-3
@@ -138,8 +136,8 @@ def _entry(name: str, world_from_cam: Any, camera: Mapping[str, float] | None) -
 def _pinhole(camera: Camera | None) -> dict[str, float]:
     if camera is None:
         return {}
-    size = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
-    return size | {"cx": camera.cx + HALF_PIXEL, "cy": camera.cy + HALF_PIXEL}
+    names = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+    return dict(zip(names, (camera.width, camera.height, *pinhole_params(camera)), strict=True))
 
 
 def _placed(folder: Path, image: Path, frame_id: int | str) -> tuple[str, str]:
@@ -198,15 +196,13 @@ def _camera(values: dict[str, Any], where: str) -> Camera | None:
 def _image_file(path: Path, camera: Camera, values: dict[str, Any]) -> ImageFile:
     """The image with the lens that the file says."""
     k1, k2, k3, k4, p1, p2 = (number(values.get(name)) or 0.0 for name in DISTORTION)
-    pinhole = (camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL)
     if values.get("camera_model") == FISHEYE:
-        return ImageFile(path, camera.width, camera.height, FISHEYE, (*pinhole, k1, k2, k3, k4))
+        return image_file(path, camera, FISHEYE, (k1, k2, k3, k4))
     if k3:
-        return ImageFile(
-            path, camera.width, camera.height, "FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-        )
-    lens, more = (PERSPECTIVE, (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
-    return ImageFile(path, camera.width, camera.height, lens, (*pinhole, *more))
+        return image_file(path, camera, "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    return (
+        image_file(path, camera, PERSPECTIVE, (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else image_file(path, camera)
+    )
 
 
 def _existing(folder: Path, name: Any) -> Path | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import IO
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.types.input_files import read_input_text
 
+_DIGITS = re.compile(r"(\d+)")
 SHOWN = 5
 """How many records a note names before it only counts them."""
 
@@ -24,12 +26,19 @@ class Row:
     fields: list[str]
 
 
-def read_text(path: Path) -> str:
-    """The text of a file, whatever its bytes; raises `SourceError` where it cannot be read."""
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """While a file is read: what the system refuses becomes a `SourceError` that names it."""
     try:
-        return read_input_text(path, errors="replace")
+        yield
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, whatever its bytes; raises `SourceError` where it cannot be read."""
+    with reading(path):
+        return read_input_text(path, errors="replace")
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -56,6 +65,12 @@ def listed(items: Sequence[object]) -> str:
 def counted(count: int, noun: str) -> str:
     """A count with its noun: `1 image`, `2 images`."""
     return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def natural(name: str) -> tuple[tuple[int, int, str], ...]:
+    """A sort key that takes digits for numbers."""
+    parts = (part for part in _DIGITS.split(name) if part)
+    return tuple((0, int(part[:18]), part) if part.isascii() and part.isdecimal() else (1, 0, part) for part in parts)
 
 
 def inside(folder: Path, name: str) -> Path | None:

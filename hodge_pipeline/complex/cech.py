@@ -14,26 +14,22 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline.complex.coboundary import check_edges
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.types import Bools, CloudSet, Floats, Ints
+from hodge_pipeline.types import CloudSet, Floats, Ints
 
 CANDIDATES_AT_ONCE = 2_000_000
 SIMPLICES_AT_ONCE = 2_000
-MOST_SIMPLICES = 50_000_000
+MOST_LISTED = 50_000_000
 
 
 @dataclass(frozen=True)
 class SimplicialComplex:
-    """Simplices by dimension: `simplices[k] (N_k, k + 1)` vertex rows, ascending in each row, rows in that order too.
+    """Vertices, edges and triangles: `simplices[k] (N_k, k + 1)` vertex rows, ascending in each row, rows in that
+    order too. Of cliques of more vertices nothing that is computed here depends.
 
     The orientation of a simplex is that of its ascending vertices: an edge (i, j) has i < j.
     """
 
     simplices: tuple[Ints, ...]
-
-    @property
-    def dimension(self) -> int:
-        """The highest dimension listed, even if it has no simplex."""
-        return len(self.simplices) - 1
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -63,8 +59,6 @@ class SimplicialComplex:
 
     def coboundary(self, order: int) -> csr_matrix:
         """d_order (N_{order+1}, N_order) int8 of Eq. (1): `(d ω)_{0…p+1} = Σ (−1)^i ω_{0…î…p+1}`, rows as listed."""
-        if not 0 <= order < self.dimension:
-            raise GraphError(f"d{order} needs simplices of dimension {order + 1}: the complex has {self.dimension}")
         cofaces = self.simplices[order + 1]
         count, corners = cofaces.shape
         columns = [self.rows_of(np.delete(cofaces, i, axis=1)) for i in range(corners)]
@@ -109,55 +103,40 @@ def orient_edges(edges: Ints, vertex_count: int) -> OrientedEdges:
     return OrientedEdges(simple, row, np.where(edges[:, 0] <= edges[:, 1], 1, -1))
 
 
-def flag_complex(edges: Ints, vertex_count: int, dimension: int = 2, most: int = MOST_SIMPLICES) -> SimplicialComplex:
-    """Every clique of up to `dimension + 1` vertices (Section 4). Parallel edges count once, self-loops not at all.
+def flag_complex(edges: Ints, vertex_count: int) -> SimplicialComplex:
+    """Every clique of up to three vertices (Section 4). Parallel edges count once, self-loops not at all.
 
-    Raises `GraphError` before a dimension would list more than `most` simplices; `clique_counts` says how many.
+    Raises `GraphError` before it would list more than 50 million triangles; `clique_counts` says how many.
     The last complexes are kept: the stages of a round, which ask for that of the same graph, share one.
     """
-    if dimension < 1:
-        raise GraphError(f"a complex of dimension {dimension} has no edges: ask for 1 or more")
-    return _cliques(orient_edges(edges, vertex_count).edges.tobytes(), vertex_count, dimension, most)
+    return _cliques(orient_edges(edges, vertex_count).edges.tobytes(), vertex_count)
 
 
 @lru_cache(maxsize=2)
-def _cliques(pairs: bytes, vertex_count: int, dimension: int, most: int) -> SimplicialComplex:
+def _cliques(pairs: bytes, vertex_count: int) -> SimplicialComplex:
     simple = np.frombuffer(pairs, np.int64).reshape(-1, 2)
-    search = _CliqueSearch(simple, vertex_count)
-    levels = [np.arange(vertex_count, dtype=np.int64)[:, None], simple]
-    ranked = search.ranked_edges
-    for order in range(2, dimension + 1):
-        parts, found = [np.zeros((0, order + 1), np.int64)], 0
-        for part in search.extended(ranked):
-            found += len(part)
-            if found > most:
-                raise GraphError(
-                    f"the graph has more than {most} cliques of {order + 1} vertices: thin out its edges, or raise "
-                    "the limit"
-                )
-            parts.append(part)
-        ranked = np.concatenate(parts)
-        levels.append(_in_order(np.sort(search.vertex_of_rank[ranked], axis=1), vertex_count))
-    for level in levels:
-        level.flags.writeable = False
-    return SimplicialComplex(tuple(levels))
+    search = _TriangleSearch(simple, vertex_count)
+    parts, found = [np.zeros((0, 3), np.int64)], 0
+    for part in search.triangles():
+        found += len(part)
+        if found > MOST_LISTED:
+            raise GraphError(f"the graph has more than {MOST_LISTED} triangles: thin out its edges")
+        parts.append(part)
+    triangles = np.sort(search.vertex_of_rank[np.concatenate(parts)], axis=1)
+    triangles = triangles[np.lexsort(triangles.T[::-1])]
+    vertices = np.arange(vertex_count, dtype=np.int64)[:, None]
+    vertices.flags.writeable = triangles.flags.writeable = False
+    return SimplicialComplex((vertices, simple, triangles))
 
 
-def clique_counts(edges: Ints, vertex_count: int, dimension: int = 2) -> tuple[int, ...]:
-    """How many simplices of each dimension the flag complex has; the top one is counted without being kept."""
+def clique_counts(edges: Ints, vertex_count: int) -> tuple[int, int, int]:
+    """How many vertices, edges and triangles the flag complex has; triangles are counted without being kept."""
     simple = orient_edges(edges, vertex_count).edges
-    search = _CliqueSearch(simple, vertex_count)
-    counts, ranked = [vertex_count, len(simple)], search.ranked_edges
-    for _ in range(2, dimension):
-        ranked = np.concatenate([np.zeros((0, ranked.shape[1] + 1), np.int64), *search.extended(ranked)])
-        counts.append(len(ranked))
-    if dimension >= 2:
-        counts.append(sum(len(part) for part in search.extended(ranked)))
-    return tuple(counts[: dimension + 1])
+    return vertex_count, len(simple), sum(map(len, _TriangleSearch(simple, vertex_count).triangles()))
 
 
-class _CliqueSearch:
-    """Cliques in the order of vertex degree: a vertex has at most √(2E) neighbours of higher rank."""
+class _TriangleSearch:
+    """Triangles in the order of vertex degree: a vertex has at most √(2E) neighbours of higher rank."""
 
     def __init__(self, edges: Ints, vertex_count: int) -> None:
         degree = np.bincount(edges.ravel(), minlength=vertex_count)
@@ -167,43 +146,28 @@ class _CliqueSearch:
         ranked = np.sort(rank[edges], axis=1)
         self.count = vertex_count
         self.keys = np.sort(ranked[:, 0] * vertex_count + ranked[:, 1])
-        self.ranked_edges: Ints = np.stack([self.keys // max(vertex_count, 1), self.keys % max(vertex_count, 1)], 1)
-        self.offsets = np.searchsorted(self.ranked_edges[:, 0], np.arange(vertex_count + 1))
+        self.edges: Ints = np.stack([self.keys // max(vertex_count, 1), self.keys % max(vertex_count, 1)], 1)
+        self.offsets = np.searchsorted(self.edges[:, 0], np.arange(vertex_count + 1))
 
-    def extended(self, cliques: Ints) -> Iterator[Ints]:
-        """The cliques (N, k + 1) that extend cliques (M, k) by a vertex of higher rank, in bounded batches."""
-        last = cliques[:, -1]
+    def triangles(self) -> Iterator[Ints]:
+        """The triangles (N, 3) by ascending ranks, in bounded batches: each edge with a vertex of higher rank."""
+        last = self.edges[:, 1]
         candidates = self.offsets[last + 1] - self.offsets[last]
         ends = np.cumsum(candidates)
         start = 0
-        while start < len(cliques):
+        while start < len(last):
             before = int(ends[start - 1]) if start else 0
             stop = max(start + 1, int(np.searchsorted(ends, before + CANDIDATES_AT_ONCE, side="right")))
-            yield self._extend(cliques[start:stop], candidates[start:stop])
+            yield self._extended(self.edges[start:stop], candidates[start:stop])
             start = stop
 
-    def _extend(self, cliques: Ints, candidates: Ints) -> Ints:
-        row = np.repeat(np.arange(len(cliques)), candidates)
+    def _extended(self, edges: Ints, candidates: Ints) -> Ints:
+        row = np.repeat(np.arange(len(edges)), candidates)
         within = np.arange(len(row)) - np.repeat(np.cumsum(candidates) - candidates, candidates)
-        new = self.ranked_edges[self.offsets[cliques[row, -1]] + within, 1]
-        for corner in range(cliques.shape[1] - 1):
-            joined = self._has_edge(cliques[row, corner], new)
-            row, new = row[joined], new[joined]
-        return np.concatenate([cliques[row], new[:, None]], axis=1)
-
-    def _has_edge(self, low: Ints, high: Ints) -> Bools:
-        wanted = low * self.count + high
-        place = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
-        return np.asarray(self.keys[place] == wanted)
-
-
-def _in_order(simplices: Ints, vertex_count: int) -> Ints:
-    if simplices.shape[1] * np.log2(max(vertex_count, 2)) < 62:
-        key = np.zeros(len(simplices), np.int64)
-        for column in simplices.T:
-            key = key * vertex_count + column
-        return simplices[np.argsort(key, kind="stable")]
-    return simplices[np.lexsort(simplices.T[::-1])]
+        new = self.edges[self.offsets[edges[row, 1]] + within, 1]
+        wanted = edges[row, 0] * self.count + new
+        joined = self.keys[np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)] == wanted
+        return np.concatenate([edges[row[joined]], new[joined, None]], axis=1)
 
 
 def voxel_occupancy(clouds: CloudSet, world_from_cam: Floats, voxel_m: float) -> csr_matrix:
@@ -225,19 +189,15 @@ def voxel_occupancy(clouds: CloudSet, world_from_cam: Floats, voxel_m: float) ->
     return occupancy
 
 
-def nerve(flag: SimplicialComplex, occupancy: csr_matrix, least_voxels: int = 1) -> SimplicialComplex:
-    """The complex of Definition 1: cliques of three or more clouds only where they share `least_voxels` voxels.
+def nerve(flag: SimplicialComplex, occupancy: csr_matrix) -> SimplicialComplex:
+    """The complex of Definition 1: triangles only where the three clouds share a voxel.
 
     Vertices and edges are the viewing graph's and stay as they are.
     """
-    kept = list(flag.simplices[:2])
-    for simplices in flag.simplices[2:]:
-        parts = [np.zeros(0, bool)]
-        for start in range(0, len(simplices), SIMPLICES_AT_ONCE):
-            block = simplices[start : start + SIMPLICES_AT_ONCE]
-            common = occupancy[block[:, 0]]
-            for corner in block.T[1:]:
-                common = common.multiply(occupancy[corner]).tocsr()
-            parts.append(common.getnnz(axis=1) >= least_voxels)
-        kept.append(simplices[np.concatenate(parts)])
-    return SimplicialComplex(tuple(kept))
+    vertices, edges, triangles = flag.simplices
+    kept = [np.zeros(0, bool)]
+    for start in range(0, len(triangles), SIMPLICES_AT_ONCE):
+        a, b, c = triangles[start : start + SIMPLICES_AT_ONCE].T
+        common = occupancy[a].multiply(occupancy[b]).tocsr().multiply(occupancy[c]).tocsr()
+        kept.append(common.getnnz(axis=1) > 0)
+    return SimplicialComplex((vertices, edges, triangles[np.concatenate(kept)]))

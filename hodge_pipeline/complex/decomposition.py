@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +18,27 @@ ENOUGH = 1e-9
 
 
 @dataclass(frozen=True)
+class Energies:
+    """Energy Σ w|ω|² of the parts of a 1-form, (rotation in rad², translation in m²) each, on so many simplices.
+
+    Exact: what moving the poses takes away; co-exact: the curl of triangles; harmonic: loops that no triangle fills.
+    """
+
+    simplices: tuple[int, ...]
+    exact: tuple[float, float]
+    coexact: tuple[float, float]
+    harmonic: tuple[float, float]
+
+    @property
+    def shares(self) -> dict[str, tuple[float, float]]:
+        """The share of each part in the rotation's and the translation's energy; 0 where there is none at all."""
+        parts = {"exact": self.exact, "coexact": self.coexact, "harmonic": self.harmonic}
+        total = np.sum(list(parts.values()), axis=0)
+        scale = np.where(total > 0, total, 1.0)
+        return {name: (float(part[0] / scale[0]), float(part[1] / scale[1])) for name, part in parts.items()}
+
+
+@dataclass(frozen=True)
 class HodgeDecomposition:
     """`ω = exact + coexact + harmonic`, each (E, k), orthogonal in the inner product of `weights (E,)`.
 
@@ -31,33 +51,17 @@ class HodgeDecomposition:
     harmonic: Floats
     weights: Floats
 
-    def energies(self) -> Mapping[str, tuple[float, float]]:
-        """(rotation, translation) energy `Σ w |ω|²` of the whole form and each part, in rad² and m².
+    def energies(self, simplices: tuple[int, ...] = ()) -> Energies:
+        """The energy of each part, on a complex of so many simplices.
 
         Columns 0-2 are the rotation, the rest the translation. Depends on the world's origin: form ω around the
         centroid (see `centroids`).
         """
-        parts = {"exact": self.exact, "coexact": self.coexact, "harmonic": self.harmonic}
-        whole = {"total": self.exact + self.coexact + self.harmonic}
-        return {name: self._energy(part) for name, part in (whole | parts).items()}
-
-    def shares(self) -> Mapping[str, tuple[float, float]]:
-        """(rotation, translation) share in [0, 1] of each part in the total energy; 0 where there is none at all."""
-        energies = self.energies()
-        total = energies["total"]
-        return {
-            name: (_share(rotation, total[0]), _share(translation, total[1]))
-            for name, (rotation, translation) in energies.items()
-            if name != "total"
-        }
+        return Energies(simplices, *(self._energy(part) for part in (self.exact, self.coexact, self.harmonic)))
 
     def _energy(self, form: Floats) -> tuple[float, float]:
         columns = self.weights @ form**2
         return float(columns[:3].sum()), float(columns[3:].sum())
-
-
-def _share(part: float, total: float) -> float:
-    return part / total if total > 0 else 0.0
 
 
 def hodge_decomposition(d0: csr_matrix, d1: csr_matrix, omega: Floats, weights: Floats) -> HodgeDecomposition:

@@ -40,18 +40,14 @@ def shifted(world_from_cam: Floats, offset: Floats) -> Floats:
     return out
 
 
-def surface_form(surface: Surface, omega: Floats, lengths: Floats | None = None) -> Floats:
+def surface_form(surface: Surface, omega: Floats) -> Floats:
     """ω (E + D, k) on every edge of the surface, from ω (E, k) on the graph's (Algorithm 2, Eq. (5)).
 
-    A diagonal gets the sum of ω along a shortest path of the graph: by hops, or by positive `lengths (E,)` such as
-    the edges' standard deviations. One that joins a vertex to itself gets 0, one parallel to an edge that edge's ω
-    (of several, the shortest, then the first). Where shortest paths tie, the vertices' order decides.
+    A diagonal gets the sum of ω along a path of the graph with the fewest edges. One that joins a vertex to itself gets
+    0, one parallel to an edge that edge's ω (of several, the first). Where paths tie, the vertices' order decides.
     """
     count = surface.graph_edge_count
     if omega.shape[0] != count:
         raise GraphError(f"ω has {omega.shape[0]} rows, but the embedded graph has {count} edges")
-    lengths = np.ones(count) if lengths is None else np.asarray(lengths, float)
-    if lengths.shape != (count,) or not (np.isfinite(lengths) & (lengths > 0)).all():
-        raise GraphError(f"shortest paths need a positive, finite length for each of the {count} edges")
     graph_edges, diagonals = surface.edges[:count], surface.edges[count:]
-    return np.concatenate([omega, path_integrals(graph_edges, surface.vertex_count, omega, lengths, diagonals)])
+    return np.concatenate([omega, path_integrals(graph_edges, surface.vertex_count, omega, diagonals)])

@@ -17,7 +17,7 @@ from hodge_pipeline.complex.cech import (
     voxel_occupancy,
 )
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.decomposition import HodgeDecomposition, hodge_decomposition
+from hodge_pipeline.complex.decomposition import Energies, HodgeDecomposition, hodge_decomposition
 from hodge_pipeline.complex.one_form import centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import CloudSet, Floats, Ints, ViewGraph
@@ -70,27 +70,6 @@ def one_form(graph: ViewGraph, world_from_cam: Floats, component: Ints | None = 
     return OneForm(*orient_edges(graph.edges, graph.vertex_count).pooled(omega, np.ones(graph.edge_count)))
 
 
-@dataclass(frozen=True)
-class Energies:
-    """Energy Σ w|ω|² of the parts of a 1-form, (rotation in rad², translation in m²) each, on so many simplices.
-
-    Exact: what moving the poses takes away; co-exact: the curl of triangles; harmonic: loops that no triangle fills.
-    """
-
-    simplices: tuple[int, ...]
-    exact: tuple[float, float]
-    coexact: tuple[float, float]
-    harmonic: tuple[float, float]
-
-    @property
-    def shares(self) -> dict[str, tuple[float, float]]:
-        """The share of each part in the rotation's and the translation's energy; 0 where there is none at all."""
-        parts = {"exact": self.exact, "coexact": self.coexact, "harmonic": self.harmonic}
-        total = np.sum(list(parts.values()), axis=0)
-        scale = np.where(total > 0, total, 1.0)
-        return {name: (float(part[0] / scale[0]), float(part[1] / scale[1])) for name, part in parts.items()}
-
-
 def decompose(complex_: SimplicialComplex, omega: OneForm) -> HodgeDecomposition:
     """The Helmholtz–Hodge decomposition of ω on a complex (Theorem 4, Eq. (6))."""
     return hodge_decomposition(complex_.coboundary(0), complex_.coboundary(1), omega.values, omega.weights)
@@ -98,5 +77,4 @@ def decompose(complex_: SimplicialComplex, omega: OneForm) -> HodgeDecomposition
 
 def energies(complex_: SimplicialComplex, parts: HodgeDecomposition) -> Energies:
     """How much of ω each part holds."""
-    found = parts.energies()
-    return Energies(complex_.counts, found["exact"], found["coexact"], found["harmonic"])
+    return parts.energies(complex_.counts)

@@ -10,22 +10,22 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats, Ints
 
 CELLS_AT_ONCE = 8_000_000  # of the table (sources, vertices): about 100 MB with distances
-FIRST_RADIUS = 4.0  # in longest edges; diagonals of small cells need no more
+FIRST_RADIUS = 4.0  # edges; diagonals of small cells need no more
 
 
 class _Lookup:
-    """The shortest, then first, edge between each pair of joined vertices."""
+    """The first edge between each pair of joined vertices."""
 
-    def __init__(self, edges: Ints, vertex_count: int, lengths: Floats) -> None:
+    def __init__(self, edges: Ints, vertex_count: int) -> None:
         self.count = vertex_count
         key = edges.min(axis=1) * vertex_count + edges.max(axis=1)
-        order = np.lexsort((np.arange(len(edges)), lengths, key))
+        order = np.argsort(key, kind="stable")
         order = order[(edges[:, 0] != edges[:, 1])[order]]
         self.keys, first = np.unique(key[order], return_index=True)
         self.edge = order[first]
         self.forward = edges[self.edge, 0] == edges[self.edge].min(axis=1)
         low, high = self.keys // max(vertex_count, 1), self.keys % max(vertex_count, 1)
-        self.adjacency = csr_matrix((lengths[self.edge], (low, high)), shape=(vertex_count, vertex_count))
+        self.adjacency = csr_matrix((np.ones(len(low)), (low, high)), shape=(vertex_count, vertex_count))
 
     def find(self, a: Ints, b: Ints) -> tuple[Ints, Ints]:
         """The edge (N,) that joins a and b, −1 where none does, and +1 where it runs from a to b."""
@@ -35,28 +35,28 @@ class _Lookup:
         return edge, np.where((a < b) == self.forward[place], 1, -1)
 
 
-def path_integrals(edges: Ints, vertex_count: int, omega: Floats, lengths: Floats, pairs: Ints) -> Floats:
-    """Σ ω (N, k) along a shortest path from `pairs[:, 0]` to `pairs[:, 1]`; 0 from a vertex to itself.
+def path_integrals(edges: Ints, vertex_count: int, omega: Floats, pairs: Ints) -> Floats:
+    """Σ ω (N, k) along a path of fewest edges from `pairs[:, 0]` to `pairs[:, 1]`; 0 from a vertex to itself.
 
-    Joined vertices take the edge between them, whatever its length. Searches start small and widen, by batches of
+    Joined vertices take the edge between them. Searches start small and widen, by batches of
     sources. Raises `GraphError` where no path joins a pair.
     """
     out = np.zeros((len(pairs), omega.shape[1]))
     apart = np.flatnonzero(pairs[:, 0] != pairs[:, 1])
     if len(apart) == 0:
         return out
-    lookup = _Lookup(edges, vertex_count, lengths)
+    lookup = _Lookup(edges, vertex_count)
     edge, sign = lookup.find(pairs[apart, 0], pairs[apart, 1])
     joined = edge >= 0
     out[apart[joined]] = sign[joined, None] * omega[edge[joined]]
-    open_rows, radius = apart[~joined], FIRST_RADIUS * float(lengths.max())
+    open_rows, radius = apart[~joined], FIRST_RADIUS
     while len(open_rows):
         reached = _integrate_within(lookup, omega, pairs[open_rows], radius, out, open_rows)
         open_rows = open_rows[~reached]
         if len(open_rows) and np.isinf(radius):
             a, b = pairs[open_rows[0]]
             raise GraphError(f"no path joins vertex rows {a} and {b}, yet an edge of the surface does")
-        radius = np.inf if radius > lengths.sum() else radius * 4
+        radius = np.inf if radius > len(edges) else radius * 4
     return out
 
 

@@ -62,10 +62,7 @@ class Quotient:
         levers = ((cluster_from[i, :3, 3] ** 2).sum(axis=1) + (cluster_from[j, :3, 3] ** 2).sum(axis=1)) / 2
         turn = noise.rotation_rad[rows]
         own = Noise(turn, np.sqrt(noise.translation_m[rows] ** 2 + ACROSS * turn**2 * levers))
-        information = np.zeros((len(rows), 6, 6))
-        information[:, range(3), range(3)] = 1 / own.rotation_rad[:, None] ** 2
-        information[:, range(3, 6), range(3, 6)] = 1 / own.translation_m[:, None] ** 2
-        coarse = ViewGraph.from_edges(np.arange(len(centres)), ends[rows], motion, information)
+        coarse = ViewGraph.from_edges(np.arange(len(centres)), ends[rows], motion, own.information)
         return cls(rows, coarse, own, at, cluster, cluster_from)
 
     def whole(self, poses: Floats) -> Floats:

@@ -34,6 +34,7 @@ from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.diagnosis.working_point import recentred, working_point
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.solvers.backbone.trust import find_backbone
+from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
@@ -48,6 +49,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     and edges that name no vertex.
     """
     check_graph(graph)
+    graph = replace(graph, dimension=2) if is_planar(graph) else graph
     if (backbone := find_backbone(graph, options.trust)) is not None:
         return judged_on_backbone(graph, backbone, options)
     stated, (graph, turned) = graph, in_vertex_order(graph)
@@ -95,7 +97,8 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
     cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))
     found = _report(stated, cycles, probability, verdict, kept, undecided, consensus.fit, world_from_cam)
-    return replace(found, notes=(*found.notes, *noise.doubts, *free_direction_notes(stated)))
+    information = _of_noise(noise, point, graph.dimension == 2)
+    return replace(found, information=information, notes=(*found.notes, *noise.doubts, *free_direction_notes(stated)))
 
 
 def _with_witnesses(graph: ViewGraph, cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
@@ -110,10 +113,16 @@ def _with_witnesses(graph: ViewGraph, cycles: Cycles, used: Bools, evidence: Evi
 
 
 def _with_noise(graph: ViewGraph, motions: Floats, noise: Noise) -> ViewGraph:
-    information = np.zeros((graph.edge_count, 6, 6))
-    information[:, range(3), range(3)] = 1 / noise.rotation_rad[:, None] ** 2
-    information[:, range(3, 6), range(3, 6)] = 1 / noise.translation_m[:, None] ** 2
-    return replace(graph, i_from_j=motions, information=information)
+    return replace(graph, i_from_j=motions, information=noise.information)
+
+
+def _of_noise(noise: Noise, point: Floats, planar: bool) -> Floats:
+    """The information (E, 6, 6) of noise at the working point, in the axes and at the origin of the frames."""
+    there = se3.adjoint(se3.from_parts(np.eye(3), -point))
+    information = there.T @ noise.information @ there
+    if planar:
+        information[:, OUT_OF_PLANE] = information[:, :, OUT_OF_PLANE] = 0
+    return np.asarray(information)
 
 
 def _verdicts(probability: Floats, untestable: Bools, used: Bools, options: DiagnosisOptions) -> NDArray[np.str_]:
@@ -148,6 +157,7 @@ def _report(
         residual_m=residual[0],
         residual_deg=residual[1],
         leverage=np.where(kept, share, 0.0),
+        information=graph.information,
         cycles=cycles,
         witnesses_for=telling[0],
         witnesses_against=telling[1],

@@ -48,6 +48,14 @@ class Noise:
     translation_m: Floats
     doubts: tuple[str, ...] = ()
 
+    @property
+    def information(self) -> Floats:
+        """The information (E, 6, 6) at the working point."""
+        out = np.zeros((len(self.rotation_rad), 6, 6))
+        out[:, range(3), range(3)] = 1 / self.rotation_rad[:, None] ** 2
+        out[:, range(3, 6), range(3, 6)] = 1 / self.translation_m[:, None] ** 2
+        return out
+
     def select(self, rows: Ints | Bools) -> Noise:
         """That of these edges."""
         return Noise(self.rotation_rad[rows], self.translation_m[rows], self.doubts)

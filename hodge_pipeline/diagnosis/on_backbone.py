@@ -53,6 +53,7 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisO
         residual_m=residual_m,
         residual_deg=residual_deg,
         leverage=np.where(kept, 1 - 1 / (1 + resistance), 0.0),
+        information=graph.information,
         cycles=cycles,
         witnesses_for=_witnesses(np.where(kept, cycle, -1)),
         witnesses_against=_witnesses(np.where(kept, -1, cycle)),

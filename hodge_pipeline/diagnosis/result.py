@@ -38,6 +38,7 @@ class Diagnosis:
     - `residual_m`, `residual_deg (E,)`: against the robust poses; NaN between two pieces.
     - `leverage (E,)`: an edge's share in determining the relative pose of its ends, 1 where removing it splits its
       piece; 0 for one that is not kept.
+    - `information (E, 6, 6)`: that the edges were judged with, in j's axes.
     - `cycles`; `witnesses_for`, `witnesses_against (E, 3)`: their rows, the most telling first, −1 for none.
     - `piece (V,)`: 0 the largest; `world_from_cam (V, 4, 4)`: each piece in a frame of its own.
     - `notes`: counts and caveats, one line each.
@@ -50,6 +51,7 @@ class Diagnosis:
     residual_m: Floats
     residual_deg: Floats
     leverage: Floats
+    information: Floats
     cycles: Cycles
     witnesses_for: Ints
     witnesses_against: Ints

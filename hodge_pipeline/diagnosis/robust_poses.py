@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import left_over, squares_at_both_ends
+from hodge_pipeline.complex.judging import FREEDOM, left_over, squares_at_both_ends
 from hodge_pipeline.diagnosis.clusters import Quotient, clustered
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.noise import Noise
@@ -28,8 +28,8 @@ non-convexity, Yang et al. 2020), and what does not follow falls out.
 """
 GENTLE = ANNEALED[-1:]
 """For poses that are near already."""
-FREEDOM, DIMENSION = 4.0, 6
-"""Degrees of freedom of Student's t, the tails of real registration errors, and of a pose."""
+DIMENSION = 6
+"""Of a pose."""
 FULLY, ROUGHLY, COARSELY = (4, Limits(20, 1e-6)), (4, Limits(6, 1e-4)), (4, Limits(10, 1e-4))
 """Rounds of weights and what ends the steps in each: of a solve, of a large graph's, and of clusters."""
 LARGE = 20_000

@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.robust import solve_robust
 from hodge_pipeline.types import Floats, ViewGraph
 
 

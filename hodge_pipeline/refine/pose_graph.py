@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline import registry
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.pairs.edits import joining
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
-from hodge_pipeline.solvers.robust import solve_robust
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.unknown import without_frames
@@ -156,7 +157,11 @@ def solve_file(path: Path, choices: Choices) -> SolvedFile:
 def _solved(graph: ViewGraph, start: Floats | None, choices: Choices) -> Solution:
     if choices.robust:
         return solve_robust(
-            graph, start=start, objective=choices.objective, certificate=choices.certificate, trust=choices.trust
+            graph,
+            start=start,
+            diagnosis=DiagnosisOptions(trust=choices.trust),
+            objective=choices.objective,
+            certificate=choices.certificate,
         )
     return solve(
         graph,

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.parts import Energies
+from hodge_pipeline.complex.components import connected_components, in_runs
+from hodge_pipeline.complex.decomposition import Energies
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.evaluation.residuals import with_residuals
@@ -26,7 +26,7 @@ from hodge_pipeline.start.known_positions import up_of
 from hodge_pipeline.start.unordered.tour import propose_along_tour
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, ViewGraph
 from hodge_pipeline.types.edges import HELD_OUT
-from hodge_pipeline.types.notes import notes_of
+from hodge_pipeline.types.notes import Note, notes_of
 
 LEFT_OUT = 1e-3
 """A weight below which a robust solver has left an edge out, whether or not it keeps a rest."""
@@ -105,7 +105,9 @@ class Work:
         """The table with the status of every registered pair; one that odometry measured, and that was registered to
         somewhere else, keeps odometry's measurement.
         """
-        found = accepted(edges, self.recipe.acceptance, self.scene.drift, self.scale)
+        found, slid = accepted(edges, self.recipe.acceptance, self.scene.drift)
+        if len(slid):
+            self.steps.note(Note("slid", len(slid), in_runs(slid, self.scene.first.vertex_ids)))
         return found if self.scene.drift is None else with_odometry(found, self.scene.first.edges)
 
     @property

@@ -1,30 +1,26 @@
-"""Linear back ends behind one small interface: which library factorises, or preconditions, and on which graph.
+"""The two ways to solve a graph's linear systems, and which is cheaper on which graph.
 
-A direct one factorises; an iterative one preconditions conjugate gradients, at a cost that grows with the graph alone
-and not with its fill.
+SuperLU factorises; multigrid preconditions conjugate gradients, at a cost that grows with the graph alone and not with
+its fill. (CHOLMOD was tried in SuperLU's place: after the block elimination it is no faster on any graph.)
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
-from hodge_pipeline.solvers.linear import Factor, factorise, factorise_blocks, fill_reducing_order
+from hodge_pipeline.solvers.linear import Factor, factorise, fill_reducing_order
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioning, multigrid
 from hodge_pipeline.types import Floats, Ints
 
-BackendName: TypeAlias = Literal["auto", "superlu", "cholmod", "multigrid"]
+BackendName: TypeAlias = Literal["auto", "superlu", "multigrid"]
 ITERATIVE_FROM = 15_000
 """Vertices: below, a factorisation and a hundred solves cost less than the hierarchies."""
 CHAIN_EDGES_PER_VERTEX = 1.5
@@ -43,12 +39,10 @@ SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
 class Backend:
     """How linear systems of a graph are solved: by factors, or, with `precondition`, by conjugate gradients.
 
-    `factorise_core` gives what solves with a matrix in the order of elimination; None is SuperLU, which can do so in
-    single precision. `precondition` gives an approximate inverse, symmetric and positive definite, of a block matrix.
+    `precondition` gives an approximate inverse, symmetric and positive definite, of a block matrix.
     """
 
     name: BackendName
-    factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]] | None = None
     precondition: Preconditioning | None = None
 
     @property
@@ -61,36 +55,12 @@ class Backend:
         size = int(laplacian.shape[0])
         if size and self.precondition is not None:
             return _conjugate_gradients(csr_matrix(laplacian), self.precondition)
-        if size and self.factorise_core is not None:
-            return Factor(size, self.factorise_core(laplacian))
         return factorise(laplacian, "NATURAL")
-
-    def factorise_blocks(self, plan: Elimination, matrix: bsr_matrix, single: bool = False) -> Factor:
-        """The factor of a block matrix in the order of elimination; `single`: in float32, where there is a choice.
-
-        An iterative back end leaves it to SuperLU. Raises `GraphError` where the matrix is singular.
-        """
-        return factorise_blocks(plan, matrix, single and self.factorise_core is None, self.factorise_core)
 
 
 def backend(name: BackendName) -> Backend:
-    """The back end of this name, not `auto`. Raises `GraphError` where its library is not installed."""
-    if name == "cholmod":
-        if not cholmod_installed():
-            raise GraphError("back end cholmod is not installed: pip install scikit-sparse, or take backend auto")
-        return Backend(name, factorise_core=_cholmod)
+    """The back end of this name, not `auto`."""
     return Backend(name, precondition=_multigrid()) if name == "multigrid" else Backend("superlu")
-
-
-@cache
-def cholmod_installed() -> bool:
-    """Whether scikit-sparse can be imported: looked up once, since a search of the path takes as long as a twentieth
-    of a solve for a thousand poses.
-    """
-    try:
-        return importlib.util.find_spec("sksparse.cholmod") is not None
-    except ModuleNotFoundError:
-        return False
 
 
 def choose(name: BackendName, tail: Ints, head: Ints, count: int, direct: bool = False) -> tuple[Backend, Elimination]:
@@ -99,7 +69,7 @@ def choose(name: BackendName, tail: Ints, head: Ints, count: int, direct: bool =
     `auto` is the cheaper of a factorisation, whose fill is foretold, and multigrid; where one will be needed
     (`direct`), it is a factorisation.
     """
-    factors = backend("cholmod" if cholmod_installed() else "superlu") if name == "auto" else backend(name)
+    factors = backend("superlu" if name == "auto" else name)
     if factors.iterative:
         return factors, unordered(count)
     if name != "auto" or direct or count <= ITERATIVE_FROM:
@@ -148,13 +118,3 @@ def _multigrid() -> Preconditioning:
     """Multigrid for matrices that share their patterns, as those of one problem do."""
     coarsening = Coarsening()
     return lambda matrix, modes: multigrid(matrix, modes, lambda coarse: factorise(coarse).solve, coarsening).cycle
-
-
-def _cholmod(matrix: csc_matrix) -> Callable[[Floats], Floats]:
-    from sksparse.cholmod import CholmodError, cholesky
-
-    try:
-        factor = cholesky(csc_matrix(matrix, dtype=float), ordering_method="natural")
-    except CholmodError as error:
-        raise GraphError(f"a linear system of {matrix.shape[0]} unknowns is singular: {error}") from error
-    return lambda rhs: np.asarray(factor(rhs))

@@ -8,10 +8,9 @@ import numpy as np
 from scipy.sparse import bsr_matrix, diags_array
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.backends import Backend
 from hodge_pipeline.solvers.cg import CgResult, truncated_cg
 from hodge_pipeline.solvers.elimination import Elimination
-from hodge_pipeline.solvers.linear import Factor
+from hodge_pipeline.solvers.linear import Factor, factorise_blocks
 from hodge_pipeline.types import Floats
 
 FEWEST_CG_STEPS = 60
@@ -47,7 +46,6 @@ class DirectSolver:
     """
 
     plan: Elimination
-    backend: Backend
     cg_first: bool = True
     factor: Factor | None = None
     tried: int = 0
@@ -80,10 +78,10 @@ class DirectSolver:
     def _factor_of(self, hessian: bsr_matrix) -> Factor:
         """Its factor; that of a damped one where rounding has made it singular, as edges of wild lengths do."""
         try:
-            return self.backend.factorise_blocks(self.plan, hessian)
+            return factorise_blocks(self.plan, hessian)
         except GraphError:
             damped = hessian + diags_array(DAMPING * hessian.diagonal())
-            return self.backend.factorise_blocks(self.plan, damped.tobsr(hessian.blocksize))
+            return factorise_blocks(self.plan, damped.tobsr(hessian.blocksize))
 
     def refined(self, exact: bsr_matrix, gradient: Floats, enough: float) -> CgResult | None:
         """The step of another Hessian, preconditioned by the latest factor; None where it is not definite."""

@@ -19,7 +19,7 @@ from hodge_pipeline.solvers.isotropic import step_solver
 from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.problem import Problem
-from hodge_pipeline.solvers.rotations import exponential, lever
+from hodge_pipeline.solvers.rotations import lever
 from hodge_pipeline.types import Floats
 
 
@@ -105,12 +105,7 @@ class FullObjective:
 
     def moved(self, point: Point, direction: Floats) -> FullPoint:
         """The point whose free poses are moved by a direction (free · (p + d),)."""
-        free, p = self.problem.free_count, self.problem.tangent_size
-        step = direction.reshape(free, p + self.problem.dimension)
-        turned, shifted = point.rotations.copy(), point.translations.copy()
-        turned[:free] = exponential(step[:, :p]) @ point.rotations[:free]
-        shifted[:free] += step[:, p:]
-        return self.at(turned, shifted)
+        return self.at(*self.problem.moved(point.rotations, point.translations, direction))
 
     def normal_equations(self, left: FullResiduals) -> tuple[Floats, bsr_matrix]:
         """Half the gradient (free · (p + d),) and half the Gauss-Newton Hessian."""

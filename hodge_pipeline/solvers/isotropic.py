@@ -18,7 +18,7 @@ from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.objective import Residuals, curvature, gradient, residuals
 from hodge_pipeline.solvers.problem import Problem
-from hodge_pipeline.solvers.rotations import axial, exponential, lever
+from hodge_pipeline.solvers.rotations import axial, lever
 from hodge_pipeline.solvers.translations import TranslationSolver
 from hodge_pipeline.types import Floats
 
@@ -54,7 +54,7 @@ def cg_first(problem: Problem) -> bool:
 def step_solver(problem: Problem) -> DirectSolver | IterativeSolver:
     """What solves for the steps of all unknowns, by the problem's back end."""
     structure = problem.structure
-    return structure.iterative or DirectSolver(structure.elimination, structure.backend, cg_first(problem))
+    return structure.iterative or DirectSolver(structure.elimination, cg_first(problem))
 
 
 @dataclass(frozen=True)
@@ -106,12 +106,7 @@ class JointObjective:
 
     def moved(self, point: Point, direction: Floats) -> JointPoint:
         """The point whose free poses are moved by a direction (free · (p + d),)."""
-        free, p = self.problem.free_count, self.problem.tangent_size
-        step = direction.reshape(free, p + self.problem.dimension)
-        turned, shifted = point.rotations.copy(), point.translations.copy()
-        turned[:free] = exponential(step[:, :p]) @ point.rotations[:free]
-        shifted[:free] += step[:, p:]
-        return self.at(turned, shifted)
+        return self.at(*self.problem.moved(point.rotations, point.translations, direction))
 
     def _iterated(
         self, solver: IterativeSolver, point: JointPoint, slopes: Floats, tolerance: float, enough: float, near: bool

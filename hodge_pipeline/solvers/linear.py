@@ -52,26 +52,18 @@ def factorise(matrix: csc_matrix | csr_matrix, ordering: str = "auto", single: b
     return Factor(size, factor.solve)
 
 
-def factorise_blocks(
-    plan: Elimination,
-    matrix: bsr_matrix,
-    single: bool = False,
-    core: Callable[[csc_matrix], Callable[[Floats], Floats]] | None = None,
-) -> Factor:
+def factorise_blocks(plan: Elimination, matrix: bsr_matrix, single: bool = False) -> Factor:
     """The factor of a symmetric positive definite block matrix (n · s, n · s) whose rows are in the plan's order.
 
-    `single`: in float32. `core` factorises what the plan's rounds leave, in place of SuperLU. Raises `GraphError`
-    where the matrix is singular.
+    `single`: in float32. Raises `GraphError` where the matrix is singular.
     """
-    if not plan.groups and core is not None:
-        return Factor(int(matrix.shape[0]), core(by_columns(matrix)))
     if not plan.groups:
         return factorise(by_columns(matrix), "NATURAL" if plan.ordered else "auto", single)
     try:
         found = eliminate(
             plan,
             matrix.astype(np.float32 if single else np.float64, copy=False),
-            core if core is not None else lambda left: factorise(left, "NATURAL", single).solve,
+            lambda left: factorise(left, "NATURAL", single).solve,
         )
     except np.linalg.LinAlgError as error:
         raise GraphError(_singular(matrix.shape[0])) from error

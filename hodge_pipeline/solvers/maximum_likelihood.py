@@ -51,8 +51,8 @@ def solve(
       indefinite information matrix is solved as isotropic, and a note says so.
     - `start (V, 4, 4)` sets the gauge of each component; with `initial="given"` the descent begins there, else at
       the chordal rotations, which need no start.
-    - `backend` of linear systems: `superlu` and `cholmod` factorise, `multigrid` preconditions conjugate gradients, at
-      a cost that does not depend on the fill; `auto` takes what will be cheaper on this graph.
+    - `backend` of linear systems: `superlu` factorises, `multigrid` preconditions conjugate gradients, at a cost that
+      does not depend on the fill; `auto` takes what will be cheaper on this graph.
     - `dimension`: 2 for a graph in the plane; None takes the graph's, and 2 where every edge lies in the plane.
     - `fixed`: rows of vertices that stay at their start; None takes the graph's.
     - `priors`: unary pose priors; all poses that have one share the world's gauge. None takes the graph's.
@@ -62,8 +62,8 @@ def solve(
         graph = ViewGraph.from_edges(np.arange(4), edges, i_from_j, information)
         world_from_cam = solve(graph).world_from_cam
 
-    Raises `GraphError` for motions that are not finite and rigid, edges and fixed rows that name no vertex, unknown
-    options, and a back end not installed.
+    Raises `GraphError` for motions that are not finite and rigid, edges and fixed rows that name no vertex, and
+    unknown options.
     """
     check_choice("objective", objective, ObjectiveName)
     check_choice("initial", initial, InitialName)
@@ -157,8 +157,8 @@ class MaximumLikelihoodSolver:
     )
     backend: BackendName = Field(
         "auto",
-        description="of linear systems: superlu and cholmod (scikit-sparse) factorise; multigrid "
-        "preconditions conjugate gradients, whatever the fill; auto: what will be cheapest here and is installed",
+        description="of linear systems: superlu factorises; multigrid preconditions conjugate gradients, whatever the "
+        "fill; auto: what will be cheapest here",
     )
     certificate: bool = Field(False, description="test whether the isotropic minimum is the global one")
     max_iterations: int = Field(100, gt=0, description="Newton steps; real graphs need 3 to 12")

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from hodge_pipeline.complex.coboundary import coboundary_0
-from hodge_pipeline.complex.connectivity import connectivity
 from hodge_pipeline.complex.cotangent import cotangent_weights
 from hodge_pipeline.complex.cycles import Loops, loop_products
 from hodge_pipeline.complex.decomposition import hodge_decomposition
@@ -18,6 +17,7 @@ from hodge_pipeline.complex.embedding import Embedding, Surface, embed, triangul
 from hodge_pipeline.complex.homology import homology_generators, motion_deviation
 from hodge_pipeline.complex.one_form import surface_form
 from hodge_pipeline.complex.rotation import angular_rotation, random_rotation
+from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.types import Floats, Ints
 
 RotationSystem = Literal["random", "angular"]
@@ -59,7 +59,7 @@ class PaperSurface:
 
     def shares(self, omega_on_surface: Floats) -> Mapping[str, float]:
         """The share of each Hodge part in the energy of ω, rotation and translation apart (Theorem 4)."""
-        parts = hodge_decomposition(self.d0, self.surface.d1, omega_on_surface, self.weights).shares()
+        parts = hodge_decomposition(self.d0, self.surface.d1, omega_on_surface, self.weights).energies().shares
         named = {}
         for name, (rotation, translation) in parts.items():
             named[f"share_{name}_rotation"], named[f"share_{name}_translation"] = rotation, translation
@@ -70,15 +70,19 @@ class PaperSurface:
         return homology_generators(self.embedding)
 
     def connectivity_notes(self) -> tuple[str, ...]:
-        """Whether the graph is 3-connected, as Algorithm 1 asks; what it lacks."""
-        found = connectivity(self.embedding.edges, self.embedding.vertex_count)
-        if found.three_connected:
+        """What the graph lacks to be 3-connected, as Algorithm 1 asks: edges without which, one or two, it falls apart.
+
+        Vertices without which it does are not looked for.
+        """
+        edges, count = self.embedding.edges, self.embedding.vertex_count
+        series = series_classes(edges, count)
+        bridges, chains = int((series < 0).sum()), int((np.bincount(series[series >= 0]) > 1).sum())
+        least = int(np.bincount(edges.ravel(), minlength=count).min())
+        if not bridges and not chains and least > 2:
             return ()
-        if found.three_connected is None:
-            return ("whether the graph is 3-connected, as Algorithm 1 asks, takes too long to tell",)
         return (
-            f"the graph is not 3-connected, as Algorithm 1 asks: {len(found.bridges)} bridges, "
-            f"{len(found.cut_vertices)} cut vertices, least degree {found.least_degree}; it is embedded all the same",
+            f"the graph is not 3-connected, as Algorithm 1 asks: {bridges} bridges, {chains} groups of edges in "
+            f"series, least degree {least}; it is embedded all the same",
         )
 
 

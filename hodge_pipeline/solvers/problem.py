@@ -18,6 +18,7 @@ from hodge_pipeline.solvers.backends import Backend, BackendName, choose
 from hodge_pipeline.solvers.elimination import Elimination
 from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.linear import Factor, corrected
+from hodge_pipeline.solvers.rotations import exponential
 from hodge_pipeline.types import Bools, Floats, Ints
 
 SAME_RATIO = 1e-13
@@ -227,6 +228,15 @@ class Problem:
             solve, scale = self.rotation_factor.solve, 1 / ratio[0]
             return Factor(self.free_count, lambda rhs: scale * solve(rhs))
         return self.structure.backend.factorise(self.structure.laplacian(self.tau))
+
+    def moved(self, rotations: Floats, translations: Floats, direction: Floats) -> tuple[Floats, Floats]:
+        """Poses whose free ones are moved by a direction (free · (p + d),) in the world's axes."""
+        free, p = self.free_count, self.tangent_size
+        step = direction.reshape(free, p + self.dimension)
+        turned, shifted = rotations.copy(), translations.copy()
+        turned[:free] = exponential(step[:, :p]) @ rotations[:free]
+        shifted[:free] += step[:, p:]
+        return turned, shifted
 
 
 def _indicator(vertices: Ints, count: int) -> csc_matrix:

@@ -13,7 +13,6 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.chordal import initial_rotations
 from hodge_pipeline.solvers.newton import Point
-from hodge_pipeline.solvers.objective import gradient, residuals
 from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
 from hodge_pipeline.solvers.rotations import project
@@ -83,7 +82,7 @@ def prepare(
 ) -> Setup:
     """The set-up of a graph; `direct`: a factorisation will be needed, whatever it costs.
 
-    Raises `GraphError` where its numbers cannot be used, or the back end is not installed.
+    Raises `GraphError` where its numbers cannot be used.
     """
     check_choice("backend", backend, BackendName)
     check_choice("dimension", dimension, DimensionName)
@@ -128,13 +127,3 @@ def _gauge(component: Ints, fixed: Ints, start: Floats | None) -> Floats:
     free = ~held[component]
     gauge[free] = start[first[component[free]]]
     return gauge
-
-
-def relative_gradient(graph: ViewGraph, world_from_cam: Floats) -> float:
-    """The norm of F's gradient at these poses (V, 4, 4) over that at the start which `solve` would choose."""
-    setup = prepare(graph, world_from_cam)
-
-    def norm(rotations: Floats, translations: Floats) -> float:
-        return float(np.linalg.norm(gradient(setup.problem, residuals(setup.problem, rotations, translations))))
-
-    return norm(*setup.initial("given")) / max(norm(*setup.initial("chordal")), 1e-300)

@@ -15,6 +15,8 @@ from hodge_pipeline.types import Bools, Bytes, Floats, Floats32, PointCloud
 
 NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 COLOURS = ("red", "green", "blue")
+PACKED = ("rgb", "rgba")
+"""Colours of four bytes, 0xAARRGGBB, declared as a float by PCL's convention."""
 TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time")
 """When a point was measured: Ouster, Velodyne, Hesai and Livox name it differently, and count in their own units."""
 REVOLUTION_S = (0.01, 2.0)
@@ -56,6 +58,16 @@ def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
         _eight_bits(_joined(colours)) if colours else None,
         times_s=seconds_after_first(_joined(times)) if times else None,
     )
+
+
+def unpacked(columns: dict[str, Any]) -> dict[str, Any]:
+    """The columns with those of packed colours unpacked, unless they have colours already."""
+    packed = next((name for name in PACKED if name in columns and columns[name].dtype.itemsize == 4), None)
+    if packed is None or all(name in columns for name in COLOURS):
+        return columns
+    words = np.ascontiguousarray(columns[packed])
+    words = words.view(np.dtype("u4").newbyteorder(words.dtype.byteorder))
+    return columns | {"red": words >> 16 & 255, "green": words >> 8 & 255, "blue": words & 255}
 
 
 def seconds_after_first(times: Floats) -> Floats32 | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.clouds.columns import points_of_columns
-from hodge_adapters.text_rows import read_rows, to_floats
+from hodge_adapters.text_rows import read_rows, reading, to_floats
 from hodge_adapters.trajectories.text import read_kitti
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -34,10 +34,8 @@ def read_bin(path: Path) -> PointCloud:
 
     Raises `SourceError` where it has none of these.
     """
-    try:
+    with reading(path):
         values = np.frombuffer(read_input(path), np.uint8)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
     tables = {width: values.view("<f4").reshape(-1, width) for width in WIDTHS if len(values) % (4 * width) == 0}
     if not tables:
         raise SourceError(f"{path}: {len(values)} bytes are no float32 rows of three to five columns: copy it again")

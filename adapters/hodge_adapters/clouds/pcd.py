@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from hodge_adapters.clouds.columns import number_rows, parts_of, points_of_parts
+from hodge_adapters.clouds.columns import PACKED, number_rows, parts_of, points_of_parts, unpacked
+from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PointCloud
 from hodge_pipeline.types.input_files import read_input
@@ -22,7 +23,6 @@ MAX_EXPANSION = 264
 MAX_EXPANDED_BYTES = 1 << 30
 """Compressed points are expanded whole: 1 GiB are 30 million points with normals and colours."""
 _CODES = {"F": "f", "I": "i", "U": "u"}
-_PACKED = ("rgb", "rgba")
 
 
 @dataclass(frozen=True)
@@ -45,21 +45,11 @@ def read_pcd(path: Path) -> PointCloud:
 
     Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
     """
-    try:
+    with reading(path):
         contents = read_input(path)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
     header = _read_header(path, contents)
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}[header.kind]
-    return points_of_parts(path, map(_unpacked, read(path, contents, header)))
-
-
-def _unpacked(columns: dict[str, Any]) -> dict[str, Any]:
-    for name in _PACKED:
-        if name in columns and columns[name].dtype.itemsize == 4:
-            packed = np.ascontiguousarray(columns[name]).view(np.uint32)
-            columns |= {"red": packed >> 16 & 255, "green": packed >> 8 & 255, "blue": packed & 255}
-    return columns
+    return points_of_parts(path, map(unpacked, read(path, contents, header)))
 
 
 def expand_lzf(compressed: bytes, size: int) -> bytearray | None:
@@ -137,7 +127,7 @@ def _read_ascii(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dict
         for name, code, count in header.fields:
             column = table[:, at]
             # Packed colours are the bits of the number that is written.
-            columns[name] = _as_type(column, code) if name in _PACKED else column
+            columns[name] = _as_type(column, code) if name in PACKED else column
             at += count
         yield columns
     if rest := sum(1 for _ in lines):

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from hodge_adapters.clouds.columns import number_rows, points_of_parts
-from hodge_adapters.text_rows import write_bytes_atomically
-from hodge_pipeline.errors import SourceError
+from hodge_adapters.text_rows import reading, write_bytes_atomically
 from hodge_pipeline.types import Model, PointCloud
 from hodge_pipeline.types.input_files import open_input
 from hodge_pipeline.types.ply import PlyHeader, model_parts, read_header, vertex_parts
@@ -29,13 +28,10 @@ def read_ply(path: Path) -> PointCloud:
 
     Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
     """
-    try:
-        with open_input(path) as file:
-            header = read_header(path, file)
-            parts = _binary_parts if header.order else _ascii_parts
-            return points_of_parts(path, parts(path, file, header))
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
+    with reading(path), open_input(path) as file:
+        header = read_header(path, file)
+        parts = _binary_parts if header.order else _ascii_parts
+        return points_of_parts(path, parts(path, file, header))
 
 
 def write_ply(path: Path, cloud: PointCloud) -> None:

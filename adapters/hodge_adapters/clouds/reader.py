@@ -19,9 +19,8 @@ from hodge_adapters.clouds.kitti import is_scan, read_bin, scan_poses
 from hodge_adapters.clouds.pcd import read_pcd
 from hodge_adapters.clouds.ply import read_ply, write_ply
 from hodge_adapters.clouds.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
-from hodge_adapters.colmap.files import natural
 from hodge_adapters.posed import posed_frames, written
-from hodge_adapters.text_rows import listed
+from hodge_adapters.text_rows import listed, natural
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError

@@ -5,7 +5,7 @@ COLMAP puts 0, 0 at the outer corner of the first pixel; here whole numbers are 
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -15,10 +15,10 @@ from hodge_adapters.colmap.depth import read_depth_map
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import CameraRecord
 from hodge_adapters.images import pixels
+from hodge_adapters.images.lens_models import HALF_PIXEL
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32
 
-HALF_PIXEL = 0.5
 UNDISTORTED = ("SIMPLE_PINHOLE", "PINHOLE")
 
 
@@ -96,8 +96,3 @@ def read_undistorted_colour(path: Path, *, record: CameraRecord, size: tuple[int
         colour = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
     columns, rows = undistortion(record, size)
     return np.asarray(cv2.remap(colour, columns, rows, cv2.INTER_LINEAR, borderValue=(0, 0, 0)), np.uint8)
-
-
-def colour_reader(path: Path, record: CameraRecord, size: tuple[int, int]) -> partial[Bytes]:
-    """The lazy colour image of a frame."""
-    return partial(read_undistorted_colour, path, record=record, size=size)

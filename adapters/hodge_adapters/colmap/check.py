@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.colmap.pycolmap_import import pycolmap
-from hodge_adapters.text_rows import read_text, to_floats
+from hodge_adapters.text_rows import read_text, reading, to_floats
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types.input_files import open_input
 
@@ -26,15 +26,11 @@ _U32, _I32, _U64 = struct.Struct("<I"), struct.Struct("<i"), struct.Struct("<Q")
 def check_files(paths: Sequence[Path]) -> None:
     """Raise `SourceError` with file and byte, or line, where one of them ends too early, too late or in mid-record."""
     for path in paths:
-        try:
+        with reading(path):
             if path.suffix == ".txt":
                 _check_lines(path)
             else:
                 _check_bytes(path)
-        except OSError as error:
-            raise SourceError(
-                f"{path}: cannot be read ({error.strerror}): restore the file or its permissions"
-            ) from error
 
 
 def check_words(paths: Sequence[Path]) -> None:

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.colmap.check import REMEDY, check_files, check_words
-from hodge_adapters.colmap.files import MODEL_FILES, model_ending, natural
+from hodge_adapters.colmap.files import MODEL_FILES, model_ending
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, Points
+from hodge_adapters.text_rows import natural
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,27 +31,29 @@ MAX_VALUE_BYTES = 1 << 26
 """The keypoints of an image, or the matches of a pair: 64 MiB are 2.8 million keypoints of six columns."""
 
 
+@contextmanager
+def _opened(path: Path, instead: str = "leave it out") -> Iterator[sqlite3.Connection]:
+    """The database. Raises `SourceError` for a file that is none, or one that is damaged."""
+    try:
+        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
+            yield database
+    except DAMAGED as error:
+        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or {instead}") from error
+
+
 def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) -> Iterator[Pair]:
     """Pairs of the model's images with enough verified matches; i is the image with the greater id.
 
     Raises `SourceError` for a file that is no database of COLMAP, or one that is damaged.
     """
-    try:
-        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
-            yield from _pairs(database, path, model, min_shared, notes)
-    except DAMAGED as error:
-        raise SourceError(
-            f"{path}: not a whole COLMAP database ({error}): make it again, or set edges=covisibility"
-        ) from error
+    with _opened(path, "set edges=covisibility") as database:
+        yield from _pairs(database, path, model, min_shared, notes)
 
 
 def database_names(path: Path) -> set[str]:
     """The names of the images in a database. Raises `SourceError` where it is none."""
-    try:
-        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
-            return {str(name) for (name,) in database.execute("SELECT name FROM images")}
-    except DAMAGED as error:
-        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
+    with _opened(path) as database:
+        return {str(name) for (name,) in database.execute("SELECT name FROM images")}
 
 
 def has_verified_pairs(path: Path) -> bool:
@@ -59,11 +62,8 @@ def has_verified_pairs(path: Path) -> bool:
     Raises `SourceError` where it is no database.
     """
     query = "SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'two_view_geometries'"
-    try:
-        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
-            return bool(database.execute(query).fetchone()[0])
-    except (sqlite3.Error, OverflowError) as error:
-        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
+    with _opened(path) as database:
+        return bool(database.execute(query).fetchone()[0])
 
 
 class PriorRow(NamedTuple):
@@ -81,18 +81,15 @@ class PriorRow(NamedTuple):
 
 def prior_rows(path: Path) -> Sequence[PriorRow]:
     """The pose priors of a database, empty where it has none. Raises `SourceError` where it is none."""
-    try:
-        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
-            there = database.execute("SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'pose_priors'")
-            if not there.fetchone()[0]:
-                return ()
-            names = dict(database.execute("SELECT image_id, name FROM images"))
-            table = database.execute("SELECT * FROM pose_priors")
-            columns = [column for column, *_ in table.description]
-            rows = [dict(zip(columns, row, strict=True)) for row in table]
-            return [_prior(names[_image_of(row)], row) for row in rows if _image_of(row) in names]
-    except DAMAGED as error:
-        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
+    with _opened(path) as database:
+        there = database.execute("SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'pose_priors'")
+        if not there.fetchone()[0]:
+            return ()
+        names = dict(database.execute("SELECT image_id, name FROM images"))
+        table = database.execute("SELECT * FROM pose_priors")
+        columns = [column for column, *_ in table.description]
+        rows = [dict(zip(columns, row, strict=True)) for row in table]
+        return [_prior(names[_image_of(row)], row) for row in rows if _image_of(row) in names]
 
 
 def _image_of(row: Mapping[str, Any]) -> int | None:
@@ -114,32 +111,26 @@ def _prior(name: str, row: Mapping[str, Any]) -> PriorRow:
 
 def database_matches(path: Path, row_of_name: Mapping[str, int]) -> Iterator[tuple[int, int, Ints]]:
     """Rows i and j of two images by name, and the keypoints (M, 2) of i and of j that are verified to match."""
-    try:
-        with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
-            row_of_id = {
-                int(image_id): row_of_name[name]
-                for image_id, name in database.execute("SELECT image_id, name FROM images")
-                if name in row_of_name
-            }
-            rows = database.execute(
-                "SELECT pair_id, rows, config, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
-            )
-            for pair_id, count, config, data in rows:
-                first, second = (row_of_id.get(image_id) for image_id in divmod(int(pair_id), MAX_IMAGE_ID))
-                if first is not None and second is not None and config in USABLE:
-                    matches = _blob(path, f"pair {pair_id}", data, np.dtype("<u4"), count, 2)
-                    yield first, second, matches.astype(np.int64)
-    except DAMAGED as error:
-        raise SourceError(f"{path}: not a whole COLMAP database ({error}): make it again, or leave it out") from error
+    with _opened(path) as database:
+        row_of_id = _rows_by_id(database, row_of_name)
+        rows = database.execute(
+            "SELECT pair_id, rows, config, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
+        )
+        for pair_id, count, config, data in rows:
+            first, second = (row_of_id.get(image_id) for image_id in divmod(int(pair_id), MAX_IMAGE_ID))
+            if first is not None and second is not None and config in USABLE:
+                matches = _blob(path, f"pair {pair_id}", data, np.dtype("<u4"), count, 2)
+                yield first, second, matches.astype(np.int64)
+
+
+def _rows_by_id(database: sqlite3.Connection, row_of_name: Mapping[str, int]) -> dict[int, int]:
+    names = database.execute("SELECT image_id, name FROM images")
+    return {int(image_id): row_of_name[name] for image_id, name in names if name in row_of_name}
 
 
 def _pairs(database: sqlite3.Connection, path: Path, model: Model, min_shared: int, notes: list[str]) -> Iterator[Pair]:
     row_of_name = {image.name: row for row, image in enumerate(model.images)}
-    row_of_id = {
-        int(image_id): row_of_name[name]
-        for image_id, name in database.execute("SELECT image_id, name FROM images")
-        if name in row_of_name
-    }
+    row_of_id = _rows_by_id(database, row_of_name)
     cameras = camera_table(model)
     outside = 0
     rows = database.execute(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.images.headers import MAX_PIXELS
-from hodge_adapters.text_rows import inside
+from hodge_adapters.text_rows import inside, reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats32
 from hodge_pipeline.types.input_files import open_input
@@ -61,11 +61,8 @@ def sensor_depth(folder: Path, name: str, colour: Path | None) -> Path | None:
 
 
 def _parse_header(path: Path) -> tuple[tuple[int, int], int]:
-    try:
-        with open_input(path) as file:
-            match = _HEADER.match(file.read(32))
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore it or its permissions") from error
+    with reading(path), open_input(path) as file:
+        match = _HEADER.match(file.read(32))
     if match is None:
         raise SourceError(f"{path}: no depth map of COLMAP: it begins with no `width&height&1&`; make it again")
     width, height, channels = map(int, match.groups())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import re
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -16,7 +14,6 @@ MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "den
 PARENTS = 3
 LOOKED_AT = 60
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
-_DIGITS = re.compile(r"(\d+)")
 
 
 def find_model(path: Path) -> Path | None:
@@ -73,23 +70,13 @@ def find_database(model: Path) -> Path | None:
     return next((place / "database.db" for place in above if (place / "database.db").is_file()), None)
 
 
-def natural(name: str) -> tuple[tuple[int, int, str], ...]:
-    """A sort key that takes digits for numbers."""
-    parts = (part for part in _DIGITS.split(name) if part)
-    return tuple((0, int(part[:18]), part) if part.isascii() and part.isdecimal() else (1, 0, part) for part in parts)
-
-
-def parent_of(name: str) -> str:
-    """The folder part of an image's name: cameras of a rig have one each."""
-    return os.path.dirname(name)
-
-
 def find_models(path: Path) -> list[Path]:
     """The folders of all models of one scene: the path itself, or `0`, `1`, … in it or in its `sparse`."""
     if model_ending(path):
         return [path]
     for place in (path, path / "sparse"):
-        numbered = sorted((folder for folder in _folders(place) if folder.name.isdecimal()), key=lambda f: int(f.name))
+        below = [entry for entry in place.iterdir() if entry.is_dir()] if place.is_dir() else []
+        numbered = sorted((folder for folder in below if folder.name.isdecimal()), key=lambda folder: int(folder.name))
         found = [folder for folder in numbered if model_ending(folder)]
         if found:
             return found
@@ -106,7 +93,3 @@ def largest_model(folders: Sequence[Path]) -> tuple[Path, str]:
         f"{folder.name} ({counted(count, 'image')})" for folder, count in zip(folders, counts, strict=True)
     )
     return folders[counts.index(max(counts))], f"{len(folders)} models in {folders[0].parent}: {named}"
-
-
-def _folders(path: Path) -> list[Path]:
-    return [entry for entry in path.iterdir() if entry.is_dir()] if path.is_dir() else []

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,8 +22,8 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, PositionPriors
 
 FEWEST = 3
-TRIALS, REFITS = 300, 5
-"""Of three positions each: with half of them wrong, one of 8 has three right ones."""
+LEAST_AGREEING, TRIALS, REFITS = 0.5, 300, 5
+"""Share of the positions; trials of three each: with half of them wrong, one of 8 has three right ones."""
 INLIER_SIGMAS = 3.0
 DRIFT = 0.03
 """Of the extent of the positions: a model may have drifted by so much and still be placed by most of them."""
@@ -110,37 +111,31 @@ def body_priors(
 
 
 def _by_positions(here: Floats, there: Floats, sigma_m: float) -> Placing | str:
+    on_a_line = f"{len(there)} known positions lie on one line, about which the model could turn"
+    if _narrow_m(there) < SPREAD_SIGMAS * sigma_m:
+        return on_a_line
     near_m = max(INLIER_SIGMAS * sigma_m, DRIFT * float(np.linalg.norm(np.ptp(there, axis=0))))
-    triples = np.random.default_rng(0).permuted(np.tile(np.arange(len(here)), (TRIALS, 1)), axis=1)[:, :FEWEST]
-    scale, motion = _similarities(here[triples], there[triples])
-    agree = _off(here, there, scale, motion) < near_m
-    inliers = agree[agree.sum(axis=1).argmax()]
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed, options.min_inlier_ratio = near_m, 0, LEAST_AGREEING
+    options.min_num_trials = options.max_num_trials = TRIALS
+    found: Any = pycolmap.estimate_sim3d_robust(here, there, options)
+    if found is None:
+        return f"{len(there)} known positions do not fit the model: less than half of them agree"
+    motion, inliers = found["tgt_from_src"], np.asarray(found["inlier_mask"], bool)
     for _ in range(REFITS):
-        if inliers.sum() < max(FEWEST, len(there) / 2):
+        if inliers.sum() < max(FEWEST, LEAST_AGREEING * len(there)):
             return f"{len(there)} known positions do not fit the model: less than half of them agree"
-        scale, motion = _similarities(here[inliers], there[inliers])
-        inliers = _off(here, there, scale, motion) < near_m
-    spread = np.linalg.svd(there[inliers] - there[inliers].mean(axis=0), compute_uv=False)
-    if spread[1] < SPREAD_SIGMAS * sigma_m:
-        return f"{len(there)} known positions lie on one line, about which the model could turn"
+        motion = pycolmap.estimate_sim3d(here[inliers], there[inliers]) or motion
+        inliers = np.linalg.norm(np.array([motion * point for point in here]) - there, axis=1) < near_m
+    if _narrow_m(there[inliers]) < SPREAD_SIGMAS * sigma_m:
+        return on_a_line
     left_out = f" ({len(there) - inliers.sum()} do not agree)" if not inliers.all() else ""
-    turn = pycolmap.Rotation3d(np.ascontiguousarray(motion[:3, :3]))
-    told = f"in the world of {inliers.sum()} known positions{left_out}"
-    return Placing(pycolmap.Sim3d(float(scale), turn, motion[:3, 3]), told)
+    return Placing(motion, f"in the world of {inliers.sum()} known positions{left_out}")
 
 
-def _similarities(here: Floats, there: Floats) -> tuple[Floats, Floats]:
-    """Scales (...) and motions (..., 4, 4) that lay points (..., N, 3) onto others, scaled first."""
-    size_here, size_there = (
-        np.linalg.norm(points - points.mean(axis=-2, keepdims=True), axis=(-2, -1)) for points in (here, there)
-    )
-    scale = np.asarray(size_there / np.maximum(size_here, 1e-300))
-    return scale, se3.fit_rigid(there, scale[..., None, None] * here)
-
-
-def _off(here: Floats, there: Floats, scale: Floats, motion: Floats) -> Floats:
-    """How far (..., N) the points are from each other once laid so."""
-    return np.asarray(np.linalg.norm(se3.transform(motion, scale[..., None, None] * here) - there, axis=-1))
+def _narrow_m(points: Floats) -> float:
+    """How far the points spread across the line that is nearest to them."""
+    return float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1])
 
 
 def _by_gravity(down: Floats) -> Placing:

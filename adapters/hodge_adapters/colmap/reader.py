@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -14,10 +15,10 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.colmap.cameras import (
     UNDISTORTED,
-    colour_reader,
     pinhole_camera,
     read_sensor_depth,
     read_stereo_depth,
+    read_undistorted_colour,
 )
 from hodge_adapters.colmap.content import read_model
 from hodge_adapters.colmap.database import database_pairs
@@ -30,7 +31,6 @@ from hodge_adapters.colmap.files import (
     find_models,
     largest_model,
     no_model,
-    parent_of,
     part_of_model,
 )
 from hodge_adapters.colmap.records import CameraRecord, ImageRecord, Model
@@ -208,12 +208,12 @@ class ColmapReader:
             stamp_s=float(row),
             camera=camera,
             read_depth=read,
-            read_colour=colour_reader(colour, record, size) if colour else None,
+            read_colour=partial(read_undistorted_colour, colour, record=record, size=size) if colour else None,
             encoded_depth=_encoded_depth(depth, self.depth_scale) if plain else None,
             encoded_colour=partial(pixels.encoded_colour, whole_colour) if whole_colour else None,
             image=ImageFile(colour, record.width, record.height, record.model, record.params) if colour else None,
             world_from_cam=pose,
-            sequence=parent_of(image.name),
+            sequence=os.path.dirname(image.name),  # cameras of a rig have a folder each
         )
 
     def _graph(

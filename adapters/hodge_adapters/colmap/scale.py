@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.colmap.cameras import HALF_PIXEL, colmap_camera
+from hodge_adapters.colmap.cameras import colmap_camera
 from hodge_adapters.colmap.edges import positions
 from hodge_adapters.colmap.records import NO_POINT, Model
 from hodge_adapters.images import pixels
+from hodge_adapters.images.lens_models import HALF_PIXEL
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Floats32, ViewGraph

@@ -231,7 +231,7 @@ class ColmapModel:
         """Bodies at these poses, points where their rays meet; what the database matched is merged where it fits."""
         before, copy = self.records, self._copy()
         for frame_id, pose in zip(self.bodies.frame_ids, world_from_body, strict=True):
-            copy.frames[frame_id].rig_from_world = rigid3d(se3.inverse(pose))
+            copy.frames[frame_id].rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(se3.inverse(pose)[:3]))
         poses = world_from_body[self.bodies.body_of_image] @ self.bodies.body_from_cam
         for point_id, xyz in zip(before.points.ids.tolist(), points_of_rays(before, poses), strict=True):
             copy.points3D[point_id].xyz = xyz
@@ -329,8 +329,3 @@ class ColmapModel:
 
     def _copy(self) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(self.reconstruction)
-
-
-def rigid3d(b_from_a: Floats) -> pycolmap.Rigid3d:
-    """A motion as pycolmap has it."""
-    return pycolmap.Rigid3d(np.ascontiguousarray(b_from_a[:3]))

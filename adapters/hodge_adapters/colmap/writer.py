@@ -12,10 +12,10 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.colmap.cameras import HALF_PIXEL
 from hodge_adapters.colmap.content import read_model
 from hodge_adapters.colmap.files import find_model
 from hodge_adapters.colmap.pycolmap_import import pycolmap
+from hodge_adapters.images.lens_models import pinhole_params
 from hodge_adapters.posed import written
 from hodge_adapters.text_rows import counted, listed, write_bytes_atomically
 from hodge_pipeline import se3
@@ -128,12 +128,7 @@ def _lens(frame: Frame) -> Lens:
         return frame.image.lens, frame.image.width, frame.image.height, frame.image.params
     camera = frame.camera
     assert camera is not None
-    return (
-        "PINHOLE",
-        camera.width,
-        camera.height,
-        (camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL),
-    )
+    return "PINHOLE", camera.width, camera.height, pinhole_params(camera)
 
 
 def _names(frames: list[Frame]) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.images import pixels
-from hodge_adapters.text_rows import listed, read_text, to_floats
+from hodge_adapters.text_rows import listed, read_text, reading, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Floats, Floats32, Frame
@@ -77,9 +77,8 @@ def read_ray_lengths(path: Path, *, camera: Camera, units_per_metre: float) -> F
     """
     count = camera.width * camera.height
     try:
-        lengths = np.array(read_input(path, count * _BYTES_PER_NUMBER).split(), np.float64) / units_per_metre
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file") from error
+        with reading(path):
+            lengths = np.array(read_input(path, count * _BYTES_PER_NUMBER).split(), np.float64) / units_per_metre
     except ValueError as error:
         raise SourceError(f"{path}: not a text of ray lengths: copy it again from its source") from error
     if len(lengths) != count:

@@ -24,7 +24,7 @@ from hodge_adapters.tum.image_lists import StampedImages, find_association_file,
 from hodge_adapters.tum.reader import frame_ids
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Source
+from hodge_pipeline.types import Floats, Frame, Source
 from hodge_pipeline.types.input_files import beginning
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
@@ -107,13 +107,9 @@ class IclNuimReader:
     def _open_unlisted(self, path: Path) -> Source:
         """The TUM-like layout without its list: images are paired by the numbers in their names."""
         notes = ["no associations.txt: images are paired by the numbers in their names"]
-        found = list_images(path, notes)
-        delays_s = np.zeros(len(found.numbers))
-        listing = StampedImages(np.array(found.numbers, float), found.depth, found.colour, delays_s, ())
-        return self._numbered(path, listing, notes)
+        return self._numbered(path, list_images(path, notes), notes)
 
     def _numbered(self, path: Path, listing: StampedImages, notes: list[str]) -> Source:
-        camera = self._camera(ICL).camera(pixels.common_size(listing.depth))
         truth = _find_truth(path)
         trajectory, poses = None, np.full((len(listing.depth), 4, 4), np.nan)
         if truth:
@@ -124,22 +120,28 @@ class IclNuimReader:
         without = int(np.isnan(poses[:, 0, 0]).sum())
         if without:
             notes.append(f"{without} of {len(poses)} frames have no truth")
+        frames = self._frames(listing, ICL, poses, 5000.0, is_true=True)
+        files = (*listing.files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour))
+        return Source(path.resolve().name, path, frames, trajectory, notes=tuple(notes), files=files)
+
+    def _frames(
+        self, listing: StampedImages, default: Intrinsics, poses: Floats, units_per_metre: float, *, is_true: bool
+    ) -> tuple[Frame, ...]:
+        camera = self._camera(default).camera(pixels.common_size(listing.depth))
         ids = frame_ids(listing.stamps_s)
-        frames = tuple(
+        return tuple(
             image_frame(
                 ids[row],
                 listing.stamps_s[row],
                 camera,
                 listing.depth[row],
                 listing.colour[row],
-                units_per_metre=self.units_per_metre or 5000.0,
+                units_per_metre=self.units_per_metre or units_per_metre,
                 world_from_cam=poses[row],
-                is_true=True,
+                is_true=is_true,
             )
             for row in range(0, len(ids), self.every)
         )
-        files = (*listing.files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour))
-        return Source(path.resolve().name, path, frames, trajectory, notes=tuple(notes), files=files)
 
     def _open_pov(self, path: Path, pov: dict[int, Path]) -> Source:
         notes: list[str] = []
@@ -152,29 +154,18 @@ class IclNuimReader:
     def _open_redwood(self, path: Path) -> Source:
         notes: list[str] = []
         listing = list_images(path, notes)
-        camera = self._camera(REDWOOD).camera(pixels.common_size(listing.depth))
         log = find_log(path)
         estimates = read_log_file(log).poses if log else {}
         if log:
             notes.append(f"poses from {log.relative_to(path)}: an estimate of another program, not the truth")
-        without = [number for number in listing.numbers if number not in estimates]
-        if log and without:
-            notes.append(f"{len(without)} of {len(listing.numbers)} frames have no pose in it")
         none = np.full((4, 4), np.nan)
-        frames = tuple(
-            image_frame(
-                number,
-                number,
-                camera,
-                depth,
-                colour,
-                units_per_metre=self.units_per_metre or 1000.0,
-                world_from_cam=estimates.get(number, none),
-            )
-            for number, depth, colour in zip(listing.numbers, listing.depth, listing.colour, strict=True)
-        )
+        poses = np.array([estimates.get(number, none) for number in frame_ids(listing.stamps_s)])
+        without = int(np.isnan(poses[:, 0, 0]).sum())
+        if log and without:
+            notes.append(f"{without} of {len(poses)} frames have no pose in it")
+        frames = self._frames(listing, REDWOOD, poses, 1000.0, is_true=False)
         files = (*filter(None, [log]), *listing.depth, *filter(None, listing.colour))
-        return Source(path.resolve().name, path, frames[:: self.every], notes=tuple(notes), files=files)
+        return Source(path.resolve().name, path, frames, notes=tuple(notes), files=files)
 
 
 def _find_truth(folder: Path) -> Path | None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from hodge_adapters.text_rows import listed
+from hodge_adapters.tum.image_lists import StampedImages
 from hodge_pipeline.errors import SourceError
 
 COLOUR_FOLDERS = ("image", "color", "rgb")
@@ -15,15 +17,6 @@ LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.lo
 TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
 _NUMBER = re.compile(r"\D*(\d+)")
 _IMAGES = (".png", ".jpg", ".jpeg")
-
-
-@dataclass(frozen=True)
-class NumberedImages:
-    """Depth images by the number that their names start with, and colour images of the same numbers."""
-
-    numbers: list[int]
-    depth: list[Path]
-    colour: list[Path | None]
 
 
 def is_redwood(folder: Path) -> bool:
@@ -34,8 +27,8 @@ def is_redwood(folder: Path) -> bool:
     return has_colour and (folder / "depth").is_dir()
 
 
-def list_images(folder: Path, notes: list[str]) -> NumberedImages:
-    """The images of a folder by number; depth without colour is noted."""
+def list_images(folder: Path, notes: list[str]) -> StampedImages:
+    """The images of a folder by the number that their names start with, their stamp; depth without colour is noted."""
     depth = _by_number(folder / "depth", notes)
     if not depth:
         raise SourceError(
@@ -47,7 +40,9 @@ def list_images(folder: Path, notes: list[str]) -> NumberedImages:
     alone = [number for number in numbers if number not in colour]
     if alone:
         notes.append(f"{len(alone)} frames have no colour image: {listed(alone)}")
-    return NumberedImages(numbers, [depth[n] for n in numbers], [colour.get(n) for n in numbers])
+    none_s, one_run = np.zeros(len(numbers)), np.zeros(len(numbers), np.int64)
+    stamps_s = np.array(numbers, float)
+    return StampedImages(stamps_s, [depth[n] for n in numbers], [colour.get(n) for n in numbers], none_s, (), one_run)
 
 
 def find_log(folder: Path) -> Path | None:

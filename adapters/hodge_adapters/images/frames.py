@@ -16,9 +16,8 @@ from hodge_adapters.images.lens import (
     straight_colour,
     straight_depth,
 )
+from hodge_adapters.images.lens_models import image_file
 from hodge_pipeline.types import Camera, Floats, Frame, ImageFile
-
-HALF_PIXEL = 0.5
 
 
 def image_frame(
@@ -61,11 +60,9 @@ def image_frame(
 
 
 def _image_file(path: Path, camera: Camera, lens: Lens | None) -> ImageFile:
-    pinhole = (camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL)
     if lens is None:
-        return ImageFile(path, camera.width, camera.height, "PINHOLE", pinhole)
-    k1, k2, p1, p2, k3 = lens.distortion
-    return ImageFile(path, camera.width, camera.height, "FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+        return image_file(path, camera)
+    return image_file(path, camera, "FULL_OPENCV", (*lens.distortion, 0.0, 0.0, 0.0))
 
 
 def _straight(frame: Frame, lens: Lens, units_per_metre: float) -> Frame:

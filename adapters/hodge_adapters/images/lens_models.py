@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
-from hodge_pipeline.types import ImageFile
+from hodge_pipeline.types import Camera, ImageFile
+
+HALF_PIXEL = 0.5
+"""COLMAP and nerfstudio put 0, 0 at the outer corner of the first pixel; here whole numbers are pixel centres."""
 
 PERSPECTIVE, FISHEYE = "OPENCV", "OPENCV_FISHEYE"
 """nerfstudio's names: Brown's polynomial (k1, k2, k3, p1, p2), and Kannala's and Brandt's (k1 to k4)."""
@@ -22,6 +26,16 @@ NAMES: Mapping[str, tuple[str, str]] = {
 }
 RATIONAL = ("k4", "k5", "k6")
 """Of FULL_OPENCV: the denominator, which nerfstudio does not have."""
+
+
+def pinhole_params(camera: Camera) -> tuple[float, float, float, float]:
+    """Fx fy cx cy in COLMAP's pixels."""
+    return camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL
+
+
+def image_file(path: Path, camera: Camera, lens: str = "PINHOLE", distortion: tuple[float, ...] = ()) -> ImageFile:
+    """An image of this camera with the coefficients of its lens in the order of COLMAP's model."""
+    return ImageFile(path, camera.width, camera.height, lens, (*pinhole_params(camera), *distortion))
 
 
 def named(image: ImageFile) -> tuple[str, dict[str, float]] | None:

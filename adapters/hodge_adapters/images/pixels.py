@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from hodge_adapters.images.headers import is_complete, parse_header
+from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, EncodedImage, Floats32
 from hodge_pipeline.types.input_files import open_input, read_input
@@ -73,7 +74,8 @@ def encoded_colour(path: Path) -> EncodedImage:
 
 def read_whole_image(path: Path, size: tuple[int, int] | None = None) -> bytes:
     """The bytes of a PNG or JPEG file that is complete, of this (width, height) and not absurdly large."""
-    contents = _read_bytes(path)
+    with reading(path):
+        contents = read_input(path, MAX_IMAGE_BYTES)
     header = parse_header(contents, path)
     if size is not None and (header.width, header.height) != size:
         raise SourceError(
@@ -87,11 +89,8 @@ def read_whole_image(path: Path, size: tuple[int, int] | None = None) -> bytes:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the header alone; raises `SourceError` where there is none."""
-    try:
-        with open_input(path) as file:
-            header = parse_header(file.read(HEADER_BYTES), path)
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    with reading(path), open_input(path) as file:
+        header = parse_header(file.read(HEADER_BYTES), path)
     return header.width, header.height
 
 
@@ -107,14 +106,3 @@ def common_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int]:
     if not sizes:
         raise problem or SourceError("no image to take the size from: give a folder with frames")
     return sizes.most_common(1)[0][0]
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return read_input(path, MAX_IMAGE_BYTES)
-    except OSError as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: OSError) -> SourceError:
-    return SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions")

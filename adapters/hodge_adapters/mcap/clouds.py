@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_adapters.clouds.columns import TIMES, seconds_after_first
+from hodge_adapters.clouds.columns import TIMES, points_of_columns, unpacked
 from hodge_adapters.mcap.fields import Message, Payload, part, parts, pose_values, text, whole
 from hodge_adapters.mcap.records import Malformed
 from hodge_pipeline import se3
-from hodge_pipeline.types import Bytes, Floats, Floats32, PointCloud
+from hodge_pipeline.types import Floats, PointCloud
 
 MAX_POINTS = 1 << 26
 """No scanner gives 64 million points at once; a message that says so would only exhaust memory."""
@@ -62,23 +62,15 @@ def foxglove_layout(message: Message, length: int) -> CloudLayout:
 
 def read_points(payload: Payload, layout: CloudLayout) -> PointCloud:
     """The finite points, with the colours and normals that the message has; raises `SourceError`."""
-    contents = payload.read()
-    columns = _columns(payload, layout, contents)
-    points = _stacked(columns, ("x", "y", "z"))
-    good = np.isfinite(points).all(axis=1)
-    normals = _normals(columns)
-    colours = _colours(columns)
-    time = next((name for name in TIMES if name in (columns.dtype.names or ())), None)
-    if layout.cloud_from_points is not None:
-        motion = np.array(layout.cloud_from_points).reshape(4, 4)
-        points = se3.transform(motion, points.astype(np.float64)).astype(np.float32)
-        normals = None if normals is None else (normals @ motion[:3, :3].T).astype(np.float32)
-    return PointCloud(
-        points[good],
-        None if normals is None else normals[good],
-        None if colours is None else colours[good],
-        times_s=None if time is None else seconds_after_first(np.asarray(columns[time][good], float)),
-    )
+    columns = _columns(payload, layout, payload.read())
+    cloud = points_of_columns(payload.path, unpacked({name: columns[name] for name, _, _ in layout.fields}))
+    if layout.cloud_from_points is None:
+        return cloud
+    motion = np.array(layout.cloud_from_points).reshape(4, 4)
+    points = se3.transform(motion, cloud.points_in_cam.astype(np.float64)).astype(np.float32)
+    normals = cloud.normals_in_cam
+    turned = None if normals is None else (normals @ motion[:3, :3].T).astype(np.float32)
+    return replace(cloud, points_in_cam=points, normals_in_cam=turned)
 
 
 def _checked(
@@ -130,35 +122,3 @@ def _columns(payload: Payload, layout: CloudLayout, contents: bytes) -> NDArray[
     if len(contents) < layout.row_step * (layout.height - 1) + layout.width * layout.point_step:
         raise payload.error("a cloud with fewer bytes than its size needs")
     return np.asarray(np.ndarray(shape, dtype, contents, 0, strides).reshape(-1))
-
-
-def _stacked(columns: NDArray[np.void], names: tuple[str, str, str]) -> Floats32:
-    out = np.empty((len(columns), 3), np.float32)
-    for axis, name in enumerate(names):
-        out[:, axis] = columns[name]
-    return out
-
-
-def _normals(columns: NDArray[np.void]) -> Floats32 | None:
-    names = ("normal_x", "normal_y", "normal_z")
-    if not set(names) <= set(columns.dtype.names or ()):
-        return None
-    normals = _stacked(columns, names)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    good = np.isfinite(lengths) & (lengths > 0)
-    return np.where(good, normals / np.where(good, lengths, 1), 0).astype(np.float32)
-
-
-def _colours(columns: NDArray[np.void]) -> Bytes | None:
-    names = set(columns.dtype.names or ())
-    if {"red", "green", "blue"} <= names:
-        scale = 255 if columns.dtype["red"].kind == "f" else 1
-        channels = _stacked(columns, ("red", "green", "blue")) * scale
-        return np.asarray(np.clip(np.nan_to_num(channels), 0, 255).round(), np.uint8)
-    packed = next((name for name in ("rgb", "rgba") if name in names and columns.dtype[name].itemsize == 4), None)
-    if packed is None:
-        return None
-    # The four bytes of a colour are 0xAARRGGBB, and are declared as a float by PCL's convention.
-    kind = columns.dtype[packed]
-    words = np.ascontiguousarray(columns[packed]).view(np.dtype("u4").newbyteorder(kind.byteorder))
-    return np.stack([words >> 16 & 255, words >> 8 & 255, words & 255], axis=-1).astype(np.uint8)

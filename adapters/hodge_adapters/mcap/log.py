@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from collections.abc import Iterator
@@ -13,7 +12,7 @@ from typing import IO
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 
-from hodge_adapters.mcap.message_file import ALWAYS_EXPANDED_BYTES, MAX_EXPANSION, Logged, MessageFile
+from hodge_adapters.mcap.message_file import Logged, MessageFile
 from hodge_adapters.mcap.records import (
     MAGIC,
     RECORD_HEAD_BYTES,
@@ -23,14 +22,11 @@ from hodge_adapters.mcap.records import (
     ReadAt,
     Record,
     checksum,
-    expand,
     parse,
     parse_chunk,
-    read_at,
     records,
     summary_span,
 )
-from hodge_pipeline.errors import SourceError
 
 _MESSAGE = struct.Struct("<HIQQ")
 _MAX_SMALL_RECORD_BYTES = 1 << 24
@@ -44,13 +40,9 @@ class LogFile(MessageFile):
     schemas: dict[int, Schema] = field(default_factory=dict)
     _chunk_offsets: list[int] = field(default_factory=list)
     _has_footer: bool = False
-    _expansion_left: int = 0
 
     def _messages(self, file: IO[bytes]) -> Iterator[Logged]:
-        read, size = read_at(file), os.fstat(file.fileno()).st_size
-        if read(0, len(MAGIC)) != MAGIC:
-            raise SourceError(f"{self.path}: does not start as an MCAP file: record or copy it again")
-        self._expansion_left = ALWAYS_EXPANDED_BYTES + MAX_EXPANSION * size
+        read, size = self.begun(file, MAGIC, "an MCAP file")
         self._read_summary(read, size)
         at: int | None = len(MAGIC)
         while at is not None and at < size:
@@ -107,10 +99,7 @@ class LogFile(MessageFile):
 
     def _chunk(self, read: ReadAt, chunk: Chunk, complete: bool) -> Iterator[Logged]:
         if chunk.compression:
-            if chunk.uncompressed_bytes > self._expansion_left:
-                raise Malformed("a chunk past what a file of this size may expand to")
-            self._expansion_left -= chunk.uncompressed_bytes
-            contents = expand(read, chunk, chunk.uncompressed_bytes)
+            contents = self.expanded(read, chunk)
             crc = zlib.crc32(contents) if chunk.crc else 0
             inner: ReadAt = lambda offset, length: contents[offset : offset + length]  # noqa: E731
             start, end, outer = 0, len(contents), chunk

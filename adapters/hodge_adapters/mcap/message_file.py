@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -11,7 +12,17 @@ from typing import IO, NamedTuple
 from mcap.records import Channel, Schema
 
 from hodge_adapters.mcap.complaints import Complaints
-from hodge_adapters.mcap.records import MAX_MESSAGE_BYTES, Place
+from hodge_adapters.mcap.records import (
+    MAX_CHUNK_BYTES,
+    MAX_MESSAGE_BYTES,
+    Chunk,
+    Malformed,
+    Place,
+    ReadAt,
+    expand,
+    read_at,
+)
+from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types.input_files import open_input
 
@@ -61,19 +72,32 @@ class MessageFile(ABC):
     tallies: dict[str, Tally] = field(default_factory=dict)
     _is_wanted: dict[int, bool] = field(default_factory=dict)
     _of_use: Tally = field(default_factory=Tally)
+    _expansion_left: int = 0
 
     def messages(self) -> Iterator[Logged]:
         """The wanted messages. Raises `SourceError` for a file of another format; all else is complained of."""
-        try:
-            with open_input(self.path) as file:
-                yield from self._messages(file)
-        except OSError as error:
-            remedy = "restore the file or its permissions"
-            raise SourceError(f"{self.path}: cannot be read ({error.strerror}): {remedy}") from error
+        with reading(self.path), open_input(self.path) as file:
+            yield from self._messages(file)
 
     @abstractmethod
     def _messages(self, file: IO[bytes]) -> Iterator[Logged]:
         """The wanted messages of the file."""
+
+    def begun(self, file: IO[bytes], magic: bytes, kind: str) -> tuple[ReadAt, int]:
+        """What reads from the file, and its size. Raises `SourceError` where it does not start as its kind does."""
+        read, size = read_at(file), os.fstat(file.fileno()).st_size
+        if read(0, len(magic)) != magic:
+            raise SourceError(f"{self.path}: does not start as {kind}: record or copy it again")
+        self._expansion_left = ALWAYS_EXPANDED_BYTES + MAX_EXPANSION * size
+        return read, size
+
+    def expanded(self, read: ReadAt, chunk: Chunk) -> bytes:
+        """The contents of a compressed chunk. Raises `Malformed`, also where all chunks together expand to too much."""
+        size = chunk.uncompressed_bytes
+        if max(size, chunk.length) > MAX_CHUNK_BYTES or size > self._expansion_left:
+            raise Malformed("a chunk past what a file of this size may expand to")
+        self._expansion_left -= size
+        return expand(read, chunk, size)
 
     def told(self) -> str:
         """How much was read, for what is said of a file that ends too early."""

@@ -168,34 +168,19 @@ def kind_of(schema_name: str) -> Add | None:
     return _KINDS.get((package.removesuffix("_msgs"), name))
 
 
-def _add_raw_image(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
-    stamp, payload, length = _payload(recording, message, path, logged)
-    seen = Seen(stamp, logged.log_time_ns * 1e-9, frame_id(message), raw_layout(message, length), payload)
-    recording.images.setdefault(logged.channel.topic, []).append(seen)
+def _adds(
+    of: Callable[[Recording], dict[str, list[Seen[Layout]]]], layout_of: Callable[[Message, int, bytes], Layout]
+) -> Add:
+    """What adds an image or a cloud, whose layout is told by the message, its payload's length and its bytes."""
 
+    def add(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
+        stamp = recording.stamp(message, logged)
+        payload, length = payload_of(message, path, logged.place, f"{logged.channel.topic} at {stamp:.9f} s")
+        log_s, frame = logged.log_time_ns * 1e-9, frame_id(message)
+        seen = Seen(stamp, log_s, frame, layout_of(message, length, logged.data), payload)
+        of(recording).setdefault(logged.channel.topic, []).append(seen)
 
-def _add_coded_image(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
-    stamp, payload, _ = _payload(recording, message, path, logged)
-    seen = Seen(stamp, logged.log_time_ns * 1e-9, frame_id(message), compressed_layout(message, logged.data), payload)
-    recording.images.setdefault(logged.channel.topic, []).append(seen)
-
-
-def _add_ros_cloud(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
-    stamp, payload, length = _payload(recording, message, path, logged)
-    seen = Seen(stamp, logged.log_time_ns * 1e-9, frame_id(message), ros_layout(message, length), payload)
-    recording.clouds.setdefault(logged.channel.topic, []).append(seen)
-
-
-def _add_foxglove_cloud(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
-    stamp, payload, length = _payload(recording, message, path, logged)
-    seen = Seen(stamp, logged.log_time_ns * 1e-9, frame_id(message), foxglove_layout(message, length), payload)
-    recording.clouds.setdefault(logged.channel.topic, []).append(seen)
-
-
-def _payload(recording: Recording, message: Message, path: Path, logged: Logged) -> tuple[float, Payload, int]:
-    stamp = recording.stamp(message, logged)
-    record = f"{logged.channel.topic} at {stamp:.9f} s"
-    return stamp, *payload_of(message, path, logged.place, record)
+    return add
 
 
 def _add_calibration(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
@@ -247,13 +232,23 @@ def _add_transforms(recording: Recording, message: Message, path: Path, logged: 
         recording.transforms.add(parent, child, stamp, values, is_static=is_static)
 
 
+def _images(recording: Recording) -> dict[str, list[Seen[ImageLayout]]]:
+    return recording.images
+
+
+def _clouds(recording: Recording) -> dict[str, list[Seen[CloudLayout]]]:
+    return recording.clouds
+
+
+_RAW_IMAGE = _adds(_images, lambda message, length, _: raw_layout(message, length))
+_CODED_IMAGE = _adds(_images, lambda message, _, contents: compressed_layout(message, contents))
 _KINDS: dict[tuple[str, str], Add] = {
-    ("sensor", "Image"): _add_raw_image,
-    ("sensor", "CompressedImage"): _add_coded_image,
-    ("foxglove", "RawImage"): _add_raw_image,
-    ("foxglove", "CompressedImage"): _add_coded_image,
-    ("sensor", "PointCloud2"): _add_ros_cloud,
-    ("foxglove", "PointCloud"): _add_foxglove_cloud,
+    ("sensor", "Image"): _RAW_IMAGE,
+    ("sensor", "CompressedImage"): _CODED_IMAGE,
+    ("foxglove", "RawImage"): _RAW_IMAGE,
+    ("foxglove", "CompressedImage"): _CODED_IMAGE,
+    ("sensor", "PointCloud2"): _adds(_clouds, lambda message, length, _: ros_layout(message, length)),
+    ("foxglove", "PointCloud"): _adds(_clouds, lambda message, length, _: foxglove_layout(message, length)),
     ("sensor", "CameraInfo"): _add_calibration,
     ("foxglove", "CameraCalibration"): _add_calibration,
     ("sensor", "NavSatFix"): _add_fix,

@@ -21,7 +21,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from hodge_adapters.sqlite_file import DAMAGED, opened_database
-from hodge_pipeline.errors import SourceError
+from hodge_adapters.text_rows import reading
 from hodge_pipeline.types.input_files import open_input
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -87,17 +87,14 @@ def read_at(file: IO[bytes]) -> ReadAt:
 
 def read_place(path: Path, place: Place) -> bytes:
     """The bytes at a place; raises `Malformed` where they are not all there, `SourceError` without the file."""
-    try:
-        with open_input(path) as file:
-            if place.row is not None:
-                contents = _read_row(path, place.row, place.offset, place.length)
-            elif place.chunk is None:
-                contents = read_at(file)(place.offset, place.length)
-            else:
-                expanded = expand(read_at(file), place.chunk, place.offset + place.length)
-                contents = expanded[place.offset : place.offset + place.length]
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
+    with reading(path), open_input(path) as file:
+        if place.row is not None:
+            contents = _read_row(path, place.row, place.offset, place.length)
+        elif place.chunk is None:
+            contents = read_at(file)(place.offset, place.length)
+        else:
+            expanded = expand(read_at(file), place.chunk, place.offset + place.length)
+            contents = expanded[place.offset : place.offset + place.length]
     if len(contents) < place.length:
         raise Malformed("the file has changed since it was opened")
     return contents

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,9 +10,8 @@ from typing import IO
 
 from mcap.records import Channel, Schema
 
-from hodge_adapters.mcap.message_file import ALWAYS_EXPANDED_BYTES, MAX_EXPANSION, Logged, MessageFile
-from hodge_adapters.mcap.records import MAX_CHUNK_BYTES, Chunk, Malformed, Place, ReadAt, expand, read_at
-from hodge_pipeline.errors import SourceError
+from hodge_adapters.mcap.message_file import Logged, MessageFile
+from hodge_adapters.mcap.records import Chunk, Malformed, Place, ReadAt
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, CHUNK, CONNECTION = 2, 5, 7
@@ -33,13 +31,9 @@ class BagFile(MessageFile):
     """One ROS 1 bag while it is read. Its definitions are text that describes bytes; nothing of them is executed."""
 
     _channels: dict[int, tuple[Channel, Schema]] = field(default_factory=dict)
-    _expansion_left: int = 0
 
     def _messages(self, file: IO[bytes]) -> Iterator[Logged]:
-        read, size = read_at(file), os.fstat(file.fileno()).st_size
-        if read(0, len(MAGIC)) != MAGIC:
-            raise SourceError(f"{self.path}: does not start as a ROS 1 bag: record or copy it again")
-        self._expansion_left = ALWAYS_EXPANDED_BYTES + MAX_EXPANSION * size
+        read, size = self.begun(file, MAGIC, "a ROS 1 bag")
         yield from self._records(read, len(MAGIC), size)
 
     def _records(
@@ -76,10 +70,7 @@ class BagFile(MessageFile):
             raise Malformed(f"a chunk compressed by {compression!r}: only bz2, lz4 and none are known")
         (size,) = _unpacked(_NUMBER, header, "size")
         chunk = Chunk(start, length, compression, size, 0)
-        if max(size, length) > MAX_CHUNK_BYTES or size > self._expansion_left:
-            raise Malformed("a chunk past what a file of this size may expand to")
-        self._expansion_left -= size
-        contents = expand(read, chunk, size)
+        contents = self.expanded(read, chunk)
         part: ReadAt = lambda offset, count: contents[offset : offset + count]  # noqa: E731
         yield from self._records(part, 0, len(contents), chunk, inside=True)
 

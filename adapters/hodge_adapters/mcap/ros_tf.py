@@ -54,16 +54,8 @@ class TransformTree:
         """Its links, a line each, parents before children where the links form a tree."""
         return tuple(
             f"tf {parent} -> {child}: " + ("static" if child in self._static else f"{len(self._links[child])} poses")
-            for child, parent in sorted(self._parent.items(), key=lambda link: (len(self._above(link[0])), link))
+            for child, parent in sorted(self._parent.items(), key=lambda link: (len(self._chain(link[0])), link))
         )
-
-    def _above(self, child: str) -> list[str]:
-        """The frames from a child up to the root, or until they repeat."""
-        above: list[str] = []
-        while child in self._parent and child not in above:
-            above.append(child)
-            child = self._parent[child]
-        return above
 
     def add(self, parent: str, child: str, stamp_s: float, pose: tuple[float, ...], *, is_static: bool) -> None:
         """Add `parent_from_child` at a stamp. Add all before the first look-up."""
@@ -98,6 +90,7 @@ class TransformTree:
         return np.unique(np.concatenate(stamps)) if stamps else np.zeros(0)
 
     def _chain(self, frame: str) -> list[str]:
+        """The frames from this one up to the root, or until they repeat."""
         chain = [frame]
         while chain[-1] in self._parent and self._parent[chain[-1]] not in chain:
             chain.append(self._parent[chain[-1]])

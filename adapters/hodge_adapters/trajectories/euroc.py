@@ -8,12 +8,13 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.posed import length_notes, trajectory_of, written
+from hodge_adapters.posed import trajectory_of, written
 from hodge_adapters.text_rows import Row, listed, read_text, to_floats, write_text_atomically
+from hodge_adapters.trajectories.text import ordered
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Source, Trajectory
+from hodge_pipeline.types import Source
 from hodge_pipeline.types.input_files import beginning
 
 COLUMNS = 8
@@ -41,30 +42,17 @@ class EurocReader:
         Lines that are no pose are left out and noted. Raises `SourceError` where none is left.
         """
         path = file_of(Path(path))
-        good: dict[int, list[float]] = {}
-        bad: list[int] = []
-        repeated = 0
-        for row in _rows(path):
-            stamp, values = _pose(row)
-            if values is None:
-                bad.append(row.line)
-            elif stamp in good:
-                repeated += 1
-            else:
-                good[stamp] = values
+        poses = {row.line: _pose(row) for row in _rows(path)}
+        good = [pose for pose in poses.values() if pose is not None]
+        bad = [line for line, pose in poses.items() if pose is None]
         if not good:
             raise SourceError(f"{path}: no line of `nanoseconds, x, y, z, qw, qx, qy, qz, …`: is it a EuRoC file?")
-        stamps = sorted(good)
-        table = np.array([good[stamp] for stamp in stamps])
-        seconds, first = np.unique(np.array(stamps, np.float64) / NANO, return_index=True)
-        poses = se3.from_quat_xyzw(table[first, :3], table[first][:, [4, 5, 6, 3]])
+        parsed = ordered(np.array(good))
         notes = ["poses are those of the body in the file (EuRoC's ground truth: the IMU), not of a camera"]
-        notes += length_notes(table[:, 3:], "poses")
+        notes += parsed.notes
         if bad:
             notes.append(f"{len(bad)} lines that are no pose left out: {listed(bad)}")
-        if repeated or len(first) < len(stamps):
-            notes.append(f"{repeated + len(stamps) - len(first)} poses with the stamp of an earlier one left out")
-        return Source(path.stem, path, trajectory=Trajectory(seconds, poses), notes=tuple(notes), files=(path,))
+        return Source(path.stem, path, trajectory=parsed.trajectory, notes=tuple(notes), files=(path,))
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -96,12 +84,12 @@ def _rows(path: Path) -> list[Row]:
     return [row for row in rows if any(row.fields)]
 
 
-def _pose(row: Row) -> tuple[int, list[float] | None]:
-    """The stamp, and position and quaternion, or None where the line has none."""
+def _pose(row: Row) -> list[float] | None:
+    """The stamp in seconds, position and quaternion (x, y, z, w), or None where the line has none."""
     values = to_floats(row.fields[1:COLUMNS])
     stamp = row.fields[0]
     whole = stamp.isascii() and stamp.isdecimal() and len(stamp) < 20 and int(stamp) < MAX_STAMP_NS
     sound = values is not None and len(values) == COLUMNS - 1 and bool(np.isfinite(values).all())
     if not whole or values is None or not sound or not 1e-6 < float(np.linalg.norm(values[3:])) < 1e6:
-        return 0, None
-    return int(stamp), values
+        return None
+    return [float(stamp) / NANO, *values[:3], *values[4:], values[3]]

@@ -37,7 +37,7 @@ def parse_tum(path: Path) -> ParsedTrajectory:
     table, bad = _tum_table(read_rows(path))
     if not len(table):
         raise _unreadable(path, bad, "stamp tx ty tz qx qy qz qw")
-    parsed = _ordered(table)
+    parsed = ordered(table)
     notes = [f"{path.name}: {note}" for note in parsed.notes]
     if bad:
         notes.append(f"{path.name}: {len(bad)} lines that are no pose left out: {listed([r.line for r in bad])}")
@@ -108,20 +108,17 @@ def _tum_table(rows: Sequence[Row]) -> tuple[Floats, list[Row]]:
     good: list[list[float]] = []
     bad: list[Row] = []
     for row in rows:
-        values = to_floats(row.fields)
-        if values and len(values) in COLUMNS and all(map(math.isfinite, values)) and _is_quat(values[4:8]):
+        values = to_floats(row.fields) or []
+        sound = len(values) in COLUMNS and all(map(math.isfinite, values))
+        if sound and 1e-100 < math.hypot(*values[4:8]) < 1e100:  # beyond these the square is no normal number
             good.append(values[:8])
         else:
             bad.append(row)
     return np.array(good, np.float64).reshape(-1, 8), bad
 
 
-def _is_quat(values: list[float]) -> bool:
-    # Beyond these the square of the length is no normal number.
-    return 1e-100 < math.hypot(*values) < 1e100
-
-
-def _ordered(table: Floats) -> ParsedTrajectory:
+def ordered(table: Floats) -> ParsedTrajectory:
+    """The trajectory of rows (N, 8) `stamp tx ty tz qx qy qz qw`, ascending; of equal stamps the first is kept."""
     stamps, first = np.unique(table[:, 0], return_index=True)
     notes = []
     if len(stamps) < len(table):
