@@ -101,6 +101,7 @@ class Work:
         world_from_cam, earlier = before.world_from_cam, before.registered(self.measured) if number > 1 else None
         registered = self.steps.step(
             register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,
+            self.recipe.acceptance.min_spread,
             title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
         )  # fmt: skip
         fresh = np.flatnonzero(registered.status != HELD_OUT)
