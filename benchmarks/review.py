@@ -59,6 +59,7 @@ def _clouds(folder: Path, rng: np.random.Generator) -> CloudSet:
     for name, kind, shape in (
         ("points", np.float32, (POINTS, 3)), ("normals", np.float32, (POINTS, 3)), ("colours", np.uint8, (POINTS, 3)),
         ("mark_points", np.float32, (0, 3)), ("mark_descriptors", np.uint8, (0, 128)),
+        ("mark_pixel_rad", np.float32, (0,)),
     ):  # fmt: skip
         np.save(folder / f"{name}.npy", np.zeros(shape, kind))
     block = rng.normal(0, 2, (each, 3)).astype(np.float32)

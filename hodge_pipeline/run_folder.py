@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.evaluation.evaluate import evaluate
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.fusion.fuse import fuse
@@ -22,6 +22,7 @@ from hodge_pipeline.report.notebook import as_html
 from hodge_pipeline.rounds.all_frames import pose_frames
 from hodge_pipeline.rounds.one_round import solve_edges
 from hodge_pipeline.scene import KeyFrames, Round, Scene, given_poses, true_poses
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import Step
 from hodge_pipeline.store.store import stored, stored_clouds
 from hodge_pipeline.store.workspace import OLD_KEY_FILE, RECIPE_FILE, RUN, is_run_folder
@@ -197,6 +198,19 @@ class Run:
     def options_left_out(self) -> tuple[str, ...]:
         """What is in the folder's recipe and unknown here, one line each: only running it again needs it."""
         return recipe_of_run(self.folder / RECIPE_FILE)[1]
+
+    def key_frames_with_images(self) -> tuple[Sequence[Frame], tuple[str, ...]]:
+        """The key frames as their source has them, none where it has gone or has others by now, and a line why."""
+        path, reader = self.recipe.source.path, self.recipe.source.reader
+        if path is None:
+            return (), ()
+        try:
+            frames = (reader or guess_reader(path)).open(path).frames
+        except (HodgeError, OSError) as error:
+            return (), (f"without colour images: {error}",)
+        if len(frames) != len(self.source.frames):
+            return (), (f"without colour images: {path} has other frames by now",)
+        return tuple(frames[row] for row in self.key_frames.rows), ()
 
     def show(self, width: int = 960, height: int = 540) -> Any:
         """The recording in a Rerun viewer in a notebook's cell, in pixels (extra `notebook`); elsewhere `hodge view`.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.decomposition import Energies
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, Solution, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
@@ -124,13 +125,15 @@ class KeyFrames:
 
 @dataclass(frozen=True)
 class Drift:
-    """What odometry says of the way between two frames: its poses (K, 4, 4), the part (K,) of each that it held
-    together, and the share of the way that it may err by.
+    """What odometry says of the path between two frames: its poses (K, 4, 4), the part (K,) of each that it held
+    together, the `covariance (K, 6, 6)` of the path from the first row to each, in the world's axes, and the squared
+    Mahalanobis distance from which on a pair contradicts it.
     """
 
     world_from_cam: Floats
     part: Ints
-    largest: float
+    covariance: Floats
+    gate: float
 
 
 @dataclass(frozen=True)
@@ -205,6 +208,20 @@ def sequence_numbers(source: Source) -> Ints:
     for number, rows in enumerate(sequences_of(source).values()):
         numbers[rows] = number
     return numbers
+
+
+def own_trajectory(source: Source) -> Trajectory | None:
+    """The trajectory of a source, or the poses of its frames as one; None where it has neither.
+
+    Raises `SourceError` where frames of several sequences have stamps that repeat.
+    """
+    posed = [(frame.stamp_s, frame.world_from_cam) for frame in source.frames if frame.world_from_cam is not None]
+    if source.trajectory is not None or not posed:
+        return source.trajectory
+    stamps = np.array([stamp for stamp, _ in posed])
+    if (np.diff(stamps) <= 0).any():
+        raise SourceError(f"{source.path}: several sequences with stamps of their own: give one sequence's folder")
+    return Trajectory(stamps, np.array([pose for _, pose in posed]))
 
 
 def _filled(poses: Floats, found: Bools, times: Floats) -> Floats:

@@ -18,6 +18,10 @@ ARM_M = 1.0
 """Metres: a rotation counts as the displacement that it causes at this distance, about that of a room's walls."""
 
 
+LEAST_PRECISION, MOST_PRECISION = 1e-6, 1e6
+"""Of the median one, in units in which that is 1: eigenvalues of an information beyond are clipped."""
+
+
 def hat(v: Floats) -> Floats:
     """The skew matrices v^ (..., 3, 3) of vectors (..., 3): `hat(v) @ u == cross(v, u)`."""
     v = np.asarray(v, float)
@@ -62,6 +66,23 @@ def rescaled_information(information: Floats, factor: float) -> Floats:
     """Information (..., 6, 6) over (rotation, translation) of motions whose lengths are taken times the factor."""
     unit = np.repeat([1.0, 1 / factor], 3)
     return np.asarray(unit[:, None] * information * unit)
+
+
+def covariances(information: Floats) -> Floats:
+    """Inverses (E, p, p) of information matrices, their eigenvalues clipped: never infinite, never negative."""
+    if not len(information):
+        return information
+    p = information.shape[-1]
+    split = 1 if p == 3 else 3
+    precision = np.einsum("eii->ei", information)
+    unit = np.ones(p)
+    for part in (slice(0, split), slice(split, p)):
+        positive = precision[:, part][precision[:, part] > 0]
+        unit[part] = 1 / np.sqrt(np.median(positive)) if len(positive) else 1.0
+    scale = np.outer(unit, unit)
+    values, vectors = np.linalg.eigh(0.5 * (information + np.swapaxes(information, 1, 2)) * scale)
+    values = np.clip(values, LEAST_PRECISION, MOST_PRECISION)
+    return np.asarray((vectors / values[:, None]) @ np.swapaxes(vectors, 1, 2) * scale)
 
 
 def left_jacobian(phi: Floats) -> Floats:

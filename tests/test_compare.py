@@ -16,11 +16,12 @@ from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import layout
 from hodge_pipeline.report.compared import write_comparison
 from hodge_pipeline.report.comparison import compare, tables
-from hodge_pipeline.report.write import Report, SourceSummary, write_report
+from hodge_pipeline.report.contents import Report, SourceSummary
+from hodge_pipeline.report.write import write_report
 from hodge_pipeline.types import Floats, Model, Source, Trajectory
 from hodge_pipeline.types.ply import model_parts
-from test_recording import circle, rows
-from test_report import read_page
+from recording_data import circle, rows
+from report_data import read_page
 
 MOVED = se3.exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -0.5]))
 

@@ -14,7 +14,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation import scores
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, REACH_M
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances, evaluation_pairs, evenly, score_table
+from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances, evaluation_pairs, score_table, some_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud, ViewGraph
 
 
@@ -124,8 +124,8 @@ def test_of_many_frames_the_pairs_of_some_are_scored(kind: scores.GraphKind, mon
 
 def test_of_many_pairs_some_are_taken_evenly() -> None:
     pairs = np.arange(20).reshape(10, 2)
-    assert evenly(pairs, 10) is pairs
-    assert evenly(pairs, 4)[:, 0].tolist() == [0, 4, 10, 14]
+    assert some_of(pairs, 10) is pairs
+    assert some_of(pairs, 4)[:, 0].tolist() == [0, 4, 10, 14]
 
 
 def test_the_distance_graph_joins_near_centroids() -> None:

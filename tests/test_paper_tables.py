@@ -104,7 +104,7 @@ def test_every_format_holds_every_table() -> None:
 @pytest.mark.parametrize("kind", ["distance", "iou", "sift"])
 def test_the_papers_recipes_reject_no_registered_pair(kind: str) -> None:
     recipe = load_recipe(f"paper_{kind}", [], "frames")
-    assert recipe.start.relocalise is False and recipe.start.max_drift is None  # type: ignore[attr-defined]
+    assert recipe.start.relocalise is False and recipe.start.tail is None  # type: ignore[attr-defined]
     count = 3
     poor = Edges.of(np.array([[0, 2], [0, 3], [1, 3]])).put(
         slice(None),

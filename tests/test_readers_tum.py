@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hodge_adapters.association import interpolated_poses, nearest_pairs
+from hodge_adapters.tum.image_lists import StampedImages, read_pairs
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
@@ -107,6 +108,45 @@ def test_association_files_in_both_orders(folder: Path, depth_first: bool) -> No
     assert [frame.stamp_s for frame in source.frames] == [10.0, 11.25], "the depth image's stamp, in order"
     assert colour_names(source) == ["10.010000.png", "11.260000.png"]
     assert any("not in order" in note for note in source.notes)
+
+
+def stamped_lists(folder: Path, stamps_s: list[float]) -> StampedImages:
+    """The pairs of numbered images, colour 5 ms after depth, listed in this order, and the notes."""
+    for kind, delay_s in (("depth", 0.0), ("rgb", 0.005)):
+        (folder / kind).mkdir(parents=True)
+        lines = [f"{stamp_s + delay_s:.6f} {kind}/{number}.png\n" for number, stamp_s in enumerate(stamps_s)]
+        (folder / f"{kind}.txt").write_text("".join(lines))
+        for number in range(len(stamps_s)):
+            (folder / kind / f"{number}.png").touch()
+    return read_pairs(folder, 0.02, [])
+
+
+def test_frames_of_a_clock_that_jumps_back_stay_in_the_order_of_the_file(tmp_path: Path) -> None:
+    """Sorted by their stamps those before and after would be interleaved, and half of them have the other's colour."""
+    stamps_s = [100 + number / 30 - 0.4 * (number >= 20) for number in range(40)]
+    found = stamped_lists(tmp_path / "jump", stamps_s)
+    assert [path.stem for path in found.depth] == [str(number) for number in range(40)]
+    assert [path and path.stem for path in found.colour] == [path.stem for path in found.depth]
+    assert found.runs.tolist() == [0] * 20 + [1] * 20
+    swapped = [*stamps_s[:5], stamps_s[6], stamps_s[5], *stamps_s[7:20]]
+    assert np.array_equal(stamped_lists(tmp_path / "swapped", swapped).stamps_s, np.round(sorted(swapped), 6))
+    shuffled = np.random.default_rng(0).permutation(stamps_s[:20]).tolist()
+    assert np.array_equal(stamped_lists(tmp_path / "shuffled", shuffled).stamps_s, np.round(sorted(shuffled), 6))
+
+
+def test_the_truth_is_not_taken_where_the_clock_jumped_back(folder: Path) -> None:
+    depth = (folder / "depth.txt").read_text().splitlines()
+    stamps = [float(line.split()[0]) for line in depth if not line.startswith("#")]
+    files = [line.split()[1] for line in depth if not line.startswith("#")]
+    again = [(stamp, name) for _ in range(20) for stamp, name in zip(stamps, files, strict=True)]
+    again = [(100 + row / 30 - 0.5 * (row >= 20), name) for row, (_, name) in enumerate(again)][:40]
+    (folder / "depth.txt").write_text("".join(f"{stamp:.6f} {name}\n" for stamp, name in again))
+    truth = [tum_line(100 + row / 30, np.eye(4)) for row in range(40)]
+    (folder / "groundtruth.txt").write_text("\n".join(truth) + "\n")
+    source = TumReader().open(folder)
+    assert [frame.true_world_from_cam is not None for frame in source.frames] == [True] * 20 + [False] * 20
+    assert any("the clock jumps back before image 20:" in note for note in source.notes)
+    assert any("before the clock jumps back alone" in note for note in source.notes)
 
 
 def test_an_association_file_that_does_not_say_which_is_depth(folder: Path) -> None:

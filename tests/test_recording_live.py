@@ -11,7 +11,7 @@ import pytest
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import binary, layout, live
 from hodge_pipeline.recording.merge import find_parts
-from test_recording import circle, record, record_all, rows
+from recording_data import circle, record, record_all, rows
 from test_recording_run import entities
 
 TRIES = 120
@@ -35,7 +35,7 @@ def test_a_viewer_gets_each_part_once(tmp_path: Path) -> None:
     listener = live.start(flags, binary.quiet_environment(tmp_path))
     try:
         live.wait_for(port, listener)
-        shown = live.Live(f"rerun+http://{live.HOST}:{port}/proxy", "test", "run-1")
+        shown = live.Live(f"rerun+http://{live.HOST}:{port}/proxy", "run-1")
         record(tmp_path / "parts").poses("odometry", circle())
         shown.show(find_parts(tmp_path / "parts"))
         record_all(record(tmp_path / "parts"))

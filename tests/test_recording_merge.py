@@ -16,7 +16,7 @@ from hodge_pipeline.recording import binary, layout, shapes
 from hodge_pipeline.recording.eye import look_at
 from hodge_pipeline.recording.merge import contents_of, find_parts, merge
 from hodge_pipeline.types import CloudSet
-from test_recording import circle, make_frames, record, record_all, ring_graph, rows
+from recording_data import circle, make_frames, record, record_all, ring_graph, rows
 from tools.recording_pictures import picture
 
 KILLED_WRITER = """
@@ -25,7 +25,7 @@ from pathlib import Path
 import rerun as rr
 from hodge_pipeline.recording import layout, stream
 path = stream.partial_path(Path(sys.argv[1]))
-killed = stream.open_stream("test", "run-1")
+killed = stream.open_stream("run-1")
 killed.save(path)
 for row in range(5):
     killed.set_time(layout.STORY, duration=float(row))
@@ -108,7 +108,7 @@ def test_rows_of_a_killed_writer_are_kept_until_its_stage_is_done(tmp_path: Path
     part.parent.mkdir()
     killed = subprocess.run([sys.executable, "-c", KILLED_WRITER, str(part)], check=False)
     assert killed.returncode == 9 and not part.exists()
-    merged = merge(part.parent, tmp_path / "mended.rrd", "test", "run-1")
+    merged = merge(find_parts(part.parent), tmp_path / "mended.rrd", "run-1")
     assert [row[0] for row in rows(merged.path, "/killed", "Scalars:scalars")] == [0, 1, 2, 3, 4]
     verify(merged.path, tmp_path)
     record(part.parent).edges(2, ring_graph(circle()), circle())
@@ -133,7 +133,7 @@ def test_stages_without_anything_to_show(tmp_path: Path) -> None:
     recorder.frames("nothing", [])
     recorder.clouds([], CloudSet.from_clouds([]))
     recorder.poses("truth", np.zeros((0, 4, 4)))
-    recorder.evaluation()
+    recorder.evaluation((), {}, {}, {})
     recorder.text("", [])
     merged = recorder.finish(tmp_path / "recording.rrd")
     assert merged is not None and merged.notes == ()

@@ -25,9 +25,9 @@ from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.uses.record_again import record_again
+from recording_data import rgb, rows
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_pipeline import SMALL, Log, small_recipe
-from test_recording import rgb, rows
 
 NORMAL = ("executor.workers=0", "recording.level=normal", "evaluation.tables=false")
 

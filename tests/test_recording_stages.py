@@ -17,7 +17,7 @@ from hodge_pipeline.recording.growth import first_frame
 from hodge_pipeline.recording.merge import find_parts, with_pairs
 from hodge_pipeline.recording.registration import chosen_pairs, moved_m
 from hodge_pipeline.types import CloudSet, Edges, Model, PointCloud, ViewGraph
-from test_recording import circle, make_solution, record, rgb, ring_graph, rows
+from recording_data import circle, make_solution, record, rgb, ring_graph, rows
 
 
 def registered(count: int = 4) -> tuple[Edges, np.ndarray]:
@@ -107,7 +107,8 @@ def test_verdicts_have_entities_of_their_own(tmp_path: Path) -> None:
     graph = ring_graph(poses)
     verdict = np.array(["consistent"] * (graph.edge_count - 2) + ["wrong", "untestable"])
     probability = np.where(verdict == "untestable", np.nan, 0.5)
-    record(tmp_path).diagnosis(graph, poses, verdict, probability, np.full(graph.edge_count, "so it is"))
+    judged = Edges.measured(graph).put(slice(None), verdict=verdict, probability=probability, why="so it is")
+    record(tmp_path).diagnosis(graph, poses, judged)
     part = tmp_path / "890-diagnosis.rrd"
     (lines,) = rows(part, layout.verdict("wrong"), "LineStrips3D:strips")
     np.testing.assert_array_equal(np.float32(lines), np.float32(poses[graph.edges[-2:-1], :3, 3]))

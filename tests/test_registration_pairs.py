@@ -12,7 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.executors.local import InProcess, LocalExecutor
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
-from hodge_pipeline.registration.gaps import has_gap, over_gap
+from hodge_pipeline.registration.gaps import gaps, over_gap
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.registration.pairs import Acceptance, register_pairs
@@ -203,10 +203,10 @@ def test_a_hole_is_a_step_much_longer_than_the_others_of_its_sequence() -> None:
     stamps = np.concatenate([slow, fast])
     pairs = np.array([[0, 1], [0, 5], [6, 7], [8, 9]])
     assert over_gap(pairs, rows, stamps).tolist() == [False, False, False, True]
-    assert has_gap(rows, stamps)
-    assert not has_gap(rows[:1], stamps)
-    assert not has_gap(rows, stamps[::-1])  # no clock
-    assert not has_gap([], stamps)
+    assert gaps(rows, stamps).tolist() == [[8, 9]]
+    assert not len(gaps(rows[:1], stamps))
+    assert not len(gaps(rows, stamps[::-1]))  # no clock
+    assert not len(gaps([], stamps))
 
 
 def test_sequences_are_not_joined_and_stand_apart(folder: Path) -> None:

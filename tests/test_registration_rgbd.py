@@ -11,11 +11,21 @@ from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.guided import guided_match
 from hodge_pipeline.registration.landmarks import back_projected, find_landmarks
 from hodge_pipeline.registration.rgbd import Rgbd
-from hodge_pipeline.registration.visual import visual_motion
-from hodge_pipeline.types import Camera, CloudSet, Floats, Frame, Landmarks, PointCloud
+from hodge_pipeline.registration.visual import VisualMotion, visual_motion
+from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, Landmarks, PointCloud
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+PIXEL_RAD = 1 / 525.0
 I_FROM_J = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
+
+
+def motion_of(points_i: Floats, points_j: Floats, pixel_rad: float = PIXEL_RAD) -> VisualMotion | None:
+    pixels = np.full(len(points_i), pixel_rad)
+    return visual_motion(points_i, points_j, (pixels, pixels), seed=0)
+
+
+def landmarks_at(points: Floats32, descriptors: Bytes) -> Landmarks:
+    return Landmarks(points, descriptors, np.full(len(points), PIXEL_RAD, np.float32))
 
 
 def points_before(count: int, rng: np.random.Generator) -> Floats:
@@ -28,7 +38,7 @@ def test_exact_landmarks_give_the_motion(xi: list[float], seed: int):
     motion = se3.exp(np.array(xi))
     points_j = points_before(40, np.random.default_rng(seed))
     points_i = se3.transform(motion, points_j)
-    found = visual_motion(points_i[points_i[:, 2] > 0.3], points_j[points_i[:, 2] > 0.3], seed=0)
+    found = motion_of(points_i[points_i[:, 2] > 0.3], points_j[points_i[:, 2] > 0.3])
     assert found is not None
     np.testing.assert_allclose(found.i_from_j, motion, atol=1e-6)
 
@@ -40,7 +50,7 @@ def test_two_thirds_of_wrong_matches_are_outvoted_and_the_error_has_the_size_tha
         points_j = points_before(150, rng)
         points_i = se3.transform(I_FROM_J, points_j) + rng.normal(0, 0.006, (150, 3))
         points_i[:100] = points_before(100, rng)
-        found = visual_motion(points_i, points_j, seed=0)
+        found = motion_of(points_i, points_j)
         assert found is not None and 40 <= found.inliers <= 65
         error = se3.log(se3.inverse(I_FROM_J) @ found.i_from_j)
         assert np.linalg.norm(error[3:]) < 0.02
@@ -50,9 +60,9 @@ def test_two_thirds_of_wrong_matches_are_outvoted_and_the_error_has_the_size_tha
 
 def test_landmarks_that_agree_on_nothing_give_no_motion_that_counts():
     rng = np.random.default_rng(3)
-    found = visual_motion(points_before(100, rng), points_before(100, rng), seed=0)
+    found = motion_of(points_before(100, rng), points_before(100, rng))
     assert found is None or found.inliers < Rgbd().min_inliers
-    assert visual_motion(points_before(7, rng), points_before(7, rng), seed=0) is None
+    assert motion_of(points_before(7, rng), points_before(7, rng)) is None
 
 
 def test_three_points_give_their_rigid_motion():
@@ -113,8 +123,8 @@ def frames_of(count: int) -> tuple[PointCloud, PointCloud]:
     descriptors = rng.integers(0, 255, (count, 128), dtype=np.uint8)
     marks = plane[:count]
     shifted = marks + np.array([0.1, 0, 0], np.float32)
-    return PointCloud(plane, normals, None, Landmarks(shifted, descriptors)), PointCloud(
-        plane, normals, None, Landmarks(marks, descriptors)
+    return PointCloud(plane, normals, None, landmarks_at(shifted, descriptors)), PointCloud(
+        plane, normals, None, landmarks_at(marks, descriptors)
     )
 
 
@@ -137,7 +147,7 @@ def twins(cloud: PointCloud) -> PointCloud:
     marks = cloud.landmarks
     assert marks is not None
     half = len(marks) // 2
-    return replace(cloud, landmarks=Landmarks(marks.points_in_cam, np.tile(marks.descriptors[:half], (2, 1))))
+    return replace(cloud, landmarks=landmarks_at(marks.points_in_cam, np.tile(marks.descriptors[:half], (2, 1))))
 
 
 def test_landmarks_that_look_alike_are_told_apart_by_where_they_are():
@@ -167,7 +177,7 @@ def test_unlike_landmarks_near_a_guess_agree_on_nothing():
     target, source = frames_of(400)
     assert source.landmarks is not None
     other = np.random.default_rng(9).integers(0, 255, (400, 128), dtype=np.uint8)
-    source = replace(source, landmarks=Landmarks(source.landmarks.points_in_cam, other))
+    source = replace(source, landmarks=landmarks_at(source.landmarks.points_in_cam, other))
     found, alone = (
         one.register(one.prepare(target), one.prepare(source), np.eye(4)) for one in (Rgbd(), Rgbd(guided_m=0))
     )
@@ -196,3 +206,28 @@ def test_landmarks_survive_the_disk(tmp_path: Path):
     read = CloudSet.open(tmp_path)
     assert [len(cloud.landmarks or ()) for cloud in read] == [5, 5, 0]
     np.testing.assert_array_equal(read[1].landmarks.descriptors, clouds[1].landmarks.descriptors)
+    np.testing.assert_array_equal(read[1].landmarks.pixel_rad, clouds[1].landmarks.pixel_rad)
+
+
+@pytest.mark.parametrize("larger", [1, 3])
+def test_a_pixel_of_a_landmark_is_one_of_the_image_and_an_angle(larger: int):
+    """A camera of a quarter of the pixels covers four times the angle with each; a larger image makes it smaller."""
+    frame = textured_frame()
+    image = np.kron(frame.read_colour(), np.ones((larger, larger, 1), np.uint8))
+    found = find_landmarks(replace(frame, read_colour=lambda: image), 100, 0.2, 6.0)
+    np.testing.assert_allclose(found.pixel_rad, 1 / (larger * CAMERA.fx), rtol=1e-6)
+
+
+def test_the_error_has_the_size_that_the_information_says_of_a_camera_of_few_pixels_too():
+    squares = {525.0: [0.0], 130.0: [0.0]}
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        points_j = points_before(200, rng)
+        points_i = se3.transform(I_FROM_J, points_j)
+        points_i[:, :2] += rng.normal(0, 0.75 * np.sqrt(2) / 130, (200, 2)) * points_i[:, 2:]
+        for focal, own in squares.items():
+            found = motion_of(points_i, points_j, 1 / focal)
+            assert found is not None
+            error = se3.log(se3.inverse(I_FROM_J) @ found.i_from_j)
+            own.append(error @ found.information @ error / 6)
+    assert 0.2 < np.mean(squares[130.0]) < 3 < np.mean(squares[525.0])

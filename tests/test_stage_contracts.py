@@ -28,7 +28,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "edges: combined": {"builders": tuple(registry.load("edges", name)() for name in ("sequential", "overlap"))},
 }
 LACKS = {
-    "registration: rgbd": {"other axes"},  # landmarks are weighed by their depth: the axes must be the camera's
     "rewriters: seven_scenes": {"new poses"},  # it writes the poses alone, which without images are no sequence
 }
 FILES = {

@@ -286,8 +286,9 @@ def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(sequ
     source = TumReader().open(sequence)
     frames = [replace(frame, stamp_s=frame.stamp_s + 3600.0 * (row >= 30)) for row, frame in enumerate(source.frames)]
     whole, _ = track(source, tmp_path / "whole")
-    found, _ = track(replace(source, frames=tuple(frames)), tmp_path / "stopped")
+    found, notes = track(replace(source, frames=tuple(frames)), tmp_path / "stopped")
     assert found.found.all()
+    assert any("the recording stops at 1 places (3600.0 s before 30)" in note for note in notes)
     poses, expected = (all_poses(source, one, one.world_from_key) for one in (found, whole))
     assert np.abs(poses - expected).max() < 0.06
 

@@ -17,8 +17,7 @@ from rerun.experimental import ViewerClient
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import binary, layout
 from hodge_pipeline.recording.live import HOST, free_port
-from hodge_pipeline.recording.merge import find_parts, merge_parts
-from hodge_pipeline.recording.recorder import APPLICATION
+from hodge_pipeline.recording.merge import find_parts, merge
 
 TABS = ("story", "frames", "registration", "complex", "solver", "model", "evaluation", "log")
 WIDTH = 1000
@@ -35,7 +34,7 @@ def draw(run: Path, out: Path, tabs: tuple[str, ...]) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         for tab in tabs:
             recording, png = Path(scratch) / f"{tab}.rrd", out / f"recording-{tab}.png"
-            merge_parts(parts, recording, APPLICATION, f"picture-{tab}", active_tab=TABS.index(tab))
+            merge(parts, recording, f"picture-{tab}", active_tab=TABS.index(tab))
             picture(recording, png, wait_s=8.0)
             with Image.open(png) as image:
                 height = round(image.height * WIDTH / image.width)

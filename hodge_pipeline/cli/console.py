@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib.util import find_spec
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -25,7 +26,9 @@ from rich.table import Table
 from rich.text import Text
 
 from hodge_pipeline.cli.guard import unguarded
+from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.stages import Advance, no_progress
+from hodge_pipeline.store.artifacts import json_text
 from hodge_pipeline.types.notes import Note, Rank
 from hodge_pipeline.types.text import visible
 
@@ -58,6 +61,11 @@ class ProgressBars:
             console=self._console,
             disable=not self._draws,
         )
+
+    @classmethod
+    def of(cls, shown: Shown) -> ProgressBars:
+        """As a command shows what it does: JSON stands alone."""
+        return cls(shown.quiet or shown.as_json, shown.verbose)
 
     def __enter__(self) -> ProgressBars:
         self._progress.start()
@@ -110,6 +118,11 @@ class RateColumn(ProgressColumn):
         """The rate while it runs, of the whole once it is done."""
         rate = task.finished_speed or task.speed
         return Text(f"{rate:.3g}/s" if rate and (task.total or 0) > 1 else "", style="progress.data.speed")
+
+
+def print_json(data: Any) -> None:
+    """A value on stdout as JSON, a line for each number or word."""
+    print(json_text(data), end="")
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], *, words: Sequence[str] = ()) -> None:

@@ -8,16 +8,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from hodge_pipeline import registry
 from hodge_pipeline.cli.paths import keep_source
 from hodge_pipeline.cli.reader_choice import choose_reader
-from hodge_pipeline.errors import RecipeError, SourceError, not_written
+from hodge_pipeline.errors import RecipeError, not_written
 from hodge_pipeline.run_folder import Run
+from hodge_pipeline.scene import own_trajectory
 from hodge_pipeline.stages import Writer
 from hodge_pipeline.store.workspace import is_run_folder
-from hodge_pipeline.types import Source, Trajectory
+from hodge_pipeline.types import Source
 
 BY_NAME = {"transforms.json": "nerfstudio"}
 BY_SUFFIX = {
@@ -53,9 +52,8 @@ def convert(
     if not overwrite and out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise RecipeError(f"{out}: is there already: give another name, or --overwrite to replace it")
     whole = is_run_folder(source) and reader is None
-    opened = with_trajectory(
-        Run.load(source).posed_source() if whole else choose_reader(source, reader, settings).open(source)
-    )
+    opened = Run.load(source).posed_source() if whole else choose_reader(source, reader, settings).open(source)
+    opened = replace(opened, trajectory=own_trajectory(opened))
     name = to or writer_name(out, opened)
     writer: Writer = registry.load("writers", name)()
     try:
@@ -81,17 +79,3 @@ def writer_name(out: Path, source: Source) -> str:
     if name not in known:
         raise RecipeError(f"{out}: no writer for '{out.suffix}': name one with --to ({', '.join(known)})")
     return name
-
-
-def with_trajectory(source: Source) -> Source:
-    """The source, with the poses of its frames as trajectory where it has none of its own.
-
-    Raises `SourceError` where frames of several sequences have stamps that repeat.
-    """
-    posed = [(frame.stamp_s, frame.world_from_cam) for frame in source.frames if frame.world_from_cam is not None]
-    if source.trajectory is not None or not posed:
-        return source
-    stamps = np.array([stamp for stamp, _ in posed])
-    if (np.diff(stamps) <= 0).any():
-        raise SourceError(f"{source.path}: several sequences with stamps of their own: convert one sequence's folder")
-    return replace(source, trajectory=Trajectory(stamps, np.array([pose for _, pose in posed])))

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hodge_pipeline.cli.console import ProgressBars, print_table
+from hodge_pipeline.cli.console import ProgressBars, print_json, print_table
+from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.report.brief import COLUMNS, LABEL, LINES, at_most, labelled
 
 if TYPE_CHECKING:
@@ -20,24 +21,20 @@ LEAST_SHOWN, MOST_BAD = 3, 20
 HEADER = ("edge", "verdict", "right", "why", "what to do")
 
 
-def diagnose(
-    path: Path, out: Path | None, *, top: int | None, trust: str | None, quiet: bool, as_json: bool, verbose: bool
-) -> None:
+def diagnose(path: Path, out: Path | None, shown: Shown, *, top: int | None, trust: str | None) -> None:
     """Judge every edge, print the worst, and leave the rest in a folder where one is given."""
     from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
 
-    with ProgressBars(quiet or as_json, verbose) as terminal:
+    with ProgressBars.of(shown) as terminal:
         with terminal.stage("diagnosis", 1):
             found = diagnose_subject(open_subject(path, trust))
         if out is not None:
             with terminal.stage("pictures and recording", 1):
                 write_diagnosed(out, found)
-    if as_json:
-        from hodge_pipeline.store.artifacts import json_text
-
-        print(json_text(_as_json(found, out)), end="")
-    elif not quiet:
-        _print(found, out, top, verbose=verbose)
+    if shown.as_json:
+        print_json(_as_json(found, out))
+    elif not shown.quiet:
+        _print(found, out, top, verbose=shown.verbose)
 
 
 def _print(found: Diagnosed, out: Path | None, top: int | None, *, verbose: bool) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
+from hodge_pipeline.cli.console import print_json
+from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import (
@@ -39,7 +41,7 @@ class Pairs:
         return bool(self.disable or self.enable or self.register or self.right)
 
 
-def edit(folder: Path, pairs: Pairs, *, undo: bool, listing: bool, quiet: bool, as_json: bool) -> None:
+def edit(folder: Path, pairs: Pairs, shown: Shown, *, undo: bool, listing: bool) -> None:
     """Add to the history of edits, or take the last back, and print what the edits now come to."""
     if undo and pairs:
         raise GraphError("--undo takes the last edit back: give it alone")
@@ -50,9 +52,10 @@ def edit(folder: Path, pairs: Pairs, *, undo: bool, listing: bool, quiet: bool, 
         if changed:
             history = history.undo() if undo else history.added(_checked(folder, listed, pairs))
             write_history(folder, history)
-    if as_json:
-        _print_json(folder, history)
-    elif not quiet:
+    if shown.as_json:
+        edits = [asdict(one) for one in history.edits]
+        print_json({"run": str(folder), "switches": history.switches, "edits": edits})
+    elif not shown.quiet:
         _print(folder, history, listed, changed=changed, listing=listing or not changed)
 
 
@@ -115,12 +118,3 @@ def _facts(edges: Edges, row: int | None, switch: str) -> str:
     right = f"probability {probability:.2f}" if np.isfinite(probability) else ""
     why = edges.why[row] if edges.status[row] == REJECTED else ""
     return "  (" + ", ".join(word for word in (edges.proposed_by[row], why, edges.verdict[row], right) if word) + ")"
-
-
-def _print_json(folder: Path, history: History) -> None:
-    from dataclasses import asdict
-
-    from hodge_pipeline.store.artifacts import json_text
-
-    edits = [asdict(one) for one in history.edits]
-    print(json_text({"run": str(folder), "switches": history.switches, "edits": edits}), end="")

@@ -19,9 +19,9 @@ def inspect(path: Path, *, reader: str | None, settings: Sequence[str], as_json:
 
     facts = facts_of(path, choose_reader(path, reader, settings) if reader or settings else None)
     if as_json:
-        from hodge_pipeline.store.artifacts import json_text
+        from hodge_pipeline.cli.console import print_json
 
-        print(json_text(facts), end="")
+        print_json(facts)
         return
     for name, value in (*facts.items(), ("next", next_command(path, facts, reader))):
         for row, text in enumerate(_rows(value)):

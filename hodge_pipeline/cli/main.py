@@ -20,6 +20,7 @@ from hodge_pipeline.cli.options import (
     Quiet,
     Reader,
     ReaderSet,
+    Shown,
     Strict,
     Trust,
     Truth,
@@ -104,8 +105,8 @@ def run(
     from hodge_pipeline.cli import run as running
 
     sets = [*(overrides or []), *running.named_truth(truth)]
-    shown = {"quiet": quiet, "as_json": json, "live": live, "verbose": verbose}
-    running.run(recipe, source, out, sets, overwrite=overwrite, dask=dask, strict=strict, **shown)
+    shown = Shown(quiet, json, verbose)
+    running.run(recipe, source, out, sets, shown, overwrite=overwrite, live=live, dask=dask, strict=strict)
 
 
 @app.command()
@@ -128,8 +129,8 @@ def demo(
 
     if lidar and rooms > 1:
         raise typer.BadParameter("--rooms and --lidar are two demos: give one of them")
-    shown = {"quiet": quiet, "verbose": verbose}
-    running.demo(out, overrides or [], lidar=lidar, rooms=rooms, overwrite=overwrite, dask=dask, **shown)
+    shown = Shown(quiet, verbose=verbose)
+    running.demo(out, overrides or [], shown, lidar=lidar, rooms=rooms, overwrite=overwrite, dask=dask)
 
 
 @app.command()
@@ -173,16 +174,10 @@ def solve(
     from hodge_pipeline.cli import solve as solving
 
     options = solving.choices(
-        objective,
-        start,
-        disable or [],
-        time_limit,
-        robust=robust,
-        trust=trust,
-        certificate=certificate,
+        objective, start, disable or [], time_limit, robust=robust, trust=trust, certificate=certificate,
         sesync_units=sesync_units,
-    )
-    solving.solve(graph, options, out=out, run_folder=run_folder, quiet=quiet, as_json=json, dask=dask, verbose=verbose)
+    )  # fmt: skip
+    solving.solve(graph, options, Shown(quiet, json, verbose), out=out, run_folder=run_folder, dask=dask)
 
 
 @app.command()
@@ -203,7 +198,7 @@ def diagnose(
     """Say which edges are wrong, why, and what to do: by the cycles that they lie in, before any solve."""
     from hodge_pipeline.cli import diagnose as diagnosing
 
-    diagnosing.diagnose(path, out, top=top, trust=trust, quiet=quiet, as_json=json, verbose=verbose)
+    diagnosing.diagnose(path, out, Shown(quiet, json, verbose), top=top, trust=trust)
 
 
 @app.command()
@@ -237,7 +232,7 @@ def edit(
     from hodge_pipeline.cli import edit as editing
 
     pairs = editing.Pairs(disable or [], enable or [], register or [], right or [])
-    editing.edit(run_folder, pairs, undo=undo, listing=listing, quiet=quiet, as_json=json)
+    editing.edit(run_folder, pairs, Shown(quiet, json), undo=undo, listing=listing)
 
 
 @app.command()

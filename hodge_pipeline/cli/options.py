@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
+
+
+class Shown(NamedTuple):
+    """How a command tells what it did: not at all, as JSON, or with every stage, table and note."""
+
+    quiet: bool = False
+    as_json: bool = False
+    verbose: bool = False
+
 
 Overrides = Annotated[
     list[str] | None,

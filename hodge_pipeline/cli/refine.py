@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hodge_pipeline.cli.options import Dask, Force, Json, Overrides, Overwrite, Quiet, Truth, Verbose
+from hodge_pipeline.cli.options import Dask, Force, Json, Overrides, Overwrite, Quiet, Shown, Truth, Verbose
 
 HELP = """Make the poses of COLMAP or SLAM better, in their own format.
 
@@ -53,23 +53,11 @@ def trajectory(
     json: Json = False,
 ) -> None:
     """Refine SLAM poses with the frames they belong to: loops, registration, a robust solve."""
-    from hodge_pipeline.cli import refine_trajectory as refining_trajectory
-    from hodge_pipeline.cli.run import named_truth
+    from hodge_pipeline.cli import run as running
 
-    refining_trajectory.refine(
-        poses,
-        frames,
-        out,
-        match,
-        recipe,
-        [*named_truth(truth), *(overrides or [])],
-        force=force,
-        overwrite=overwrite,
-        quiet=quiet,
-        as_json=json,
-        verbose=verbose,
-        dask=dask,
-    )
+    sets, how = [*running.named_truth(truth), *(overrides or [])], {"force": force, "overwrite": overwrite}
+    shown = Shown(quiet, json, verbose)
+    running.refine_trajectory(poses, frames, out, match, recipe, sets, shown, dask=dask, **how)
 
 
 @group.command()
@@ -124,15 +112,5 @@ def colmap(
     sets = [f"model.{name}={value}" for name, value in given.items() if value is not None]
     if depth_camera is not None:
         sets.append(f"model.depth_camera=[{', '.join(map(str, depth_camera))}]")
-    refining_colmap.refine(
-        model,
-        out,
-        [*sets, *(overrides or [])],
-        recipe=recipe,
-        force=force,
-        overwrite=overwrite,
-        quiet=quiet,
-        as_json=json,
-        verbose=verbose,
-        dask=dask,
-    )
+    sets, how = [*sets, *(overrides or [])], {"force": force, "overwrite": overwrite}
+    refining_colmap.refine(model, out, sets, Shown(quiet, json, verbose), recipe=recipe, dask=dask, **how)

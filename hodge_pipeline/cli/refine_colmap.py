@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hodge_pipeline.cli.console import ProgressBars, print_table
+from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.cli.run import resumable
 from hodge_pipeline.errors import CheckError
 from hodge_pipeline.refine.model_options import RECIPE, load_model_refinement
@@ -24,13 +25,11 @@ def refine(
     model: Path,
     out: Path,
     overrides: Sequence[str],
+    shown: Shown,
     *,
     recipe: str,
     force: bool,
     overwrite: bool,
-    quiet: bool,
-    as_json: bool,
-    verbose: bool,
     dask: str | None,
 ) -> None:
     """Refine a model into a run folder. Raises `CheckError` (exit code 3) where the guard kept the input as worse."""
@@ -38,15 +37,15 @@ def refine(
     from hodge_pipeline.types.input_files import read_input_text
     from hodge_pipeline.uses.colmap import run_refinement
 
-    with resumable(out), ProgressBars(quiet or as_json) as terminal:
+    with resumable(out), ProgressBars.of(shown._replace(verbose=False)) as terminal:
         done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal, dask=dask)
-    if as_json:
+    if shown.as_json:
         print(read_input_text(out / "report.json"), end="")
-    elif not quiet:
+    elif not shown.quiet:
         for result in done.results:
-            if verbose:
+            if shown.verbose:
                 _print_tables(result)
-            print("\n".join(_lines(result, alone=len(done.results) == 1, verbose=verbose)))
+            print("\n".join(_lines(result, alone=len(done.results) == 1, verbose=shown.verbose)))
         if (out / "sparse").is_dir():
             print(f"{'model':<9}{out / 'sparse'}")
         print(f"{'report':<9}{out / 'report.html'}")

@@ -1,4 +1,4 @@
-"""The commands that run: `hodge run`, `hodge demo`."""
+"""The commands that run a recipe: `hodge run`, `hodge demo`, `hodge refine trajectory`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from hodge_pipeline.cli.console import ProgressBars, print_table
-from hodge_pipeline.errors import CheckError, RecipeError
+from hodge_pipeline.cli.console import ProgressBars, print_json, print_table
+from hodge_pipeline.cli.options import Shown
+from hodge_pipeline.errors import CheckError, RecipeError, SourceError
 from hodge_pipeline.recipe.schema import load_recipe
 
 if TYPE_CHECKING:
@@ -25,14 +26,12 @@ def run(
     source: Path | None,
     out: Path,
     overrides: Sequence[str],
+    shown: Shown,
     *,
     overwrite: bool,
-    quiet: bool,
-    as_json: bool,
     live: bool = False,
     dask: str | None = None,
     strict: bool = False,
-    verbose: bool = False,
 ) -> None:
     """Run a recipe and print what came out."""
     loaded = load_recipe(recipe, overrides, source)
@@ -41,13 +40,13 @@ def run(
     from hodge_pipeline.executors.dask import describe
     from hodge_pipeline.uses.recipe_run import run as run_pipeline
 
-    with resumable(out), ProgressBars(quiet or as_json, verbose) as terminal, _viewer(live, terminal) as address:
+    with resumable(out), ProgressBars.of(shown) as terminal, _viewer(live, terminal) as address:
         if dask is not None:
             terminal.say(describe(dask))
         result = run_pipeline(
             loaded, out, overwrite=overwrite, watcher=terminal, live=address, dask=dask, strict=strict
         )
-    print_result(result, quiet=quiet, as_json=as_json, verbose=verbose)
+    print_result(result, shown)
     if result.refined is not None and result.refined.decision.exit_code:
         raise CheckError(result.refined.decision.reason)
 
@@ -57,15 +56,14 @@ def named_truth(truth: str | None) -> list[str]:
     return [] if truth is None else [f"evaluation.truth={json.dumps(truth)}"]
 
 
-def print_result(result: Run, *, quiet: bool, as_json: bool, verbose: bool = False) -> None:
+def print_result(result: Run, shown: Shown) -> None:
     """Print the report of a run: ten lines, with all tables and notes, or JSON."""
-    if as_json:
-        from hodge_pipeline.report.write import as_json as report_json
-        from hodge_pipeline.store.artifacts import json_text
+    if shown.as_json:
+        from hodge_pipeline.report.write import as_json
 
-        print(json_text(report_json(result.report)), end="")
-    elif not quiet:
-        _print_summary(result, verbose=verbose)
+        print_json(as_json(result.report))
+    elif not shown.quiet:
+        _print_summary(result, verbose=shown.verbose)
 
 
 @contextmanager
@@ -107,13 +105,12 @@ def resumable(out: Path) -> Iterator[None]:
 def demo(
     out: Path,
     overrides: Sequence[str],
+    shown: Shown,
     *,
     lidar: bool,
     rooms: int,
     overwrite: bool,
-    quiet: bool,
     dask: str | None,
-    verbose: bool,
 ) -> None:
     """Make the demo's room, building or street, or find it in the cache, and run `demo`, or `lidar`, on it."""
     from hodge_pipeline.demo.sequence import BuildingOptions, DemoOptions, World, demo_source
@@ -122,13 +119,33 @@ def demo(
     room: World = DemoOptions() if rooms == 1 else BuildingOptions(rooms=rooms)
     options: World = StreetOptions() if lidar else room
     title = "scan the demo street" if lidar else f"render the demo's {'room' if rooms == 1 else f'{rooms} rooms'}"
-    with ProgressBars(quiet, verbose) as terminal, terminal.stage(title, options.frames) as advance:
+    with ProgressBars.of(shown) as terminal, terminal.stage(title, options.frames) as advance:
         folder = demo_source(options=options, advance=advance)
     truth = named_truth(str(folder / TRUTH_FILE)) if lidar else []
-    run(
-        "lidar" if lidar else "demo", folder, out, [*truth, *overrides], overwrite=overwrite, quiet=quiet,
-        as_json=False, dask=dask, verbose=verbose,
-    )  # fmt: skip
+    run("lidar" if lidar else "demo", folder, out, [*truth, *overrides], shown, overwrite=overwrite, dask=dask)
+
+
+def refine_trajectory(
+    poses: Path,
+    frames: Path,
+    out: Path,
+    match: str,
+    recipe: str,
+    overrides: Sequence[str],
+    shown: Shown,
+    *,
+    force: bool,
+    overwrite: bool,
+    dask: str | None,
+) -> None:
+    """Run `slam_refine` on given poses and frames; `CheckError`, exit code 3, where the poses given are better."""
+    from hodge_pipeline.start.match_poses import recipe_for
+
+    if not poses.exists():
+        raise SourceError(f"{poses}: no such file or folder: give the poses to refine")
+    ours = ["start.stage=given", f"start.path={json.dumps(str(poses))}", f"start.match={match}"]
+    ours.append(f"guard.force={str(force).lower()}")
+    run(recipe or recipe_for(frames), frames, out, [*ours, *overrides], shown, overwrite=overwrite, dask=dask)
 
 
 def _print_summary(result: Run, *, verbose: bool) -> None:

@@ -6,8 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
-from hodge_pipeline.cli.console import ProgressBars
+from hodge_pipeline.cli.console import ProgressBars, print_json
 from hodge_pipeline.cli.convert import writer_name
+from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.cli.paths import check_result, keep_source
 from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.pairs.edits import read_history
@@ -61,20 +62,18 @@ def choices(
 def solve(
     path: Path,
     options: Choices,
+    shown: Shown,
     *,
     out: Path | None,
     run_folder: Path | None,
-    quiet: bool,
-    as_json: bool,
     dask: str | None,
-    verbose: bool = False,
 ) -> None:
     """Solve a file, write what was asked for, print a summary; `CheckError` where the result fails its own checks.
 
     A run folder given alone is solved and fused again, with its edits, and brought up to date.
     """
     if out is None and run_folder is None and options == Choices() and (path / RECIPE_FILE).is_file():
-        _solve_run(path, quiet=quiet, as_json=as_json, dask=dask, verbose=verbose)
+        _solve_run(path, shown, dask)
         return
     if path.is_dir() and (history := read_history(path)).edits:
         options = replace(options, disable=(*options.disable, *history.disabled))
@@ -83,7 +82,7 @@ def solve(
     if out is not None:
         check_result(out)
         keep_source(path, out)
-    with ProgressBars(quiet or as_json, verbose) as terminal, terminal.stage("solve", 1):
+    with ProgressBars.of(shown) as terminal, terminal.stage("solve", 1):
         solved = solve_file(path, options)
     if out is not None:
         write_solved(out, solved, _writer(out, solved.source))
@@ -94,14 +93,10 @@ def solve(
         left_out = write_run_folder(run_folder, solved)
     summary = solved.summary()
     summary["notes"] += left_out
-    if as_json:
-        from hodge_pipeline.store.artifacts import json_text
-
-        print(
-            json_text({"source": str(solved.source.path), "out": None if out is None else str(out), **summary}), end=""
-        )
-    elif not quiet:
-        print("\n".join(_lines(solved, summary, out, run_folder, verbose=verbose)))
+    if shown.as_json:
+        print_json({"source": str(solved.source.path), "out": None if out is None else str(out), **summary})
+    elif not shown.quiet:
+        print("\n".join(_lines(solved, summary, out, run_folder, verbose=shown.verbose)))
     _check(summary)
 
 
@@ -110,13 +105,13 @@ def _writer(out: Path, source: Source) -> str:
     return writer_name(out, source) if out.suffix.lower() in KNOWN_ENDINGS else "g2o"
 
 
-def _solve_run(folder: Path, *, quiet: bool, as_json: bool, dask: str | None, verbose: bool) -> None:
+def _solve_run(folder: Path, shown: Shown, dask: str | None) -> None:
     from hodge_pipeline.cli.run import print_result
     from hodge_pipeline.uses.recipe_run import solve_again
 
-    with ProgressBars(quiet or as_json, verbose) as terminal:
+    with ProgressBars.of(shown) as terminal:
         result = solve_again(folder, watcher=terminal, dask=dask)
-    print_result(result, quiet=quiet, as_json=as_json, verbose=verbose)
+    print_result(result, shown)
 
 
 def _lines(

@@ -170,14 +170,12 @@ def make_sequence(folder: Path | str, options: World | None = None, advance: Adv
     return folder
 
 
-def demo_source(cache_dir: Path | None = None, options: World | None = None, advance: Advance = no_progress) -> Path:
+def demo_source(options: World, advance: Advance = no_progress) -> Path:
     """The folder of the demo sequence in the user's cache, made at the first call.
 
     The cache is `$XDG_CACHE_HOME/hodge-pipeline`, else `~/.cache/hodge-pipeline`; it keeps the last few sequences used.
     """
-    options = options or DemoOptions()
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    cache = cache_dir or base / "hodge-pipeline"
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hodge-pipeline"
     key = hashlib.sha256(_stamp(options).encode()).hexdigest()[:12]
     folder = make_sequence(cache / f"demo-{key}", options, advance)
     os.utime(folder)

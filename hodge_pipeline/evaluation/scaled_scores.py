@@ -46,7 +46,7 @@ def _clouds_in_units(folder: Path, scale: float, scratch: Path) -> Iterator[None
     smaller = (clouds.points / scale).astype(np.float32)
     CloudSet(
         clouds.offsets, smaller, clouds.normals, clouds.colours,
-        clouds.marks, clouds.mark_points, clouds.mark_descriptors,
+        clouds.marks, clouds.mark_points, clouds.mark_descriptors, clouds.mark_pixel_rad,
     ).save(scratch)  # fmt: skip
     try:
         yield

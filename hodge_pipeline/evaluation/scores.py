@@ -53,7 +53,7 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind) 
     if len(usable) < 2:
         return np.zeros((0, 2), np.int64)
     find = _near_centroids if kind == "distance" else _overlapping_voxels
-    some = evenly(np.arange(len(usable)), MOST_FRAMES)
+    some = some_of(np.arange(len(usable)), MOST_FRAMES)
     found = find([clouds[int(row)] for row in usable], world_from_cam[usable], some)
     clouds.forget()
     pairs = np.unique(np.sort(found[found[:, 0] != found[:, 1]], axis=1), axis=0)
@@ -81,7 +81,7 @@ def _overlapping_voxels(clouds: Sequence[PointCloud], world_from_cam: Floats, so
     return np.stack([iou.row, iou.col], axis=1)
 
 
-def evenly(pairs: Ints, most: int) -> Ints:
+def some_of(pairs: Ints, most: int) -> Ints:
     """At most so many of the pairs (P, 2), or of other rows, spread evenly over their order."""
     if len(pairs) <= most:
         return pairs
@@ -188,7 +188,7 @@ def score_table(
     if reference not in pose_sets:
         raise GraphError(f"reference poses {reference!r} are not among {', '.join(pose_sets)}")
     clouds = CloudSet.open(clouds_folder)
-    graphs = [evenly(evaluation_pairs(clouds, pose_sets[reference], kind), MOST_PAIRS) for kind in kinds]
+    graphs = [some_of(evaluation_pairs(clouds, pose_sets[reference], kind), MOST_PAIRS) for kind in kinds]
     union, rank = np.unique(np.concatenate(graphs), axis=0, return_inverse=True)
     distances = edge_distances(clouds_folder, union, np.stack(list(pose_sets.values())), workers, advance)
     columns = np.split(rank.reshape(-1), np.cumsum([len(pairs) for pairs in graphs])[:-1])

@@ -1,4 +1,4 @@
-"""The viewer's own program: it mends cut-off files and draws pictures. It sends nothing: its telemetry is off."""
+"""Run the `rerun` binary (repair of truncated files, screenshots, viewer) with its telemetry off."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ TIMEOUT_S = 120.0
 
 
 def program() -> Path:
-    """The program itself: the `rerun` on the path is a wrapper that leaves it running when killed."""
+    """Path of the `rerun` binary; the `rerun` on PATH is a wrapper that leaves it running when killed."""
     name = "rerun.exe" if os.name == "nt" else "rerun"
     return Path(os.environ.get("RERUN_CLI_PATH") or str(files("rerun_cli") / name))
 

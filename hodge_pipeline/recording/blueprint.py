@@ -1,4 +1,4 @@
-"""How the viewer opens: on the story, with frames, solver and log in tabs beside it."""
+"""The default blueprint (layout of the viewer): a tab for each stage of a run."""
 
 from __future__ import annotations
 

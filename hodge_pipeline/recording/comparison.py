@@ -1,4 +1,4 @@
-"""Two runs in one recording: their trajectories and models, B laid onto A."""
+"""Recording of two runs for comparison: trajectories and models, B aligned to A."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from hodge_pipeline import se3
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import BACKGROUND, without_panels
-from hodge_pipeline.recording.recorder import APPLICATION
 from hodge_pipeline.recording.results import log_model
-from hodge_pipeline.recording.shapes import evenly, frustum_lines
+from hodge_pipeline.recording.shapes import frustum_lines
 from hodge_pipeline.recording.stream import log_markdown, writing
 from hodge_pipeline.types import Floats, Model
+from hodge_pipeline.types.arrays import evenly
 
 COLOURS = {"a": (230, 130, 0), "b": (86, 180, 233)}
 """Orange and sky blue of Okabe and Ito's set."""
@@ -33,7 +33,7 @@ def record_comparison(
     text: str,
 ) -> None:
     """Write the recording; the poses (S, 4, 4) of the shared frames and the models are in one world already."""
-    with writing(path, APPLICATION, f"compare-{names[0]}-{names[1]}", _blueprint(names)) as stream:
+    with writing(path, f"compare-{names[0]}-{names[1]}", _blueprint(names)) as stream:
         for side, world_from_cam, model in zip("ab", poses, models, strict=True):
             _log_run(stream, side, world_from_cam, model)
         if len(apart_m):

@@ -1,4 +1,4 @@
-"""The complex that the viewing graph spans: its triangles, coloured by what the motions round each leave over."""
+"""Log the complex of a round: triangles coloured by curl, and the energies of the parts of the 1-form."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.curl import ALPHA, log_triangles, triangle_curl_m
 from hodge_pipeline.recording.stream import log_markdown, log_notes
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 TRIANGLE_BYTES, COLUMN_BYTES = 60, 28
 
@@ -26,7 +27,7 @@ def log_complex(
     options: RecordingOptions,
     max_bytes: float,
 ) -> tuple[str, ...]:
-    """What was thinned, in words; the triangles by curl, and the energy of the 1-form before and after the solve."""
+    """Log triangles by curl, and the 1-form's energy before and after the solve; gives notes of what was thinned."""
     try:
         complex_ = flag_of(graph)
     except GraphError as error:
@@ -40,7 +41,7 @@ def log_complex(
     kept = options.count(options.edge_lines, len(triangles), TRIANGLE_BYTES, max_bytes)
     corners = solution.world_from_cam[triangles, :3, 3]
     drawable = np.flatnonzero(np.isfinite(corners).all(axis=(1, 2)))
-    rows = drawable[np.argsort(curl_m[drawable], kind="stable")][shapes.evenly(len(drawable), kept)]
+    rows = drawable[np.argsort(curl_m[drawable], kind="stable")][evenly(len(drawable), kept)]
     colours = shapes.residual_colours(curl_m[rows], options.residual_scale_m)
     if len(rows):
         log_triangles(stream, layout.complex_mesh(outer), corners[rows], colours, np.full(len(rows), ALPHA, np.uint8))

@@ -1,4 +1,4 @@
-"""Triangles of the viewing graph, coloured by what the motions round each leave over: its curl."""
+"""Log triangles of the viewing graph coloured by curl, the error of the motions around them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def log_triangles(stream: rr.RecordingStream, path: str, corners: Floats, colour
 
 
 def triangle_curl_m(graph: ViewGraph, triangles: Ints) -> Floats:
-    """What the measured motions round each triangle (T, 3) leave over, in metres; a rotation is its arc at 1 m.
+    """Curl (T,) in metres of the measured motions around each triangle (T, 3); a rotation counts as its arc at 1 m.
 
     Of parallel edges the first counts.
     """
@@ -53,7 +53,7 @@ def _motions(graph: ViewGraph, a: Ints, b: Ints) -> Floats:
 def log_tested_triangles(
     stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats, cycles: Cycles
 ) -> tuple[str, ...]:
-    """What was left out, in words; each tested triangle in the colour of √χ² of its curl, those that fail in full."""
+    """Log tested triangles coloured by √χ² of their curl, those that fail opaque; gives notes of what was left out."""
     rows = np.flatnonzero(cycles.loops.lengths == 3)
     corners = vertices_along(graph, cycles.loops, rows).reshape(-1, 3)
     finite = np.asarray(np.isfinite(world_from_cam[corners][:, :, :3, 3]).all(axis=(1, 2)))

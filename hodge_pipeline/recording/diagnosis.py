@@ -1,15 +1,15 @@
-"""The verdicts on the edges, each with an entity of its own, so that one kind can be shown alone."""
+"""Log the edges by verdict, an entity for each verdict so that the viewer can show one alone."""
 
 from __future__ import annotations
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.stream import log_markdown, log_notes
-from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types import Edges, Floats, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 COLOURS = {
     "consistent": (60, 115, 225),
@@ -27,21 +27,19 @@ def log_diagnosis(
     stream: rr.RecordingStream,
     graph: ViewGraph,
     world_from_cam: Floats,
-    verdict: NDArray[np.str_],
-    probability: Floats,
-    reason: NDArray[np.str_],
+    edges: Edges,
     options: RecordingOptions,
 ) -> tuple[str, ...]:
-    """What was thinned, in words; of the edges that are drawn those with a bad verdict come first."""
+    """Log the edges by verdict, with probability and reason as label; gives notes of what was thinned."""
     notes: tuple[str, ...] = ()
-    log_markdown(stream, layout.DIAGNOSIS, summary(graph, verdict, probability, reason))
+    log_markdown(stream, layout.DIAGNOSIS, summary(graph, edges))
     lines = shapes.segments(world_from_cam, graph.edges)
     drawable = np.isfinite(lines).all(axis=(1, 2))
-    for name in sorted(set(verdict.tolist()) | set(COLOURS)):
-        rows = np.flatnonzero((verdict == name) & drawable)
+    for name in sorted(set(edges.verdict.tolist()) | set(COLOURS)):
+        rows = np.flatnonzero((edges.verdict == name) & drawable)
         kept = options.count(options.edge_lines, len(rows), BYTES_EACH, options.max_bytes("solver") / 2)
-        rows, available = rows[shapes.evenly(len(rows), kept)], len(rows)
-        labels = [_label(graph, int(row), name, probability, reason) for row in rows]
+        rows, available = rows[evenly(len(rows), kept)], len(rows)
+        labels = [_label(graph, edges, int(row)) for row in rows]
         colour, radius = COLOURS.get(name, shapes.RESULT_COLOUR), RADII.get(name, -0.8)
         strips = rr.LineStrips3D(lines[rows], colors=[colour], radii=[radius], labels=labels, show_labels=False)
         stream.log(layout.verdict(name), strips, static=True)
@@ -51,28 +49,30 @@ def log_diagnosis(
     return notes
 
 
-def summary(graph: ViewGraph, verdict: NDArray[np.str_], probability: Floats, reason: NDArray[np.str_]) -> str:
+def summary(graph: ViewGraph, edges: Edges) -> str:
     """The verdicts counted, and the least probable edges with their reasons, as Markdown."""
-    names, counts = np.unique(verdict, return_counts=True)
+    names, counts = np.unique(edges.verdict, return_counts=True)
     lines = ["# Which edge is wrong", "", "| verdict | edges |", "|---|---|"]
     lines += [f"| {name} | {count} |" for name, count in zip(names, counts, strict=True)]
-    listed = [int(row) for row in _least_probable(verdict, probability)]
+    listed = _least_probable(edges)
     if listed:
         lines += ["", "## The least probable", "", "| edge | verdict | right with | why |", "|---|---|---|---|"]
     for row in listed:
         i, j = graph.vertex_ids[graph.edges[row]]
-        lines += [f"| {i} – {j} | {verdict[row]} | {_percent(probability[row])} | {reason[row]} |"]
+        lines += [f"| {i} – {j} | {edges.verdict[row]} | {_percent(edges.probability[row])} | {edges.why[row]} |"]
     return "\n".join(lines)
 
 
-def _least_probable(verdict: NDArray[np.str_], probability: Floats) -> Ints:
-    rows = np.flatnonzero(np.isin(verdict, ("wrong", "suspect")))
-    return np.asarray(rows[np.argsort(probability[rows], kind="stable")][:LISTED], np.int64)
+def _least_probable(edges: Edges) -> list[int]:
+    rows = np.flatnonzero(np.isin(edges.verdict, ("wrong", "suspect")))
+    chosen: list[int] = rows[np.argsort(edges.probability[rows], kind="stable")][:LISTED].tolist()
+    return chosen
 
 
-def _label(graph: ViewGraph, row: int, name: str, probability: Floats, reason: NDArray[np.str_]) -> str:
+def _label(graph: ViewGraph, edges: Edges, row: int) -> str:
     i, j = graph.vertex_ids[graph.edges[row]]
-    return f"{i} – {j}: {graph.source[row]}, {name}, {_percent(probability[row])}: {reason[row]}"
+    right = _percent(edges.probability[row])
+    return f"{i} – {j}: {graph.source[row]}, {edges.verdict[row]}, {right}: {edges.why[row]}"
 
 
 def _percent(probability: float) -> str:

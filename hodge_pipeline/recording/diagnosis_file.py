@@ -1,4 +1,4 @@
-"""`diagnosis.rrd`: a graph's edges by verdict, its triangles by curl, its harmonic loops, without a run around it."""
+"""`diagnosis.rrd` of `hodge diagnose`: edges by verdict, triangles by curl, harmonic loops."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.eye import Eye
 from hodge_pipeline.recording.loops import log_loops
 from hodge_pipeline.recording.stream import log_markdown, writing
-from hodge_pipeline.types import Floats, ViewGraph
+from hodge_pipeline.types import Edges, Floats, ViewGraph
 
 APPLICATION = "hodge-pipeline diagnosis"
 VERTEX_RADIUS = -2.5
@@ -34,12 +34,10 @@ LEGEND = """
 
 def write_diagnosis(path: Path, identity: str, graph: ViewGraph, world_from_cam: Floats, diagnosis: Diagnosis) -> None:
     """One recording, which appears under its name when it is complete; frames are drawn at these poses."""
-    with writing(path, APPLICATION, identity, _blueprint(_eye(world_from_cam))) as stream:
-        reason = np.array(diagnosis.reason, dtype=np.str_)
+    with writing(path, identity, _blueprint(_eye(world_from_cam)), APPLICATION) as stream:
         _log_vertices(stream, graph, world_from_cam)
-        log_diagnosis(
-            stream, graph, world_from_cam, diagnosis.verdict, diagnosis.probability, reason, RecordingOptions()
-        )
+        edges = diagnosis.put_into(Edges.measured(graph))
+        log_diagnosis(stream, graph, world_from_cam, edges, RecordingOptions())
         log_tested_triangles(stream, graph, world_from_cam, diagnosis.cycles)
         log_loops(stream, graph, world_from_cam)
         log_markdown(stream, layout.LEGEND, LEGEND)

@@ -1,4 +1,4 @@
-"""Where the story is looked at from: outside the room, above it, from the side where the camera was."""
+"""Initial viewpoint of the 3-D views: above and behind the cameras."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from rerun.chunk import Chunk
 
 from hodge_pipeline import se3
+from hodge_pipeline.recording.shapes import up_and_ahead
 from hodge_pipeline.types import Floats
 
 ELEVATION = 0.6
@@ -40,17 +41,10 @@ def look_at(model_chunks: Iterable[Chunk], pose_chunks: Iterable[Chunk]) -> Eye 
     scene = points if len(points) else poses[:, :3, 3]
     low, high = np.percentile(scene, [3, 97], axis=0)
     size = max(float(np.linalg.norm(high - low)), 0.5)
-    up = _unit(-poses[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
-    forward = poses[:, :3, 2].mean(axis=0)
-    forward = _unit(forward - (forward @ up) * up, _unit(np.cross(up, [1.0, 0.3, 0.2]), up))
+    up, ahead = up_and_ahead(poses)
     target = (low + high) / 2
-    position = target - DISTANCE * size * (forward - ELEVATION * up)
+    position = target - DISTANCE * size * (ahead - ELEVATION * up)
     return Eye(_triple(position), _triple(target), _triple(up))
-
-
-def _unit(vector: Floats, fallback: Floats) -> Floats:
-    length = float(np.linalg.norm(vector))
-    return vector / length if length > 1e-3 else fallback
 
 
 def _triple(vector: Floats) -> tuple[float, float, float]:

@@ -1,4 +1,4 @@
-"""Images, cameras and clouds of the frames."""
+"""Log images, cameras and clouds of the frames."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import rerun as rr
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.shapes import evenly
 from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes
 from hodge_pipeline.types import Camera, CloudSet, EncodedImage, Floats, Frame, Ints
+from hodge_pipeline.types.arrays import evenly
 
 CHUNK_BYTES = 4_000_000
 """Images go in chunks of this size: few enough to be quick, small enough for a viewer to fetch one."""
@@ -26,7 +26,7 @@ the largest is 1.2 times the mean, and the mean of 64 is known to 1 %."""
 def log_frames(
     stream: rr.RecordingStream, name: str, frames: Sequence[Frame], notes: Sequence[str], options: RecordingOptions
 ) -> tuple[str, ...]:
-    """What was thinned, in words; the images as their files hold them, the cameras, the frames' names."""
+    """Log encoded images, cameras and names of the frames; gives notes of what was thinned or unreadable."""
     rows, thinned = image_rows(frames, options)
     log_markdown(stream, layout.SOURCE, "\n".join([f"# {name}", f"{len(frames)} frames", *(f"- {n}" for n in notes)]))
     log_notes(stream, 0, thinned)
@@ -71,7 +71,7 @@ def _sizes(frames: Sequence[Frame]) -> Floats:
 def log_clouds(
     stream: rr.RecordingStream, frames: Sequence[Frame], clouds: CloudSet, options: RecordingOptions
 ) -> tuple[str, ...]:
-    """What was thinned, in words; each frame's cloud in its camera's axes, under the moving camera."""
+    """Log each frame's cloud in its camera's axes; gives notes of what was thinned."""
     total = int(clouds.offsets[-1])
     kept = options.count(options.cloud_points, total, POINT_BYTES, options.max_bytes("clouds"))
     if not options.has_images or not total or not kept:

@@ -1,4 +1,4 @@
-"""Trajectories, the viewing graph, and the solve."""
+"""Log trajectories, the viewing graph and the iterations of a solve."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_columns
 from hodge_pipeline.types import Edges, Floats, Frame, Ints, Solution, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 LINE_BYTES = 40
 """One edge of the film: two points, a colour, two list offsets."""
@@ -26,7 +27,7 @@ TRAJECTORY_RADIUS, FRUSTUM_RADIUS, EDGE_RADIUS, CENTRE_RADIUS = -1.6, -0.5, -0.6
 def log_poses(
     stream: rr.RecordingStream, name: str, world_from_cam: Floats, frames: Sequence[Frame], options: RecordingOptions
 ) -> tuple[str, ...]:
-    """What was left out, in words; a trajectory as a line, as frusta, and as one transform for each frame."""
+    """Log a trajectory as a line, as frusta and as transforms; gives notes of what was left out."""
     drawable = np.flatnonzero(shapes.is_drawable(world_from_cam))
     sequences = np.array([frame.sequence for frame in frames] or [""] * len(world_from_cam), dtype=np.str_)
     colour = shapes.TRAJECTORY_COLOURS.get(name, shapes.RESULT_COLOUR)
@@ -35,7 +36,7 @@ def log_poses(
         lines, colors=[colour], radii=[TRAJECTORY_RADIUS], labels=[name] * len(lines), show_labels=False
     )
     stream.log(layout.trajectory(name), line, static=True)
-    picked = drawable[shapes.evenly(len(drawable), options.frusta)]
+    picked = drawable[evenly(len(drawable), options.frusta)]
     frusta = rr.LineStrips3D(shapes.frustum_lines(world_from_cam[picked]), colors=[colour], radii=[FRUSTUM_RADIUS])
     stream.log(layout.frusta(name), frusta, static=True)
     stream.send_columns(
@@ -55,24 +56,22 @@ def log_edges(
     outer: int,
     graph: ViewGraph,
     world_from_cam: Floats,
-    residual_m: Floats | None,
-    verdicts: Sequence[str] | None,
     rejected: Edges | None,
     options: RecordingOptions,
     max_bytes: float,
 ) -> tuple[str, ...]:
-    """What was thinned, in words; the edges coloured by residual, with their reason, and the pairs that failed."""
-    residual_m = shapes.residuals_m(graph, world_from_cam) if residual_m is None else np.asarray(residual_m, float)
+    """Log edges coloured by residual, and rejected pairs with the reason; gives notes of what was thinned."""
+    residual_m = shapes.residuals_m(graph, world_from_cam)
     colours = shapes.residual_colours(residual_m, options.residual_scale_m)
     kept = options.count(options.edge_lines, graph.edge_count, LINE_BYTES + LABEL_BYTES, max_bytes / 2)
-    rows = shapes.evenly(graph.edge_count, kept)
-    labels = [_label(graph, int(row), residual_m, verdicts) for row in rows]
+    rows = evenly(graph.edge_count, kept)
+    labels = [_label(graph, int(row), residual_m) for row in rows]
     _log_lines(stream, layout.edges(outer), world_from_cam, graph.edges[rows], colours[rows], labels)
     if rejected is not None:
         kept = options.count(options.edge_lines, len(rejected.pairs), LINE_BYTES, max_bytes / 4)
-        pairs = rejected.pairs[shapes.evenly(len(rejected.pairs), kept)]
+        pairs = rejected.pairs[evenly(len(rejected.pairs), kept)]
         grey = np.full((len(pairs), 3), shapes.REJECTED_COLOUR, np.uint8)
-        why = rejected.why[shapes.evenly(len(rejected.pairs), kept)]
+        why = rejected.why[evenly(len(rejected.pairs), kept)]
         named = zip(graph.vertex_ids[pairs[:, 0]], graph.vertex_ids[pairs[:, 1]], why, strict=True)
         labels = [f"{i} – {j}: rejected, {reason}" for i, j, reason in named]
         _log_lines(stream, layout.rejected(outer), world_from_cam, pairs, grey, labels)
@@ -90,7 +89,7 @@ def log_solution(
     options: RecordingOptions,
     max_bytes: float,
 ) -> tuple[str, ...]:
-    """What was thinned, in words; the film of the solve, its scalars, and the edges under its result."""
+    """Log the iterations of a solve, its scalars and the edges at its result; gives notes of what was thinned."""
     states = [start, *(step.world_from_cam for step in solution.history)]
     states += [solution.world_from_cam] if not solution.history else []
     residuals = np.array([shapes.residuals_m(graph, poses) for poses in states]).reshape(len(states), graph.edge_count)
@@ -102,9 +101,7 @@ def log_solution(
         notes += _log_film(stream, outer, graph, states, residuals, first_iteration, options, max_bytes / 2)
     colours = shapes.residual_colours(residuals[-1], options.residual_scale_m)
     colours[solution.weights == 0] = shapes.IGNORED_COLOUR
-    lines = shapes.evenly(
-        graph.edge_count, options.count(options.edge_lines, graph.edge_count, LINE_BYTES, max_bytes / 4)
-    )
+    lines = evenly(graph.edge_count, options.count(options.edge_lines, graph.edge_count, LINE_BYTES, max_bytes / 4))
     final = solution.world_from_cam
     _log_lines(stream, layout.solved_edges(outer), final, graph.edges[lines], colours[lines], None)
     log_notes(stream, outer, solution.notes)
@@ -112,7 +109,7 @@ def log_solution(
 
 
 def solver_series(states: Sequence[Floats], residuals: Floats, solution: Solution) -> Mapping[str, tuple[Ints, Floats]]:
-    """Rows and values of each scalar: 0 is the start, which has no objective and no step."""
+    """Rows and values of each scalar over the iterations; row 0 is the start, without objective and step."""
     count = len(states)
     series: dict[str, tuple[Ints, Floats]] = {}
     known = np.isfinite(residuals).any(axis=1) if residuals.size else np.zeros(count, bool)
@@ -170,14 +167,14 @@ def _log_film(
     options: RecordingOptions,
     max_bytes: float,
 ) -> list[str]:
-    """Edges and camera centres after each inner iteration, evenly thinned: rather lines than iterations."""
+    """Log edges and camera centres after each inner iteration; edges are thinned before iterations are."""
     drawn = np.flatnonzero(np.all([shapes.is_drawable(poses) for poses in states], axis=0))
     has_ends = np.isin(graph.edges, drawn).all(axis=1)
     available = int(np.count_nonzero(has_ends))
     steps = options.count(options.film_steps, len(states), STEP_LINES * LINE_BYTES, max_bytes)
-    rows = shapes.evenly(len(states), max(steps, 2))
+    rows = evenly(len(states), max(steps, 2))
     kept = options.count(options.edge_lines, available, LINE_BYTES * len(rows), max_bytes)
-    lines = np.flatnonzero(has_ends)[shapes.evenly(available, kept)]
+    lines = np.flatnonzero(has_ends)[evenly(available, kept)]
     indexes = iteration_columns(outer, len(states), first_iteration, rows)
     if len(lines):
         strips = np.concatenate([shapes.segments(states[row], graph.edges[lines]) for row in rows])
@@ -210,11 +207,10 @@ def _log_lines(
     stream.log(path, strips, static=True)
 
 
-def _label(graph: ViewGraph, row: int, residual_m: Floats, verdicts: Sequence[str] | None) -> str:
+def _label(graph: ViewGraph, row: int, residual_m: Floats) -> str:
     i, j = (graph.vertex_ids[k] for k in graph.edges[row])
-    verdict = f", {verdicts[row]}" if verdicts is not None else ""
     fitness = "" if np.isnan(graph.fitness[row]) else f", fitness {graph.fitness[row]:.2f}"
-    return f"{i} – {j}: {graph.source[row]}, {1000 * residual_m[row]:.1f} mm{fitness}{verdict}"
+    return f"{i} – {j}: {graph.source[row]}, {1000 * residual_m[row]:.1f} mm{fitness}"
 
 
 def _thinning(what: str, kept: int, available: int, outer: int) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The model as it grows: each point from the frame on that saw it first."""
+"""Log the model growing over time: each point appears with the first frame that saw it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.stream import story_columns
 from hodge_pipeline.types import CloudSet, Floats, Floats32, Ints, Model
+from hodge_pipeline.types.arrays import evenly
 
 STEPS = 24
 MOST_POINTS = 120_000
@@ -27,9 +28,9 @@ def log_growth(
     slot: int,
     options: RecordingOptions,
 ) -> None:
-    """The model's points in `STEPS` lots, each with an entity of its own that appears with its frame."""
+    """Log the model's points in `STEPS` entities, each of which appears with its first frame."""
     kept = options.count(MOST_POINTS, len(model.points_in_world), POINT_BYTES, options.max_bytes("model") / 2)
-    rows = shapes.evenly(len(model.points_in_world), min(kept, MOST_POINTS))
+    rows = evenly(len(model.points_in_world), min(kept, MOST_POINTS))
     if not options.has_images or not len(rows) or not len(clouds):
         return
     points = model.points_in_world[rows]

@@ -1,4 +1,4 @@
-"""Every entity path, timeline and part name of a recording, in one place. `docs/recordings.md` explains them."""
+"""Names of all entities, timelines and part files of a recording; `docs/recordings.md` explains them."""
 
 from __future__ import annotations
 

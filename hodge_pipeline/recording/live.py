@@ -1,4 +1,4 @@
-"""A run in a viewer while it works: each part is sent once it is recorded. Only this machine can listen."""
+"""Stream a running run to a viewer on this machine, part by part."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ START_S = 60.0
 
 
 class Live:
-    """A viewer that is shown the parts of one recording, in the order in which they are done."""
+    """Sends the parts of one recording to a viewer as they are finished."""
 
-    def __init__(self, address: str, application_id: str, recording_id: str) -> None:
-        self._stream = open_stream(application_id, recording_id)
+    def __init__(self, address: str, recording_id: str) -> None:
+        self._stream = open_stream(recording_id)
         self._stream.connect_grpc(address)
         self._sent: set[Path] = set()
 
@@ -143,7 +143,7 @@ def free_port(wished: int) -> int:
 
 
 def answers(port: int) -> bool:
-    """Whether somebody listens on this port of this machine."""
+    """Whether a process listens on this port of this machine."""
     with socket.socket() as probe:
         probe.settimeout(0.5)
         return probe.connect_ex((HOST, port)) == 0

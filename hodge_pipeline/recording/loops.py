@@ -1,4 +1,4 @@
-"""The loops of the viewing graph that no triangles fill, drawn as loops."""
+"""Log harmonic loops: cycles of the viewing graph that no triangles fill."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BRIGHT_MEDIANS = 4.0
 
 
 def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats) -> tuple[str, ...]:
-    """What was left out, in words; each hole's loop as a closed line, its label how far the motions around it close."""
+    """Log one closed line for each hole, labelled with its closure error; gives notes of what was left out."""
     notes: tuple[str, ...] = ()
     try:
         holes = unfilled_loops(graph.edges, graph.vertex_count, most_loops=MOST_LOOPS)

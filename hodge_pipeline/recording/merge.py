@@ -1,4 +1,4 @@
-"""All parts of a run as one recording, with the blueprint that opens on the story."""
+"""Merge the parts of a run into one recording with its blueprint; damaged parts are repaired."""
 
 from __future__ import annotations
 
@@ -27,17 +27,7 @@ class Merged:
     notes: tuple[str, ...] = ()
 
 
-def merge(folder: Path, out: Path, application_id: str, recording_id: str) -> Merged:
-    """One file of all parts in the folder, in the order of the run.
-
-    A part that a killed writer left is taken where no complete one is there.
-    """
-    return merge_parts(find_parts(folder), out, application_id, recording_id)
-
-
-def merge_parts(
-    parts: Iterable[Path], out: Path, application_id: str, recording_id: str, *, active_tab: int = 0
-) -> Merged:
+def merge(parts: Iterable[Path], out: Path, recording_id: str, *, active_tab: int = 0) -> Merged:
     """One file of these parts, in the order of the run that their names say; it opens on a tab, the story.
 
     A damaged part is mended as far as it can be read; the others are not touched by it.
@@ -51,7 +41,7 @@ def merge_parts(
         poses = layout.poses(contents.trajectory)
         room = look_at(_chunks(readers, layout.MODEL), _chunks(readers, poses))
         graph = look_at((), _chunks(readers, poses))
-        with writing(out, application_id, recording_id, make_blueprint(contents, room, graph, active_tab)) as stream:
+        with writing(out, recording_id, make_blueprint(contents, room, graph, active_tab)) as stream:
             for _, reader in readers:
                 send(stream, reader, poses)
             log_notes(stream, 0, notes, level="WARN")
@@ -60,7 +50,7 @@ def merge_parts(
 
 
 def find_parts(folder: Path) -> list[Path]:
-    """The parts in the order of the run; unfinished ones where there is no complete one."""
+    """The parts in the order of the run; what a killed writer left where there is no complete one."""
     complete = [path for path in folder.glob(f"*{layout.PART_SUFFIX}") if not path.name.startswith(".")]
     unfinished = set(folder.glob(f".*{layout.PARTIAL_SUFFIX}")) - {partial_path(path) for path in complete}
     parts = [path for path in (*complete, *unfinished) if layout.parse_part(path.name)[0]]

@@ -1,4 +1,4 @@
-"""A recording in a notebook's cell, by Rerun's own widget."""
+"""Show a recording in a notebook cell by Rerun's widget."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import rerun.notebook
 from rerun.error_utils import RerunMissingDependencyError
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording.recorder import APPLICATION
 from hodge_pipeline.recording.run import FILE
+from hodge_pipeline.recording.stream import APPLICATION
 
 
 def viewer(folder: Path, width: int, height: int) -> Any:

@@ -1,13 +1,11 @@
-"""The recorder: one method for each stage of a run, one part file for each call, `finish` to merge them."""
+"""`Recorder`: one method and one part file for each stage of a run."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import frames as frame_log
@@ -16,13 +14,12 @@ from hodge_pipeline.recording import layout, results
 from hodge_pipeline.recording.complex import log_complex
 from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.growth import log_growth
-from hodge_pipeline.recording.merge import Merged, merge
+from hodge_pipeline.recording.merge import Merged, find_parts, merge
 from hodge_pipeline.recording.registration import log_registration
 from hodge_pipeline.recording.stream import writing
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Model, Solution, ViewGraph
 
 Notes = tuple[str, ...]
-APPLICATION = "hodge-pipeline"
 
 
 class Recorder:
@@ -37,11 +34,10 @@ class Recorder:
         self,
         folder: Path,
         recording_id: str,
-        application_id: str = APPLICATION,
         options: RecordingOptions | None = None,
         rounds: int = 1,
     ) -> None:
-        self.folder, self.recording_id, self.application_id = folder, recording_id, application_id
+        self.folder, self.recording_id = folder, recording_id
         self.options = options or RecordingOptions()
         self.rounds = max(rounds, 1)
 
@@ -73,23 +69,14 @@ class Recorder:
         outer: int,
         graph: ViewGraph,
         world_from_cam: Floats,
-        *,
-        residual_m: Floats | None = None,
-        verdicts: Sequence[str] | None = None,
         rejected: Edges | None = None,
     ) -> Notes:
-        """The viewing graph of an outer round under the poses it was made with, and the candidates that failed.
-
-        `residual_m (E,)` colours the edges; without it, what `shapes.residuals_m` gives. `verdicts (E,)` go into the
-        edges' labels.
-        """
+        """The viewing graph of an outer round under the poses it was made with, and the candidates that failed."""
         return self._part(
             layout.outer_number(outer, 0),
             "edges",
             str(outer),
-            lambda s: graph_log.log_edges(
-                s, outer, graph, world_from_cam, residual_m, verdicts, rejected, self.options, self._round_bytes
-            ),
+            lambda s: graph_log.log_edges(s, outer, graph, world_from_cam, rejected, self.options, self._round_bytes),
         )
 
     def solution(
@@ -117,21 +104,9 @@ class Recorder:
 
         return self._part(layout.outer_number(outer, 1), "solution", str(outer), log)
 
-    def diagnosis(
-        self,
-        graph: ViewGraph,
-        world_from_cam: Floats,
-        verdict: NDArray[np.str_],
-        probability: Floats,
-        reason: NDArray[np.str_],
-    ) -> Notes:
-        """The edges (E,) by verdict, under the last poses; the label of each says how probable it is, and why."""
-        return self._part(
-            890,
-            "diagnosis",
-            "",
-            lambda s: log_diagnosis(s, graph, world_from_cam, verdict, probability, reason, self.options),
-        )
+    def diagnosis(self, graph: ViewGraph, world_from_cam: Floats, edges: Edges) -> Notes:
+        """The edges of a graph by verdict, under the last poses; the label of each says how probable it is, and why."""
+        return self._part(890, "diagnosis", "", lambda s: log_diagnosis(s, graph, world_from_cam, edges, self.options))
 
     def model(self, model: Model, clouds: CloudSet | None = None, world_from_cam: Floats | None = None) -> Notes:
         """The fused scene; with the clouds of the frames and their poses also how it grows."""
@@ -145,16 +120,15 @@ class Recorder:
 
     def evaluation(
         self,
-        frames: Sequence[Frame] = (),
-        *,
-        per_frame: Mapping[str, Floats] | None = None,
-        bars: Mapping[str, Floats] | None = None,
-        tables: Mapping[str, str] | None = None,
+        frames: Sequence[Frame],
+        per_frame: Mapping[str, Floats],
+        bars: Mapping[str, Floats],
+        tables: Mapping[str, str],
     ) -> Notes:
         """Scores: series (N,) over the frames such as the ATE in metres, bar charts, and Markdown tables by title."""
 
         def log(stream: rr.RecordingStream) -> Notes:
-            results.log_evaluation(stream, frames, per_frame or {}, bars or {}, tables or {})
+            results.log_evaluation(stream, frames, per_frame, bars, tables)
             return ()
 
         return self._part(901, "evaluation", "", log)
@@ -172,7 +146,7 @@ class Recorder:
         """All parts of the folder as one file that opens on the story; None with level `off`."""
         if self.options.level == "off":
             return None
-        return merge(self.folder, out, self.application_id, self.recording_id)
+        return merge(find_parts(self.folder), out, self.recording_id)
 
     @property
     def _round_bytes(self) -> float:
@@ -183,5 +157,5 @@ class Recorder:
             return ()
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / layout.part_name(number, stage, detail)
-        with writing(path, self.application_id, self.recording_id) as stream:
+        with writing(path, self.recording_id) as stream:
             return log(stream)

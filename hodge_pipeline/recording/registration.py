@@ -1,4 +1,4 @@
-"""What registration found: its numbers for every pair, and chosen pairs before and after."""
+"""Log registrations: statistics of all pairs, and clouds of chosen pairs before and after."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import rerun as rr
 from hodge_pipeline import se3
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.shapes import evenly
 from hodge_pipeline.recording.stream import log_markdown
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32
+from hodge_pipeline.types.arrays import evenly
 
 POINTS_SHOWN = 6_000
 TARGET_COLOUR, BEFORE_COLOUR, AFTER_COLOUR = (86, 180, 233), (230, 130, 0), (240, 228, 66)
@@ -29,7 +29,7 @@ def log_registration(
     clouds: CloudSet,
     options: RecordingOptions,
 ) -> tuple[str, ...]:
-    """Nothing to remark; histograms and columns of all pairs (P,), the clouds of the chosen ones in i's axes.
+    """Log histograms and columns of all pairs (P,), and the clouds of chosen ones in i's axes; nothing is left out.
 
     `guesses (P, 4, 4)` is `i_from_j` as registration began.
     """

@@ -1,4 +1,4 @@
-"""The fused model, the scores, the recipe and the log."""
+"""Log the fused model, the scores, the recipe and the run's log."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ POINT_RADIUS = -1.2
 def log_model(
     stream: rr.RecordingStream, model: Model, options: RecordingOptions, path: str = layout.MODEL
 ) -> tuple[str, ...]:
-    """What was thinned, in words; the fused scene as a mesh or as points, there at every time."""
+    """Log the fused scene as a static mesh or point cloud; gives notes of what was thinned."""
     available = len(model.points_in_world)
     bytes_each = VERTEX_BYTES + (0 if model.triangles is None else 2 * TRIANGLE_BYTES)
     kept = options.count(options.model_points, available, bytes_each, options.max_bytes("model"))
@@ -79,6 +79,6 @@ def log_text(stream: rr.RecordingStream, recipe: str, log_lines: Sequence[str], 
 
 
 def level_of(line: str) -> str:
-    """The level that a line of the log speaks of."""
+    """The log level of a line, by the words in it."""
     lower = line.lower()
     return "ERROR" if "error" in lower else "WARN" if "warning" in lower else "INFO"

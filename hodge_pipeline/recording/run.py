@@ -1,4 +1,4 @@
-"""A run's artifacts into its recording: each stage's part as soon as the stage is done, merged at the end."""
+"""Record a run: each stage's part when the stage is done, all parts merged at the end."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.live import Live
-from hodge_pipeline.recording.merge import find_parts, merge_parts
-from hodge_pipeline.recording.recorder import APPLICATION, Recorder
+from hodge_pipeline.recording.merge import find_parts, merge
+from hodge_pipeline.recording.recorder import Recorder
 from hodge_pipeline.scene import FIRST, START, Round, given_poses, has_given, has_truth, pose_sets, true_poses
 from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.start.clouds import clouds as clouds_step
@@ -50,7 +50,7 @@ class Recording:
         self._rounds: list[Round] = []
         self._clouds: CloudSet | None = None
         self._identity = identity_of(folder)
-        self._live = None if live is None else Live(live, APPLICATION, self._identity)
+        self._live = None if live is None else Live(live, self._identity)
 
     def __enter__(self) -> Recording:
         return self
@@ -102,12 +102,8 @@ class Recording:
     def diagnosis(self, last: Round) -> None:
         """The last round's edges with the verdict on each."""
         self._rounds[-1] = last
-        graph, poses, edges = last.graph, last.world_from_cam, last.graph_edges
-        self._part(
-            "diagnosis",
-            (graph, poses, edges.verdict, edges.probability, edges.why),
-            lambda to: to.diagnosis(graph, poses, edges.verdict, edges.probability, edges.why),
-        )
+        inputs = last.graph, last.world_from_cam, last.graph_edges
+        self._part("diagnosis", inputs, lambda to: to.diagnosis(*inputs))
 
     def scores(self, scores: ScoreTable | None) -> None:
         """The errors of the frames and the score tables."""
@@ -168,7 +164,7 @@ class Recording:
         parts = [*self._parts, *find_parts(folder)]
         if self._live is not None:
             self._live.show(parts)
-        return notes + merge_parts(parts, out, APPLICATION, self._identity).notes
+        return notes + merge(parts, out, self._identity).notes
 
 
 def record_part(
@@ -193,7 +189,7 @@ def merge_recording(
 
 
 def _record_reference(recorder: Recorder, source: Source, rounds: Sequence[Round]) -> Notes:
-    """True and given poses, laid onto the last ones, so that they are seen to differ and nothing else."""
+    """Record true and given poses, aligned to the last ones."""
     if not rounds:
         return ()
     named = {"truth": true_poses(source)} if has_truth(source) else {}

@@ -1,4 +1,4 @@
-"""Lines, colours and thinning: plain arrays, no Rerun."""
+"""Line segments, frusta, colours and thinned models as plain arrays, without Rerun."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.types import Bytes, Floats, Floats32, Ints, Model, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 RESIDUAL_COLOURS = np.array([[60, 115, 225], [130, 145, 170], [190, 180, 120], [255, 225, 50]], float)
 """Blue to yellow, ever brighter: legible without red and green, and in grey; the worst edges stand out."""
@@ -19,12 +20,6 @@ TRAJECTORY_COLOURS = {"truth": (0, 200, 140), "odometry": (230, 130, 0), "start"
 FRUSTUM_DEPTH_M = 0.06
 _CORNERS = np.array([[-0.8, -0.6, 1.0], [0.8, -0.6, 1.0], [0.8, 0.6, 1.0], [-0.8, 0.6, 1.0]]) * FRUSTUM_DEPTH_M
 _FRUSTUM = np.vstack([_CORNERS, np.zeros((1, 3))])[[0, 4, 1, 2, 4, 3, 0, 1, 2, 3]]
-
-
-def evenly(available: int, kept: int) -> Ints:
-    """Rows (kept,) of `available`, evenly spread, the first and the last among them."""
-    kept = max(min(kept, available), 0)
-    return np.unique(np.linspace(0, available - 1, kept).round().astype(np.int64)) if kept else np.zeros(0, np.int64)
 
 
 def residuals_m(graph: ViewGraph, world_from_cam: Floats) -> Floats:
@@ -62,6 +57,19 @@ def strips(world_from_cam: Floats, sequences: np.ndarray[tuple[int, ...], np.dty
 def frustum_lines(world_from_cam: Floats) -> Floats32:
     """One line (N, 10, 3) for each pose, that draws its frustum, x right and z forward."""
     return np.asarray(se3.transform(world_from_cam, _FRUSTUM), np.float32)
+
+
+def up_and_ahead(world_from_cam: Floats) -> tuple[Floats, Floats]:
+    """Unit vectors (3,): the cameras' mean up direction, and their mean view direction across it."""
+    up = unit(-world_from_cam[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
+    ahead = world_from_cam[:, :3, 2].mean(axis=0)
+    return up, unit(ahead - (ahead @ up) * up, unit(np.cross(up, [1.0, 0.3, 0.2]), up))
+
+
+def unit(vector: Floats, fallback: Floats) -> Floats:
+    """The vector (3,) at length 1; the fallback where it has hardly any length."""
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-3 else fallback
 
 
 def thin_model(model: Model, kept: int) -> Model:

@@ -1,4 +1,4 @@
-"""The recording of a graph that was solved on its own, without a run's stages."""
+"""Recording of a pose-graph file that `hodge solve` solved."""
 
 from __future__ import annotations
 

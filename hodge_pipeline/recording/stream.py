@@ -1,4 +1,4 @@
-"""One file, one explicit recording stream: written under a temporary name, renamed when complete."""
+"""Recording streams into files, written under a temporary name and renamed when complete."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from hodge_pipeline.recording import layout
 from hodge_pipeline.scene import UNIX_STAMP_S, has_real_stamps
 from hodge_pipeline.types import Floats, Frame, Ints
 
+APPLICATION = "hodge-pipeline"
+"""By which the viewer keeps a layout that the user has changed."""
 TURN_S, STALLED_S = 2.0, 60.0
 """How long Rerun is waited for at a time, and after how long without a byte its writer counts as dead."""
 LEAST_FREE_BYTES = 1 << 16
 
 
-def open_stream(application_id: str, recording_id: str) -> rr.RecordingStream:
+def open_stream(recording_id: str, application: str = APPLICATION) -> rr.RecordingStream:
     """A stream of its own, without clock timelines: the same input gives the same rows."""
-    stream = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
+    stream = rr.RecordingStream(application, recording_id=recording_id, send_properties=False)
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     return stream
@@ -37,11 +39,11 @@ def partial_path(path: Path) -> Path:
 
 @contextmanager
 def writing(
-    path: Path, application_id: str, recording_id: str, blueprint: rr.blueprint.Blueprint | None = None
+    path: Path, recording_id: str, blueprint: rr.blueprint.Blueprint | None = None, application: str = APPLICATION
 ) -> Iterator[rr.RecordingStream]:
     """A stream into this file, which appears under its name only when all is in it."""
     partial = partial_path(path)
-    stream = open_stream(application_id, recording_id)
+    stream = open_stream(recording_id, application)
     stream.save(partial, default_blueprint=blueprint)
     try:
         yield stream

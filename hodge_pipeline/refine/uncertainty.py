@@ -12,6 +12,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.guard import Change
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 MOST_SAMPLED = 60
 """Poses at which the covariance is taken: enough for a root mean square."""
@@ -35,7 +36,7 @@ def change(graph: ViewGraph, solution: Solution, before: Floats) -> Change:
     moved = se3.inverse(before) @ solution.world_from_cam
     translation_m = _rms(np.linalg.norm(moved[:, :3, 3], axis=1))
     rotation_deg = float(np.rad2deg(_rms(se3.rotation_angle(moved))))
-    rows = np.unique(np.linspace(0, graph.vertex_count - 1, MOST_SAMPLED).round().astype(np.int64))
+    rows = evenly(graph.vertex_count, MOST_SAMPLED)
     rotation, translation = _sigmas(graph, solution, used, rows)
     return Change(translation_m, rotation_deg, SIGMAS * translation, SIGMAS * float(np.rad2deg(rotation)))
 

@@ -14,6 +14,8 @@ MIN_POINTS = 10
 MIN_SIGMA_SHARE = 0.02
 """No sensor is better than 1/50 of the distance that it is matched within, 1 mm of 5 cm in a room: keeps noise-free
 (modelled) pairs finite in any unit."""
+SAME_FITNESS = 0.05
+"""What the fitness of two registrations of a pair may differ by that surfaces cannot tell apart."""
 
 FindNearest: TypeAlias = Callable[[Floats], tuple[Ints, Floats]]
 """Rows of the nearest target points, and squared distances in m², for query points (N, 3)."""

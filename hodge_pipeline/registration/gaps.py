@@ -28,7 +28,7 @@ def over_gap(pairs: Ints, sequences: Sequence[Ints], stamps_s: Floats) -> Bools:
     return np.asarray(stamps_s[pairs[:, 1]] - stamps_s[pairs[:, 0]] > longest[pairs[:, 0]])
 
 
-def has_gap(sequences: Sequence[Ints], stamps_s: Floats) -> bool:
-    """Whether a sequence has a hole."""
-    steps = [np.stack([rows[:-1], rows[1:]], axis=1) for rows in sequences]
-    return bool(over_gap(np.concatenate(steps), sequences, stamps_s).any()) if steps else False
+def gaps(sequences: Sequence[Ints], stamps_s: Floats) -> Ints:
+    """The rows (G, 2) before and behind each hole."""
+    steps = np.concatenate([np.zeros((0, 2), np.int64), *(np.stack([r[:-1], r[1:]], axis=1) for r in sequences)])
+    return np.asarray(steps[over_gap(steps, sequences, stamps_s)])

@@ -33,10 +33,15 @@ def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: fl
             continue
         z, sound = sound_depth(depth, np.round(pixels).astype(np.int64), min_range_m, max_range_m)
         points = back_projected(pixels[sound].astype(np.float32), z[sound], frame.camera)
-        marks = Landmarks(points, descriptors[sound])
+        marks = Landmarks(points, descriptors[sound], _pixel_rad(len(points), grey, depth, frame.camera))
         if len(marks) >= min(FEW, count):
             break
     return marks
+
+
+def _pixel_rad(count: int, grey: Bytes, depth: Floats32, camera: Camera) -> Floats32:
+    """The angle (n,) of a pixel of the image, whose features are found in it however large the depth image is."""
+    return np.full(count, depth.shape[1] / (grey.shape[1] * camera.fx), np.float32)
 
 
 def _features(grey: Bytes, depth_shape: tuple[int, ...], count: int, contrast: float) -> tuple[Floats, Bytes]:

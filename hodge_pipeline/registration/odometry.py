@@ -43,12 +43,14 @@ class OdometryOptions:
         le=1,
         description="below it tracking is lost: no edge, the motion is the one before it, and it is said",
     )
-    max_drift: float | None = Field(
-        default=0.3,
+    tail: float | None = Field(
+        default=0.01,
         gt=0,
-        description="share of the path between two frames (metres, and radians at 1 m) that odometry may be off by; "
-        "where it was not lost between them a pair that contradicts it by more is no edge. Of right pairs on three "
-        "real sequences 99 % stay below 0.27. null: odometry rejects no pair",
+        lt=1,
+        description="share of right pairs that are lost because odometry contradicts them: a pair is no edge where it "
+        "is that unlikely by the covariance of the path between its frames and its own (Student's distribution with 4 "
+        "degrees of freedom: 9.5 sigma for 0.01). Of 2300 right pairs on four real sequences it rejects none. null: "
+        "odometry rejects no pair",
     )
 
 

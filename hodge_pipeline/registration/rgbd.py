@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.assessment import Assessment, assess, unregistered
+from hodge_pipeline.registration.assessment import SAME_FITNESS, Assessment, assess, unregistered
 from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.gicp import Gicp, PreparedCloud
 from hodge_pipeline.registration.guided import guided_match
@@ -24,8 +24,6 @@ from hodge_pipeline.registration.visual import VisualMotion, visual_motion
 from hodge_pipeline.types import Floats, Ints, Landmarks, PointCloud, Registration
 
 ASSESSED_POINTS = 1000
-SAME_FITNESS = 0.05
-"""What the fitness of two registrations may differ by that surfaces cannot tell apart."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -94,7 +92,9 @@ class Rgbd:
         return self._by_landmarks(target, source, visual)
 
     def _visual(self, target: PreparedFrame, source: PreparedFrame, pairs: Ints) -> VisualMotion | None:
-        found = visual_motion(target.landmarks[pairs[:, 0]], source.landmarks[pairs[:, 1]], self.seed)
+        i, j = pairs.T
+        pixels_rad = target.pixel_rad[i], source.pixel_rad[j]
+        found = visual_motion(target.landmarks[i], source.landmarks[j], pixels_rad, self.seed)
         return found and replace(found, information=found.information / self.matches_per_sample)
 
     def _suffices(self, visual: VisualMotion | None) -> bool:
@@ -177,3 +177,4 @@ class PreparedFrame(PreparedCloud):
         landmarks = cloud.landmarks or Landmarks.none()
         self.landmarks = np.asarray(landmarks.points_in_cam, np.float64)
         self.descriptors = root_sift(np.asarray(landmarks.descriptors))
+        self.pixel_rad = np.asarray(landmarks.pixel_rad, np.float64)

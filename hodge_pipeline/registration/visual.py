@@ -15,14 +15,14 @@ from hodge_pipeline.types import Bools, Floats
 
 TRIPLES = 300
 FEWEST_MATCHES = 8
-PIXEL_SIGMA_RAD = 0.75 / 525.0
-"""Three quarters of a pixel of a camera of 60°: a feature's own error, once the shutter's is taken out."""
+PIXEL_SIGMA = 0.75
+"""Pixels: a feature's own error, once the shutter's is taken out, on TUM fr1."""
 DEPTH_SIGMAS = 2.0
 """What `depth_sigma`, the noise of one pixel on a plane, is taken times: features lie where depth is worst."""
 GATE = 3.0
 """Standard deviations, in each of three axes, at which a match stops to count."""
-GATE_PIXEL_SIGMA_RAD = 1.5 / 525.0
-"""A pixel and a half: what a match may err by and still be right, blur and a camera that turns fast included."""
+GATE_PIXEL_SIGMA = 1.5
+"""Pixels: what a match may err by and still be right, blur and a camera that turns fast included."""
 STEPS = 8
 
 
@@ -41,8 +41,8 @@ def depth_sigma(z_m: Floats) -> Floats:
     return np.asarray(0.0012 + 0.0019 * (z_m - 0.4) ** 2)
 
 
-def covariances(points: Floats, pixel_sigma_rad: float, depth_sigmas: float) -> Floats:
-    """Covariances (n, 3, 3) of landmarks (n, 3) in their camera's axes: depth along the ray, the pixel across."""
+def covariances(points: Floats, pixel_sigma_rad: Floats, depth_sigmas: float) -> Floats:
+    """Covariances (n, 3, 3) of landmarks (n, 3) in their camera's axes: depth along the ray, the pixel (n,) across."""
     z = points[:, 2]
     ray = points / z[:, None]
     across, along = (pixel_sigma_rad * z) ** 2, (depth_sigmas * depth_sigma(z)) ** 2
@@ -51,13 +51,18 @@ def covariances(points: Floats, pixel_sigma_rad: float, depth_sigmas: float) -> 
     )
 
 
-def visual_motion(points_i: Floats, points_j: Floats, seed: int) -> VisualMotion | None:
-    """The motion that most matched landmarks (M, 3) agree on, None where too few do."""
+def visual_motion(
+    points_i: Floats, points_j: Floats, pixels_rad: tuple[Floats, Floats], seed: int
+) -> VisualMotion | None:
+    """The motion that most matched landmarks (M, 3) agree on, None where too few do; `pixels_rad` (M,) each are the
+    angles that a pixel covers there.
+    """
     count = len(points_i)
     if count < FEWEST_MATCHES:
         return None
-    errors_i, errors_j = (covariances(points, PIXEL_SIGMA_RAD, DEPTH_SIGMAS) for points in (points_i, points_j))
-    gate_i, gate_j = (covariances(points, GATE_PIXEL_SIGMA_RAD, 1.0) for points in (points_i, points_j))
+    both = tuple(zip((points_i, points_j), pixels_rad, strict=True))
+    errors_i, errors_j = (covariances(points, PIXEL_SIGMA * pixel, DEPTH_SIGMAS) for points, pixel in both)
+    gate_i, gate_j = (covariances(points, GATE_PIXEL_SIGMA * pixel, 1.0) for points, pixel in both)
     rows = np.random.default_rng(seed).integers(0, count, (TRIPLES, 3))
     guesses = se3.fit_rigid(points_i[rows], points_j[rows])
     spread = np.sqrt((np.trace(gate_i, axis1=1, axis2=2) + np.trace(gate_j, axis1=1, axis2=2)) / 3)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError, WorkspaceError
+from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.recording.comparison import record_comparison
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.comparison import Comparison, RunFacts, tables
@@ -16,6 +16,7 @@ from hodge_pipeline.report.document import Banner, Document, Picture, Section, m
 from hodge_pipeline.report.photographs import sides
 from hodge_pipeline.report.plots import draw
 from hodge_pipeline.store.artifacts import write_text
+from hodge_pipeline.store.workspace import make_folder
 from hodge_pipeline.types import Floats, Model
 from hodge_pipeline.types.ply import read_model
 
@@ -24,11 +25,11 @@ def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
     """Write the page and the recording into a folder, made if it is not there, and give back their paths."""
     html, recording = folder / "compare.html", folder / "compare.rrd"
     models = _model(comparison.a, np.eye(4)), _model(comparison.b, comparison.a_from_b)
+    make_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         write_text(html, render(_page(comparison, models)))
     except OSError as error:
-        raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
+        raise not_written(html, error) from error
     names = comparison.a.name, comparison.b.name
     poses = comparison.a_poses, comparison.b_poses
     record_comparison(recording, names, poses, models, comparison.apart_m, markdown(tables(comparison)))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,7 +13,7 @@ from hodge_pipeline.report.document import Table
 from hodge_pipeline.types import Floats
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.positions import PositionFit
-from hodge_pipeline.types.text import cell
+from hodge_pipeline.types.text import cell, csv_text
 
 SCATTER = 1.5
 """Times their stated sigma, from which positions are said to scatter more than that."""
@@ -63,14 +61,12 @@ def table(fit: PositionFit) -> Table:
 
 def as_csv(fit: PositionFit) -> str:
     """The positions with what they are off by, metres east, north, up, and in sigmas; empty where not placed."""
-    out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(["position", "e", "n", "u", "off_e", "off_n", "off_u", "sigmas", "status"])
+    rows: list[list[object]] = [["position", "e", "n", "u", "off_e", "off_n", "off_u", "sigmas", "status"]]
     status = np.where(fit.used, "used", np.where(fit.rejected, "rejected", "not placed"))
     numbers = np.column_stack([fit.points, fit.residuals, fit.distance]).round(4)
     for label, values, word in zip(fit.labels.tolist(), numbers.tolist(), status.tolist(), strict=True):
-        rows.writerow([cell(label), *("" if np.isnan(value) else value for value in values), word])
-    return out.getvalue()
+        rows.append([cell(label), *("" if np.isnan(value) else value for value in values), word])
+    return csv_text(rows)
 
 
 def _rms(fit: PositionFit) -> Floats:

@@ -17,6 +17,7 @@ from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Frame, Ints, Source
+from hodge_pipeline.types.arrays import evenly
 
 FRAMES = 200
 """Frames whose clouds are merged: more of them add nothing that is seen in a picture."""
@@ -97,7 +98,7 @@ def _closer(scenes: Sequence[raster.Points], view: raster.View) -> raster.View:
 
 
 def _some(rows: Ints) -> Ints:
-    return np.asarray(rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), FRAMES)).round().astype(int))])
+    return np.asarray(rows[evenly(len(rows), FRAMES)])
 
 
 def four_sides(clouds: CloudSet, before: Floats, after: Floats, component: Ints) -> tuple[Picture, ...]:

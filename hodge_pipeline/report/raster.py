@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from hodge_pipeline import se3
+from hodge_pipeline.recording.shapes import unit, up_and_ahead
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Floats32, Ints, PointCloud
 
 WIDTH, HEIGHT = 560, 400
@@ -96,7 +97,11 @@ def merged(clouds: CloudSet, world_from_cam: Floats, rows: Ints) -> Points:
 def two(first: PointCloud, second: PointCloud, i_from_j: Floats, tints: Sequence[Sequence[float]]) -> Points:
     """Cloud i and cloud j, moved by `i_from_j`, each in a colour of its own."""
     parts = [
-        Points.of(np.asarray(cloud.points_in_cam, np.float32), cloud.normals_in_cam, _tinted(len(cloud), tint))
+        Points.of(
+            np.asarray(cloud.points_in_cam, np.float32),
+            cloud.normals_in_cam,
+            _tinted(len(cloud), tint),
+        )
         for cloud, tint in zip((first, second), tints, strict=True)
     ]
     return Points.joined([parts[0], parts[1].moved(i_from_j)])
@@ -110,14 +115,12 @@ def around(scene: Points, world_from_cam: Floats) -> dict[str, View]:
     """One view from each of four sides, above the scene; up is where the cameras have it, on average."""
     sample = scene.points[:: max(1, len(scene.points) // FRAMING_POINTS)].astype(float)
     known = world_from_cam[np.isfinite(world_from_cam).all(axis=(1, 2))]
-    up = _unit(-known[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
-    ahead = known[:, :3, 2].mean(axis=0)
-    ahead = _unit(ahead - (ahead @ up) * up, _unit(np.cross(up, [1.0, 0.3, 0.2]), up))
+    up, ahead = up_and_ahead(known)
     found = {}
     for name, degrees in SIDES.items():
         turn = se3.exp(np.concatenate([np.deg2rad(degrees) * up, np.zeros(3)]))[:3, :3]
         look = np.cos(ELEVATION_RAD) * (turn @ ahead) - np.sin(ELEVATION_RAD) * up
-        right = _unit(np.cross(look, up), np.array([1.0, 0.0, 0.0]))
+        right = unit(np.cross(look, up), np.array([1.0, 0.0, 0.0]))
         found[name] = holding(np.stack([right, np.cross(look, right), look]), sample)
     return found
 
@@ -130,11 +133,6 @@ def holding(
     extent = high - low
     metres_per_pixel = max(extent[0] / size[0], extent[1] / size[1], 1e-4) * MARGIN
     return View(axes, (low + high) / 2 @ axes, float(metres_per_pixel), size)
-
-
-def _unit(vector: Floats, fallback: Floats) -> Floats:
-    length = float(np.linalg.norm(vector))
-    return vector / length if length > 1e-3 else fallback
 
 
 def picture(scene: Points, view: View) -> Bytes:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -51,7 +49,7 @@ from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import Store, versions
 from hodge_pipeline.types import Floats, Ints, Solution, Source, Trajectory
-from hodge_pipeline.types.text import cell, file_stems
+from hodge_pipeline.types.text import cell, csv_text, file_stems
 
 KEY_OF_CACHE = r"-[0-9a-f]{12}$"
 """What a cached folder's name ends with, which tells nobody anything."""
@@ -74,12 +72,10 @@ def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:
 
 def write_pose_table(folder: Path, source: Source, world_from_cam: Floats) -> None:
     """`poses.csv`: every frame by its name, and the 4x4 matrix world from camera (or scan), row by row."""
-    table = io.StringIO(newline="")
-    rows = csv.writer(table, csv.unix_dialect, quoting=csv.QUOTE_MINIMAL)
-    rows.writerow(["name", *(f"m{row}{column}" for row in range(4) for column in range(4))])
-    for frame, numbers in zip(source.frames, (world_from_cam + 0.0).reshape(-1, 16).tolist(), strict=True):
-        rows.writerow([cell(str(frame.frame_id)), *map(repr, numbers)])
-    artifacts.write_text(folder / "poses.csv", table.getvalue())
+    header = ["name", *(f"m{row}{column}" for row in range(4) for column in range(4))]
+    poses = zip(source.frames, (world_from_cam + 0.0).reshape(-1, 16).tolist(), strict=True)
+    rows = ([cell(str(frame.frame_id)), *map(repr, numbers)] for frame, numbers in poses)
+    artifacts.write_text(folder / "poses.csv", csv_text([header, *rows]))
 
 
 def write_graph(folder: Path, source: Source, last: Round) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.recording.solved import record_graph
 from hodge_pipeline.refine.pose_graph import RUN_GRAPH, SolvedFile, write_solved
@@ -22,6 +21,7 @@ from hodge_pipeline.report.write import write_report
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import versions
+from hodge_pipeline.store.workspace import make_folder
 from hodge_pipeline.types import Edges, Floats
 from hodge_pipeline.types.notes import notes_of
 
@@ -30,10 +30,7 @@ SOLVED = "solved.json"
 
 def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
     """Write the folder, made if it is not there; what the recording left out, in words."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --run") from error
+    make_folder(folder, "--run")
     write_solved(folder / RUN_GRAPH, solved)
     write_edges(folder / "edges.csv", _edges(solved), solved.graph.vertex_ids)
     artifacts.write_json(folder / SOLVED, solved.summary())

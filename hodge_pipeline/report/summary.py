@@ -28,7 +28,6 @@ def trajectory_rows(
     component: Ints | None = None,
     sequence: Sequence[str] | None = None,
     *,
-    with_scale: bool = False,
     delta_frames: int = 1,
 ) -> tuple[TrajectoryRow, ...]:
     """The errors of each named set of poses (N, 4, 4) against the truth (N, 4, 4), NaN where a frame has none.
@@ -43,7 +42,7 @@ def trajectory_rows(
     return tuple(
         _trajectory_row(
             name,
-            absolute_error(poses, truth, component, with_scale=with_scale),
+            absolute_error(poses, truth, component),
             relative_error(poses, truth, delta_frames, component=parts),
         )
         for name, poses in pose_sets.items()

@@ -8,39 +8,11 @@ from typing import Any
 
 from hodge_pipeline.evaluation.scores import SIGMA_M, ScoreTable
 from hodge_pipeline.report import known_positions
-from hodge_pipeline.report.contents import (
-    ComponentRow,
-    EdgeRow,
-    GraphSummary,
-    LoopRow,
-    Path3D,
-    Pictures,
-    Report,
-    Residuals,
-    SourceSummary,
-    StageRow,
-    TrajectoryRow,
-)
+from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import render
 from hodge_pipeline.report.run_page import document
 from hodge_pipeline.report.verdict import judge, suspicions
 from hodge_pipeline.store.artifacts import write_json, write_text
-
-__all__ = [
-    "ComponentRow",
-    "EdgeRow",
-    "GraphSummary",
-    "LoopRow",
-    "Path3D",
-    "Pictures",
-    "Report",
-    "Residuals",
-    "SourceSummary",
-    "StageRow",
-    "TrajectoryRow",
-    "as_json",
-    "write_report",
-]
 
 FORMAT_VERSION = 3
 """Raised when a key of `report.json` is renamed, moved or removed."""

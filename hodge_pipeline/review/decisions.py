@@ -13,10 +13,9 @@ from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError, not_wr
 from hodge_pipeline.pairs.edits import VERBS, Edit, History, read_history_file, write_history_file
 from hodge_pipeline.store.workspace import holding
 from hodge_pipeline.types.input_files import read_input_text
+from hodge_pipeline.types.text import cell, csv_text
 
 COLUMNS = ("time", "who", "decision", "pairs", "verdict", "score", "residual_m", "residual_deg", "note")
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a spreadsheet takes for the beginning of a formula: such a cell gets an apostrophe."""
 
 
 class StaleError(HodgeError):
@@ -138,20 +137,13 @@ class Decisions:
         self._append([said.time, said.who, prefix + " ".join(pairs), named, *known, said.note])
 
     def _append(self, cells: Sequence[str]) -> None:
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        if not self._log.exists():
-            writer.writerow(COLUMNS)
-        writer.writerow([_plain(cell) for cell in cells])
+        header = [] if self._log.exists() else [COLUMNS]
+        text = csv_text([*header, [cell(word) for word in cells]])
         try:
             with self._log.open("a", encoding="utf-8", newline="") as file:
-                file.write(text.getvalue())
+                file.write(text)
         except OSError as error:
             raise not_written(self._log, error) from error
-
-
-def _plain(cell: str) -> str:
-    return f"'{cell}" if cell.startswith(FORMULA) else cell
 
 
 @contextmanager

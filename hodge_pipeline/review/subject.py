@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline.errors import HodgeError, SourceError
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.pairs.edits import FILE
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.candidates import NO_EDGE
@@ -20,7 +20,7 @@ from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.sources.inspect import guess_reader, guesses
+from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
@@ -97,7 +97,7 @@ def _of_run(path: Path) -> Subject:
     left = int((last.edges.status == REJECTED).sum() - (edges.status == REJECTED).sum())
     unknown = tuple(str(Note("option unknown", detail=line)) for line in run.options_left_out)
     notes = (f"{left} rejected pairs have no motion and are not listed",) if left else ()
-    frames, complaint = _frames(run, recipe)
+    frames, complaint = run.key_frames_with_images()
     unfinished = "the run is not finished: run the same command again; until then it can only be looked at"
     return Subject(
         path=path,
@@ -132,20 +132,6 @@ def _of_all(solution: Solution | None, world_from_cam: Floats, edges: Edges) -> 
     if solution is None:
         return Solution(world_from_cam, np.zeros(len(world_from_cam), np.int64), weights)
     return replace(solution, weights=weights)
-
-
-def _frames(run: Run, recipe: Recipe) -> tuple[Sequence[Frame], tuple[str, ...]]:
-    """The key frames with their images: a run can be reviewed when its source has gone."""
-    path = recipe.source.path
-    if path is None:
-        return (), ()
-    try:
-        frames = (recipe.source.reader or guess_reader(path)).open(path).frames
-    except (HodgeError, OSError) as error:
-        return (), (f"without colour images: {error}",)
-    if len(frames) != len(run.source.frames):
-        return (), (f"without colour images: {path} has other frames by now",)
-    return tuple(frames[row] for row in run.key_frames.rows), ()
 
 
 def _of_graph(path: Path) -> Subject:

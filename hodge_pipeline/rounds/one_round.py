@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.complex.decomposition import Energies
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions, SolveWith
@@ -112,7 +112,9 @@ class Work:
         """The table with the status of every registered pair; one that odometry measured, and that was registered to
         somewhere else, keeps odometry's measurement.
         """
-        found = accepted(edges, self.recipe.acceptance, self.scene.drift, self.scale)
+        found, slid = accepted(edges, self.recipe.acceptance, self.scene.drift)
+        if len(slid):
+            self.steps.note(Note("slid", len(slid), in_runs(slid, self.scene.first.vertex_ids)))
         return found if self.scene.drift is None else with_odometry(found, self.scene.first.edges)
 
     @property

@@ -17,6 +17,7 @@ from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.setup import NO_ROWS
 from hodge_pipeline.types import Bools, Floats, Ints, Priors, ViewGraph, Words
+from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.positions import PositionFit
 
 FEWEST = 3
@@ -247,7 +248,7 @@ def _tested(
     from what all others say, NaN where its piece is not placed.
     """
     vertices = np.unique(fixes.vertices[reached])
-    sampled = vertices[np.unique(np.linspace(0, len(vertices) - 1, MOST_COVARIANCES).round().astype(int))]
+    sampled = vertices[evenly(len(vertices), MOST_COVARIANCES)]
     covariances = marginal_covariances(graph, poses, sampled)
     nearest = np.abs(fixes.vertices[:, None] - sampled).argmin(axis=1)
     lever = fixes.lever(poses)

@@ -11,6 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bools, Floats, Floats32, Frame, Trajectory
+from hodge_pipeline.types.arrays import evenly
 
 SAMPLED_FRAMES = 8
 LISTED = 5
@@ -121,9 +122,8 @@ def _note_ids(frames: Sequence[Frame], oddities: list[str]) -> None:
 def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
     """Depth range and invalid share of a few frames, evenly over the sequence, and their images that cannot be read."""
     with_depth = [frame for frame in frames if frame.read_depth is not None or frame.read_points is not None]
-    picked = np.unique(np.linspace(0, len(with_depth) - 1, SAMPLED_FRAMES).round().astype(int)) if with_depth else ()
     depths, faults = [], []
-    for row in picked:
+    for row in evenly(len(with_depth), SAMPLED_FRAMES):
         frame = with_depth[row]
         try:
             depths.append(_depth(frame).ravel())

@@ -1,1 +1,1 @@
-"""Where the first poses of a run come from."""
+"""Initial poses: odometry, key-frame tracking, given poses, LiDAR odometry, or global registration without order."""

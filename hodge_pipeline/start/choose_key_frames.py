@@ -1,4 +1,4 @@
-"""Key frames: those that are registered, chosen by how far the camera moved."""
+"""Choose key frames by how far the camera has moved since the last one."""
 
 from __future__ import annotations
 

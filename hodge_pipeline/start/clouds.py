@@ -1,4 +1,4 @@
-"""The clouds that every start needs, with landmarks where frames are matched by their images."""
+"""The step that makes the point clouds of all frames, with SIFT landmarks where frames are matched by images."""
 
 from __future__ import annotations
 

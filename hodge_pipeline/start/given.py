@@ -1,4 +1,4 @@
-"""First poses that another program made: matched to the frames, between sparse ones carried by odometry."""
+"""Initial poses from another program: associated with the frames; odometry fills the gaps between sparse ones."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from hodge_pipeline.scene import (
     Scene,
     has_truth,
     key_source,
+    own_trajectory,
     sequence_numbers,
     sequences_of,
     true_poses,
@@ -215,12 +216,7 @@ def read_trajectory(path: Path, steps: Steps) -> Trajectory:
     if opened.graph is not None and opened.graph.edge_count:
         raise SourceError(f"{path}: a graph of measured edges, which needs no frames: give it to hodge solve")
     steps.note(*notes_of("given file", (f"{path.name}: {note}" for note in opened.notes)))
-    if opened.trajectory is not None:
-        return opened.trajectory
-    posed = [(frame.stamp_s, frame.world_from_cam) for frame in opened.frames if frame.world_from_cam is not None]
-    if not posed:
+    found = own_trajectory(replace(opened, path=path))
+    if found is None:
         raise SourceError(f"{path}: has no poses to start from: give a trajectory; a graph goes to hodge solve")
-    stamps = np.array([stamp for stamp, _ in posed])
-    if (np.diff(stamps) <= 0).any():
-        raise SourceError(f"{path}: several sequences with stamps of their own: give one sequence's poses")
-    return Trajectory(stamps, np.array([pose for _, pose in posed]))
+    return found

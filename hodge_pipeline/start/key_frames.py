@@ -1,4 +1,4 @@
-"""First poses of long sequences: key frames are registered, all other frames follow them."""
+"""Initial poses of long sequences: optical flow tracks every frame, and only key frames enter the pose graph."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
@@ -118,7 +119,7 @@ def is_video(source: Source) -> bool:
 
 
 def followers(source: Source, tracked: Tracked) -> KeyFrames:
-    """How all frames of the source move with the key frames."""
+    """The `KeyFrames` of a tracked source: how poses of all frames follow from those of the key frames."""
     return KeyFrames(
         rows=tracked.key_rows,
         first=tracked.world_from_key[tracked.anchors] @ tracked.key_from_frame,
@@ -187,7 +188,7 @@ def _renumbered(rows: Ints, key_of_row: dict[int, int]) -> Ints:
 
 
 def _anchored(parts: list[BlockRows], cut: list[FrameBlock], key_of_row: dict[int, int]) -> dict[str, Any]:
-    """What each row of the whole was registered to; a row that two blocks share belongs to the earlier one."""
+    """Key frame, relative motion and success of each frame; a row that two blocks share belongs to the earlier one."""
     fresh = [slice(int(block.warm_up), None) for block in cut]
     rows = np.concatenate([part.rows[keep] for part, keep in zip(parts, fresh, strict=True)])
     anchors = np.concatenate([part.anchors[keep] for part, keep in zip(parts, fresh, strict=True)])
@@ -202,7 +203,7 @@ def _anchored(parts: list[BlockRows], cut: list[FrameBlock], key_of_row: dict[in
 
 
 def _without_lonely(tracked: Tracked) -> Tracked:
-    """A key frame that no step holds, and its followers, were not found, as frames in the dark are not."""
+    """Mark a key frame without any odometry edge, and the frames tracked from it, as not found."""
     lonely = np.bincount(tracked.piece)[tracked.piece] == 1
     return tracked if lonely.all() else replace(tracked, found=tracked.found & ~lonely[tracked.anchors])
 
@@ -229,6 +230,10 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
     back = [row for rows in sequences_of(source).values() for row in _where_the_clock_goes_back(source, rows)]
     if back:
         notes.append(Note("clock", len(back), in_runs(np.array(back), ids)))
+    holes, stamps = gaps(list(sequences_of(source).values()), stamps_of(source)), stamps_of(source)
+    if len(holes):
+        told = [f"{stamps[j] - stamps[i]:.1f} s before {ids[j]}" for i, j in holes[:NOTES_SHOWN].tolist()]
+        notes.append(Note("holes", len(holes), ", ".join(told) + ", …" * (len(holes) > NOTES_SHOWN)))
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
     sizes = np.bincount(tracked.piece)

@@ -1,4 +1,4 @@
-"""First poses of a spinning LiDAR by KISS-ICP, sweeps deskewed; key frames are registered, all others follow them."""
+"""Initial poses of a spinning LiDAR by KISS-ICP with deskewed sweeps; only key frames enter the pose graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Positions known from elsewhere, and which point of which key frame each is."""
+"""Known positions (GNSS, surveyed) associated with the key frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The poses that a refinement starts from: whose they are, and which belongs to which frame."""
+"""Associate given poses with frames: by stamp, by frame number or by row."""
 
 from __future__ import annotations
 

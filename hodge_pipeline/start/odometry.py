@@ -1,4 +1,4 @@
-"""First poses from consecutive frames, every frame registered to the one before it."""
+"""Initial poses by frame-to-frame odometry, its parts joined by global registration where asked for."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.registration import odometry as tracking
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.gaps import has_gap
+from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.registration.odometry import Odometry, OdometryOptions
-from hodge_pipeline.scene import Drift, KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
+from hodge_pipeline.registration.odometry_path import drift_of
+from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import landmarks_for, make_clouds
 from hodge_pipeline.start.unordered.join import join_parts
@@ -49,7 +49,7 @@ class OdometryStart(OdometryOptions):
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """Every frame of the source with its cloud and its pose by odometry."""
         sequences, stamps = tuple(sequences_of(source).values()), _stamps(source)
-        options = self.cloud_options(clouds, len(sequences) > 1 or has_gap(sequences, stamps))
+        options = self.cloud_options(clouds, len(sequences) > 1 or len(gaps(sequences, stamps)) > 0)
         made = make_clouds(source, options, steps, workers)
         found = steps.step(
             chain, made, sequences, stamps, self.odometry, title="odometry", total=len(stamps), workers=workers
@@ -62,13 +62,12 @@ class OdometryStart(OdometryOptions):
         """The scene of the key frames of `source`, its parts joined as `relocalise` says."""
         keys = key_source(source, key_frames.rows)
         steps.remember(keys, steps.key([source, key_frames.rows]))
-        part = connected_components(found.steps.pairs, len(found.world_from_cam))
-        drift = Drift(found.world_from_cam, part, np.inf if self.max_drift is None else self.max_drift)
+        drift = drift_of(found.world_from_cam, found.steps, self.tail)
         first = Round(found.steps, vertex_ids(keys), found.world_from_cam)
-        several = int((np.bincount(part) > 1).sum()) > 1
+        several = int((np.bincount(drift.part) > 1).sum()) > 1
         if self.relocalise is True or (self.relocalise == "auto" and several):
             first = join_parts(keys, clouds, first, drift, self.unordered, steps, workers)
-        return Scene(source, keys, key_frames, clouds, first, None if self.max_drift is None else drift)
+        return Scene(source, keys, key_frames, clouds, first, None if self.tail is None else drift)
 
 
 def chain(

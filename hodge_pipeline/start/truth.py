@@ -1,4 +1,4 @@
-"""The truth that the user names: a file of poses, or the poses that come with the frames."""
+"""Ground-truth poses that the user names: a file of poses, or the poses that come with the frames."""
 
 from __future__ import annotations
 

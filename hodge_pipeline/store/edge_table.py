@@ -17,7 +17,7 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Edges
 from hodge_pipeline.types.arrays import Words
 from hodge_pipeline.types.input_files import read_input
-from hodge_pipeline.types.text import cell, cell_text
+from hodge_pipeline.types.text import cell, cell_text, csv_text
 
 COLUMNS = {
     "source": "proposed_by",
@@ -47,16 +47,13 @@ def write_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic], *, ha
     """
     edges = edges.select(np.argsort(~edges.in_graph, kind="stable"))
     columns = [_cells(name, getattr(edges, field)) for name, field in COLUMNS.items()]
-    text = io.StringIO(newline="")
-    # A lone \r ends a line for those who read the table, and the writer does not quote for it.
-    everywhere = any("\r" in str(name) for name in vertex_ids)
-    table = csv.writer(text, csv.unix_dialect) if everywhere else csv.writer(text, lineterminator="\n")
-    table.writerow(("i", "j", *(COLUMNS if has_metres else [UNITS.get(name, name) for name in COLUMNS])))
+    header = ("i", "j", *(COLUMNS if has_metres else [UNITS.get(name, name) for name in COLUMNS]))
     names = [cell(str(name)) if isinstance(name, str) else name for name in vertex_ids.tolist()]
     ends = [[names[vertex] for vertex in side] for side in edges.pairs.T.tolist()]
-    table.writerows(zip(*ends, *columns, strict=True))
+    # A lone \r ends a line for those who read the table, and the writer does not quote for it.
+    has_returns = any("\r" in str(name) for name in vertex_ids)
     try:
-        artifacts.write_text(path, text.getvalue())
+        artifacts.write_text(path, csv_text([header, *zip(*ends, *columns, strict=True)], quoted=has_returns))
     except OSError as error:
         raise not_written(path, error) from error
 

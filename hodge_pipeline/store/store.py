@@ -197,9 +197,9 @@ def stored_clouds(folder: Path) -> list[CloudSet]:
         if f"{CLOUDS}/offsets.npy" in files:
             try:
                 _check_files(path, files)
+                found.append(CloudSet.open(path / CLOUDS))
             except (OSError, ValueError) as error:
                 raise _damaged(path, error) from error
-            found.append(CloudSet.open(path / CLOUDS))
     return found
 
 

@@ -113,6 +113,14 @@ class Workspace:
         self.close()
 
 
+def make_folder(folder: Path, option: str = "--out") -> None:
+    """Make a folder where there is none. Raises `WorkspaceError` that names the option which gave it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another {option}") from error
+
+
 @contextmanager
 def holding(folder: Path) -> Iterator[None]:
     """While the body runs no run uses the folder. Raises `WorkspaceError` where one does already."""

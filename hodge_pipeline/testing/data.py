@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, PointCloud, Source
 
-FRAMES, TURNS, WIDTH, HEIGHT = 12, 0.02, 160, 120
+FRAMES, TURNS, WIDTH, HEIGHT = 12, 0.02, 320, 240
 """Neighbours are up to 4 cm and 2 degrees apart; the camera goes there and back."""
 CLOUD_VOXEL_M, LANDMARKS = 0.04, 500
 

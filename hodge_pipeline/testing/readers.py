@@ -14,6 +14,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import FrameReader, Sniff
 from hodge_pipeline.testing.stage import check_stage
 from hodge_pipeline.types import Camera, EncodedImage, Frame, PointCloud, Positions, Source, Trajectory, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 MAX_PICKLED_FRAME_BYTES = 1 << 14
 """A lazy frame is paths and numbers; anything larger holds an image."""
@@ -59,7 +60,7 @@ def check_frames(frames: Sequence[Frame], again: Sequence[Frame], max_decoded: i
     for sequence in {frame.sequence for frame in frames}:
         stamps = [frame.stamp_s for frame in frames if frame.sequence == sequence]
         assert (np.diff(stamps) > 0).all(), f"sequence {sequence!r}: stamps do not ascend"
-    for row in np.unique(np.linspace(0, len(frames) - 1, max_decoded).round().astype(int)) if frames else ():
+    for row in evenly(len(frames), max_decoded):
         _check_images(frames[int(row)])
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import HodgeError, SourceError
+from hodge_pipeline.scene import own_trajectory
 from hodge_pipeline.stages import FrameReader, PoseRewriter, Writer
 from hodge_pipeline.testing.data import room
 from hodge_pipeline.testing.stage import Contract, raises
@@ -166,10 +167,9 @@ class _Rewriting:
 
 
 def _poses_of(source: Source) -> Trajectory:
-    if source.trajectory is not None:
-        return source.trajectory
-    posed = [(frame.stamp_s, frame.world_from_cam) for frame in source.frames if frame.world_from_cam is not None]
-    return Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed]))
+    found = own_trajectory(source)
+    assert found is not None, "the original has no poses"
+    return found
 
 
 def _writes_the_new_poses(case: _Rewriting) -> None:

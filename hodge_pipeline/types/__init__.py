@@ -73,10 +73,13 @@ class EncodedImage:
 
 @dataclass(frozen=True)
 class Landmarks:
-    """What a frame's image can be recognised by: `points_in_cam (n, 3)` metres, SIFT `descriptors (n, 128)` bytes."""
+    """What a frame's image can be recognised by: `points_in_cam (n, 3)` metres, SIFT `descriptors (n, 128)` bytes, and
+    `pixel_rad (n,)`, the angle that a pixel of the image covers, by which each may be off sideways.
+    """
 
     points_in_cam: Floats32
     descriptors: Bytes
+    pixel_rad: Floats32
 
     def __len__(self) -> int:
         return len(self.points_in_cam)
@@ -84,7 +87,7 @@ class Landmarks:
     @classmethod
     def none(cls) -> Landmarks:
         """No landmark."""
-        return cls(np.zeros((0, 3), np.float32), np.zeros((0, 128), np.uint8))
+        return cls(np.zeros((0, 3), np.float32), np.zeros((0, 128), np.uint8), np.zeros(0, np.float32))
 
 
 @dataclass(frozen=True)
@@ -279,11 +282,12 @@ class CloudSet(Sequence[PointCloud]):
     """The down-sampled cloud of every frame, as memory-mapped columns: opening one costs no copy.
 
     `offsets (N + 1,)` cut `points (P, 3)`, `normals (P, 3)`, `colours (P, 3)` into frames; an empty slice is a frame
-    without a valid measurement. `marks (N + 1,)` cut the landmarks' `mark_points (Q, 3)` and `mark_descriptors
-    (Q, 128)` likewise. `folder` is where the columns lie, which worker processes open; None of what is in memory.
+    without a valid measurement. `marks (N + 1,)` cut the landmarks' `mark_points (Q, 3)`, `mark_descriptors (Q, 128)`
+    and `mark_pixel_rad (Q,)` likewise. `folder` is where the columns lie, which worker processes open; None of what is
+    in memory.
     """
 
-    FILES = ("offsets", "points", "normals", "colours", "marks", "mark_points", "mark_descriptors")
+    FILES = ("offsets", "points", "normals", "colours", "marks", "mark_points", "mark_descriptors", "mark_pixel_rad")
 
     def __init__(
         self,
@@ -294,11 +298,13 @@ class CloudSet(Sequence[PointCloud]):
         marks: Ints,
         mark_points: Floats32,
         mark_descriptors: Bytes,
+        mark_pixel_rad: Floats32,
         folder: Path | None = None,
     ) -> None:
         self.folder = folder
         self.offsets, self.points, self.normals, self.colours = offsets, points, normals, colours
         self.marks, self.mark_points, self.mark_descriptors = marks, mark_points, mark_descriptors
+        self.mark_pixel_rad = mark_pixel_rad
 
     @classmethod
     def open(cls, folder: Path) -> CloudSet:
@@ -324,6 +330,7 @@ class CloudSet(Sequence[PointCloud]):
             _offsets([len(one) for one in landmarks]),
             np.concatenate([empty, *(one.points_in_cam for one in landmarks)]).astype(np.float32),
             np.concatenate([Landmarks.none().descriptors, *(one.descriptors for one in landmarks)]),
+            np.concatenate([Landmarks.none().pixel_rad, *(one.pixel_rad for one in landmarks)]).astype(np.float32),
         )
 
     def save(self, folder: Path) -> None:
@@ -346,7 +353,7 @@ class CloudSet(Sequence[PointCloud]):
         row %= len(self)
         cut = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
         own = slice(int(self.marks[row]), int(self.marks[row + 1]))
-        landmarks = Landmarks(self.mark_points[own], self.mark_descriptors[own])
+        landmarks = Landmarks(self.mark_points[own], self.mark_descriptors[own], self.mark_pixel_rad[own])
         return PointCloud(self.points[cut], self.normals[cut], self.colours[cut], landmarks)
 
     def __iter__(self) -> Iterator[PointCloud]:

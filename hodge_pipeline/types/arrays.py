@@ -1,4 +1,4 @@
-"""Names of the arrays that flow."""
+"""Names of the arrays that flow, and some of their rows."""
 
 from typing import TypeAlias
 
@@ -11,3 +11,9 @@ Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
 Bytes: TypeAlias = NDArray[np.uint8]
 Words: TypeAlias = NDArray[np.str_]
+
+
+def evenly(available: int, most: int) -> Ints:
+    """At most so many rows (N,) of `available`, spread evenly, the first and the last among them."""
+    kept = max(min(most, available), 0)
+    return np.unique(np.linspace(0, available - 1, kept).round().astype(np.int64)) if kept else np.zeros(0, np.int64)

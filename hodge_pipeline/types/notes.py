@@ -51,9 +51,18 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
     ),
+    "holes": (
+        Rank.LOOK,
+        "the recording stops at {count} places ({detail}): what the frames on both sides share tells the motion there",
+    ),
     "path broken": (
         Rank.LOOK,
         "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
+    ),
+    "slid": (
+        Rank.LOOK,
+        "odometry slid unnoticed at {count} frames ({detail}): the pairs over these steps agree on where they lead, "
+        "and count in its place",
     ),
     "sweeps untimed": (
         Rank.FACT,

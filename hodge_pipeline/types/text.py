@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 import shlex
+from collections.abc import Iterable
 
 _UNSEEN = "\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ud800-\udfff\ufeff\ufff9-\ufffb"
 _ONE_LINE, _LINES = re.compile(f"[{_UNSEEN}]"), re.compile(f"(?![\n\t])[{_UNSEEN}]")
@@ -34,6 +37,13 @@ def cell(text: str) -> str:
 def cell_text(text: str) -> str:
     """What `cell` was given."""
     return text[1:] if _FORMULA.match(text[1:2]) and text.startswith("'") else text
+
+
+def csv_text(rows: Iterable[Iterable[object]], *, quoted: bool = False) -> str:
+    """The rows as CSV; `quoted`: every cell. Words that strangers wrote are given by `cell`."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL if quoted else csv.QUOTE_MINIMAL).writerows(rows)
+    return text.getvalue()
 
 
 def file_stems(names: list[str]) -> list[str]:

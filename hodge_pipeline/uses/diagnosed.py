@@ -17,20 +17,17 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
-from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.pairs.edits import joining, pair_names, read_history
-from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
 from hodge_pipeline.report.diagnosis_page import PageContents, document
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
 from hodge_pipeline.report.document import render
 from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.run_folder import Run
-from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
-from hodge_pipeline.store.workspace import is_run_folder
+from hodge_pipeline.store.workspace import is_run_folder, make_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, USED
 from hodge_pipeline.types.notes import Note
@@ -88,9 +85,8 @@ def _file_subject(path: Path) -> Subject:
 def _run_subject(path: Path, run: Run) -> Subject:
     _ = run.report  # raises where the run has not ended
     last, recipe = run.result, run.recipe
-    frames, notes = _frames(recipe)
+    frames, notes = run.key_frames_with_images()
     unknown = tuple(str(Note("option unknown", detail=line)) for line in run.options_left_out)
-    known = len(frames) == len(run.source.frames)
     return Subject(
         path,
         path.resolve().name,
@@ -100,20 +96,10 @@ def _run_subject(path: Path, run: Run) -> Subject:
         options=recipe.diagnosis,
         suggestions=recipe.suggestions,
         tried=last.rejected.pairs,
-        frames=tuple(frames[row] for row in run.key_frames.rows) if known else (),
+        frames=frames,
         clouds=run.clouds,
         notes=(*unknown, *notes),
     )
-
-
-def _frames(recipe: Recipe) -> tuple[Sequence[Frame], tuple[str, ...]]:
-    """The frames, for their images alone: a run can be diagnosed when its source has gone."""
-    if recipe.source.path is None:
-        return (), ()
-    try:
-        return (recipe.source.reader or guess_reader(recipe.source.path)).open(recipe.source.path).frames, ()
-    except (HodgeError, OSError) as error:
-        return (), (f"without colour images: {error}",)
 
 
 def _edited(path: Path, graph: ViewGraph, edges: Edges) -> Edges:
@@ -208,10 +194,7 @@ def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> t
 
 def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:
     """`edges.csv`, `poses.tum`, `diagnosis.html` and `diagnosis.rrd` in a folder, made if it is not there."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WorkspaceError(f"{out}: cannot be written ({error.strerror}): give another --out") from error
+    make_folder(out)
     subject, found = diagnosed.subject, diagnosed.diagnosis
     residuals = {"residual_m": found.residual_m, "residual_rad": np.deg2rad(found.residual_deg)}
     write_edges(out / "edges.csv", replace(found.put_into(subject.edges), **residuals), subject.graph.vertex_ids)

@@ -40,9 +40,9 @@ def list_images(folder: Path, notes: list[str]) -> StampedImages:
     alone = [number for number in numbers if number not in colour]
     if alone:
         notes.append(f"{len(alone)} frames have no colour image: {listed(alone)}")
-    none_s = np.zeros(len(numbers))
+    none_s, one_run = np.zeros(len(numbers)), np.zeros(len(numbers), np.int64)
     stamps_s = np.array(numbers, float)
-    return StampedImages(stamps_s, [depth[n] for n in numbers], [colour.get(n) for n in numbers], none_s, ())
+    return StampedImages(stamps_s, [depth[n] for n in numbers], [colour.get(n) for n in numbers], none_s, (), one_run)
 
 
 def find_log(folder: Path) -> Path | None:

@@ -12,11 +12,13 @@ import numpy as np
 from hodge_adapters.association import nearest_pairs
 from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats
+from hodge_pipeline.types import Floats, Ints
 
 ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
 LONGEST_DELAY_S = 0.1
 """Between the images of one frame: stamps further apart are not of one clock."""
+JUMP, LINES_OF_RUN = 10.0, 10
+"""Usual steps by which a clock jumps back, and lines of a list to a jump: more of either are lines out of order."""
 _STAMP_NAME = re.compile(r"\d+\.\d+\.(png|jpg|jpeg)", re.IGNORECASE)
 _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
 
@@ -24,7 +26,7 @@ _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
 @dataclass(frozen=True)
 class StampedImages:
     """Depth images in order of their stamps, each with its colour image where there is one, and how many seconds later
-    that was taken.
+    that was taken. `runs (N,)` number the parts, in the order of the file, between jumps of the clock back in time.
     """
 
     stamps_s: Floats
@@ -32,6 +34,7 @@ class StampedImages:
     colour: list[Path | None]
     colour_delays_s: Floats
     files: tuple[Path, ...]
+    runs: Ints
 
 
 def find_association_file(folder: Path) -> Path | None:
@@ -63,12 +66,13 @@ def read_pairs(folder: Path, max_difference_s: float, notes: list[str]) -> Stamp
         [colour[row] for row in rows],
         found.colour_delays_s[rows],
         found.files,
+        found.runs[rows],
     )
 
 
 def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> StampedImages:
     depth_list, colour_list = folder / "depth.txt", folder / "rgb.txt"
-    depth_stamps_s, depth = _listed_or_named(depth_list, folder / "depth", notes)
+    depth_stamps_s, depth, runs = _listed_or_named(depth_list, folder / "depth", notes)
     if not depth and depth_list.is_file():
         raise SourceError(f"{depth_list}: no line `stamp file` that can be used in it: write one for each depth image")
     if not depth:
@@ -77,17 +81,21 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
             "folder that holds them, or unpack the whole sequence"
         )
     lists = tuple(path for path in (depth_list, colour_list) if path.is_file())
-    colour_stamps_s, colour = _listed_or_named(colour_list, folder / "rgb", notes)
+    colour_stamps_s, colour, colour_runs = _listed_or_named(colour_list, folder / "rgb", notes)
     if not colour and not colour_list.is_file():
         notes.append("no rgb.txt: frames have no colour")
-        return StampedImages(depth_stamps_s, depth, [None] * len(depth), np.zeros(len(depth)), lists)
-    columns = nearest_pairs(depth_stamps_s, colour_stamps_s, max_difference_s)
+        return StampedImages(depth_stamps_s, depth, [None] * len(depth), np.zeros(len(depth)), lists, runs)
+    columns = np.full(len(depth), -1, np.int64)
+    for run in np.unique(runs):
+        own, other = np.flatnonzero(runs == run), np.flatnonzero(colour_runs == run)
+        found = nearest_pairs(depth_stamps_s[own], colour_stamps_s[other], max_difference_s)
+        columns[own] = np.where(found >= 0, np.append(other, -1)[found], -1)
     alone = int((columns < 0).sum())
     if alone:
         notes.append(f"{alone} depth images have no colour image within {max_difference_s:g} s")
     paired = [colour[column] if column >= 0 else None for column in columns.tolist()]
     delays_s = np.where(columns >= 0, np.append(colour_stamps_s, 0.0)[columns] - depth_stamps_s, 0.0)
-    return StampedImages(depth_stamps_s, depth, paired, delays_s, lists)
+    return StampedImages(depth_stamps_s, depth, paired, delays_s, lists, runs)
 
 
 def stamped_images(folder: Path) -> list[tuple[float, Path]]:
@@ -99,18 +107,18 @@ def stamped_images(folder: Path) -> list[tuple[float, Path]]:
     return [(float(path.stem), path) for path in names]
 
 
-def _listed_or_named(path: Path, images: Path, notes: list[str]) -> tuple[Floats, list[Path]]:
-    """Stamps and paths by the list or, where it is missing, by the names of the images."""
+def _listed_or_named(path: Path, images: Path, notes: list[str]) -> tuple[Floats, list[Path], Ints]:
+    """Stamps, paths and runs by the list or, where it is missing, by the names of the images."""
     if path.is_file():
         return _read_list(path, notes)
     found = stamped_images(images)
     if found:
         notes.append(f"no {path.name}: the stamps of {len(found)} images are those of their names in {images.name}/")
-    return np.array([stamp for stamp, _ in found]), [image for _, image in found]
+    return np.array([stamp for stamp, _ in found]), [image for _, image in found], np.zeros(len(found), np.int64)
 
 
-def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path]]:
-    """Stamps, ascending and unique, and paths of a list `stamp file`."""
+def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path], Ints]:
+    """Stamps, ascending and unique in each run, paths and runs of a list `stamp file`."""
     found: list[tuple[float, Path]] = []
     unreadable: list[int] = []
     outside: list[int] = []
@@ -124,8 +132,8 @@ def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path]]:
         else:
             found.append((stamp_s, image))
     notes += _left_out(path.name, "`stamp file`", unreadable, outside)
-    stamps_s, rows = _in_order(np.array([stamp for stamp, _ in found]), path.name, notes)
-    return stamps_s, [found[row][1] for row in rows]
+    stamps_s, rows, runs = _in_order(np.array([stamp for stamp, _ in found]), path.name, notes)
+    return stamps_s, [found[row][1] for row in rows], runs
 
 
 def _from_association(path: Path, notes: list[str]) -> StampedImages:
@@ -149,10 +157,10 @@ def _from_association(path: Path, notes: list[str]) -> StampedImages:
     notes += _left_out(path.name, "`stamp file stamp file`", unreadable, outside)
     if not found:
         raise SourceError(f"{path}: no line `stamp file stamp file` that can be used in it: mend or remove the file")
-    stamps_s, order = _in_order(np.array([stamp for stamp, *_ in found]), path.name, notes)
+    stamps_s, order, runs = _in_order(np.array([stamp for stamp, *_ in found]), path.name, notes)
     delays_s = np.array([found[row][3] for row in order])
     return StampedImages(
-        stamps_s, [found[row][1] for row in order], [found[row][2] for row in order], delays_s, (path,)
+        stamps_s, [found[row][1] for row in order], [found[row][2] for row in order], delays_s, (path,), runs
     )
 
 
@@ -178,11 +186,27 @@ def _stamp(row: Row, column: int) -> float | None:
     return values[0] if values and math.isfinite(values[0]) else None
 
 
-def _in_order(stamps_s: Floats, name: str, notes: list[str]) -> tuple[Floats, list[int]]:
-    """Ascending unique stamps and their rows; of equal ones the first is kept."""
-    unique, rows = np.unique(stamps_s, return_index=True)
-    if len(unique) < len(stamps_s):
-        notes.append(f"{name}: {len(stamps_s) - len(unique)} lines with the stamp of an earlier one left out")
-    if (np.diff(stamps_s) < 0).any():
+def _in_order(stamps_s: Floats, name: str, notes: list[str]) -> tuple[Floats, list[int], Ints]:
+    """Stamps, ascending and unique in each run, their rows and runs; of equal ones the first is kept."""
+    runs = _runs(stamps_s)
+    order = np.lexsort((stamps_s, runs))
+    again = np.flatnonzero((np.diff(stamps_s[order]) == 0) & (np.diff(runs[order]) == 0)) + 1
+    order = np.delete(order, again)
+    if len(again):
+        notes.append(f"{name}: {len(again)} lines with the stamp of an earlier one left out")
+    if runs.any():
+        places = listed((np.flatnonzero(np.diff(runs)) + 1).tolist())
+        notes.append(f"{name}: the clock jumps back before image {places}: images are taken in the order of the file")
+    elif (np.diff(stamps_s) < 0).any():
         notes.append(f"{name}: lines were not in order of time: sorted")
-    return unique, rows.tolist()
+    return stamps_s[order], order.tolist(), runs[order]
+
+
+def _runs(stamps_s: Floats) -> Ints:
+    """The run (N,) of each line, ascending: a new one begins where the clock jumps back; one run of shuffled lines."""
+    steps = np.diff(stamps_s)
+    ahead = steps[steps > 0]
+    back = np.flatnonzero(steps < -JUMP * np.median(ahead)) if len(ahead) else np.zeros(0, np.int64)
+    if len(back) * LINES_OF_RUN > len(stamps_s):
+        back = back[:0]
+    return np.asarray(np.searchsorted(back, np.arange(len(stamps_s)), side="left"), np.int64)

@@ -132,7 +132,7 @@ class TumReader:
             )
         scale = self.depth_scale or found.units_per_metre or UNITS_PER_METRE
         trajectory, truth_file = self._truth(path, listing.stamps_s, notes)
-        poses = self._poses(trajectory, listing.stamps_s, notes)
+        poses = self._poses(trajectory, listing, notes)
         ids = frame_ids(listing.stamps_s)
         rows = range(0, len(ids), self.every)
         return Source(
@@ -222,11 +222,15 @@ class TumReader:
             raise SourceError(f"{file}: {counts}: truth_match row needs one pose for each frame")
         return Trajectory(stamps_s, parsed.trajectory.world_from_cam), (file,)
 
-    def _poses(self, trajectory: Trajectory | None, stamps_s: Floats, notes: list[str]) -> Floats:
+    def _poses(self, trajectory: Trajectory | None, listing: StampedImages, notes: list[str]) -> Floats:
         """Poses (N, 4, 4) at the frames' stamps, NaN where the truth has none."""
+        stamps_s = listing.stamps_s
         if trajectory is None:
             return np.full((len(stamps_s), 4, 4), np.nan)
         poses = interpolated_poses(trajectory, stamps_s, self.max_gap_s, self.max_difference_s)
+        if listing.runs.any() and self.truth_match == "stamp":
+            poses[listing.runs > 0] = np.nan
+            notes.append("the truth is taken for the frames before the clock jumps back alone")
         without = int(np.isnan(poses[:, 0, 0]).sum())
         if without:
             hint = ": are its stamps of another clock? see truth_match" if without == len(stamps_s) else ""

@@ -10,9 +10,6 @@ from hodge_pipeline import se3
 from hodge_pipeline.solvers.weights import PLANAR_AXES
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
-LEAST_PRECISION, MOST_PRECISION = 1e-6, 1e6
-"""Of the median one, in units in which that is 1: eigenvalues of an information beyond are clipped."""
-
 
 @dataclass(frozen=True)
 class Chain:
@@ -113,7 +110,7 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     axes = PLANAR_AXES if graph.dimension == 2 else np.arange(6)
-    covariance = covariances(graph.information[:, axes[:, None], axes])
+    covariance = se3.covariances(graph.information[:, axes[:, None], axes])
     rows = np.flatnonzero(~backbone & (graph.edges[:, 0] != graph.edges[:, 1]))
     step, step_covariance = np.tile(np.eye(4), (len(order), 1, 1)), np.zeros((len(order), len(axes), len(axes)))
     at = np.flatnonzero(step_edge >= 0)
@@ -169,23 +166,6 @@ def _directed(motion: Floats, covariance: Floats, reverse: Bools, axes: Ints) ->
     covariance[reverse] = turned @ covariance[reverse] @ np.swapaxes(turned, 1, 2)
     motion[reverse] = se3.inverse(motion[reverse])
     return motion, covariance
-
-
-def covariances(information: Floats) -> Floats:
-    """Inverses (E, p, p) of information matrices, their eigenvalues clipped: never infinite, never negative."""
-    if not len(information):
-        return information
-    p = information.shape[-1]
-    split = 1 if p == 3 else 3
-    precision = np.einsum("eii->ei", information)
-    unit = np.ones(p)
-    for part in (slice(0, split), slice(split, p)):
-        positive = precision[:, part][precision[:, part] > 0]
-        unit[part] = 1 / np.sqrt(np.median(positive)) if len(positive) else 1.0
-    scale = np.outer(unit, unit)
-    values, vectors = np.linalg.eigh(0.5 * (information + np.swapaxes(information, 1, 2)) * scale)
-    values = np.clip(values, LEAST_PRECISION, MOST_PRECISION)
-    return np.asarray((vectors / values[:, None]) @ np.swapaxes(vectors, 1, 2) * scale)
 
 
 def _walk(edges: Ints, count: int, rows: Ints) -> tuple[Ints, Ints, Ints]:

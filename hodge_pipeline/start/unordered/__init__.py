@@ -1,1 +1,1 @@
-"""A start from nothing: frames or scans in no order, pieces after lost tracking, several sequences of one scene."""
+"""Initial poses by global registration: unordered frames or scans, pieces after lost tracking, several sequences."""

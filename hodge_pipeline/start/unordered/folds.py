@@ -1,4 +1,4 @@
-"""Scenes folded onto themselves: places that look alike lie on each other, until free space says that they cannot.
+"""Unfold scenes in which look-alike places were merged: free space in depth images shows that they are distinct.
 
 Each edge of a fold may be flawless, and all of them agree; but frames that no edge joins are brought together too, and
 one camera then sees through what the other saw.
@@ -15,7 +15,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import Diagnosis
-from hodge_pipeline.evaluation.scores import evenly
+from hodge_pipeline.evaluation.scores import some_of
 from hodge_pipeline.start.unordered.hypotheses import ViewOf, violations
 from hodge_pipeline.start.unordered.options import HypothesisLimits
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, ViewGraph
@@ -70,7 +70,7 @@ def contradictions(
     every = np.stack([rows[i], rows[j]], axis=1)
     first, second = every.T
     chosen = (pieces.piece[first] == pieces.piece[second]) & (held[first] != held[second])
-    pairs = evenly(every[chosen], MOST_PAIRS)
+    pairs = some_of(every[chosen], MOST_PAIRS)
     motions = se3.inverse(pieces.poses[pairs[:, 0]]) @ pieces.poses[pairs[:, 1]]
     seen_through = violations(clouds, pairs, motions, view_of)
     certain = seen_through > CERTAIN * limits.max_violation  # false for NaN

@@ -1,4 +1,4 @@
-"""Matches, refined and weighed: which of them are good enough for the diagnosis to judge."""
+"""Refine matched pairs by ICP and reject those with little overlap, free-space violations or other colours."""
 
 from __future__ import annotations
 

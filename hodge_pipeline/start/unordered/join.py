@@ -1,4 +1,4 @@
-"""First poses without a guess: of frames in no order, or of the parts that odometry left apart."""
+"""The start `unordered`, and the joining of parts that odometry left disconnected."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.gaps import has_gap
+from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.scene import START, Drift, KeyFrames, Round, Scene, sequences_of, vertex_ids
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import landmarks_for, make_clouds
@@ -90,5 +90,5 @@ def _stays(source: Source, edges: Edges, found: Start) -> bool:
     if len(np.unique(parts)) == 1:
         return False
     stamps_s = np.array([frame.stamp_s for frame in source.frames])
-    holes = has_gap(list(sequences_of(source).values()), stamps_s)
+    holes = len(gaps(list(sequences_of(source).values()), stamps_s)) > 0
     return not holes and len(np.unique(found.piece)) >= len(np.unique(parts))

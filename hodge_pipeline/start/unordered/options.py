@@ -1,4 +1,4 @@
-"""How poses are found from nothing."""
+"""Options of global registration for initial poses."""
 
 from __future__ import annotations
 

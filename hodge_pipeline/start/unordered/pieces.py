@@ -1,4 +1,4 @@
-"""Pieces that no evidence joins, laid beside each other so that none lies in another."""
+"""Lay out components that no edge joins side by side, without overlap."""
 
 from __future__ import annotations
 

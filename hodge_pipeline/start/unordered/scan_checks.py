@@ -1,4 +1,4 @@
-"""What is odd about scans before any pair is tried: units, copies, surfaces that fix no motion."""
+"""Checks of scans before registration: unit mismatch, duplicates, surfaces that leave a motion undetermined."""
 
 from __future__ import annotations
 

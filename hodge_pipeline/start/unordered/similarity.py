@@ -1,4 +1,4 @@
-"""Which frames or scans to match: the nearest by global descriptors of their own local features."""
+"""Candidate pairs: nearest neighbours by global descriptors (VLAD) of local features."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses from nothing, on one screen: describe, propose, match, weigh, and let the diagnosis say what to trust."""
+"""Global registration of all frames: describe, propose pairs, match, verify, and keep what the diagnosis trusts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.registration.acceptance import contradicts_odometry
+from hodge_pipeline.registration.acceptance import CONTRADICTS
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
+from hodge_pipeline.registration.odometry_path import contradicts_odometry
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
@@ -69,7 +70,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     if scene.drift is not None:
         counted = np.flatnonzero(hypotheses.counts)
         far = counted[contradicts_odometry(hypotheses.select(counted), scene.drift)]
-        hypotheses = hypotheses.put(far, status=REJECTED, why="farther off than odometry drifts")
+        hypotheses = hypotheses.put(far, status=REJECTED, why=CONTRADICTS)
     notes.append(_tried(len(rows), pairs, hypotheses))
     labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
     measured = labelled.select(labelled.counts).as_graph(scene.vertex_ids)

@@ -1,4 +1,4 @@
-"""What free space is judged by: the depth image of every frame, made small and kept in files, or a scan's panorama."""
+"""Free-space views on disk: the small depth image of every frame, or the panorama of a scan."""
 
 from __future__ import annotations
 

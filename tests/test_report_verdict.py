@@ -1,0 +1,217 @@
+"""The verdict of a report and what it tells to distrust, by hand."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_pipeline.evaluation.difference import MEASURABLE, sign_of
+from hodge_pipeline.evaluation.residuals import with_residuals
+from hodge_pipeline.report.brief import brief
+from hodge_pipeline.report.contents import (
+    Path3D,
+    Pictures,
+    RefinementSummary,
+    Report,
+    SourceSummary,
+    WrongEdges,
+)
+from hodge_pipeline.report.summary import graph_summary, weigh_wrong
+from hodge_pipeline.report.verdict import judge, suspicions
+from hodge_pipeline.report.write import write_report
+from hodge_pipeline.scene import Round
+from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver
+from hodge_pipeline.stages import Step, no_progress
+from hodge_pipeline.types import Edges
+from hodge_pipeline.types.notes import Rank
+from report_data import circle, make_report, read_page, ring, scored, told
+
+
+@pytest.fixture(scope="module")
+def report() -> Report:
+    return make_report()
+
+
+@pytest.mark.parametrize(
+    ("before_m", "after_m", "outcome", "words"),
+    [
+        (0.020, 0.012, "improved", "fell from 20 mm to 12 mm (−40 %)"),
+        (0.010, 0.015, "worse", "rose from 10 mm to 15 mm (+50 %)"),
+        (0.010, 0.0101, "unchanged", "hardly changed, from 10 mm to 10.1 mm (+1 %)"),
+    ],
+)
+def test_the_verdict_follows_the_scores(before_m: float, after_m: float, outcome: str, words: str) -> None:
+    verdict = judge(Report("r", SourceSummary("tum", "x", 4), scores=scored(0.01, before_m, after_m)))
+    assert verdict.outcome == outcome
+    assert words in verdict.sentence
+
+
+def test_errors_that_disagree_are_mixed(report: Report) -> None:
+    verdict = judge(replace(report, scores=scored(0.01, 0.01, 0.02)))
+    assert verdict.outcome == "mixed"
+    best, bad = verdict.headline.split(", but ")
+    assert best == "Mixed against odometry: RPE of the rotation 4.43° → 0.443° and 2 more better"
+    assert bad.startswith("distance of clouds (near-centroid pairs) 10 mm → 20 mm, distance of clouds (overlapping")
+    assert [change.sign for change in verdict.changes] == [-1, -1, 1, 1, 1]
+
+
+def test_a_measure_that_got_worse_is_named_in_the_headline() -> None:
+    verdict = judge(told((0.5, 0.017), (0.4, 0.020)))
+    assert verdict.outcome == "mixed"
+    assert verdict.headline == "Mixed against odometry: ATE 50 cm → 40 cm, but RPE 17 mm → 20 mm"
+    assert "the error of the motion from frame to frame (RPE) rose from 17 mm to 20 mm (+18 %)" in verdict.details
+
+
+def test_a_largest_error_that_got_worse_is_named_too() -> None:
+    report = told((0.5, 0.020), (0.4, 0.017))
+    start, result = report.trajectories
+    rows = (start, replace(result, ate_max_m=0.7))
+    verdict = judge(replace(report, trajectories=rows))
+    assert verdict.headline.endswith(", but largest error 50 cm → 70 cm") and verdict.outcome == "mixed"
+    refined = RefinementSummary("refined", "Better than the poses given", "clouds lie nearer")
+    verdict = judge(replace(report, trajectories=rows, refinement=refined))
+    assert verdict.headline == "Better than the poses given, but largest error 50 cm → 70 cm"
+
+
+def test_a_difference_below_what_was_measured_is_none(tmp_path: Path) -> None:
+    report = told((1e-17, 3e-18), (3e-17, 1e-17))
+    verdict = judge(report)
+    assert verdict.outcome == "unchanged" and verdict.headline == "Unchanged against odometry"
+    assert [change.share for change in verdict.changes] == [0, 0, 0]
+    assert "(ATE) is unchanged at < 0.004 mm" in verdict.sentence, "a millionth of 4 m"
+    page, numbers = write_report(tmp_path, report)
+    assert not re.search(r"e-1\d", read_page(page)[0] + verdict.sentence)
+    assert json.loads(numbers.read_text("utf-8"))["verdict"]["outcome"] == "unchanged"
+
+
+def test_what_can_be_measured_goes_by_the_extent_of_the_scene() -> None:
+    assert judge(told((2e-6, 1.0), (3e-6, 1.0), extent_m=4.0)).outcome == "unchanged"
+    assert judge(told((2e-6, 1.0), (3e-6, 1.0), extent_m=0.4)).outcome == "worse"
+    assert judge(told((1e-17, 1.0), (0.003, 1.0))).details.startswith(
+        "the error of the trajectory (ATE) rose from < 0.004 mm to 3 mm;"
+    ), "no share of nothing"
+    assert sign_of(1.0, 1.0 + MEASURABLE, 2 * MEASURABLE) == 0
+
+
+@pytest.mark.parametrize(
+    ("component", "unordered", "headline"),
+    [
+        ([0] * 12 + [1] * 8, False, "In 2 pieces (12, 8 of 20 frames): improved against odometry"),
+        ([0] * 12 + [1] * 3 + [2] * 3 + [3] * 2, False, "In 4 pieces (12, 3, 3, … of 20 frames): improved against"),
+        ([0] * 19 + [1], False, "19 of 20 frames joined: improved against odometry"),
+        ([0] * 20, False, "Improved against odometry"),
+        ([0] * 20, True, "20 of 20 scans joined"),
+        (list(range(20)), True, "No two of 20 scans joined: improved against odometry"),
+    ],
+)
+def test_pieces_come_first_in_the_headline(
+    report: Report, tmp_path: Path, component: list[int], unordered: bool, headline: str
+) -> None:
+    drawn = report.pictures.graph
+    assert drawn is not None
+    graph = graph_summary(Edges.measured(drawn), drawn.vertex_ids, np.array(component))
+    source = replace(report.source, unordered=unordered, kind="scans" if unordered else "frames")
+    shown = replace(report, graph=graph, source=source)
+    verdict = judge(shown)
+    assert verdict.headline.startswith(headline) and verdict.outcome == "improved"
+    several = "pieces" in headline
+    assert (verdict.pieces > 1) == several and verdict.mark == ("mixed" if several else "improved")
+    page, numbers = write_report(tmp_path, shown)
+    assert headline in read_page(page)[0]
+    assert json.loads(numbers.read_text("utf-8"))["verdict"]["sentence"].startswith(headline)
+    assert headline in " ".join(line.strip() for line in brief(shown, "runs/a")), "the terminal says the same"
+
+
+def test_a_refinement_whose_error_against_the_truth_rose_is_mixed() -> None:
+    refinement = RefinementSummary("refined", "Better than the poses given", "edge chi2 2 -> 1")
+    verdict = judge(replace(told((0.5, 0.017), (0.6, 0.017)), refinement=refinement))
+    assert verdict.outcome == "mixed"
+    assert verdict.headline == "Better than the poses given, but ATE 50 cm → 60 cm, largest error 50 cm → 60 cm"
+
+
+def test_the_worst_edge_is_the_wrong_one(report: Report) -> None:
+    worst = report.worst_edges[0]
+    assert (worst.i, worst.j, worst.source) == ("107", "108", "sequential")
+    assert worst.residual_m == pytest.approx(0.5, abs=0.02)
+    sizes = [edge.residual_m * 100 + edge.residual_deg for edge in report.worst_edges]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+def test_what_to_distrust_is_said(report: Report) -> None:
+    #  0–…–9   10–…–18   19
+    component = np.array([0] * 10 + [1] * 9 + [2])
+    assert report.pictures.graph is not None
+    edges = Edges.measured(report.pictures.graph).put(slice(None), weight=np.array([0.0] * 2 + [1.0] * 18))
+    summary = graph_summary(edges, report.pictures.graph.vertex_ids, component)
+    said = "\n".join(map(str, suspicions(replace(report, graph=summary, scores=scored(0.01, 0.1, 0.01)))))
+    for expected in (
+        "2 pairs were tried twice",
+        "falls into 3 parts",
+        "1 of 20 frames have no edge",
+        "ignored 2 of 20 edges",
+        "At least 1 edges",
+        "odometry: 2 of 3 near-centroid pairs have no point within 10 cm",
+    ):
+        assert expected in said
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "spread", "said"), [(None, 1.0, False), (0.009, 1.0, False), (0.33, 1.0, True), (0.33, 100.0, False)]
+)
+def test_a_result_that_has_not_settled_is_not_to_be_trusted(shift_m: float | None, spread: float, said: bool) -> None:
+    path = Path3D("result", np.array([[0.0, 0, 0], [4, 0, 0], [4, 4, 0]]) * spread)
+    report = Report("r", SourceSummary("tum", "x", 3), last_shift_m=shift_m, pictures=Pictures(paths=(path,)))
+    lines = [str(note) for note in suspicions(report)]
+    assert ("not to be trusted" in "".join(lines)) == said
+    if said:
+        assert "33 cm" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (WrongEdges(0), []),
+        (WrongEdges(11, "5 at frame 12", 0.0018), ["11 of the edges used are judged wrong, 5 at frame 12; without them "
+          "no pose moves by more than 1.8 mm: nothing to do."]),
+        (WrongEdges(2, "3–9", 0.12), ["2 of the edges used are judged wrong, 3–9; without them poses move by up to "
+          "12 cm: hodge diagnose shows them."]),
+        (WrongEdges(2, "3–9", 0.0, 1), ["2 of the edges used are judged wrong, 3–9; without them the scene falls into "
+          "1 more pieces: hodge diagnose shows them."]),
+    ],
+)  # fmt: skip
+def test_wrong_edges_are_weighed_by_what_they_do(report: Report, wrong: WrongEdges, said: list[str]) -> None:
+    notes = [note for note in suspicions(replace(report, wrong_edges=wrong)) if note.kind in ("wrong", "harmless")]
+    assert [str(note) for note in notes] == said
+    assert all((note.rank == Rank.LOOK) == (note.kind == "wrong") for note in notes)
+
+
+def test_what_wrong_edges_do_is_solved_for(tmp_path: Path) -> None:
+    """A ring with one edge half a metre off that counts fully: without it the poses are exact again."""
+    truth = circle()
+    graph = ring(truth)
+    solver = MaximumLikelihoodSolver()
+    solution = solver.solve(graph, truth)
+    edges = with_residuals(Edges.measured(graph), solution.world_from_cam, solution.weights)
+    verdicts = np.full(20, "consistent", dtype="<U12")
+    last = Round(edges.put(slice(None), verdict=verdicts), graph.vertex_ids, solution.world_from_cam, solution)
+    step = Step(tmp_path, no_progress, lambda *notes: None)
+    assert weigh_wrong(last, solver, step=step) == WrongEdges(0)
+    verdicts[7] = "wrong"
+    last = replace(last, edges=edges.put(slice(None), verdict=verdicts))
+    found = weigh_wrong(last, solver, step=step)
+    assert (found.count, found.frames, found.pieces_more) == (1, "107–108", 0)
+    assert found.moved_m > 0.05, "as far as the edge had bent the ring"
+    verdicts[12] = "wrong"
+    found = weigh_wrong(replace(last, edges=edges.put(slice(None), verdict=verdicts)), solver, step=step)
+    assert (found.count, found.pieces_more) == (2, 1)
+
+
+def test_clouds_that_fit_better_than_at_the_truth_are_explained(report: Report) -> None:
+    better = replace(report, scores=scored(0.010, 0.020, 0.009))
+    assert [note.kind for note in suspicions(better)].count("above truth") == 1
+    assert "above truth" not in [note.kind for note in suspicions(report)]
