@@ -137,6 +137,14 @@ class Drift:
 
 
 @dataclass(frozen=True)
+class Closed:
+    """The first poses (K, 4, 4), the loops along the path closed, and the pairs (P, 2) that closed them."""
+
+    world_from_cam: Floats
+    pairs: Ints
+
+
+@dataclass(frozen=True)
 class GivenFile:
     """A file of given poses, what it holds, and the moments (P,) of its poses on the clock of `KeyFrames.times`.
 
@@ -160,7 +168,8 @@ class Scene:
 
     `drift`: None where the first poses are not odometry's; `given`: the file that they come from, where there is one;
     `in_order`: whether frames that follow each other in the source do so in time; `sightings`: the folder of what
-    frames that are no key frames saw of these, where they were tracked.
+    frames that are no key frames saw of these, where they were tracked; `closed`: the first poses with
+    the loops along the path closed, None where nobody looked for any.
     """
 
     whole: Source
@@ -173,6 +182,7 @@ class Scene:
     given: GivenFile | None = None
     in_order: bool = True
     sightings: Path | None = None
+    closed: Closed | None = None
 
 
 def key_source(whole: Source, rows: Ints) -> Source:

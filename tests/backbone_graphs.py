@@ -54,11 +54,12 @@ def drive(
     loops: int = 100,
     wrong: float = 0.5,
     in_groups: bool = False,
+    group: int = 12,
     misstated: tuple[float, float] = (1.0, 1.0),
     turned: bool = False,
 ) -> Drive:
     """Three laps round a ring, or another of `WORLDS`. `wrong`: share of the loops that join places at random, or in
-    groups of 12 that agree.
+    groups of this size that agree.
 
     `misstated`: what the stated standard deviations of steps and of loops are too large by; `turned`: every edge is
     written the other way round.
@@ -69,7 +70,7 @@ def drive(
     near = cKDTree(truth[:, :3, 3]).query_pairs(3.0, output_type="ndarray")
     near = np.sort(near[np.abs(near[:, 0] - near[:, 1]) > 20], axis=1)
     good = near[rng.choice(len(near), min(len(near), round(loops * (1 - wrong))), replace=False)]
-    bad, bad_motion = _wrong(rng, truth, round(loops * wrong), in_groups, dimension)
+    bad, bad_motion = _wrong(rng, truth, round(loops * wrong), group if in_groups else 1, dimension)
     edges = np.concatenate([steps, good, bad])
     exact = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]]
     exact[len(steps) + len(good) :] = bad_motion
@@ -158,16 +159,16 @@ def _noise(rng: np.random.Generator, size: Floats, dimension: int) -> Floats:
     return xi
 
 
-def _wrong(rng: np.random.Generator, truth: Floats, count: int, in_groups: bool, dimension: int) -> tuple[Ints, Floats]:
+def _wrong(rng: np.random.Generator, truth: Floats, count: int, group: int, dimension: int) -> tuple[Ints, Floats]:
     edges: list[tuple[int, int]] = []
     motion: list[Floats] = []
     while len(edges) < count:
-        i, j = rng.integers(0, len(truth) - 12, 2)
+        i, j = rng.integers(0, len(truth) - max(group, 12), 2)
         if np.linalg.norm(truth[i, :3, 3] - truth[j, :3, 3]) < 10:
             continue
         shift = se3.exp(_noise(rng, np.array([[0.3, 2.0]]), dimension))[0]
         world_from_world = truth[i] @ shift @ se3.inverse(truth[j])
-        for k in range(12 if in_groups else 1):
+        for k in range(group):
             edges.append((i + k, j + k))
             motion.append(se3.inverse(truth[i + k]) @ world_from_world @ truth[j + k])
     return np.array(edges[:count], np.int64).reshape(-1, 2), np.array(motion[:count]).reshape(-1, 4, 4)

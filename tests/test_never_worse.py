@@ -11,7 +11,7 @@ import pytest
 
 import hodge_pipeline
 from hodge_adapters.colmap.models import ColmapModels
-from hodge_adapters.colmap.ties import Ties, similarity
+from hodge_adapters.colmap.ties import similarity
 from hodge_pipeline import se3
 from hodge_pipeline.refine.model_solve import calibrated
 from test_refine_colmap import FREE
@@ -67,7 +67,7 @@ def test_a_join_is_as_exact_as_the_images_that_both_models_have(data_dir: Path) 
     for key in ids[:280]:  # ties by matches: the same points, triangulated apart
         second.points3D[key].xyz = second.points3D[key].xyz + rng.normal(scale=0.003 * size, size=3)
     second.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0.3, 0.5, -0.2])), np.array([1.0, 2.0, 3.0])))
-    found = similarity(first, second, Ties(np.array([ids, ids]).T))
+    found = similarity(first, second, np.array([ids, ids]).T)
     assert found is not None and found[0].scale == pytest.approx(0.5, rel=1e-9)
 
 

@@ -104,7 +104,9 @@ def test_another_run_gives_the_same_poses_on_any_number_of_workers(run: Run, tmp
     np.testing.assert_array_equal(other.result.world_from_cam, run.result.world_from_cam)
 
 
-@pytest.mark.parametrize("title", ["odometry", "registration, round 1", "solve, round 2", "fusion 1", "recording"])
+@pytest.mark.parametrize(
+    "title", ["odometry", "loops along the path", "registration, round 1", "solve, round 2", "fusion 1", "recording"]
+)
 def test_a_run_that_was_stopped_goes_on_where_it_stopped(run: Run, tmp_path: Path, title: str) -> None:
     recipe = small_recipe(run.source.path, "executor.workers=0", "evaluation.tables=false")
     first, second = Log(stop_at=title), Log()

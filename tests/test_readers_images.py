@@ -38,10 +38,10 @@ def test_colour_is_rgb(tmp_path: Path, suffix: str) -> None:
 
 def test_encoded_images_are_the_bytes_of_the_file(tmp_path: Path) -> None:
     depth, colour = write_depth(tmp_path / "d.png", depth_values()), write_colour(tmp_path / "c.jpg")
-    encoded = pixels.encoded_depth(depth, units_per_metre=5000.0)
+    encoded = pixels.encoded(depth, units_per_metre=5000.0)
     assert (encoded.contents, encoded.media_type, encoded.units_per_metre) == (depth.read_bytes(), "image/png", 5000.0)
-    assert pixels.encoded_colour(colour).contents == colour.read_bytes()
-    assert pixels.encoded_colour(colour).media_type == "image/jpeg"
+    assert pixels.encoded(colour).contents == colour.read_bytes()
+    assert pixels.encoded(colour).media_type == "image/jpeg"
 
 
 def test_a_partial_pickles_and_reads_the_same(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hodge_adapters.association import interpolated_poses, nearest_pairs
+from hodge_adapters.tum import reader
 from hodge_adapters.tum.image_lists import StampedImages, read_pairs
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
@@ -305,6 +306,17 @@ def test_a_renamed_folder_is_known_by_its_images(name: str, data_dir: Path, tmp_
     source = TumReader().open(tmp_path)
     assert source.frames[0].camera.fx == 517.3
     assert any("intrinsics of fr1 taken, tried on the images" in note for note in source.notes)
+
+
+def test_two_cameras_that_images_and_date_do_not_tell_apart_are_both_named(
+    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "RECORDED_ON", dict.fromkeys(reader.RECORDED_ON, set()))
+    for entry in (data_dir / "tum" / "fr1_rpy_part").iterdir():
+        (tmp_path / entry.name).symlink_to(entry)
+    (note,) = (note for note in TumReader().open(tmp_path).notes if "tried on the images" in note)
+    taken, other = ("fr1", "fr2") if "of fr1 taken" in note else ("fr2", "fr1")
+    assert f"of {taken} taken" in note and f"set camera={other} if it was that" in note
 
 
 def test_a_camera_without_distortion_is_not_taken_for_another(tmp_path: Path) -> None:

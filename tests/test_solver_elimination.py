@@ -8,7 +8,6 @@ from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers import elimination
-from hodge_pipeline.solvers.backends import backend
 from hodge_pipeline.solvers.direct import DirectSolver
 from hodge_pipeline.solvers.elimination import plan_elimination
 from hodge_pipeline.solvers.linear import factorise_blocks, fill_reducing_order
@@ -78,7 +77,7 @@ def test_an_old_factor_serves_a_near_hessian_and_a_far_one_gets_its_own():
     first = block_laplacian(plan, k[:-1], k[1:], 3, rng)
     gradient = rng.normal(size=len(first))
     nowhere = np.zeros((len(k), 3))
-    direct = DirectSolver(plan, backend("superlu"))
+    direct = DirectSolver(plan)
     direct.solve(bsr_matrix(first, blocksize=(3, 3)), gradient, 1e-3, 0.0, nowhere)
     factor = direct.factor
     near = direct.solve(bsr_matrix(1.01 * first, blocksize=(3, 3)), gradient, 1e-3, 0.0, nowhere)

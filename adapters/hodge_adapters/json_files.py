@@ -13,9 +13,6 @@ from hodge_adapters.text_rows import read_text, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
-from hodge_pipeline.types.input_files import beginning
-
-SNIFFED_BYTES = 4096
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -29,11 +26,6 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise SourceError(f"{path}: not a JSON object: is it another file?")
     return content
-
-
-def first_text(path: Path) -> str:
-    """The first characters of a file, empty where it cannot be read."""
-    return beginning(path, SNIFFED_BYTES).decode("utf-8-sig", "replace")
 
 
 def objects(value: Any, where: str) -> list[dict[str, Any]]:

@@ -15,9 +15,9 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.images import pixels
 from hodge_adapters.images.lens_models import FISHEYE, HALF_PIXEL, PERSPECTIVE, image_file, named, pinhole_params
-from hodge_adapters.json_files import first_text, motion, number, objects, read_json, whole, write_json
+from hodge_adapters.json_files import motion, number, objects, read_json, whole, write_json
 from hodge_adapters.posed import trajectory_of, written
-from hodge_adapters.text_rows import inside, listed, write_bytes_atomically
+from hodge_adapters.text_rows import first_text, inside, listed, write_bytes_atomically
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, Frame, ImageFile, Source, Trajectory
@@ -89,8 +89,8 @@ class NerfstudioReader:
             camera=camera,
             read_depth=partial(read, depth) if depth and camera else None,
             read_colour=partial(pixels.read_colour, colour, size=size) if colour else None,
-            encoded_depth=partial(pixels.encoded_depth, depth, units_per_metre=1 / unit) if depth and camera else None,
-            encoded_colour=partial(pixels.encoded_colour, colour) if colour else None,
+            encoded_depth=partial(pixels.encoded, depth, units_per_metre=1 / unit) if depth and camera else None,
+            encoded_colour=partial(pixels.encoded, colour) if colour else None,
             image=_image_file(colour, camera, {**content, **entry}) if colour and camera else None,
             world_from_cam=pose,
         )

@@ -14,8 +14,9 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.json_files import first_text, motion, numbers, objects, read_json, whole, write_json
+from hodge_adapters.json_files import motion, numbers, objects, read_json, whole, write_json
 from hodge_adapters.posed import trajectory_of, written
+from hodge_adapters.text_rows import first_text
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff

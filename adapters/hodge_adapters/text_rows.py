@@ -11,9 +11,10 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from hodge_pipeline.errors import SourceError, not_written
-from hodge_pipeline.types.input_files import read_input_text
+from hodge_pipeline.types.input_files import beginning, read_input_text
 
 _DIGITS = re.compile(r"(\d+)")
+SNIFFED_BYTES = 4096
 SHOWN = 5
 """How many records a note names before it only counts them."""
 
@@ -33,6 +34,19 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
+
+
+def names_in(folder: Path) -> list[str]:
+    """The names in a folder, ascending; raises `SourceError` where it cannot be listed."""
+    try:
+        return sorted(os.listdir(folder))
+    except OSError as error:
+        raise SourceError(f"{folder}: cannot be listed ({error.strerror}): give a folder that can be read") from error
+
+
+def first_text(path: Path, size: int = SNIFFED_BYTES) -> str:
+    """The first characters of a file, empty where it cannot be read."""
+    return beginning(path, size).decode("utf-8-sig", "replace")
 
 
 def read_text(path: Path) -> str:

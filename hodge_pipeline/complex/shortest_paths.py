@@ -38,8 +38,8 @@ class _Lookup:
 def path_integrals(edges: Ints, vertex_count: int, omega: Floats, pairs: Ints) -> Floats:
     """Σ ω (N, k) along a path of fewest edges from `pairs[:, 0]` to `pairs[:, 1]`; 0 from a vertex to itself.
 
-    Joined vertices take the edge between them. Searches start small and widen, by batches of
-    sources. Raises `GraphError` where no path joins a pair.
+    Joined vertices take the edge between them. Searches start small and widen, by batches of sources. Raises
+    `GraphError` where no path joins a pair.
     """
     out = np.zeros((len(pairs), omega.shape[1]))
     apart = np.flatnonzero(pairs[:, 0] != pairs[:, 1])

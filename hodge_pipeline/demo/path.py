@@ -15,6 +15,8 @@ from hodge_pipeline.types import Floats
 
 TREMOR_HZ = (0.6, 3.0)
 TREMOR_TERMS = 6
+LAST_ROOM = 7
+"""Waypoints in the last room of a walk; the others have four on each way."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,10 @@ class HandHeldLoop:
 
 @dataclass(frozen=True)
 class Walk:
-    """A walk through the rooms of a building to the last one and back to where it began, looking ahead and about."""
+    """A walk through the rooms of a building to the last one and back to where it began.
+
+    The camera looks ahead, and in each room once all round, both ways: on the way back it sees what it has seen before.
+    """
 
     seed: int
     rooms: int
@@ -84,11 +89,26 @@ class Walk:
         return np.asarray(steady @ se3.exp(_tremor(self.seed, times_s, 0.004, 0.3)))
 
     def _heading(self, way: Floats) -> Floats:
-        """Where (N,) the way leads, radians: the mean over a metre, so that nobody turns on the spot."""
+        """Where (N,) the camera looks, radians: where the way leads, and all round in each room."""
+        return np.asarray(np.interp(way, *self._headings))
+
+    @cached_property
+    def _headings(self) -> tuple[Floats, Floats]:
+        """The heading at places along the way: the mean over a metre, so that nobody turns on the spot."""
         grid = np.linspace(0, float(self._way.x[-1]), max(2, int(20 * self._way.x[-1])))
         ahead = self._way(grid, 1)
-        angle = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
-        return np.asarray(np.interp(way, grid, gaussian_filter1d(angle, 10, mode="nearest")))
+        angle = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])) + np.interp(grid, self._way.x, self._rounds)
+        return grid, gaussian_filter1d(angle, 10, mode="nearest")
+
+    @property
+    def _rounds(self) -> Floats:
+        """How far (W,) the camera has turned round at each waypoint, radians, besides the turns of the way."""
+        passed = 4 * (self.rooms - 1)
+        turned = np.zeros(2 * passed + LAST_ROOM)
+        for first in (*range(1, passed, 4), *range(passed + LAST_ROOM, 2 * passed + LAST_ROOM, 4)):
+            turned[first + 1] += np.pi
+            turned[first + 2] += np.pi
+        return np.cumsum(turned)
 
 
 def _waypoints(rooms: int) -> list[Floats]:

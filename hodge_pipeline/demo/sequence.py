@@ -29,7 +29,7 @@ from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Bytes, Camera, Floats
 from hodge_pipeline.types.input_files import read_input_text
 
-VERSION = 2
+VERSION = 3
 """Raised whenever the same options give other files, so that nobody goes on with old ones."""
 STAMP_FILE = "demo.json"
 FIRST_STAMP_S = 1_400_000_000.0

@@ -35,7 +35,7 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisO
     probability = np.where(backbone.steps, np.where(in_loop, RIGHT_STEP, np.nan), backbone.right)
     probability[backbone.steps & ~kept] = 1 - RIGHT_STEP
     untestable = np.isnan(probability)
-    wrong = ~kept & (probability < options.wrong_below)
+    wrong = ~kept & (probability < options.wrong_below) & (backbone.steps | backbone.found.confirmed)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
     piece = connected_components(graph.edges[kept], graph.vertex_count)
     displacement_m, angle = edge_residuals(graph, backbone.world_from_cam)

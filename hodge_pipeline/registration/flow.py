@@ -20,7 +20,8 @@ from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame
 
 CORNERS = 300
 """Of a key frame, at most: more cost time and add nothing (TUM fr1)."""
-CORNER_QUALITY, CORNERS_APART_PX = 0.01, 8.0
+CORNER_QUALITY, CORNERS_APART = 0.01, 1 / 80
+"""The second: share of the image's width, 8 pixels of 640, so that a small image has as many."""
 WINDOW_PX, LEVELS = 15, 3
 """Of the flow: with a predicted motion it finds a corner within about 60 pixels of where it should be."""
 BACKWARD_PX = 0.7
@@ -83,7 +84,8 @@ def flow_image(frame: Frame, range_m: tuple[float, float], unit_m: float = 1.0) 
 
 def find_corners(image: FlowImage) -> Corners:
     """The strongest corners of an image that have a depth."""
-    found = cv2.goodFeaturesToTrack(image.grey, 2 * CORNERS, CORNER_QUALITY, CORNERS_APART_PX)
+    apart_px = CORNERS_APART * image.grey.shape[1]
+    found = cv2.goodFeaturesToTrack(image.grey, 2 * CORNERS, CORNER_QUALITY, apart_px)
     pixels = np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
     seen = _seen(image, pixels)
     kept = np.flatnonzero(np.isfinite(seen[:, 2]))[:CORNERS]

@@ -89,6 +89,7 @@ class _Pairs:
         return np.asarray(np.where(drift.part[low] == drift.part[high], chi2, 0.0))
 
     def select(self, rows: Bools | Ints) -> _Pairs:
+        """These pairs alone."""
         return _Pairs(self.low[rows], self.high[rows], self.motion[rows], self.covariance[rows])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.block_store import BlockStore
-from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.pairs import held_where_sliding, register_pairs
 from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import HELD_OUT, MEASURED, USED
@@ -24,6 +24,7 @@ def register_edges(
     world_from_cam: Floats,
     earlier: Edges | None = None,
     scale: float = 1.0,
+    min_spread: float = 0.0,
     *,
     workers: Workers,
     step: Step,
@@ -31,7 +32,7 @@ def register_edges(
     """Step: the table with its candidates registered from these poses; a killed run goes on at its last block.
 
     A pair that was registered `earlier`, to where the poses put it still, keeps that registration; lengths are
-    multiplied by `scale`.
+    multiplied by `scale`. `min_spread`: see `Acceptance`.
     """
     assert clouds.folder is not None
     held_out = edges.status == HELD_OUT
@@ -47,6 +48,7 @@ def register_edges(
         finished=blocks.read(), on_block=blocks.write,
     )  # fmt: skip
     blocks.remove()
+    found = held_where_sliding(found, guesses[missing], min_spread)
     kept = candidates.select(rows)
     if earlier is not None and len(rows):
         columns = {name: getattr(earlier, name)[known] for name in (*MEASURED, "iterations", "converged")}

@@ -15,6 +15,7 @@ from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.pairs.candidates import merge
 from hodge_pipeline.pairs.held_out import HeldOut
+from hodge_pipeline.pairs.revisits import REVISIT
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.registration.acceptance import accepted, with_odometry
 from hodge_pipeline.registration.register import register_edges
@@ -79,13 +80,17 @@ class Work:
     fixes: Fixes | None = None
 
     def placed_first(self) -> Round:
-        """The first round, its poses in the world of known positions where there are any: loops are then near."""
+        """The first round, its loops closed along the path, its poses in the world of known positions where there are
+        any: pairs that close loops are then near.
+        """
         scene = self.scene
+        closed = scene.closed
+        first = scene.first if closed is None else replace(scene.first, world_from_cam=closed.world_from_cam)
         if self.fixes is None or scene.is_given:
-            return scene.first
-        up = up_of(scene, scene.first.world_from_cam)
-        found = self.steps.step(place_first, scene.first, self.fixes, up, title="known positions")
-        return replace(scene.first, world_from_cam=found)
+            return first
+        up = up_of(scene, first.world_from_cam)
+        found = self.steps.step(place_first, first, self.fixes, up, title="known positions")
+        return replace(first, world_from_cam=found)
 
     def propose(self, number: int, before: Round) -> Edges:
         """The pairs to register in round `number` from the poses of the one before."""
@@ -95,6 +100,8 @@ class Work:
             propose_edges, recipe.edges, scene.source, scene.clouds, before.world_from_cam, self.measured, held_out,
             scene.in_order, self.scale, title=f"edges, round {number}",
         )  # fmt: skip
+        if scene.closed is not None:
+            proposed = merge([proposed, Edges.proposed(scene.closed.pairs, REVISIT)])[0]
         return with_start_edges(proposed, scene.first)
 
     def register(self, number: int, edges: Edges, before: Round) -> Registered:
@@ -102,6 +109,7 @@ class Work:
         world_from_cam, earlier = before.world_from_cam, before.registered(self.measured) if number > 1 else None
         registered = self.steps.step(
             register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,
+            self.recipe.acceptance.min_spread,
             title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
         )  # fmt: skip
         fresh = np.flatnonzero(registered.status != HELD_OUT)

@@ -7,14 +7,13 @@ its fill. (CHOLMOD was tried in SuperLU's place: after the block elimination it 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from hodge_pipeline.solvers.cg import truncated_cg
+from hodge_pipeline.solvers.cg import solved_columns
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
 from hodge_pipeline.solvers.linear import Factor, factorise, fill_reducing_order
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioning, multigrid
@@ -35,50 +34,24 @@ JOINT_SIZE = 6
 SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
 
 
-@dataclass(frozen=True)
-class Backend:
-    """How linear systems of a graph are solved: by factors, or, with `precondition`, by conjugate gradients.
-
-    `precondition` gives an approximate inverse, symmetric and positive definite, of a block matrix.
-    """
-
-    name: BackendName
-    precondition: Preconditioning | None = None
-
-    @property
-    def iterative(self) -> bool:
-        """Whether it makes no factors."""
-        return self.precondition is not None
-
-    def factorise(self, laplacian: csc_matrix) -> Factor:
-        """What solves with a scalar Laplacian (n, n) in the order of elimination, to the rounding of a factor."""
-        size = int(laplacian.shape[0])
-        if size and self.precondition is not None:
-            return _conjugate_gradients(csr_matrix(laplacian), self.precondition)
-        return factorise(laplacian, "NATURAL")
-
-
-def backend(name: BackendName) -> Backend:
-    """The back end of this name, not `auto`."""
-    return Backend(name, precondition=_multigrid()) if name == "multigrid" else Backend("superlu")
-
-
-def choose(name: BackendName, tail: Ints, head: Ints, count: int, direct: bool = False) -> tuple[Backend, Elimination]:
-    """The back end for a graph, and its plan of elimination; edges (tail, head), `count` vertices that are not pinned.
+def choose(
+    name: BackendName, tail: Ints, head: Ints, count: int, direct: bool = False
+) -> tuple[Preconditioning | None, Elimination]:
+    """What preconditions linear systems of a graph, None where they are factorised, and its plan of elimination; edges
+    (tail, head), `count` vertices that are not pinned.
 
     `auto` is the cheaper of a factorisation, whose fill is foretold, and multigrid; where one will be needed
     (`direct`), it is a factorisation.
     """
-    factors = backend("superlu" if name == "auto" else name)
-    if factors.iterative:
-        return factors, unordered(count)
+    if name == "multigrid":
+        return _multigrid(), unordered(count)
     if name != "auto" or direct or count <= ITERATIVE_FROM:
-        return factors, plan_elimination(tail, head, count, fill_reducing_order)
+        return None, plan_elimination(tail, head, count, fill_reducing_order)
     if len(tail) < CHAIN_EDGES_PER_VERTEX * count:
         plan = plan_elimination(tail, head, count, _order_of_narrow)
         if SECONDS_A_PRODUCT * JOINT_SIZE**3 * plan.work < SECONDS_A_BLOCK * (count + 2 * len(tail)):
-            return factors, plan
-    return backend("multigrid"), unordered(count)
+            return None, plan
+    return _multigrid(), unordered(count)
 
 
 def _order_of_narrow(core: csc_matrix) -> Ordering:
@@ -97,19 +70,18 @@ def _width(core: csc_matrix) -> float:
     return float(np.median(np.maximum.reduceat(reach, core.indptr[:-1])))
 
 
-def _conjugate_gradients(matrix: csr_matrix, precondition: Preconditioning) -> Factor:
+def laplacian_factor(laplacian: csc_matrix, precondition: Preconditioning | None) -> Factor:
+    """What solves with a scalar Laplacian (n, n) in the order of elimination, to the rounding of a factor."""
+    if precondition is None or not laplacian.shape[0]:
+        return factorise(laplacian, "NATURAL")
+    matrix = csr_matrix(laplacian)
     blocks = matrix.tobsr((1, 1))
     apply = precondition(blocks, Modes())
 
     def solve(rhs: Floats) -> Floats:
-        found = truncated_cg(
-            lambda x: np.asarray(matrix @ x.reshape(rhs.shape)).reshape(-1),
-            lambda r: apply(blocks, r.reshape(rhs.shape)).reshape(-1),
-            -rhs.reshape(-1),
-            SCALAR_TOLERANCE,
-            MAX_SCALAR_STEPS,
+        return solved_columns(
+            lambda x: np.asarray(matrix @ x), lambda r: apply(blocks, r), rhs, SCALAR_TOLERANCE, MAX_SCALAR_STEPS
         )
-        return found.x.reshape(rhs.shape)
 
     return Factor(int(matrix.shape[0]), solve)
 

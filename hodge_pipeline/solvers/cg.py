@@ -65,3 +65,15 @@ def truncated_cg(
         direction -= z
         rz = new
     return CgResult(x, r, max_steps)
+
+
+def solved_columns(apply: Operator, precondition: Operator, rhs: Floats, tolerance: float, most_steps: int) -> Floats:
+    """The solution x (n, k) of `apply(x) = rhs`, all columns as one system; `apply` and `precondition` take (n, k)."""
+    found = truncated_cg(
+        lambda x: apply(x.reshape(rhs.shape)).reshape(-1),
+        lambda r: precondition(r.reshape(rhs.shape)).reshape(-1),
+        -rhs.reshape(-1),
+        tolerance,
+        most_steps,
+    )
+    return found.x.reshape(rhs.shape)

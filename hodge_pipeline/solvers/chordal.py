@@ -10,7 +10,7 @@ from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.cg import truncated_cg
+from hodge_pipeline.solvers.cg import solved_columns
 from hodge_pipeline.solvers.direct import SECONDS_A_PRODUCT
 from hodge_pipeline.solvers.elimination import Elimination
 from hodge_pipeline.solvers.linear import factorise_blocks
@@ -112,11 +112,4 @@ def _solve(plan: Elimination, matrix: bsr_matrix, rhs: Floats) -> Floats:
         factor = factorise_blocks(plan, matrix, single=True)
     except GraphError:
         return factorise_blocks(plan, matrix).solve(rhs)
-    found = truncated_cg(
-        lambda x: np.asarray(matrix @ x.reshape(rhs.shape)).reshape(-1),
-        lambda r: factor.solve(r.reshape(rhs.shape)).reshape(-1),
-        -rhs.reshape(-1),
-        CG_TOLERANCE,
-        MAX_CG_STEPS,
-    )
-    return found.x.reshape(rhs.shape)
+    return solved_columns(lambda x: np.asarray(matrix @ x), factor.solve, rhs, CG_TOLERANCE, MAX_CG_STEPS)

@@ -79,7 +79,7 @@ class JointObjective:
     @classmethod
     def of(cls, problem: Problem) -> JointObjective:
         """The objective of a problem."""
-        precondition = problem.structure.backend.precondition
+        precondition = problem.structure.precondition
         matching = None if precondition is None else TranslationSolver.of(problem, precondition)
         return cls(problem, step_solver(problem), matching)
 

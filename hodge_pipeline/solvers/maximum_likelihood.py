@@ -18,7 +18,7 @@ from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
 from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Limits, Point
-from hodge_pipeline.solvers.options import check_choice, check_positive
+from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.priors import with_world, without_world
 from hodge_pipeline.solvers.setup import InitialName, Setup, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, SolverIteration, ViewGraph
@@ -67,7 +67,8 @@ def solve(
     """
     check_choice("objective", objective, ObjectiveName)
     check_choice("initial", initial, InitialName)
-    check_positive("time_limit_s", time_limit_s, "seconds")
+    if not time_limit_s > 0:
+        raise GraphError(f"time_limit_s is {time_limit_s:g}: expected seconds above zero")
     check_rows(graph.fixed if fixed is None else np.asarray(fixed), graph.vertex_count, "fixed")
     start = None if start is None else np.asarray(start, float)
     if start is None and (initial == "given" or (fixed is not None and len(fixed))):

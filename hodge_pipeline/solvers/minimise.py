@@ -99,14 +99,14 @@ def steps_are_direct(problem: Problem) -> bool:
 
 def joint_at_once(problem: Problem) -> bool:
     """Whether steps move all unknowns from the first, by such a factorisation or an iterative back end."""
-    if problem.structure.backend.iterative:
+    if problem.structure.precondition is not None:
         return True
     return problem.free_count > CG_FIRST_TO and steps_are_direct(problem)
 
 
 def full_at_once(problem: Problem) -> bool:
     """Whether the full objective's steps are by factorisations from the first: then the isotropic one is no help."""
-    return not problem.structure.backend.iterative and not cg_first(problem) and steps_are_direct(problem)
+    return problem.structure.precondition is None and not cg_first(problem) and steps_are_direct(problem)
 
 
 def full_objective(setup: Setup) -> FullObjective:

@@ -11,9 +11,3 @@ def check_choice(name: str, value: object, choices: Any) -> None:
     """Raises `GraphError` that lists the choices where the value is none of a `Literal` type's."""
     if value not in get_args(choices):
         raise GraphError(f"{name} {value!r} does not exist: take {' or '.join(map(repr, get_args(choices)))}")
-
-
-def check_positive(name: str, value: float, unit: str) -> None:
-    """Raises `GraphError` where the value is not above zero, or not a number."""
-    if not value > 0:
-        raise GraphError(f"{name} is {value:g}: expected {unit} above zero")

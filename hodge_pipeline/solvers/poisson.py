@@ -54,24 +54,26 @@ class PoissonSolver:
     """
 
     weights: EdgeWeighting = Field(
-        "unit",
+        default="unit",
         description="weight of each edge: unit as in the paper up to a factor; "
         "information, 6 / tr(S Ω⁻¹ S) with S = diag(lever_arm_m × 3, 1 × 3), for measured pose graphs",
     )
     lever_arm_m: float = Field(
-        1.0,
+        default=1.0,
         gt=0,
         description="metres: a rotation counts as the displacement it causes at this distance, about that of the "
         "scene from the camera (1 m suits rooms)",
     )
     inner_iterations: int = Field(
-        3, ge=1, description="Poisson steps with the same edges: each leaves about 2 % of the error (paper: 1 to 3)"
+        default=3,
+        ge=1,
+        description="Poisson steps with the same edges: each leaves about 2 % of the error (paper: 1 to 3)",
     )
     tolerance: float = Field(
-        1e-10, gt=0, description="stop once the RMS of f over the vertices (radians and metres) is below this"
+        default=1e-10, gt=0, description="stop once the RMS of f over the vertices (radians and metres) is below this"
     )
     log: Logarithm = Field(
-        "se3",
+        default="se3",
         description="logarithm of the residual motion: se3 does not depend on the edges' directions; pairing is the "
         "paper's own (rotation vector, translation), which does",
     )

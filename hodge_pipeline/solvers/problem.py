@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 
-from hodge_pipeline.solvers.backends import Backend, BackendName, choose
+from hodge_pipeline.solvers.backends import BackendName, choose, laplacian_factor
 from hodge_pipeline.solvers.elimination import Elimination
 from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.linear import Factor, corrected
+from hodge_pipeline.solvers.multigrid import Preconditioning
 from hodge_pipeline.solvers.rotations import exponential
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -100,7 +101,8 @@ class Structure:
 
     - `order (n,)`: the graph's vertex at each position; the first `free_count` positions are unknown.
     - `tail`, `head (E,)`: positions of i and j.
-    - `elimination`: of the free vertices, whose positions are its own; `backend`: for linear systems on them.
+    - `elimination`: of the free vertices, whose positions are its own; `precondition`: of linear
+      systems on them, None where these are factorised.
     """
 
     order: Ints
@@ -108,15 +110,14 @@ class Structure:
     tail: Ints
     head: Ints
     elimination: Elimination
-    backend: Backend
+    precondition: Preconditioning | None
 
     @cached_property
     def iterative(self) -> IterativeSolver | None:
         """The solver for steps of all unknowns, where the back end is iterative: its preconditioner serves one descent
         after another.
         """
-        precondition = self.backend.precondition
-        return None if precondition is None else IterativeSolver(precondition)
+        return None if self.precondition is None else IterativeSolver(self.precondition)
 
     @cached_property
     def at_tail(self) -> csc_matrix:
@@ -144,6 +145,10 @@ class Structure:
 
         found = self.symmetric_pattern.assemble(entries, (1, 1))
         return csc_matrix((found.data.reshape(-1), found.indices, found.indptr), found.shape)
+
+    def factor(self, weights: Floats) -> Factor:
+        """What solves with that Laplacian."""
+        return laplacian_factor(self.laplacian(weights), self.precondition)
 
     @cached_property
     def coupling_pattern(self) -> BlockPattern:
@@ -214,7 +219,7 @@ class Problem:
         """The scalar Laplacian of κ, factorised once."""
         if self.factors is not None:
             return self.factors.rotation
-        return self.structure.backend.factorise(self.structure.laplacian(self.kappa))
+        return self.structure.factor(self.kappa)
 
     @cached_property
     def translation_factor(self) -> Factor:
@@ -227,7 +232,7 @@ class Problem:
         if len(ratio) and np.isfinite(ratio).all() and np.ptp(ratio) <= SAME_RATIO * ratio[0]:
             solve, scale = self.rotation_factor.solve, 1 / ratio[0]
             return Factor(self.free_count, lambda rhs: scale * solve(rhs))
-        return self.structure.backend.factorise(self.structure.laplacian(self.tau))
+        return self.structure.factor(self.tau)
 
     def moved(self, rotations: Floats, translations: Floats, direction: Floats) -> tuple[Floats, Floats]:
         """Poses whose free ones are moved by a direction (free · (p + d),) in the world's axes."""
@@ -251,7 +256,7 @@ def reweighted(problem: Problem, scale: Floats) -> Problem:
     """
     changed = np.flatnonzero(scale != 1)
     new = replace(problem, kappa=scale * problem.kappa, tau=scale * problem.tau, factors=None)
-    if len(changed) > MOST_CORRECTIONS or problem.structure.backend.iterative:
+    if len(changed) > MOST_CORRECTIONS or problem.structure.precondition is not None:
         return new
     change = scale[changed] - 1
     ends = np.stack([problem.tail[changed], problem.head[changed]], axis=1)

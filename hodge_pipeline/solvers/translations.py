@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import bsr_matrix, csr_matrix
 
-from hodge_pipeline.solvers.cg import truncated_cg
+from hodge_pipeline.solvers.cg import solved_columns
 from hodge_pipeline.solvers.multigrid import Modes, Preconditioner, Preconditioning
 from hodge_pipeline.solvers.objective import translation_force
 from hodge_pipeline.solvers.problem import Problem
@@ -35,13 +35,9 @@ class TranslationSolver:
         """Translations (n, d) near those that minimise F for these rotations, from a guess; the pinned ones stay."""
         force = translation_force(self.problem, rotations, translations)
         csr = csr_matrix((self.matrix.data.reshape(-1), self.matrix.indices, self.matrix.indptr), self.matrix.shape)
-        found = truncated_cg(
-            lambda x: np.asarray(csr @ x.reshape(force.shape)).reshape(-1),
-            lambda r: self.precondition(self.matrix, r.reshape(force.shape)).reshape(-1),
-            force.reshape(-1),
-            TOLERANCE,
-            MOST_STEPS,
+        step = solved_columns(
+            lambda x: np.asarray(csr @ x), lambda r: self.precondition(self.matrix, r), -force, TOLERANCE, MOST_STEPS
         )
         out: Floats = translations.copy()
-        out[: self.problem.free_count] += found.x.reshape(force.shape)
+        out[: self.problem.free_count] += step
         return out

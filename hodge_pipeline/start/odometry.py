@@ -9,18 +9,21 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline import se3
+from hodge_pipeline.pairs.revisits import Revisits, find_revisits
 from hodge_pipeline.registration import odometry as tracking
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.registration.odometry import Odometry, OdometryOptions
 from hodge_pipeline.registration.odometry_path import drift_of
-from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
+from hodge_pipeline.scene import START, Closed, KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
+from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import landmarks_for, make_clouds
 from hodge_pipeline.start.unordered.join import join_parts
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.types import CloudSet, Floats, Ints, Source
-from hodge_pipeline.types.notes import notes_of
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source
+from hodge_pipeline.types.notes import Note, notes_of
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
@@ -35,6 +38,11 @@ class OdometryStart(OdometryOptions):
         "auto: only where it left something apart, true: always, which closes loops that have drifted too far as well",
     )
     unordered: GlobalStart = Field(default=GlobalStart(), description="how parts are joined without a guess")
+    revisits: Revisits | None = Field(
+        default=Revisits(),
+        description="how loops are closed along the path, so that the first pairs are proposed and registered from "
+        "poses that have not drifted apart; null: they are not",
+    )
 
     @property
     def odometry(self) -> OdometryOptions:
@@ -67,7 +75,26 @@ class OdometryStart(OdometryOptions):
         several = int((np.bincount(drift.part) > 1).sum()) > 1
         if self.relocalise is True or (self.relocalise == "auto" and several):
             first = join_parts(keys, clouds, first, drift, self.unordered, steps, workers)
-        return Scene(source, keys, key_frames, clouds, first, None if self.tail is None else drift)
+        closed = None
+        if self.revisits is not None and first.name != START:
+            total = len(found.world_from_cam)
+            closed = steps.step(
+                close_loops, clouds, first, drift.part, self.revisits, title="loops along the path", total=total
+            )
+        return Scene(source, keys, key_frames, clouds, first, None if self.tail is None else drift, closed=closed)
+
+
+def close_loops(clouds: CloudSet, first: Round, part: Ints, options: Revisits, *, step: Step) -> Closed:
+    """Step: the first poses, where the path of a part (K,) comes back to a place moved to agree with it."""
+    found = find_revisits(clouds, first.world_from_cam, part, options, step.advance)
+    if not len(found):
+        return Closed(first.world_from_cam, found.pairs)
+    graph = Edges.joined([first.edges, found]).as_graph(np.arange(len(clouds)))
+    poses = PoissonSolver(robust="none").solve(graph, first.world_from_cam).world_from_cam
+    moved = se3.inverse(first.world_from_cam) @ poses
+    largest_m = float(np.linalg.norm(moved[:, :3, 3], axis=1).max())
+    step.note(Note("revisits", len(found), f"{largest_m:.2g} m"))
+    return Closed(poses, found.pairs)
 
 
 def chain(

@@ -75,6 +75,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "truth": (Rank.FACT, "{count} of {detail} frames have a true pose, by the truth that was named"),
     "no truth near": (Rank.LOOK, "{detail}: no pose has a true one near in time: its error is not measured"),
     "carried": (Rank.LOOK, "{count} frames without a given pose are carried from the nearest ones by odometry"),
+    "revisits": (
+        Rank.FACT,
+        "{count} pairs close loops along the path, before the first round: odometry's poses move by up to {detail}",
+    ),
     "left apart": (Rank.LOOK, "nothing joins what tracking left apart: it starts where the guessed motion puts it"),
     "positions of no frame": (
         Rank.FACT,

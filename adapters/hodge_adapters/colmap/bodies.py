@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from hodge_adapters.colmap.pycolmap_import import pycolmap
+from hodge_adapters.colmap.records import matrix_of
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
@@ -29,8 +31,9 @@ def bodies_of(reconstruction: pycolmap.Reconstruction, image_ids: Sequence[int])
     frame_ids = list(dict.fromkeys(image.frame_id for image in images))
     row = {frame_id: number for number, frame_id in enumerate(frame_ids)}
     body_of_image = np.array([row[image.frame_id] for image in images], np.int64)
-    world_from_body = np.array([_world_from_rig(reconstruction.frames[key]) for key in frame_ids])
-    world_from_cam = np.array([_matrix(image.cam_from_world().inverse()) for image in images])
+    poses: list[Any] = [reconstruction.frames[key].rig_from_world for key in frame_ids]
+    world_from_body = np.array([matrix_of(pose.inverse()) for pose in poses])
+    world_from_cam = np.array([matrix_of(image.cam_from_world().inverse()) for image in images])
     first = np.unique(body_of_image, return_index=True)[1]
     return Bodies(
         frame_ids=tuple(frame_ids),
@@ -56,13 +59,3 @@ def body_graph(graph: ViewGraph, bodies: Bodies) -> ViewGraph:
         i_from_j=bodies.body_from_cam[i] @ chosen.i_from_j @ cam_from_body,
         information=np.swapaxes(adjoint, 1, 2) @ chosen.information @ adjoint,
     )
-
-
-def _world_from_rig(frame: pycolmap.Frame) -> Floats:
-    pose = frame.rig_from_world
-    assert pose is not None
-    return _matrix(pose.inverse())
-
-
-def _matrix(motion: pycolmap.Rigid3d) -> Floats:
-    return np.vstack([motion.matrix(), [0.0, 0.0, 0.0, 1.0]])

@@ -14,7 +14,7 @@ import numpy as np
 from hodge_adapters.colmap.check import REMEDY, check_files, check_words
 from hodge_adapters.colmap.files import MODEL_FILES, model_ending
 from hodge_adapters.colmap.pycolmap_import import pycolmap
-from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, Points
+from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, Points, matrix_of
 from hodge_adapters.text_rows import natural
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -178,7 +178,7 @@ def _check(model: Model, where: Path) -> None:
 
 def _pose(image: pycolmap.Image) -> Floats:
     """COLMAP's `cam_from_world`, inverted: the one place where this is done."""
-    return se3.inverse(np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]]))
+    return se3.inverse(matrix_of(image.cam_from_world()))
 
 
 def _image(image: pycolmap.Image, tracks: bool) -> ImageRecord:

@@ -209,7 +209,7 @@ def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
     whole_from_other, agreeing = found
     moved = pycolmap.Reconstruction(other.reconstruction)
     moved.transform(whole_from_other)
-    points = f"{agreeing} of {len(ties.ids)} points in both"
+    points = f"{agreeing} of {len(ties)} points in both"
     note = f"{other.name} joined to {whole.name} by {points}, scale {whole_from_other.scale:.4g}"
     depth = replace(whole.depth, files={**other.depth.files, **whole.depth.files})
     known = replace(whole.known, images={**other.known.images, **whole.known.images})

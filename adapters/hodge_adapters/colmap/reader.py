@@ -210,7 +210,7 @@ class ColmapReader:
             read_depth=read,
             read_colour=partial(read_undistorted_colour, colour, record=record, size=size) if colour else None,
             encoded_depth=_encoded_depth(depth, self.depth_scale) if plain else None,
-            encoded_colour=partial(pixels.encoded_colour, whole_colour) if whole_colour else None,
+            encoded_colour=partial(pixels.encoded, whole_colour) if whole_colour else None,
             image=ImageFile(colour, record.width, record.height, record.model, record.params) if colour else None,
             world_from_cam=pose,
             sequence=os.path.dirname(image.name),  # cameras of a rig have a folder each
@@ -240,7 +240,7 @@ class ColmapReader:
 def _encoded_depth(depth: Path | None, units_per_metre: float) -> partial[EncodedImage] | None:
     if depth is None or depth.suffix != ".png":
         return None
-    return partial(pixels.encoded_depth, depth, units_per_metre=units_per_metre)
+    return partial(pixels.encoded, depth, units_per_metre=units_per_metre)
 
 
 def _sizes(model: Model, depths: list[Path | None]) -> dict[int, tuple[int, int]]:

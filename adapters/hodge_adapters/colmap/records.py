@@ -6,12 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hodge_pipeline.types import Floats, Ints
 
 NO_POINT = -1
+
+
+def matrix_of(motion: Any) -> Floats:
+    """The motion (4, 4) of one of pycolmap's `Rigid3d`."""
+    return np.vstack([motion.matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)

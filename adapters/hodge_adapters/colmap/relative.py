@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_adapters.colmap.pycolmap_import import pycolmap
+from hodge_adapters.colmap.records import matrix_of
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -94,7 +95,7 @@ def by_structure(sighting: Sighting, min_inliers: int, seed: int) -> tuple[Relat
         found = pycolmap.estimate_and_refine_absolute_pose(pixels[rows], sighting.xyz[rows], camera, options)
         if found is None:
             return None
-        motions.append(np.vstack([found["cam_from_world"].matrix(), [0.0, 0.0, 0.0, 1.0]]))
+        motions.append(matrix_of(found["cam_from_world"]))
         agreeing &= np.asarray(found["inlier_mask"], bool)
         if agreeing.mean() < LEAST_AGREEING:
             return None

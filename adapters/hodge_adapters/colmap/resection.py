@@ -12,7 +12,7 @@ from hodge_adapters.colmap.bodies import Bodies
 from hodge_adapters.colmap.cameras import colmap_camera
 from hodge_adapters.colmap.points import points_of_rays
 from hodge_adapters.colmap.pycolmap_import import pycolmap
-from hodge_adapters.colmap.records import Model, Points
+from hodge_adapters.colmap.records import Model, Points, matrix_of
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -73,7 +73,7 @@ def _placed(model: Model, bodies: Bodies, rows: Ints) -> Floats | None:
     if found is None or found["num_inliers"] < LEAST_INLIERS:
         return None
     key = "cam_from_world" if len(images) == 1 else "rig_from_world"
-    pose = np.vstack([found[key].matrix(), [0.0, 0.0, 0.0, 1.0]])
+    pose = matrix_of(found[key])
     body_from_world = bodies.body_from_cam[images[0]] @ pose if len(images) == 1 else pose
     out = se3.inverse(body_from_world)
     return out if np.isfinite(out).all() else None

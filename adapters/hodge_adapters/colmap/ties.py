@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +22,6 @@ LEAST_TIES = 12
 LEAST_TIE_SHARE = 0.15
 REFITS = 5
 """Each to the better half, as least trimmed squares concentrate."""
-
-
-@dataclass(frozen=True)
-class Ties:
-    """Points that are the same: `ids (T, 2)` in the one model and the other."""
-
-    ids: Ints
 
 
 def point_ids_by_name(reconstruction: pycolmap.Reconstruction) -> dict[str, Ints]:
@@ -73,8 +65,8 @@ def held_apart(reconstruction: pycolmap.Reconstruction, database: Path, min_shar
     return sum(_is_apart(of_name[names[i]], of_name[names[j]], len(matches), min_shared) for i, j, matches in pairs)
 
 
-def tie_points(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, database: Path | None) -> Ties:
-    """Points of two models that a match, or an image in both, calls one."""
+def tie_points(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, database: Path | None) -> Ints:
+    """The ids (T, 2) of points of two models that a match, or an image in both, calls one."""
     of_first, of_second = point_ids_by_name(first), point_ids_by_name(second)
     pairs: set[tuple[int, int]] = set()
     for name in of_first.keys() & of_second.keys():
@@ -84,22 +76,22 @@ def tie_points(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, 
             pairs.update(zip(a[both].tolist(), b[both].tolist(), strict=True))
     if database is not None:
         pairs.update(_matched_points(of_first, of_second, database))
-    return Ties(np.array(sorted(pairs), np.int64).reshape(-1, 2))
+    return np.array(sorted(pairs), np.int64).reshape(-1, 2)
 
 
 def similarity(
-    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, ties: Ties
+    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, ties: Ints
 ) -> tuple[pycolmap.Sim3d, int] | None:
-    """`first_from_second` by the tied points, and how many agree with it; None where too few do."""
-    if len(ties.ids) < LEAST_TIES:
+    """`first_from_second` by the tied points (T, 2), and how many agree with it; None where too few do."""
+    if len(ties) < LEAST_TIES:
         return None
-    here = np.array([first.points3D[a].xyz for a in ties.ids[:, 0].tolist()])
-    there = np.array([second.points3D[b].xyz for b in ties.ids[:, 1].tolist()])
+    here = np.array([first.points3D[a].xyz for a in ties[:, 0].tolist()])
+    there = np.array([second.points3D[b].xyz for b in ties[:, 1].tolist()])
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = NEAR_SHARE * _distance(first), 0
     options.min_inlier_ratio, options.confidence, options.max_num_trials = 0.05, 0.9999, 20_000
     found: Any = pycolmap.estimate_sim3d_robust(there, here, options)
-    if found is None or found["num_inliers"] < max(LEAST_TIES, LEAST_TIE_SHARE * len(ties.ids)):
+    if found is None or found["num_inliers"] < max(LEAST_TIES, LEAST_TIE_SHARE * len(ties)):
         return None
     return _refitted(found["tgt_from_src"], there, here, found["inlier_mask"]), int(found["num_inliers"])
 

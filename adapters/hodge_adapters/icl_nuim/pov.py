@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from functools import partial
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.images import pixels
-from hodge_adapters.text_rows import listed, read_text, reading, to_floats
+from hodge_adapters.text_rows import listed, names_in, read_text, reading, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Floats, Floats32, Frame
@@ -26,10 +25,7 @@ _BYTES_PER_NUMBER = 32
 
 def list_pov(folder: Path) -> dict[int, Path]:
     """The `.depth` files of a folder by frame number."""
-    try:
-        matches = [(_DEPTH_FILE.match(name), folder / name) for name in sorted(os.listdir(folder))]
-    except OSError as error:
-        raise SourceError(f"{folder}: cannot be listed ({error.strerror}): give a folder that can be read") from error
+    matches = [(_DEPTH_FILE.match(name), folder / name) for name in names_in(folder)]
     return {int(match[2]): path for match, path in matches if match}
 
 
@@ -55,7 +51,7 @@ def pov_frames(
                 camera=camera,
                 read_depth=partial(read_ray_lengths, path, camera=camera, units_per_metre=units_per_metre),
                 read_colour=partial(pixels.read_colour, colour, size=size) if has_colour else None,
-                encoded_colour=partial(pixels.encoded_colour, colour) if has_colour else None,
+                encoded_colour=partial(pixels.encoded, colour) if has_colour else None,
                 world_from_cam=pose,
                 true_world_from_cam=pose,
             )

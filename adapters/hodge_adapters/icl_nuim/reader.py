@@ -18,6 +18,7 @@ from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked
 from hodge_adapters.images.frames import image_frame
 from hodge_adapters.posed import posed_frames
+from hodge_adapters.text_rows import first_text
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs
@@ -25,7 +26,6 @@ from hodge_adapters.tum.reader import frame_ids
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, Source
-from hodge_pipeline.types.input_files import beginning
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
 REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
@@ -174,6 +174,6 @@ def _find_truth(folder: Path) -> Path | None:
 
 def _is_numbered(association: Path) -> bool:
     """Whether its first row has a frame number where TUM has a time."""
-    lines = beginning(association, SNIFFED_BYTES).decode("utf-8-sig", "replace").splitlines()
+    lines = first_text(association, SNIFFED_BYTES).splitlines()
     row = next((line.split() for line in lines if line.strip() and not line.startswith("#")), [""])
     return row[0].isdigit()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.text_rows import listed
+from hodge_adapters.text_rows import listed, names_in
 from hodge_adapters.tum.image_lists import StampedImages
 from hodge_pipeline.errors import SourceError
 
@@ -51,10 +50,7 @@ def find_log(folder: Path) -> Path | None:
 
 
 def _by_number(folder: Path, notes: list[str]) -> dict[int, Path]:
-    try:
-        names = sorted(name for name in os.listdir(folder) if name.lower().endswith(_IMAGES))
-    except OSError as error:
-        raise SourceError(f"{folder}: cannot be listed ({error.strerror}): restore it or its permissions") from error
+    names = [name for name in names_in(folder) if name.lower().endswith(_IMAGES)]
     found: dict[int, Path] = {}
     skipped: list[str] = []
     for name in names:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,10 +37,7 @@ def read_depth(
     `size` is the camera's (width, height). Raises `SourceError` for a missing or damaged file, for one that is not
     single-channel 16 bit, and for one of another size.
     """
-    contents = read_whole_image(path, size)
-    stored = cv2.imdecode(np.frombuffer(contents, np.uint8), cv2.IMREAD_UNCHANGED)
-    if stored is None:
-        raise SourceError(f"{path}: the image cannot be decoded: copy it again from its source")
+    stored = _decoded(path, size, cv2.IMREAD_UNCHANGED)
     if stored.ndim != 2 or stored.dtype != np.uint16:
         kind = f"{stored.dtype} with {1 if stored.ndim == 2 else stored.shape[2]} channel(s)"
         raise SourceError(f"{path}: depth must be uint16 with one channel, this is {kind}: is it a colour image?")
@@ -53,23 +51,20 @@ def read_depth(
 
 def read_colour(path: Path, *, size: tuple[int, int] | None = None) -> Bytes:
     """Colour (H, W, 3) uint8 RGB. Raises `SourceError` as `read_depth` does."""
-    contents = read_whole_image(path, size)
-    stored = cv2.imdecode(np.frombuffer(contents, np.uint8), cv2.IMREAD_COLOR)
+    return np.asarray(cv2.cvtColor(_decoded(path, size, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _decoded(path: Path, size: tuple[int, int] | None, how: int) -> Any:
+    stored = cv2.imdecode(np.frombuffer(read_whole_image(path, size), np.uint8), how)
     if stored is None:
         raise SourceError(f"{path}: the image cannot be decoded: copy it again from its source")
-    return np.asarray(cv2.cvtColor(stored, cv2.COLOR_BGR2RGB), np.uint8)
+    return stored
 
 
-def encoded_depth(path: Path, *, units_per_metre: float) -> EncodedImage:
-    """The file's bytes untouched, after the same checks as before decoding."""
+def encoded(path: Path, *, units_per_metre: float | None = None) -> EncodedImage:
+    """The file's bytes untouched, after the same checks as before decoding; of depth with its units."""
     contents = read_whole_image(path)
     return EncodedImage(contents, parse_header(contents, path).media_type, units_per_metre)
-
-
-def encoded_colour(path: Path) -> EncodedImage:
-    """The file's bytes untouched, after the same checks as before decoding."""
-    contents = read_whole_image(path)
-    return EncodedImage(contents, parse_header(contents, path).media_type)
 
 
 def read_whole_image(path: Path, size: tuple[int, int] | None = None) -> bytes:

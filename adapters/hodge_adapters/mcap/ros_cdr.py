@@ -29,7 +29,6 @@ _ROS1_TIMES = {"time": "uint32 sec\nuint32 nanosec", "duration": _TIME}
 _MAX_DEPTH = 16
 
 Message: TypeAlias = dict[str, Any]
-Read: TypeAlias = "Callable[[Cursor, int], Any]"
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.text_rows import listed, read_rows, read_text, to_floats
+from hodge_adapters.text_rows import listed, names_in, read_rows, read_text, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
@@ -103,11 +103,7 @@ def with_depth(path: Path, chosen: Sequence[tuple[str, Path]], notes: list[str])
 def _list_numbers(folder: Path) -> dict[int, dict[str, Path]]:
     """The files of each frame number, by what they are; a PNG counts before a JPEG."""
     found: dict[int, dict[str, Path]] = defaultdict(dict)
-    try:
-        names = sorted(os.listdir(folder))
-    except OSError as error:
-        raise SourceError(f"{folder}: cannot be listed ({error.strerror}): restore its permissions") from error
-    for name in names:
+    for name in names_in(folder):
         match = FRAME_FILE.match(name)
         if match and (match[2].lower() == "pose") == (match[3].lower() == "txt"):
             found[int(match[1])][match[2].lower()] = folder / name

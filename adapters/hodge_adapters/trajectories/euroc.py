@@ -9,13 +9,12 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.posed import trajectory_of, written
-from hodge_adapters.text_rows import Row, listed, read_text, to_floats, write_text_atomically
+from hodge_adapters.text_rows import Row, first_text, listed, read_text, to_floats, write_text_atomically
 from hodge_adapters.trajectories.text import ordered
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source
-from hodge_pipeline.types.input_files import beginning
 
 COLUMNS = 8
 NANO = 1_000_000_000
@@ -29,7 +28,7 @@ class EurocReader:
 
     def sniff(self, path: Path) -> Sniff:
         """By the first lines: whole nanoseconds, then numbers with commas between."""
-        lines = beginning(file_of(Path(path)), 4096).decode("utf-8-sig", "replace").splitlines()[:2]
+        lines = first_text(file_of(Path(path))).splitlines()[:2]
         if lines and "timestamp" in lines[0] and "q_RS_w" in lines[0]:
             return Sniff(0.95, "EuRoC's header")
         fields = lines[0].split(",") if lines else []

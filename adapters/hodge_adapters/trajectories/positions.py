@@ -10,11 +10,10 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.text_rows import Row, listed, read_text
+from hodge_adapters.text_rows import Row, first_text, listed, read_text
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Source
-from hodge_pipeline.types.input_files import beginning
 from hodge_pipeline.types.positions import Positions, from_geodetic
 
 SPELLINGS = {
@@ -35,7 +34,6 @@ SPELLINGS = {
 }
 """Names of a column, in small letters, as tables of GNSS receivers and of photogrammetry have them."""
 WANTED = "name or stamp (seconds), then e,n,u (metres) or lat,lon,alt (degrees, metres), then sigma (metres) if known"
-SNIFFED_BYTES = 4096
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -45,7 +43,7 @@ class PositionsReader:
     def sniff(self, path: Path) -> Sniff:
         """By the first line: the names of a coordinate's three columns, and of a name or stamp."""
         path = Path(path)
-        head = beginning(path, SNIFFED_BYTES).decode("utf-8-sig", "replace").splitlines() if path.is_file() else []
+        head = first_text(path).splitlines()
         rows = _rows(head[:1])
         if not rows or not _axes(_columns(rows[0].fields)):
             return Sniff(0.0, "no line that names columns of positions")

@@ -8,11 +8,10 @@ from pathlib import Path
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.text_rows import to_floats
+from hodge_adapters.text_rows import first_text, to_floats
 from hodge_adapters.trajectories.text import COLUMNS, parse_tum, read_kitti
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source
-from hodge_pipeline.types.input_files import beginning
 
 SNIFFED_LINES = 40
 SNIFFED_BYTES = 1 << 14
@@ -54,7 +53,7 @@ class KittiPosesReader:
 
 def first_rows(path: Path) -> list[list[str]]:
     """The fields of the first lines that are no comment, cut at blanks, none where it cannot be read."""
-    lines = beginning(path, SNIFFED_BYTES).decode("utf-8-sig", "replace").split("\n")[:-1] or [""]
+    lines = first_text(path, SNIFFED_BYTES).split("\n")[:-1] or [""]
     rows = (line.split("#", 1)[0].split() for line in lines)
     return list(islice((row for row in rows if row), SNIFFED_LINES))
 

@@ -179,11 +179,14 @@ class TumReader:
         own = "give those of your camera with camera=[fx,fy,cx,cy]"
         if tried:
             days = {str(day) for day in np.asarray(listing.stamps_s, "datetime64[s]").astype("datetime64[D]")}
-            name = next((name for name in tried if RECORDED_ON[name] & days), next(iter(tried)))
+            dated = next((name for name in tried if RECORDED_ON[name] & days), None)
+            name = dated or next(iter(tried))
+            others = "" if dated else " or ".join(f"camera={other}" for other in tried if other != name)
+            doubt = f"; images tell little between these and the stamps' date nothing: set {others} if it was that"
             gains = ", ".join(f"{name} by {100 * gain:.0f} %" for name, gain in tried.items())
             notes.append(
                 f"intrinsics of {name} taken, tried on the images: errors are smaller than with 525 525 319.5 239.5 "
-                f"({gains}): {own}"
+                f"({gains}){doubt if others else ''}: {own}"
             )
             return CAMERAS[name], ()
         notes.append(

@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.breaks import Break, Testimony, Usual, agreed_breaks, unusual_breaks
+from hodge_pipeline.solvers.backbone.breaks import (
+    Break,
+    Testimony,
+    Usual,
+    agreed_breaks,
+    strained_break,
+    unusual_breaks,
+)
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import Wrong
-from hodge_pipeline.solvers.backbone.fit import linearise
-from hodge_pipeline.solvers.backbone.inference import BY_CHANCE, Inferred, by_chance, infer
+from hodge_pipeline.solvers.backbone.fit import linearise, settled
+from hodge_pipeline.solvers.backbone.inference import (
+    BY_CHANCE,
+    MOST_STEPS,
+    TOLERANCE,
+    Inferred,
+    by_chance,
+    infer,
+    thinned,
+)
 from hodge_pipeline.solvers.backbone.scales import learn_scales, mixture
 from hodge_pipeline.types import Bools
 
@@ -26,35 +43,43 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
     """
     chain = joined(chain)
-    found = infer(chain, always, thin)
+    wrong = Wrong.of(chain, chain.poses())  # one for all trials: evidence is against all loops being wrong
+    judge = partial(infer, wrong=wrong, always=always, thin=thin)
+    found = judge(chain)
     for _ in range(MOST_BREAKS):
-        better = None if found is None else _better(chain, found, always, thin)
+        better = None if found is None else _better(chain, found, judge)
         if better is None:
             break
         chain, found = better
     return None if found is None else (chain, found)
 
 
-def _better(chain: Chain, found: Inferred, always: Bools, thin: bool) -> tuple[Chain, Inferred] | None:
+def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> tuple[Chain, Inferred] | None:
     """The chain with one more step bridged, and its loops judged; None where it has none that is broken."""
     for broken, least in _candidates(chain, found):
         tried = bridged(chain, broken)
-        other = infer(tried, always, thin)
-        if other is not None and other.log_evidence > found.log_evidence + least:
-            return tried, other
+        for scales in (None, found.scales):  # as learned anew, and so that nothing but the step differs
+            other = judge(tried, scales=scales)
+            if other is not None and other.log_evidence > found.log_evidence + least:
+                return tried, other
     return None
 
 
 def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
-    """Breaks worth a trial, with what each must win; one that is unlike all others has won some of it."""
+    """Breaks worth a trial, with what each must win beside what it has won."""
     scaled = found.scales.applied(chain)
     linear, (right, wrong) = linearise(scaled, chain.poses()), found.judged.log_density
     shares = np.log(mixture(found.judged.log_density)[0])
-    told = Testimony.of(scaled, linear, np.logaddexp(shares[0] + right - wrong, shares[1]), wrong)
-    usual, least, fold = Usual.of(chain), by_chance(len(right)), np.log(max(len(right), 1))
+    told = Testimony.of(scaled, linear, np.logaddexp(shares[0] + right - wrong, shares[1]), wrong, found.used)
+    usual, least, fold = Usual.of(chain), by_chance(len(right)), np.log(max(told.testimonies(), 1))
     agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     worth = [(each, least) for each in agreed[:MOST_TRIED]]
+    reduced = thinned(scaled, np.flatnonzero(found.used))
+    if len(reduced.runs):
+        strained = strained_break(scaled, reduced, settled(scaled, reduced, found.poses, MOST_STEPS, TOLERANCE), usual)
+        if strained is not None and strained.log_evidence > BY_CHANCE:
+            worth.append((strained, BY_CHANCE - strained.log_evidence))
     return worth + [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
 
 
@@ -72,12 +97,13 @@ def joined(chain: Chain) -> Chain:
         wrong = Wrong.of(chain, poses)
         scaled = learn_scales(chain, poses, wrong)[0].applied(chain)
         linear, none = linearise(scaled, poses), np.zeros(len(chain.ends))
-        told = Testimony.of(scaled, linear, none, wrong.log_density(scaled, poses))
+        told = Testimony.of(scaled, linear, none, wrong.log_density(scaled, poses), none > 0)
         pairs = chain.path[chain.ends]
         best, found = BY_CHANCE + float(np.log(len(pairs))), None
         for low, high in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).tolist():
             rows = np.flatnonzero((pairs == [low, high]).all(axis=1))
-            for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
+            for seed in told.seeds(rows) if len(rows) > 1 else ():
+                factor = told.factor(np.full(len(rows), seed), rows)
                 if (score := float(told.gains(seed, rows, factor).sum())) > best:
                     best, found = score, (low, high, seed)
         if found is None:

@@ -225,3 +225,27 @@ def settled(chain: Chain, reduced: Reduced, poses: Floats, steps: int, tolerance
 
 
 HALVINGS = 4
+
+
+LEAST_LEFT = 1e-6
+
+
+def without(own: Floats, across: Floats) -> Floats:
+    """`S (S − K)⁻¹ S` for the covariances S of edges and K of the same motions with all edges, S among them."""
+    ones, unit = scaled(own)
+    factor = np.linalg.cholesky(ones) * unit[:, :, None]
+    inverse = np.linalg.inv(factor)
+    values, vectors = np.linalg.eigh(inverse @ across @ np.swapaxes(inverse, 1, 2))
+    left = np.maximum(1 - values, LEAST_LEFT)
+    wide = factor @ vectors
+    return np.asarray((wide / left[:, None]) @ np.swapaxes(wide, 1, 2))
+
+
+def without_run(reduced: Reduced, linear: Linear) -> tuple[Floats, Floats, Floats]:
+    """The residual (S, p) of each run at poses solved without it, its covariance (S, p, p), and that part of it which
+    is of these poses.
+    """
+    own = np.asarray(linear.path(*reduced.ends[reduced.runs].T), float)
+    total = without(own, reduced.factor(linear).across()[: len(own)])
+    ahead = np.linalg.solve(own, reduced.residuals(linear)[0][..., None])
+    return (total @ ahead)[..., 0], total, total - own

@@ -8,9 +8,9 @@ import numpy as np
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import Wrong, student
-from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, inverse, linearise, scaled, settled
+from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, inverse, linearise, scaled, settled, without
 from hodge_pipeline.solvers.backbone.polish import LOCAL, polished
-from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales, mixture
+from hodge_pipeline.solvers.backbone.scales import EVEN, Scales, learn_scales, mixture
 from hodge_pipeline.solvers.backbone.sparse import Factored
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -53,13 +53,16 @@ class Inferred:
     confirmed: bool
 
 
-def infer(chain: Chain, always: Bools, thin: bool = True) -> Inferred | None:
+def infer(
+    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None
+) -> Inferred | None:
     """Judge the loops of a chain; those of `always (M,)` count whatever they say. Where they would leave more than
     `MOST_UNKNOWNS`, all are judged at the poses of some of the right ones, or None comes back without `thin`.
+
+    `scales`: of the errors; learned from the loops where none are given.
     """
     poses = chain.poses()
-    wrong = Wrong.of(chain, poses)
-    scales, shares = learn_scales(chain, poses, wrong)
+    scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
     chain = scales.applied(chain)
     linear = start = linearise(chain, poses)
     judged = _judge(chain, start, None, shares, wrong)
@@ -189,27 +192,13 @@ def uncertainty(chain: Chain, linear: Linear, reduced: Reduced | None) -> Floats
     through = _between(chain, linear, reduced, factored)
     out = np.where((_size(through) < _size(out))[:, None, None], through, out) + own
     across = factored.across()[len(reduced.runs) :]
-    out[reduced.active] = _without(own[reduced.active], across)
+    out[reduced.active] = without(own[reduced.active], across)
     return out
 
 
 def _size(covariance: Floats) -> Floats:
     with np.errstate(invalid="ignore"):
         return np.where(np.isfinite(covariance[:, 0, 0]), np.einsum("mii->m", covariance), np.inf)
-
-
-LEAST_LEFT = 1e-6
-
-
-def _without(own: Floats, across: Floats) -> Floats:
-    """`S (S − K)⁻¹ S` for the covariances S of loops and K of the same motions with all loops, S among them."""
-    ones, unit = scaled(own)
-    factor = np.linalg.cholesky(ones) * unit[:, :, None]
-    inverse = np.linalg.inv(factor)
-    values, vectors = np.linalg.eigh(inverse @ across @ np.swapaxes(inverse, 1, 2))
-    left = np.maximum(1 - values, LEAST_LEFT)
-    wide = factor @ vectors
-    return np.asarray((wide / left[:, None]) @ np.swapaxes(wide, 1, 2))
 
 
 def _between(chain: Chain, linear: Linear, reduced: Reduced, factored: Factored) -> Floats:

@@ -25,10 +25,12 @@ TESTED = 0.3
 """Of the steps in short cycles that close: from there on every edge is judged, none trusted. On graphs of rooms .77 to
 .98 are, on those of places visited again 0 to .1.
 """
-LOOPS_AT_A_STEP, AGREEING = 0.5, 0.05
-"""From so many loops to a step on, of which no backbone confirms any, so large a share of the steps between loops that
-agree with each other says that the backbone is wrong. Fewer loops may be groups that take one place for another; among
-random ones hardly any agree.
+LOOPS_AT_A_STEP = 0.5
+"""From there on loops may make a lattice, in which no edge needs to be trusted."""
+AGREEING = 0.05
+"""Where loops are more than steps and no backbone confirms any, so large a share of the steps between loops that agree
+with each other says that the backbone is wrong. Fewer loops may be groups that take one place for another; among random
+ones hardly any agree.
 """
 
 
@@ -117,7 +119,9 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
 
 def _loops_agree(chain: Chain, steps: Bools) -> bool:
     """Whether many loops agree with each other, though none with the backbone: it is what is wrong then."""
-    return _many_loops(chain, steps) and bool(tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum())
+    return len(chain.loop_edge) > steps.sum() and bool(
+        tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum()
+    )
 
 
 def _many_loops(chain: Chain, steps: Bools) -> bool:

@@ -15,6 +15,7 @@ from hodge_pipeline.registration.acceptance import CONTRADICTS
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.registration.odometry_path import contradicts_odometry
 from hodge_pipeline.scene import Drift
+from hodge_pipeline.solvers.backbone.trust import SEQUENTIAL
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
 from hodge_pipeline.start.unordered.hypotheses import weigh
@@ -67,7 +68,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
     views = Views.make(scene.frames, clouds, rows, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
-    if scene.drift is not None:
+    if scene.drift is not None and options.diagnosis.trust != SEQUENTIAL:  # a backbone judges loops and its own steps
         counted = np.flatnonzero(hypotheses.counts)
         far = counted[contradicts_odometry(hypotheses.select(counted), scene.drift)]
         hypotheses = hypotheses.put(far, status=REJECTED, why=CONTRADICTS)

@@ -1,0 +1,184 @@
+"""Loops closed along the path: where the camera comes back to a place, its clouds are registered to those of before.
+
+Odometry drifts, but a camera that comes back along places it knows is off by what it drifted since the last of them
+alone. So the path is followed once, and each place found again puts what follows where the path was before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from hodge_pipeline import se3
+from hodge_pipeline.pairs.overlap import voxels
+from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.pairs import PreparedClouds
+from hodge_pipeline.stages import Advance, Registrar, no_progress
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
+
+REVISIT = "revisit"
+"""Why a pair is proposed."""
+SAMPLED_CLOUDS = 50
+LOOP_RANGES = 4.0
+"""Median ranges of the path, a turn as the arc at that range, between two views that close a loop: two thirds of a full
+turn. Nearer ones the edge builders find."""
+REACH_RANGES = 2.0
+"""Median ranges, a turn as above, beyond which two views share too little."""
+VIEWS_APART, COMPARED = 3, 12
+"""Key frames between those of before that a view is compared with, whose motions err apart, and how many: the
+nearest."""
+VOXEL_RANGES = 0.1
+"""Median ranges: the least side of the voxels in which two views share space, .2 m in a room."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+class Revisits:
+    """How loops are closed along the path, before any pair is proposed."""
+
+    every_m: float = Field(
+        default=1.0, gt=0, description="metres of the path, a turn as the arc at the scene, between two attempts"
+    )
+    drift_share: float = Field(
+        default=0.02, gt=0, lt=1, description="of that path, what odometry may be off by since the last place known"
+    )
+    most_m: float = Field(
+        default=1.5,
+        gt=0,
+        description="metres that a place may be off: beyond it none is looked for, since rooms that look alike may lie "
+        "so near",
+    )
+    agree_m: float = Field(
+        default=0.2,
+        gt=0,
+        description="metres, a turn as above: two views of before must put a view so near to the same place",
+    )
+    min_iou: float = Field(
+        default=0.25, ge=0, lt=1, description="share of the space of two views that both must see, to be registered"
+    )
+    min_fitness: float = Field(default=0.3, ge=0, le=1, description="share of a cloud with a point of the other nearby")
+    registration: Registrar = Field(
+        default=Gicp(distances_m=(1.0, 0.5, 0.2, 0.1, 0.05), source_points=(1000, 1000, 1000, 2000, 4000)),
+        description="how a view is registered to one of before, from a guess that may be half a metre off",
+    )
+
+
+def find_revisits(
+    clouds: CloudSet, world_from_cam: Floats, part: Ints, options: Revisits, advance: Advance = no_progress
+) -> Edges:
+    """The pairs that close loops, registered, from poses (K, 4, 4) in the order of the path; `advance` counts poses.
+
+    Between two parts (K,) odometry says nothing, and no loop is looked for. A view is believed to be at a place of
+    before where two views there put it at the same spot, no farther off than odometry drifts along the shortest way of
+    steps and loops between them.
+    """
+    return _Path(clouds, world_from_cam, part, options).found(advance)
+
+
+class _Path:
+    """The path so far: its poses as the loops found put them, and the ways between its views."""
+
+    def __init__(self, clouds: CloudSet, world_from_cam: Floats, part: Ints, options: Revisits) -> None:
+        assert clouds.folder is not None
+        self._options = options
+        self._prepared, self._has_points = PreparedClouds(clouds.folder, options.registration), clouds.sizes > 0
+        self._clouds, self._range_m = clouds, _median_range_m(clouds)
+        self._steps = se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:]
+        step_m = self._far(self._steps)
+        self._at_m = np.concatenate([[0.0], np.cumsum(step_m)])
+        self._way_m = np.where(part[1:] == part[:-1], step_m, np.inf)
+        self._poses = world_from_cam.copy()
+        self._loops: list[tuple[int, int, Registration]] = []
+
+    def found(self, advance: Advance) -> Edges:
+        tried_m = 0.0
+        for row in range(1, len(self._poses)):
+            self._poses[row] = self._poses[row - 1] @ self._steps[row - 1]
+            advance(1)
+            if self._at_m[row] - tried_m < self._options.every_m or not self._has_points[row]:
+                continue
+            near, allowed_m = self._candidates(row)
+            if len(near) == 2:
+                tried_m = self._at_m[row]
+                self._try(row, near, allowed_m)
+                self._clouds.forget()
+                self._prepared.clouds.forget()
+        pairs = np.array([(i, j) for i, j, _ in self._loops], np.int64).reshape(-1, 2)
+        return Edges.of(pairs, REVISIT).with_registrations([loop for _, _, loop in self._loops])
+
+    def _candidates(self, row: int) -> tuple[Ints, Floats]:
+        """The two views of before that share most with this one, and how far off each may be, metres."""
+        options = self._options
+        before = int(np.searchsorted(self._at_m, self._at_m[row] - LOOP_RANGES * self._range_m))
+        way_m = self._ways(row, (options.most_m - options.agree_m) / options.drift_share)[:before]
+        allowed_m = options.agree_m + options.drift_share * way_m
+        shift_m = np.linalg.norm(self._poses[:before, :3, 3] - self._poses[row, :3, 3], axis=1)
+        usable = np.flatnonzero(
+            (shift_m < REACH_RANGES * self._range_m) & np.isfinite(allowed_m) & self._has_points[:before]
+        )
+        apart = self._far(se3.inverse(self._poses[usable]) @ self._poses[row])
+        near = _spaced(usable[np.argsort(apart, kind="stable")][: int((apart < REACH_RANGES * self._range_m).sum())])
+        shared = np.array([self._shared(int(one), row, float(allowed_m[one])) for one in near])
+        best = near[np.argsort(-shared, kind="stable")][:2][: int((shared > options.min_iou).sum())]
+        return best, allowed_m[best]
+
+    def _shared(self, one: int, other: int, drift_m: float) -> float:
+        """The share of the space of two views that both see, in voxels that forgive so much drift."""
+        voxel_m = max(VOXEL_RANGES * self._range_m, drift_m)
+        origin = np.floor(self._poses[one, :3, 3] / voxel_m).astype(np.int64)
+        a, b = (
+            voxels(se3.transform(self._poses[row], self._clouds[row].points_in_cam.astype(float)), voxel_m, origin)
+            for row in (one, other)
+        )
+        common = len(np.intersect1d(a, b, assume_unique=True))
+        return common / max(len(a) + len(b) - common, 1)
+
+    def _ways(self, row: int, limit_m: float) -> Floats:
+        """The shortest way (row + 1,) by steps and loops from a view to each one before it; infinite beyond a limit."""
+        i, j = np.arange(row), np.arange(1, row + 1)
+        a = np.concatenate([i, np.array([loop[0] for loop in self._loops], np.int64)])
+        b = np.concatenate([j, np.array([loop[1] for loop in self._loops], np.int64)])
+        cost = np.concatenate([self._way_m[:row], np.zeros(len(self._loops))]) + 1e-9
+        ways = csr_matrix((cost, (a, b)), shape=(row + 1, row + 1))
+        return np.asarray(dijkstra(ways, directed=False, indices=row, limit=limit_m))
+
+    def _try(self, row: int, near: Ints, allowed_m: Floats) -> None:
+        found = [self._register(int(one), row, float(most)) for one, most in zip(near, allowed_m, strict=True)]
+        if any(one is None for one in found):
+            return
+        places = [self._poses[at] @ one.i_from_j for at, one in zip(near, found, strict=True) if one is not None]
+        if self._far(se3.inverse(places[0]) @ places[1]) > self._options.agree_m:
+            return
+        self._loops += [(int(at), row, one) for at, one in zip(near, found, strict=True) if one is not None]
+        self._poses[row] = places[0]
+
+    def _register(self, target: int, source: int, allowed_m: float) -> Registration | None:
+        """The view of before with this one, None where they do not fit within what is allowed."""
+        guess = se3.inverse(self._poses[target]) @ self._poses[source]
+        found = self._options.registration.register(self._prepared[target], self._prepared[source], guess)
+        moved_m = self._far(se3.inverse(guess) @ found.i_from_j)
+        return found if found.fitness >= self._options.min_fitness and moved_m <= allowed_m else None
+
+    def _far(self, motions: Floats) -> Floats:
+        """How far (...,) motions move what is seen, metres."""
+        shift_m = np.linalg.norm(motions[..., :3, 3], axis=-1)
+        return np.asarray(shift_m + self._range_m * se3.rotation_angle(motions))
+
+
+def _spaced(rows: Ints) -> Ints:
+    """The first `COMPARED` of the rows that are `VIEWS_APART` from each earlier one."""
+    kept: list[int] = []
+    for row in rows.tolist():
+        if all(abs(row - other) >= VIEWS_APART for other in kept):
+            kept.append(row)
+        if len(kept) == COMPARED:
+            break
+    return np.array(kept, np.int64)
+
+
+def _median_range_m(clouds: CloudSet) -> float:
+    rows = np.flatnonzero(clouds.sizes > 0)
+    some = rows[:: max(1, len(rows) // SAMPLED_CLOUDS)].tolist()
+    return float(np.median([np.median(np.linalg.norm(clouds[row].points_in_cam, axis=1)) for row in some] or [1.0]))
