@@ -28,7 +28,7 @@ from hodge_pipeline.demo.sweeps import FARTHEST_M, NEAREST_M, REVOLUTION_S, Stre
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
-from hodge_pipeline.start.kiss_icp import KEY_FRAMES_IN_REACH
+from hodge_pipeline.start.sweeps import KEY_FRAMES_IN_REACH
 from hodge_pipeline.types import Floats, Ints
 from hodge_pipeline.types.edges import USED
 
@@ -61,7 +61,7 @@ def ours(folder: Path, out: Path) -> Outcome:
     done = hodge_pipeline.run(load_recipe("lidar", [], folder), out)
     after = os.times()
     total_s = sum(after[:4]) - sum(before[:4])
-    odometry_s = sum(stage.cpu_s for stage in done.report.stages if stage.name in ("KISS-ICP", "odometry"))
+    odometry_s = sum(stage.cpu_s for stage in done.report.stages if stage.name in ("sweeps", "odometry"))
     used = done.edges.select(done.edges.status == USED)
     graph = done.report.graph
     assert graph is not None

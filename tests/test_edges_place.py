@@ -9,7 +9,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.pairs.drift import DriftEdges
 from hodge_pipeline.pairs.place import PlaceEdges
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.start.kiss_icp import KissIcpStart
+from hodge_pipeline.start.sweeps import SweepsStart
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud
 
 PLACES, REACH = 30, 5
@@ -69,5 +69,5 @@ def test_neighbours_in_a_sequence_are_no_loop_but_those_of_another_are() -> None
 
 def test_the_recipe_for_sweeps_looks_for_places() -> None:
     start = load_recipe("lidar", []).start
-    assert isinstance(start, KissIcpStart)
+    assert isinstance(start, SweepsStart)
     assert [type(each) for each in start.unordered.loops] == [DriftEdges, PlaceEdges]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
+from dataclasses import dataclass
 from functools import partial
 from itertools import permutations
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -19,13 +20,14 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import make_sequence
 from hodge_pipeline.demo.street import HOUSES_M, Road, build_street
 from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, TRUTH_FILE, SpinningScanner, StreetOptions, Sweep
-from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.scale import measured_scale
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.sweeps import deskewed, velocities
-from hodge_pipeline.types import Floats, Frame, PointCloud, Source
+from hodge_pipeline.stages import Step, no_progress
+from hodge_pipeline.start.sweeps import follow
+from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
 from hodge_pipeline.uses.recipe_run import run
 from hodge_pipeline.uses.trajectory import refine_trajectory
 from mcap_data import SECOND, Log, point_cloud, ros_header
@@ -146,7 +148,6 @@ def test_five_scans_of_a_street_in_any_order(
 
 
 def test_a_street_is_followed_and_deskewed(tmp_path: Path) -> None:
-    pytest.importorskip("kiss_icp", reason="the extra lidar is not installed")
     options = StreetOptions(frames=25, beams=16, columns=360)
     folder = make_sequence(tmp_path / "street", options)
     exact = Road(options.speed_m_s).world_from_car(np.arange(25) * REVOLUTION_S)
@@ -175,11 +176,48 @@ def test_a_street_is_followed_and_deskewed(tmp_path: Path) -> None:
     assert done.source.frames[0].true_world_from_cam is not None
 
 
-def test_the_package_that_kiss_icp_needs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
-    folder = make_sequence(tmp_path / "street", StreetOptions(frames=2, beams=4, columns=72))
-    with pytest.raises(RecipeError, match=r"kiss-icp: pip install hodge-pipeline\[lidar\]"):
-        run(load_recipe("lidar", [], folder), tmp_path / "run")
+@dataclass(frozen=True)
+class Flight:
+    """A scanner that climbs, rolls and swings its yaw by up to 60 degrees a second while it flies down the street."""
+
+    speed_m_s: float
+    length_m: float = 1e9
+
+    def place(self, way_m: Floats) -> tuple[Floats, Floats, Floats]:
+        """Far away: no cars drive."""
+        far = np.full(np.shape(way_m), 1e6)
+        return far, far, 0 * far
+
+    def world_from_car(self, times_s: Floats) -> Floats:
+        """Poses (N, 4, 4)."""
+        t = np.asarray(times_s, float)
+        position = np.stack([-60 + self.speed_m_s * t, -52 + np.sin(t), 3 - np.cos(t)], axis=1)
+        turn = np.stack([0.3 * np.sin(1.3 * t), 0.2 * np.sin(0.9 * t + 1), 0.5 * np.sin(2 * t)], axis=1)
+        return se3.from_parts(se3.so3_exp(turn), position)
+
+
+@pytest.mark.parametrize("path", [Flight(4.0), Flight(0.5), Road(25.0)], ids=["flown", "swung", "fast"])
+def test_sweeps_are_followed_from_the_first_at_any_speed(path: Flight | Road, tmp_path: Path) -> None:
+    count = 25
+    own = SpinningScanner(cast(Road, path), 0, beams=16, columns=360, noise=1.0)
+    for number in range(count):
+        write_organised(tmp_path / f"{number}.pcd", own.sweep(number), 16 * 360, np.nan)
+    source = CloudFolderReader().open(tmp_path)
+    every, clouds = np.arange(count), CloudOptions(max_range_m=FARTHEST_M)
+    step = Step(tmp_path, no_progress, lambda *notes: None)
+    found = follow(source, (every,), clouds, None, step=step)
+    assert absolute_error(found.world_from_scan, path.world_from_car(every * REVOLUTION_S)).max_m < 0.25
+
+
+def test_only_clouds_that_poses_pair_are_described(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, seen = make_sequence(tmp_path / "street", StreetOptions(frames=12, beams=16, columns=180)), []
+
+    def describe(clouds: Path, registrar: object, rows: Ints, **_: object) -> None:
+        seen.extend(rows.tolist())
+
+    monkeypatch.setattr("hodge_pipeline.start.unordered.start.describe_clouds", describe)
+    run(load_recipe("lidar", SHORT, folder), tmp_path / "run")
+    assert not seen  # a straight road of 8 m has no loop
 
 
 def test_a_point_at_the_scanner_itself_is_no_measurement() -> None:
@@ -189,7 +227,6 @@ def test_a_point_at_the_scanner_itself_is_no_measurement() -> None:
 
 
 def test_a_robot_that_stands_still_has_few_key_frames_and_stays(tmp_path: Path) -> None:
-    pytest.importorskip("kiss_icp", reason="the extra lidar is not installed")
     folder = make_sequence(tmp_path / "street", StreetOptions(frames=15, beams=16, columns=360, speed_m_s=1e-6))
     recipe = load_recipe("lidar", ["recording.level=off", "fusion=[]", "evaluation.tables=false"], folder)
     done = run(recipe, tmp_path / "run")
@@ -212,7 +249,6 @@ SHORT = ["recording.level=off", "fusion=[]", "evaluation.tables=false"]
 
 
 def test_organised_clouds_with_holes_are_followed(tmp_path: Path) -> None:
-    pytest.importorskip("kiss_icp", reason="the extra lidar is not installed")
     folder, road = tmp_path / "sweeps", Road(10.0)
     folder.mkdir()
     own = SpinningScanner(road, 0, beams=16, columns=360, noise=1.0)
@@ -224,7 +260,6 @@ def test_organised_clouds_with_holes_are_followed(tmp_path: Path) -> None:
 
 
 def test_two_scanners_in_a_folder_are_followed_apart(tmp_path: Path) -> None:
-    pytest.importorskip("kiss_icp", reason="the extra lidar is not installed")
     folder, road = tmp_path / "sweeps", Road(10.0)
     folder.mkdir()
     car_from_front = se3.exp(np.array([0, 0, np.pi / 2, 1.0, 0.5, -0.8]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -62,9 +63,13 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     rows = np.flatnonzero(clouds.sizes > 0)
     by_image = uses_images(clouds, options)
     registrar: GlobalRegistrar = options.images if by_image else options.registrar
-    describe_clouds(scene.clouds, registrar, rows, scratch / DESCRIBED, workers, advance)
     notes = [] if by_image or scene.given is not None else [*check_scans(clouds, scene.vertex_ids)]
+    describe = partial(describe_clouds, scene.clouds, registrar, out=scratch / DESCRIBED, workers=workers)
+    if options.similar_per_frame:
+        describe(rows, advance=advance)
     pairs = propose(scene, clouds, rows, scratch / DESCRIBED, options)
+    if not options.similar_per_frame:  # only what the loops pair needs a description
+        describe(np.unique(pairs), advance=advance)
     matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
     views = Views.make(scene.frames, clouds, rows, scratch / VIEWS, workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)

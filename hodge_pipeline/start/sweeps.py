@@ -1,4 +1,4 @@
-"""Initial poses of a spinning LiDAR by KISS-ICP with deskewed sweeps; only key frames enter the pose graph."""
+"""Initial poses of a spinning LiDAR: scan-to-map tracking of deskewed sweeps; only key frames enter the pose graph."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import small_gicp
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.registration.assessment import MIN_POINTS
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
@@ -34,10 +36,20 @@ from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, Po
 from hodge_pipeline.types.notes import Note, notes_of
 
 VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
-"""KISS-ICP's own default, and 2 m for a scanner that sees 80 m: neighbours share nearly all they see."""
+"""0.8 m, as KISS-ICP (Vizzo et al., RA-L 2023) has it, and 2 m for a scanner that sees 80 m."""
+SMALLEST_VOXEL_M = 0.08
+"""Four times the usual noise of a range, 2 cm: smaller voxels, as in a room, would hold noise in place of surfaces."""
+START_LEVELS, LEVELS = (9, 3, 1), (3, 1)
+"""Voxels of the map, coarse to fine: the coarsest are for a velocity of 30 m a second that nobody knows yet."""
+LOOK_M, SAMPLE_M = 3.0, 0.7
+"""Times a voxel: how far correspondences may be at its level; and the finest voxel thins a sweep."""
+NEIGHBOURS, MOST_ITERATIONS, SWEEPS_KEPT = 10, 30, 100
+"""As small_gicp has them: points in a covariance; steps at a level; sweeps until a voxel that no sweep touches goes."""
 REACH_QUANTILE = 0.99
-WARM_UP = 10
-"""Sweeps, a second, until a tracker knows its way: it begins at rest, and rings on the ground look the same ahead."""
+WARM_UP, MOST_PASSES = 20, 4
+"""Sweeps that the first velocity is found on, and how often at most they are followed forth and back for it."""
+MOST_DESKEWS, FARTHER = 3, 0.9
+"""A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
 NO_CLOCK_S = 1.0
 """Between two sweeps that neither stamps nor times of points tell apart: velocities are then a sweep's."""
 
@@ -56,11 +68,13 @@ class Sweeps:
 
 
 @dataclass(frozen=True, config=OPTIONS)
-class KissIcpStart(OdometryStart):
-    """Follows a spinning LiDAR by KISS-ICP (Vizzo et al., RA-L 2023); needs `pip install hodge-pipeline[lidar]`."""
+class SweepsStart(OdometryStart):
+    """Follows a spinning LiDAR: each sweep, deskewed, is registered to a map of those before (voxelised GICP)."""
 
     voxel_m: float | None = Field(
-        default=None, gt=0, description="metres: voxels of the local map; none: a hundredth of the scanner's reach"
+        default=None,
+        gt=0,
+        description="metres: finest voxels of the map; none: a hundredth of the scanner's reach, 0.08 m or more",
     )
     distance_m: float | None = Field(
         default=None, ge=0, description="metres from one key frame to the next; none: a fortieth of the scanner's reach"
@@ -70,7 +84,7 @@ class KissIcpStart(OdometryStart):
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """The key frames of a sequence of sweeps, with deskewed clouds and poses."""
         sequences = tuple(sequences_of(source).values())
-        found = steps.step(follow, source, sequences, clouds, self.voxel_m, title="KISS-ICP", total=len(source.frames))
+        found = steps.step(follow, source, sequences, clouds, self.voxel_m, title="sweeps", total=len(source.frames))
         frames = tuple(map(deskewed_frame, source.frames, found.velocity))
         whole = replace(source, frames=frames)
         steps.remember(whole, steps.key([source, found]) + "deskewed")
@@ -100,10 +114,11 @@ def follow(
     stamps, is_clock = stamps_of(source), has_real_stamps(source.frames)
     reach_m = _reach_m(source, clouds)
     notes: list[str] = []
+    voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M * clouds.unit_m)
     for rows in sequences:
-        voxel = voxel_m or reach_m / VOXELS_IN_REACH
         since = np.diff(stamps[rows], prepend=stamps[rows[0]]) if is_clock else np.zeros(len(rows))
-        tracker = _Tracker(clouds, voxel)
+        first = [source.frames[row] for row in rows[:WARM_UP]]
+        tracker = _Tracker(clouds, voxel, LEVELS, _first_velocity(clouds, voxel, first, since))
         times = np.zeros(len(rows))
         for place, row in enumerate(rows.tolist()):
             duration, problem = tracker.follow(source.frames[row], since[place])
@@ -111,14 +126,9 @@ def follow(
             poses[row], found[row], turn_s[row] = tracker.pose, not problem, tracker.turn_s
             notes += [f"frame {source.frames[row].frame_id}: {problem}"] if problem else []
             step.advance(1)
-        first = rows[: 2 * WARM_UP]
-        behind = _from_behind(_Tracker(clouds, voxel, backwards=True), [source.frames[row] for row in first], since)
-        anew, join = first[: len(first) // 2], len(first) // 2
-        poses[anew] = poses[first[join]] @ se3.inverse(behind[join]) @ behind[:join]
         velocity[rows] = velocities(poses[rows], times)
-        poses[rows] = poses[rows] @ se3.exp(
-            -turn_s[rows, None] / 2 * velocity[rows]
-        )  # from the middle to the first point
+        from_middle = se3.exp(-turn_s[rows, None] / 2 * velocity[rows])
+        poses[rows] = poses[rows] @ from_middle  # to the first point
     step.note(*notes_of("clouds", notes))
     if not turn_s.any():
         step.note(Note("sweeps untimed"))
@@ -147,61 +157,119 @@ def _sweep(frame: Frame, clouds: CloudOptions) -> PointCloud:
 
 
 class _Tracker:
-    """KISS-ICP on one sequence: `pose` is that at the middle of the last sweep, `turn_s` how long that took, if known.
+    """Scan to map on one sequence: `pose` is that at the middle of the last sweep, which took `turn_s`, if known.
 
     Sweeps are deskewed to their middle, where a wrong velocity moves them as little forwards as back. To their first
     points it would move the next pose the other way by half, which swings for ever.
     """
 
-    def __init__(self, clouds: CloudOptions, voxel_m: float, *, backwards: bool = False) -> None:
-        self._clouds, self._sense = clouds, -1.0 if backwards else 1.0
-        self._kiss, self._velocity, self.pose, self.turn_s = _kiss_icp(clouds, voxel_m), np.zeros(6), np.eye(4), 0.0
+    def __init__(self, clouds: CloudOptions, voxel_m: float, levels: tuple[int, ...], velocity: Floats) -> None:
+        self._clouds, self._voxel_m, self._map = clouds, voxel_m, _Map(voxel_m, levels)
+        self.velocity, self.pose, self.turn_s = velocity, np.eye(4), 0.0
 
-    def follow(self, frame: Frame, since_s: float) -> tuple[float, str]:
+    def follow(self, frame: Frame, since_s: float, *, backwards: bool = False) -> tuple[float, str]:
         """The seconds since the last sweep, a revolution where no clock says (`since_s` 0), and what kept this one from
         being read.
         """
         try:
-            cloud = _sweep(frame, self._clouds)
+            cloud = _in_range(_sweep(frame, self._clouds), self._clouds)
         except (SourceError, OSError) as error:
             return since_s or self.turn_s or NO_CLOCK_S, str(error)
         if not len(cloud):
-            return since_s or self.turn_s or NO_CLOCK_S, "it has no points"
+            return since_s or self.turn_s or NO_CLOCK_S, "it has no points in range"
         self.turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
-        duration = since_s or self.turn_s or NO_CLOCK_S
-        points = deskewed(cloud, self._sense * self._velocity, self.turn_s / 2).points_in_cam.astype(np.float64)
-        before = self.pose
-        self._kiss.register_frame(points[np.isfinite(points).all(axis=1)], np.zeros(0))
-        self.pose = np.array(self._kiss.last_pose)
-        self._velocity = se3.log(se3.inverse(before) @ self.pose) / duration
+        duration, sense = since_s or self.turn_s or NO_CLOCK_S, -1.0 if backwards else 1.0
+        before, velocity, rates = self.pose, self.velocity, [self.velocity]
+        for _ in range(MOST_DESKEWS):
+            points = deskewed(cloud, sense * rates[-1], self.turn_s / 2).points_in_cam.astype(np.float64)
+            self.pose, is_first = self._map.align(points, before @ se3.exp(velocity * duration))
+            if is_first:
+                break
+            velocity = se3.log(se3.inverse(before) @ self.pose) / duration
+            rates.append(velocity)
+            if not self.turn_s or self._shift_m(rates[-1] - rates[-2], points) < self._voxel_m / 2:
+                break
+        self._map.insert(self.pose)
+        self.velocity = velocity
         return duration, ""
 
+    def _shift_m(self, rates: Floats, points: Floats) -> float:
+        """How far such an error of the velocity moves the farther points at the ends of a sweep."""
+        range_m = np.quantile(np.linalg.norm(points, axis=1), FARTHER)
+        return float((np.linalg.norm(rates[:3]) * range_m + np.linalg.norm(rates[3:])) * self.turn_s / 2)
 
-def _from_behind(tracker: _Tracker, frames: list[Frame], since_s: Floats) -> Floats:
-    """Poses (n, 4, 4) of the first frames of a sequence, each at the middle of its sweep, followed from the last one
-    back to the first by a new tracker: by then its map is full.
+
+def _in_range(cloud: PointCloud, options: CloudOptions) -> PointCloud:
+    ranges = np.linalg.norm(cloud.points_in_cam, axis=1)  # NaN compares false
+    kept = (ranges > 0) & (ranges >= options.min_range_m) & (ranges <= options.max_range_m)
+    times_s = None if cloud.times_s is None else cloud.times_s[kept]
+    return PointCloud(cloud.points_in_cam[kept], times_s=times_s)
+
+
+def _first_velocity(clouds: CloudOptions, voxel_m: float, frames: list[Frame], since_s: Floats) -> Floats:
+    """The twist a second (6,) at the first of these frames, which are followed forth and back until it stays.
+
+    At first from rest: rings on the ground look the same ahead, and give a velocity that is too small.
     """
-    poses = np.tile(np.eye(4), (len(frames), 1, 1))
-    for place in reversed(range(len(frames))):
-        tracker.follow(frames[place], since_s[place + 1] if place + 1 < len(frames) else 0.0)
-        poses[place] = tracker.pose
-    return poses
+    velocity = np.zeros(6)
+    for _ in range(MOST_PASSES):
+        before = velocity
+        for is_back in (False, True):
+            tracker = _Tracker(clouds, voxel_m, START_LEVELS, velocity)
+            places = range(len(frames))
+            for place in reversed(places) if is_back else places:
+                since = since_s[place + is_back] if place + is_back < len(since_s) else 0.0
+                duration, _ = tracker.follow(frames[place], since, backwards=is_back)
+            velocity = -tracker.velocity
+        if np.linalg.norm((velocity - before)[3:]) * duration < voxel_m / 2:
+            break
+    return velocity
 
 
-def _kiss_icp(clouds: CloudOptions, voxel_m: float) -> Any:
-    try:
-        from kiss_icp.config import KISSConfig
-        from kiss_icp.kiss_icp import KissICP
-    except ImportError as error:
-        raise RecipeError(
-            "start kiss_icp needs the package kiss-icp: pip install hodge-pipeline[lidar], or take start.stage=odometry"
-        ) from error
-    config = KISSConfig()
-    config.data.min_range, config.data.max_range = clouds.min_range_m, clouds.max_range_m
-    config.data.deskew = False
-    config.mapping.voxel_size = voxel_m
-    config.registration.max_num_threads = 1
-    return KissICP(config)
+class _Map:
+    """Voxels of Gaussians (Koide et al., ICRA 2021) of the sweeps so far, at several sizes, coarse to fine."""
+
+    def __init__(self, voxel_m: float, levels: tuple[int, ...]) -> None:
+        self._voxel_m, self._is_empty, self._sweep = voxel_m, True, None
+        self._levels = [(size * voxel_m, small_gicp.GaussianVoxelMap(size * voxel_m)) for size in levels]
+        for _, voxels in self._levels:
+            voxels.set_lru(horizon=SWEEPS_KEPT)
+
+    def align(self, points: Floats, guess: Floats) -> tuple[Floats, bool]:
+        """The pose of a sweep by points (N, 3), and whether there was nothing to align, so that it is the guess."""
+        self._sweep = self._thinned(points) if len(points) >= MIN_POINTS else None
+        if self._sweep is None or self._is_empty:
+            return guess, True
+        coarse = guess
+        for level in self._levels[:-1]:
+            found = np.asarray(self._aligned(level, coarse).T_target_source)
+            coarse = found if se3.is_motion(found) else coarse
+        both = [self._aligned(self._levels[-1], start) for start in (guess, coarse)]
+        best = min(both, key=lambda found: found.error / max(found.num_inliers, 1) ** 2)  # near, and many
+        return (np.asarray(best.T_target_source) if best.num_inliers >= MIN_POINTS else guess), False
+
+    def _aligned(self, level: tuple[float, Any], guess: Floats) -> Any:
+        size_m, voxels = level
+        return small_gicp.align(
+            voxels,
+            self._sweep,
+            guess,
+            max_correspondence_distance=LOOK_M * size_m,
+            max_iterations=MOST_ITERATIONS,
+        )
+
+    def insert(self, pose: Floats) -> None:
+        """The sweep aligned last joins the map."""
+        if self._sweep is None:
+            return
+        for _, voxels in self._levels:
+            voxels.insert(self._sweep, pose)
+        self._is_empty = False
+
+    def _thinned(self, points: Floats) -> Any:
+        sweep = small_gicp.voxelgrid_sampling(points, SAMPLE_M * self._voxel_m)
+        small_gicp.estimate_covariances(sweep, None, NEIGHBOURS)
+        return sweep
 
 
 def register_steps(
@@ -213,7 +281,7 @@ def register_steps(
     workers: Workers,
     step: Step,
 ) -> Odometry:
-    """Step: each key frame registered to the one before it, from the motion that KISS-ICP found."""
+    """Step: each key frame registered to the one before it, from the motion that the map gave."""
     assert clouds.folder is not None
     pairs = np.concatenate([np.stack([rows[:-1], rows[1:]], axis=1) for rows in sequences]).astype(np.int64)
     guesses = se3.inverse(world_from_key[pairs[:, 0]]) @ world_from_key[pairs[:, 1]]
