@@ -107,9 +107,10 @@ def thinned(chain: Chain, rows: Ints) -> Reduced:
     while True:
         chosen = spread[np.linspace(0, len(spread) - 1, count).astype(np.int64)]
         reduced = Reduced.of(chain, np.sort(chosen))
-        if reduced.network.core_size * len(chain.axes) <= MOST_UNKNOWNS:
+        unknowns = reduced.network.core_size * len(chain.axes)
+        if unknowns <= MOST_UNKNOWNS:
             return reduced
-        count = round(THINNING * count)
+        count = round(THINNING * count * MOST_UNKNOWNS / unknowns)
 
 
 MOST_UNKNOWNS = 1500
@@ -117,7 +118,7 @@ MOST_UNKNOWNS = 1500
 MOST_ACTIVE = 2000
 """Loops at the most: between their ends even a long path drifts by little."""
 THINNING = 0.8
-"""Of the loops that are left where these leave too many unknowns."""
+"""Of as many loops as would leave `MOST_UNKNOWNS` if these grew in proportion to the loops."""
 
 
 def _confirmed(factor: Floats, count: int) -> bool:
@@ -214,12 +215,16 @@ def _between(fit: Fit) -> Floats:
         near.append(nearest)
     component = reduced.network.component
     at = chain.ends[:, 1]
-    first, second = (linear.carry(reduced.ends[end], at) @ samples[end] for end in near)
-    difference = second - first
-    joint = difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
-    out = joint + gap
-    out[component[near[0]] != component[near[1]]] = np.inf
-    return np.asarray(out)
+    for rows in np.split(np.arange(len(gap)), np.arange(BATCH, len(gap), BATCH)):
+        first, second = (linear.carry(reduced.ends[end[rows]], at[rows]) @ samples[end[rows]] for end in near)
+        difference = second - first
+        gap[rows] += difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
+    gap[component[near[0]] != component[near[1]]] = np.inf
+    return gap
+
+
+BATCH = 500
+"""Loops whose samples fit in a processor's cache."""
 
 
 def _samples(fit: Fit) -> Floats:
