@@ -62,14 +62,17 @@ def open3d_line_process(graph: ViewGraph) -> Answer:
     return kept, poses, connected_components(graph.edges[kept], graph.vertex_count)
 
 
-def gtsam_gnc(graph: ViewGraph, trust_odometry: bool) -> Answer:
-    """GTSAM's GNC with truncated least squares, the 99 % threshold."""
+def gtsam_gnc(graph: ViewGraph, trust_odometry: bool, stated: bool = False) -> Answer:
+    """GTSAM's GNC with truncated least squares, the 99 % threshold; `stated`: with the graph's own information."""
     import gtsam
 
     trusted = consecutive(graph)
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([SIGMA_M / LEVER_M] * 3 + [SIGMA_M] * 3))
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for (i, j), motion in zip(graph.edges.tolist(), graph.i_from_j, strict=True):
+    for (i, j), motion, information in zip(graph.edges.tolist(), graph.i_from_j, graph.information, strict=True):
+        if stated:
+            flat = np.diag(information) == 0  # in the plane nothing leaves it
+            noise = gtsam.noiseModel.Gaussian.Information(information + np.diag(flat * 1.0))
         factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(motion), noise))
     component = connected_components(graph.edges, graph.vertex_count)
     firm = gtsam.noiseModel.Diagonal.Sigmas(np.full(6, 1e-4))
