@@ -2,8 +2,8 @@
 
 In the world frame a step's residual ρ and covariance C add up along a path, so that a run of steps between two ends of
 loops is one edge (Σρ, ΣC), and the poses inside follow from those of its ends. Loops, ends and what is solved for are
-in axes parallel to the world's with the origin at the pose itself: far from the world's origin, its own lever arm would
-make every block of the normal equations ill-conditioned.
+in axes parallel to the world's with the origin at the pose itself, runs with the origin at their later ends: far from
+the world's origin, its own lever arm would make every block of the normal equations ill-conditioned.
 """
 
 from __future__ import annotations
