@@ -79,6 +79,7 @@ def main(folder: Path) -> None:
     source, loops, run = demo_source(), folder / "loops.g2o", folder / "run"
     write_loops(loops, source)
     options = [f"measured.files=[{{path: {loops}}}]", "edges={stage: sequential, reach: 3}", "outer_iterations=1"]
+    options.append("solve_with=all")
     recipe = load_recipe("demo", [*options, "evaluation.tables=false"], source)
     if (run / "edges.csv").exists():
         write_history(run, History())

@@ -1,4 +1,4 @@
-"""The method on one screen: start, then propose, register and solve until consistent; judge, refine, fuse."""
+"""The method on one screen: start, then propose, register, judge and solve until consistent; refine, fuse."""
 
 from __future__ import annotations
 
@@ -69,7 +69,6 @@ def compute(job: Job, recording: Recording) -> Computed:
         for registered in chain(proposed_rounds(work, rounds), suggested_rounds(work, rounds), edited):
             rounds.append(consistent(work, registered))
             recording.round(len(rounds) - 1, rounds[-1])
-        rounds[-1] = work.judge(rounds[-1])
         recording.diagnosis(rounds[-1])
         scores = score(job, work, rounds)
         recording.scores(scores)
@@ -89,16 +88,16 @@ def proposed_rounds(work: Work, rounds: Sequence[Round]) -> Iterator[Registered]
 
 
 def consistent(work: Work, registered: Registered) -> Round:
-    """The poses consistent with a round's edges: the complex of their graph, ω on it, its parts, the solve."""
-    graph = registered.graph(work.scene.first.vertex_ids)
-    found = None
+    """The poses consistent with a round's edges: the verdict on each, their complex, ω on it, its parts, the solve."""
+    judged = work.judge(registered)
+    graph, found = judged.graph(work.scene.first.vertex_ids), None
     try:
-        complex_ = work.recipe.complex.of(graph, work.scene.clouds, registered.start)
-        omega = one_form(graph, registered.start)
+        complex_ = work.recipe.complex.of(graph, work.scene.clouds, judged.start)
+        omega = one_form(graph, judged.start)
         found = energies(complex_, decompose(complex_, omega))
     except GraphError as error:  # the poses do not depend on it
-        work.steps.note(Note("no decomposition", detail=f"{registered.name}: without its decomposition: {error}"))
-    return work.solve(registered, graph, found)
+        work.steps.note(Note("no decomposition", detail=f"{judged.name}: without its decomposition: {error}"))
+    return work.solve(judged, found)
 
 
 def measured(job: Job, scene: Scene) -> ViewGraph:

@@ -20,7 +20,7 @@ from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.notebook import as_html
 from hodge_pipeline.rounds.all_frames import pose_frames
-from hodge_pipeline.rounds.one_round import judge_edges, solve_edges
+from hodge_pipeline.rounds.one_round import solve_edges
 from hodge_pipeline.scene import KeyFrames, Round, Scene, given_poses, true_poses
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import Step
@@ -128,9 +128,8 @@ class Run:
         clouds = stored_clouds(steps)
         if not opening or not clouds:
             raise WorkspaceError(f"{folder}: the run has not begun to register: run the same command again")
-        judged, ended = stored(steps, judge_edges), stored(steps, end)
+        ended = stored(steps, end)
         rounds = [opening[-1].first, *stored(steps, solve_edges)]
-        rounds = [*rounds[:-1], *judged] if judged else rounds
         key_frames = opening[-1].key_frames
         scores, posed = stored(steps, evaluate), stored(steps, pose_frames)
         expanded = posed[-1] if posed else key_frames.expand(rounds[-1].world_from_cam)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +10,15 @@ from diagnosis_graphs import SIGMA, measured, near_pairs, poses_on_a_ring, spoil
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.result import UNTESTABLE
+from hodge_pipeline.diagnosis.result import UNTESTABLE, WRONG
 from hodge_pipeline.diagnosis.robust import RobustSolver
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
-from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.rounds.one_round import Registered, judge_edges, solve_edges
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.types import ViewGraph
+from hodge_pipeline.solvers.poisson import PoissonSolver
+from hodge_pipeline.stages import ConsistencySolver, Step, no_progress
+from hodge_pipeline.types import Edges, ViewGraph
+from hodge_pipeline.types.edges import IGNORED, MEASURED, USED
 
 QUICK = DiagnosisOptions()
 
@@ -33,11 +36,28 @@ def test_the_solver_leaves_wrong_edges_out_and_keeps_the_gauge() -> None:
     assert "left out by the diagnosis" in solution.notes[0]
 
 
-def test_recipes_that_use_it_bind() -> None:
-    for name in ("seven_scenes_robust", "tum_robust"):
-        assert isinstance(load_recipe(name).solver, RobustSolver)
-    changed = load_recipe("seven_scenes_robust", ["solver.diagnosis.seed=3"]).solver
-    assert isinstance(changed, RobustSolver) and changed.diagnosis.seed == 3
+def test_a_round_is_judged_before_its_solve_and_solved_with_what_is_kept(tmp_path: Path) -> None:
+    """Plain least squares: a wrong loop that the solve used would bend the ring."""
+    poses = poses_on_a_ring(20)
+    graph, right = spoiled(measured(poses, near_pairs(20, 4)), np.array([7, 31]))
+    columns = {name: getattr(graph, name) for name in MEASURED}
+    edges = replace(Edges.of(graph.edges), status=np.full(graph.edge_count, USED), **columns)
+    step = Step(tmp_path, no_progress, lambda *notes: None)
+    judged = judge_edges(edges, graph.vertex_ids, QUICK, step=step)
+    assert set(judged.verdict[~right].tolist()) == {WRONG}
+    registered = Registered("round 1", judged, np.zeros(0, np.int64), poses, poses)
+    plain = PoissonSolver()
+    bent, kept, forced = (
+        solve_edges(one, graph.vertex_ids, plain, how, None, None, None, step=step)
+        for one, how in (
+            (registered, "all"), (registered, "kept"), (replace(registered, right=~right), "kept"),
+        )
+    )  # fmt: skip
+    assert kept.solution is not None and forced.solution is not None
+    assert (kept.solution.weights[~right] == 0).all() and set(kept.edges.status[~right].tolist()) == {IGNORED}
+    assert (forced.solution.weights[~right] > 0).all(), "what a person calls right is solved with"
+    off = [np.abs(one.world_from_cam[:, :3, 3] - poses[:, :3, 3]).max() for one in (bent, kept)]
+    assert off[1] < 0.1 < off[0]
 
 
 def chain(count: int) -> ViewGraph:

@@ -132,7 +132,7 @@ def test_poses_are_of_all_frames_wherever_they_come_from(run: Run, sequence: Pat
         ("track-1/clouds/points.npy", "tracking"),
         ("begin-1/value.npz", "frames"),
         ("solve_edges-1/value.json", "solve, round 1"),
-        ("judge_edges-1/step.json", "diagnosis"),
+        ("judge_edges-1/step.json", "diagnosis, round 1"),
         ("evaluate-1/value.npz", "evaluation"),
         ("fuse-1/cloud.ply", "fusion 1"),
         ("end-1/value.json", "report"),

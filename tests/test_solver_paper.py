@@ -164,7 +164,7 @@ def test_without_diagonals_the_surface_solves_what_the_graph_solves() -> None:
     assert (surface.embedding.genus, surface.sizes()["diagonals"]) == (0, 0)
     graph = measured(edges, truth, 0.03)
     paper = PaperSolver(rotation="angular", log="se3").solve(graph, truth).world_from_cam
-    plain = PoissonSolver(robust="none").solve(graph, truth).world_from_cam
+    plain = PoissonSolver().solve(graph, truth).world_from_cam
     np.testing.assert_allclose(paper, plain, atol=1e-12)
 
 

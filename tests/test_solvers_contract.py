@@ -16,7 +16,7 @@ from hodge_pipeline.types import Floats, Solution, ViewGraph
 LACKS = {
     "maximum_likelihood": {"wrong copy of an edge"},  # least squares: every edge counts
     "paper": {"wrong copy of an edge", "zero information"},  # every edge counts, and each as much as the others
-    "poisson": {"zero information", "units x 1000"},  # unit weights by default; a lever arm of 1 m
+    "poisson": {"zero information", "wrong copy of an edge"},  # unit weights by default, least squares
 }
 
 

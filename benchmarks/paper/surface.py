@@ -70,8 +70,8 @@ def main() -> None:
     given = parser.parse_args()
     problem = read_problem(given.run, given.round)
     makers: dict[str, tuple[Callable[[int], ConsistencySolver], int]] = {
-        "graph, pairing": (lambda seed: PoissonSolver(robust="none", log="pairing"), 1),
-        "graph, se(3)": (lambda seed: PoissonSolver(robust="none"), 1),
+        "graph, pairing": (lambda seed: PoissonSolver(log="pairing"), 1),
+        "graph, se(3)": (lambda seed: PoissonSolver(), 1),
         "surface, random, pairing": (lambda seed: PaperSolver(seed=seed), SEEDS),
         "surface, random, se(3)": (lambda seed: PaperSolver(seed=seed, log="se3"), SEEDS),
         "surface, angular, pairing": (lambda seed: PaperSolver(rotation="angular"), 1),

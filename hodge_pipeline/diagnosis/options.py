@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal, TypeAlias
+
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.solvers.backbone.trust import AUTO
+
+SolveWith: TypeAlias = Literal["all", "kept"]
+"""The edges that a round is solved with: all that were accepted, or of these what the diagnosis keeps."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

@@ -22,7 +22,7 @@ from hodge_pipeline.solvers.backbone.trust import NONE, find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.setup import held_rows
-from hodge_pipeline.solvers.weights import is_planar
+from hodge_pipeline.solvers.weights import edge_weights, is_planar
 from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
 
 ROUNDS, SETTLED = 4, 1e-2
@@ -81,7 +81,9 @@ def solve_robust(
         weights, final = new, solved(new, final.world_from_cam)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
-    notes = (*unheld, _told(found, whole), *found.notes, *final.notes)
+    on_information = edge_weights(graph, 2 if graph.dimension == 2 or is_planar(graph) else 3).notes
+    told = (note for note in on_information if note not in final.notes)
+    notes = (*unheld, *told, _told(found, whole), *found.notes, *final.notes)
     metrics = {**final.metrics, "kept_edges": float((whole > 0).sum())}
     return _with_confirmation(graph, found, replace(final, weights=whole, notes=notes, metrics=metrics))
 

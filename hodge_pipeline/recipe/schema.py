@@ -11,7 +11,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.complex.parts import ComplexOptions
-from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.options import DiagnosisOptions, SolveWith
 from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.pairs.held_out import GuardOptions
@@ -98,6 +98,11 @@ class Recipe:
         description="rounds of new edges, registration and solve, each from the poses of the last",
     )
     diagnosis: DiagnosisOptions = DiagnosisOptions()
+    solve_with: SolveWith = Field(
+        default="kept",
+        description="kept: edges that the diagnosis calls wrong or suspect are left out of every solve; all: verdicts "
+        "are reported alone",
+    )
     suggestions: SuggestionOptions = SuggestionOptions()
     refiner: Refiner | None = Field(default=None, description="improves the poses of all frames after the last solve")
     fusion: tuple[Fuser, ...] = Field(default=(), description="each makes one model from the final poses")

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.complex.decomposition import Energies
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.options import DiagnosisOptions, SolveWith
+from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.pairs.candidates import merge
 from hodge_pipeline.pairs.held_out import HeldOut
@@ -51,6 +52,13 @@ class Registered:
     def graph(self, vertex_ids: NDArray[np.generic]) -> ViewGraph:
         """The viewing graph of the edges that count."""
         return self.edges.select(self.edges.counts).as_graph(vertex_ids)
+
+    def solved(self, solve_with: SolveWith) -> Bools:
+        """The rows to solve with: all that count, or of these what the diagnosis keeps or a person calls right."""
+        if solve_with == "all":
+            return self.edges.counts
+        kept = ~np.isin(self.edges.verdict, (WRONG, SUSPECT))
+        return self.edges.counts & (kept if self.right is None else kept | self.right)
 
     @property
     def title(self) -> str:
@@ -126,16 +134,20 @@ class Work:
         """The table with the edges that came measured at its end."""
         return Edges.joined([edges, Edges.measured(self.measured)])
 
-    def solve(self, registered: Registered, graph: ViewGraph, found: Energies | None) -> Round:
-        """The round of these edges, and the poses consistent with them, of which `graph` holds those that count."""
-        up = None if self.fixes is None else up_of(self.scene, registered.start)
-        return self.steps.step(
-            solve_edges, registered, graph, self.recipe.solver, found, self.fixes, up, title=registered.title
-        )
+    def judge(self, registered: Registered) -> Registered:
+        """The same with the verdict of the diagnosis on each edge, before any solve."""
+        title = f"diagnosis, {registered.name}"
+        ids = self.scene.first.vertex_ids
+        edges = self.steps.step(judge_edges, registered.edges, ids, self.recipe.diagnosis, title=title)
+        return replace(registered, edges=edges)
 
-    def judge(self, last: Round) -> Round:
-        """The last round, with the verdict of the diagnosis on each of its edges."""
-        return self.steps.step(judge_edges, last, self.recipe.diagnosis, title="diagnosis")
+    def solve(self, judged: Registered, found: Energies | None) -> Round:
+        """The round of these edges, and the poses consistent with those that the recipe solves with."""
+        recipe, ids = self.recipe, self.scene.first.vertex_ids
+        up = None if self.fixes is None else up_of(self.scene, judged.start)
+        return self.steps.step(
+            solve_edges, judged, ids, recipe.solver, recipe.solve_with, found, self.fixes, up, title=judged.title
+        )
 
 
 def propose_edges(
@@ -188,8 +200,9 @@ def place_first(first: Round, fixes: Fixes, up: Floats, *, step: Step) -> Floats
 
 def solve_edges(
     registered: Registered,
-    graph: ViewGraph,
+    vertex_ids: NDArray[np.generic],
     solver: ConsistencySolver,
+    solve_with: SolveWith,
     found: Energies | None,
     fixes: Fixes | None,
     up: Floats | None,
@@ -199,19 +212,23 @@ def solve_edges(
     """Step: the round of these edges and the poses consistent with them, and with known positions where there are any,
     `up (3,)` being what points up; `found` of ω at its start is kept.
     """
-    edges, solution = registered.edges, solver.solve(graph, registered.start)
+    edges, solved = registered.edges, registered.solved(solve_with)
+    graph = edges.select(solved).as_graph(vertex_ids)
+    solution = solver.solve(graph, registered.start)
     if registered.right is not None:
-        solution = with_right(graph, solution, registered.right[edges.counts])
+        solution = with_right(graph, solution, registered.right[solved])
     placed: Placed | None = None
     if fixes is not None and up is not None:
         placed = place(graph, solution.world_from_cam, solution.component, solution.weights, fixes, up)
         solution = replace(solution, world_from_cam=placed.world_from_cam, component=placed.component)
     weights = np.zeros(len(edges))
-    weights[edges.counts] = solution.weights
+    weights[solved] = solution.weights
     solution = replace(solution, weights=weights[edges.in_graph])
+    if left_out := int((edges.counts & ~solved).sum()):
+        step.note(Note("left out", left_out, registered.name))
     step.note(*notes_of("solver", (f"{registered.name}: {note}" for note in solution.notes)))
     return Round(
-        with_residuals(edges, solution.world_from_cam, solution.weights), graph.vertex_ids, solution.world_from_cam,
+        with_residuals(edges, solution.world_from_cam, solution.weights), vertex_ids, solution.world_from_cam,
         solution, registered.fresh, registered.before, found, edited=registered.name == EDITED,
         position_fit=None if placed is None else placed.fit,
     )  # fmt: skip
@@ -229,6 +246,7 @@ def with_right(graph: ViewGraph, solution: Solution, right: Bools) -> Solution:
     return replace(better, notes=(*solution.notes, note))
 
 
-def judge_edges(last: Round, options: DiagnosisOptions, *, step: Step) -> Round:
-    """Step: the round with the verdict of the diagnosis on each of its edges."""
-    return replace(last, edges=diagnose(last.graph, options).put_into(last.edges))
+def judge_edges(edges: Edges, vertex_ids: NDArray[np.generic], options: DiagnosisOptions, *, step: Step) -> Edges:
+    """Step: the table with the verdict of the diagnosis on each edge of its graph, those off by hand included."""
+    unjudged = edges.put(slice(None), verdict="", probability=np.nan, leverage=np.nan)
+    return diagnose(edges.select(edges.in_graph).as_graph(vertex_ids), options).put_into(unjudged)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass as plain_dataclass
-from typing import Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -23,24 +22,18 @@ from hodge_pipeline.solvers.potential import (
     deviation_metrics,
     iterate,
     loops_of,
-    residuals,
     unconverged_notes,
 )
 from hodge_pipeline.types import Bools, Floats, Solution, SolverIteration, ViewGraph
 
-WEIGHTS_SETTLED = 1e-3
-SMALLEST_WEIGHT = 1e-6  # a rejected edge still ties its ends together, so that no component falls apart
-SMALLEST_SCALE_M = 1e-6
 AFFORDABLE_BASIS = 1_000_000  # vertices times edges: a few tenths of a second
-MEDIAN_OF_SIX = 2.3126  # the median length of six unit Gaussians: of the 6-D residual whose median is taken
-TUNING = 10.29  # in standard deviations of an axis: 99.5 % efficient for six; half weight at about 3 median lengths
 
 
 @plain_dataclass(frozen=True)
 class _Problem(CentredProblem):
-    """With the weight of each edge before any kernel."""
+    """With the weight of each edge."""
 
-    base_weights: Floats
+    weights: Floats
     d0: csr_matrix
 
 
@@ -53,32 +46,17 @@ class PoissonSolver:
     would depend on where the origin is. f is taken with mean zero, then the component is moved back as one body, so
     that its first vertex keeps its pose exactly. Fixed vertices have f = 0, and a component with one is not moved back.
 
-    With a robust kernel the edges are first reweighted (IRLS) by steps from the start poses; then the weights are
-    frozen and the reported iterations begin at the start poses again. So the loop deviation D in the history falls
-    as it does in the paper: it measures the *adjusted* edges `T_i⁻¹ exp(f_j − f_i) T_j` of that one step, that is how
-    far the exponential of the sum is from the product of exponentials. It is never taken from the absolute poses,
-    where it is 0 by construction, and says nothing about the measured edges' own inconsistency, which no solver can
-    change (`measured_loop_deviation_*` in the metrics).
+    Every edge counts: a run leaves out what its diagnosis calls wrong before the solve (`solve_with`). The deviation
+    D in the history measures the *adjusted* edges `T_i⁻¹ exp(f_j − f_i) T_j` of that one step, that is how far the
+    exponential of the sum is from the product of exponentials. It is never taken from the absolute poses, where it is
+    0 by construction, and says nothing about the measured edges' own inconsistency, which no solver can change
+    (`measured_loop_deviation_*` in the metrics).
     """
 
     weights: EdgeWeighting = Field(
         default="unit",
         description="weight of each edge: unit as in the paper up to a factor; "
         "information, 6 / tr(S Ω⁻¹ S) with S = diag(lever_arm_m × 3, 1 × 3), for measured pose graphs",
-    )
-    robust: Literal["none", "geman_mcclure"] = Field(
-        default="geman_mcclure",
-        description="kernel against false edges: none is the paper's least squares; geman_mcclure, the default, all "
-        "but removes a false edge",
-    )
-    scale_m: float | None = Field(
-        default=None,
-        gt=0,
-        description="metres: the standard deviation of a good edge's residual on an axis. Default: the median residual "
-        "/ 2.31, since it has six axes, taken anew in each reweighting step",
-    )
-    reweighting_steps: int = Field(
-        default=20, ge=1, description="at most so many IRLS steps; they end once weights settle"
     )
     lever_arm_m: float = Field(
         default=1.0,
@@ -112,23 +90,19 @@ class PoissonSolver:
         proper = graph.edges[:, 0] != graph.edges[:, 1]
         used = proper & (base_weights > 0)
         problem = _problem(graph, used, base_weights, world_from_cam)
-        robust_weights, scale = self._robust_weights(problem)
         around_loops = loops_of(problem.edges, len(problem.component), AFFORDABLE_BASIS)
-        history = self._iterate(problem, robust_weights, around_loops)
-        weights = np.zeros(graph.edge_count)
-        weights[used] = robust_weights
+        history = self._iterate(problem, around_loops)
         measured = loop_deviation(around_loops(problem.i_from_j))
         metrics = {
             "loops": float(len(measured)),
             **deviation_metrics(measured, "measured_loop_deviation"),
-            "robust_scale_m": scale,
             "iterations": float(len(history)),
             **(history[-1].metrics if history else {}),
         }
         return Solution(
             world_from_cam=history[-1].world_from_cam if history else world_from_cam.copy(),
             component=problem.component,
-            weights=weights,
+            weights=used.astype(float),
             history=history,
             metrics=metrics,
             notes=(
@@ -140,34 +114,13 @@ class PoissonSolver:
             ),
         )
 
-    def _iterate(self, problem: _Problem, weights: Floats, around_loops: AroundLoops) -> tuple[SolverIteration, ...]:
+    def _iterate(self, problem: _Problem, around_loops: AroundLoops) -> tuple[SolverIteration, ...]:
         if len(problem.edges) == 0:
             return ()
-        total = problem.base_weights * weights
-        potential = problem.poisson(problem.d0, total)
-        return iterate(problem, self.log, potential, total, around_loops, self.inner_iterations, self.tolerance)
-
-    def _robust_weights(self, problem: _Problem) -> tuple[Floats, float]:
-        """The frozen weights (E,) in (0, 1], 1 without a kernel, and the scale in metres that they ended with."""
-        weights = np.ones(len(problem.edges))
-        if self.robust == "none" or len(weights) == 0:
-            return weights, float("nan")
-        poses, scale = problem.start, float("nan")
-        for _ in range(self.reweighting_steps):
-            total = problem.base_weights * weights
-            correction = problem.poisson(problem.d0, total)(problem.form(poses, self.log))
-            poses = problem.moved(poses, correction, self.log)
-            residual = self._displacement(problem, poses)
-            scale = self.scale_m or _robust_scale(residual)
-            previous, weights = weights, _kernel(residual / (TUNING * scale))
-            if np.abs(weights - previous).mean() < WEIGHTS_SETTLED:
-                break
-        return weights, scale
-
-    def _displacement(self, problem: _Problem, poses: Floats) -> Floats:
-        """The residual (E,) of each edge in its own two frames, metres: no matter where the world's origin is."""
-        translation, angle = residuals(problem.edges, problem.i_from_j, poses)
-        return np.hypot(translation, self.lever_arm_m * angle)
+        potential = problem.poisson(problem.d0, problem.weights)
+        return iterate(
+            problem, self.log, potential, problem.weights, around_loops, self.inner_iterations, self.tolerance
+        )
 
     def _convergence_notes(self, problem: _Problem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
         if not history:
@@ -182,7 +135,7 @@ def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam
     return _Problem(
         edges=edges,
         i_from_j=orthonormal(graph.i_from_j[used]),
-        base_weights=base_weights[used],
+        weights=base_weights[used],
         d0=coboundary_0(edges, graph.vertex_count),
         component=component,
         fixed=graph.fixed,
@@ -190,16 +143,6 @@ def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam
         offset=offset,
         start_in_world=world_from_cam,
     )
-
-
-def _robust_scale(residual: Floats) -> float:
-    """The standard deviation of an axis in metres, from the median; edges in no loop fit exactly and do not vote."""
-    voting = residual[residual > 1e-9 * residual.max(initial=0.0)]
-    return max(float(np.median(voting)) / MEDIAN_OF_SIX if len(voting) else 0.0, SMALLEST_SCALE_M)
-
-
-def _kernel(ratio: Floats) -> Floats:
-    return np.maximum(1.0 / (1.0 + ratio**2) ** 2, SMALLEST_WEIGHT)
 
 
 def _edge_notes(proper: Bools, base_weights: Floats) -> tuple[str, ...]:

@@ -90,7 +90,7 @@ def close_loops(clouds: CloudSet, first: Round, part: Ints, options: Revisits, *
     if not len(found):
         return Closed(first.world_from_cam, found.pairs)
     graph = Edges.joined([first.edges, found]).as_graph(np.arange(len(clouds)))
-    poses = PoissonSolver(robust="none").solve(graph, first.world_from_cam).world_from_cam
+    poses = PoissonSolver().solve(graph, first.world_from_cam).world_from_cam
     moved = se3.inverse(first.world_from_cam) @ poses
     largest_m = float(np.linalg.norm(moved[:, :3, 3], axis=1).max())
     step.note(Note("revisits", len(found), f"{largest_m:.2g} m"))

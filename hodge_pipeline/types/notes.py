@@ -103,6 +103,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
         "Known positions scatter {detail} times as far as their sigma says: a clock that is off, or an antenna away "
         "from the sensor (positions.antenna_m), looks like that.",
     ),
+    "left out": (
+        Rank.FACT,
+        "{detail}: {count} edges that the diagnosis calls wrong or suspect are left out of the solve",
+    ),
     "matched": (Rank.FACT, "{count} pairs between pieces matched, {detail}"),
     "suggested": (Rank.FACT, "{detail}"),
     "no decomposition": (Rank.LOOK, "{detail}"),
