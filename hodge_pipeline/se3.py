@@ -40,10 +40,25 @@ def so3_exp(phi: Floats) -> Floats:
 def so3_log(rotation: Floats) -> Floats:
     """Rotation vectors (..., 3) of rotation matrices (..., 3, 3), of length at most π.
 
-    At exactly π the axis has two signs; the one that scipy's quaternion gives is taken.
+    At exactly π the axis has two signs: its largest entry is taken positive. By the row of 4 q qᵀ with the largest
+    diagonal (Markley 2008), which is accurate at every angle and, where the matrix is a rotation, needs no projection.
     """
     rotation = np.asarray(rotation, float)
-    return np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()).reshape(*rotation.shape[:-2], 3)
+    r = np.moveaxis(rotation.reshape(-1, 3, 3), 0, 2)
+    trace, outer = r[0, 0] + r[1, 1] + r[2, 2], np.empty((4, 4, r.shape[2]))
+    outer[:3, :3] = r + np.swapaxes(r, 0, 1)
+    for axis in range(3):
+        outer[axis, axis] = 1 + 2 * r[axis, axis] - trace
+    outer[3, 3] = 1 + trace
+    outer[3, 0], outer[3, 1], outer[3, 2] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    outer[:3, 3] = outer[3, :3]
+    row = np.argmax(np.einsum("iin->in", outer), axis=0)
+    quat = outer[row, :, np.arange(len(row))]
+    quat *= np.where(quat[:, 3:] < 0, -1.0, 1.0)
+    sine = np.linalg.norm(quat[:, :3], axis=1)
+    angle = 2 * np.arctan2(sine, quat[:, 3])
+    phi = quat[:, :3] * (angle / np.where(sine > 0, sine, 1.0))[:, None]
+    return np.asarray(phi.reshape(*rotation.shape[:-2], 3))
 
 
 def _series(angle: Floats) -> tuple[Floats, Floats]:

@@ -12,7 +12,7 @@ from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone import inference
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
-from hodge_pipeline.solvers.backbone.fit import Reduced, linearise, settled
+from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, settled
 from hodge_pipeline.solvers.backbone.inference import left_out, uncertainty
 from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
@@ -59,22 +59,21 @@ def test_selected_inversion_is_the_dense_inverse() -> None:
 def test_the_reduced_chain_ends_at_the_minimum_over_all_poses(dimension: int) -> None:
     graph = drive(dimension=dimension, wrong=0.0, loops=30).graph
     chain = chain_of(graph)
-    everything = Reduced.of(chain, np.arange(len(chain.loop_edge)))
-    found = settled(chain, everything, chain.poses(), 30, 1e-12)
-    assert everything.cost(found) < everything.cost(linearise(chain, chain.poses())) / 10
+    bare = Fit(Reduced.of(chain, np.arange(len(chain.loop_edge))), linearise(chain, chain.poses()))
+    found = settled(bare, 30, 1e-12)
+    assert found.cost < bare.cost / 10
     exact = solve(graph)
-    again = solve(graph, start=found.poses[np.argsort(chain.order)], initial="given")
+    again = solve(graph, start=found.linear.poses[np.argsort(chain.order)], initial="given")
     assert again.metrics["objective_at_start"] == pytest.approx(exact.metrics["chi2"], rel=1e-3)
 
 
 def test_left_out_residuals_are_those_of_a_solve_without_the_loop() -> None:
     chain = chain_of(drive(wrong=0.0, loops=12).graph)
-    everything = Reduced.of(chain, np.arange(12))
-    found = settled(chain, everything, chain.poses(), 30, 1e-12)
-    without = left_out(found, everything, found.loop_residual, uncertainty(chain, found, everything))
+    found = settled(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses())), 30, 1e-12)
+    without = left_out(found, uncertainty(found.linear, found))
     for row in (0, 5, 11):
         others = Reduced.of(chain, np.delete(np.arange(12), row))
-        actual = settled(chain, others, found.poses, 30, 1e-12).loop_residual[row]
+        actual = settled(Fit(others, found.linear), 30, 1e-12).linear.loops[0][row]
         np.testing.assert_allclose(without[row], actual, atol=0.03 * np.abs(actual).max() + 2e-3)
 
 

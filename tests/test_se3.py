@@ -100,6 +100,13 @@ def test_a_half_turn_has_a_logarithm() -> None:
     np.testing.assert_allclose(np.abs(se3.log(se3.from_parts(rotations, np.zeros((3, 3))))[:, 0]), [np.pi, 3.0, 0.0])
 
 
+@pytest.mark.parametrize("angle", [1e-100, 1e-12, 1e-4, 1.0, np.pi / 2, 2.1, np.pi - 1e-4, np.pi - 1e-9])
+def test_rotation_logarithms_are_accurate_to_rounding_at_every_angle(angle: float) -> None:
+    axes = np.random.default_rng(0).normal(size=(500, 3))
+    phi = angle * np.concatenate([np.eye(3), -np.eye(3), axes / np.linalg.norm(axes, axis=1)[:, None]])
+    np.testing.assert_allclose(se3.so3_log(se3.so3_exp(phi)), phi, rtol=0, atol=4e-15 * angle)
+
+
 def test_projection_gives_the_nearest_rotation() -> None:
     rotation = se3.so3_exp(np.array([0.3, -0.2, 0.9]))
     np.testing.assert_allclose(se3.project_to_so3(0.9995 * rotation), rotation, atol=1e-12)

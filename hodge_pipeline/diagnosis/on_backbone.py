@@ -109,12 +109,13 @@ def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floa
     others = int(backbone.found.used.sum())
     lines = []
     for edge, name in enumerate(verdict.tolist()):
-        away = distance(residual[0][edge], residual[1][edge])
-        if backbone.steps[edge] and name == WRONG:
-            lines.append(f"an edge of the backbone that {over[edge]} confirmed loops over it contradict: {away}")
-        elif backbone.steps[edge]:
+        if backbone.steps[edge] and name != WRONG:
             passed = f"{over[edge]} confirmed loops pass over it" if over[edge] else "no confirmed loop passes over it"
             lines.append(f"an edge of the backbone: {passed}")
+            continue
+        away = distance(residual[0][edge], residual[1][edge])
+        if backbone.steps[edge]:
+            lines.append(f"an edge of the backbone that {over[edge]} confirmed loops over it contradict: {away}")
         elif backbone.used[edge]:
             lines.append(f"it agrees with the backbone and {others - 1} other loops: {away}")
         elif name == UNTESTABLE:

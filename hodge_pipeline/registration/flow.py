@@ -82,10 +82,10 @@ def flow_image(frame: Frame, range_m: tuple[float, float], unit_m: float = 1.0) 
     return FlowImage(np.asarray(grey, np.uint8), depth, frame.camera, range_m, unit_m)
 
 
-def find_corners(image: FlowImage) -> Corners:
-    """The strongest corners of an image that have a depth."""
+def find_corners(image: FlowImage, where: Bytes | None = None) -> Corners:
+    """The strongest corners of an image, or of `where (H, W)` it is not 0, that have a depth."""
     apart_px = CORNERS_APART * image.grey.shape[1]
-    found = cv2.goodFeaturesToTrack(image.grey, 2 * CORNERS, CORNER_QUALITY, apart_px)
+    found = cv2.goodFeaturesToTrack(image.grey, 2 * CORNERS, CORNER_QUALITY, apart_px, mask=where)
     pixels = np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
     seen = _seen(image, pixels)
     kept = np.flatnonzero(np.isfinite(seen[:, 2]))[:CORNERS]

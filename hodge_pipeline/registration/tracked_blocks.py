@@ -17,6 +17,7 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 
 STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
+COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving")
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class BlockRows:
     anchors: Ints
     key_from_row: Floats
     fitness: Floats
+    moving: Ints
     notes: tuple[str, ...]
 
 
@@ -46,7 +48,7 @@ class TrackedBlocks:
     def write(self, number: int, block: TrackedBlock) -> None:
         """Keep one block."""
         clouds = CloudSet.from_clouds(block.clouds)
-        arrays = {name: getattr(block, name) for name in ("keys", "rows", "anchors", "key_from_row", "fitness")}
+        arrays = {name: getattr(block, name) for name in COLUMNS}
         arrays["notes"] = np.array(block.notes, dtype=np.str_)
         arrays |= {STEP + field.name: getattr(block.steps, field.name) for field in fields(Edges)}
         arrays |= {SIGHTING + field.name: getattr(block.sightings, field.name) for field in fields(Sightings)}
@@ -57,7 +59,7 @@ class TrackedBlocks:
         """What became of the rows of one block."""
         with np.load(self._path(number)) as stored:
             steps = Edges(*(stored[STEP + field.name] for field in fields(Edges)))
-            columns = {name: stored[name] for name in ("keys", "rows", "anchors", "key_from_row", "fitness")}
+            columns = {name: stored[name] for name in COLUMNS}
             return BlockRows(steps=steps, notes=tuple(stored["notes"].tolist()), **columns)
 
     def keep_sightings(self, folder: Path) -> None:

@@ -17,10 +17,11 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
+from hodge_pipeline.registration.moving import rival_motion
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registry import plugin_errors
-from hodge_pipeline.types import Edges, Floats, Frame, Ints, PointCloud, Registration
+from hodge_pipeline.types import Bytes, Edges, Floats, Frame, Ints, PointCloud, Registration
 
 FRAMES_IN_BLOCK = 96
 """Three seconds at frame rate; the first and the last frame of a block are key frames, however little they moved."""
@@ -62,7 +63,8 @@ class FrameBlock:
 @dataclass(frozen=True)
 class TrackedBlock:
     """What became of a block: its key frames (rows, clouds), the steps from each to the next, and for every row the row
-    of the key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess.
+    of the key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess; and the
+    rows `moving` of frames much of which moved otherwise than the camera.
 
     A step of fitness 0 is a guess too. The block's last row is the first of the next one.
     """
@@ -74,6 +76,7 @@ class TrackedBlock:
     anchors: Ints
     key_from_row: Floats
     fitness: Floats
+    moving: Ints
     notes: tuple[str, ...]
     sightings: Sightings
 
@@ -132,6 +135,15 @@ class _View:
         """What the registrar made of the cloud."""
         return self._options.odometry.registration.prepare(self.cloud)
 
+    def leave_out(self, moving: Bytes, corners: Corners) -> None:
+        """From now on the frame has no depth where `moving (H, W)` is not 0, and flow follows these corners."""
+        assert self.image is not None
+        depth = np.where(moving, np.float32(0), self.image.depth)
+        self._frame = replace(self._frame, read_depth=lambda: depth)
+        for made in ("image", "cloud_and_note", "prepared"):
+            self.__dict__.pop(made, None)
+        self.corners = corners
+
 
 class _Tracker:
     """Follows one block: the last key frame, the last frame tracked, and the frame after it where that was lost.
@@ -148,6 +160,7 @@ class _Tracker:
         self._steps: list[tuple[int, int, Registration]] = []
         self._corner_points: dict[int, Floats] = {}
         self._sightings: dict[tuple[int, int], Followed] = {}
+        self._moving = set[int]()
         self._velocity: Floats = np.zeros(6)
         self._usual_step = float(np.median(np.diff(block.times))) if len(block.times) > 1 else 1.0
 
@@ -171,6 +184,7 @@ class _Tracker:
             anchors=rows[list(anchors)],
             key_from_row=np.array(motions),
             fitness=np.array(fitness),
+            moving=rows[np.array([place for place in sorted(self._moving) if place > first], np.int64)],
             notes=tuple(note for _, note in self._clouds.values() if note),
             sightings=self._kept_sightings(first),
         )
@@ -224,12 +238,27 @@ class _Tracker:
         if key.corners is None or view.image is None:
             return None
         found = follow(key.corners, view.image, guess)
+        if found is not None:
+            found = self._of_most_area(key, view, found, guess)
         if found is None or len(found.rows) < FEWEST_FOLLOWED or found.share < self._limits.min_fitness:
             return None
         self._corner_points[key.place] = key.corners.points
         self._sightings[key.place, view.place] = found
         information = found.information / CORNERS_A_SAMPLE
         return Registration(found.key_from_view, information, found.share, found.rmse_m, len(found.rows), 0, True)
+
+    def _of_most_area(self, key: _View, view: _View, found: Followed, guess: Floats) -> Followed:
+        """The motion found, or another one that more of the image follows; what moves leaves the key frame's cloud."""
+        assert key.image is not None and key.corners is not None and view.image is not None
+        rival = rival_motion(key.corners, view.image, found, guess)
+        if rival is None or len(rival.followed.rows) < FEWEST_FOLLOWED:
+            return found
+        self._moving.add(view.place)
+        key.leave_out(rival.moving, rival.corners if rival.fits_better else key.corners)
+        if not rival.fits_better:
+            return found
+        self._sightings = {pair: one for pair, one in self._sightings.items() if pair[0] != key.place}
+        return rival.followed
 
     def _flowed_from_last(self, view: _View) -> Registration | None:
         """The motion from the last frame tracked, which becomes a key frame, where flow finds this one."""

@@ -1,7 +1,7 @@
 """The two ways to solve a graph's linear systems, and which is cheaper on which graph.
 
 SuperLU factorises; multigrid preconditions conjugate gradients, at a cost that grows with the graph alone and not with
-its fill. (CHOLMOD was tried in SuperLU's place: after the block elimination it is no faster on any graph.)
+its fill. (CHOLMOD was tried in SuperLU's place: after the block elimination it is hardly faster on any graph.)
 """
 
 from __future__ import annotations

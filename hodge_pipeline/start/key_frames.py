@@ -236,6 +236,9 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
         notes.append(Note("holes", len(holes), ", ".join(told) + ", …" * (len(holes) > NOTES_SHOWN)))
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
+    moving = np.unique(np.concatenate([part.moving for part in parts]))
+    if len(moving):
+        notes.append(Note("moving objects", len(moving), in_runs(moving, ids)))
     sizes = np.bincount(tracked.piece)
     pieces = int((sizes > 1).sum())
     if pieces > len(sequences_of(source)):

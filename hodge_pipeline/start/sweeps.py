@@ -114,7 +114,7 @@ def follow(
     stamps, is_clock = stamps_of(source), has_real_stamps(source.frames)
     reach_m = _reach_m(source, clouds)
     notes: list[str] = []
-    voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M * clouds.unit_m)
+    voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
     for rows in sequences:
         since = np.diff(stamps[rows], prepend=stamps[rows[0]]) if is_clock else np.zeros(len(rows))
         first = [source.frames[row] for row in rows[:WARM_UP]]
@@ -281,7 +281,9 @@ def register_steps(
     workers: Workers,
     step: Step,
 ) -> Odometry:
-    """Step: each key frame registered to the one before it, from the motion that the map gave."""
+    """Step: each key frame joined to the one before it by the motion that the map gave, which is more exact than a
+    registration of the two clouds; how well these fit there is the edge's information.
+    """
     assert clouds.folder is not None
     pairs = np.concatenate([np.stack([rows[:-1], rows[1:]], axis=1) for rows in sequences]).astype(np.int64)
     guesses = se3.inverse(world_from_key[pairs[:, 0]]) @ world_from_key[pairs[:, 1]]
@@ -292,9 +294,9 @@ def register_steps(
     if not held.all():
         breaks = int((~held).sum())
         step.note(Note("path broken", breaks, str(breaks)))
-    motions = np.where(held[:, None, None], edges.i_from_j, guesses)
+    edges = replace(edges, i_from_j=guesses)
     space_m = REACHES_APART * clouds.reach_m
-    poses = chained(len(world_from_key), sequences, replace(edges, i_from_j=motions), space_m)
+    poses = chained(len(world_from_key), sequences, edges, space_m)
     return Odometry(poses, edges.select(held), ())
 
 

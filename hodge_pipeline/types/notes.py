@@ -47,6 +47,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
     ),
+    "moving objects": (
+        Rank.LOOK,
+        "much of {count} frames moved otherwise than the camera ({detail}): people or objects that move? The camera's "
+        "motion is the one that fits more of the image; key frames leave out what moves",
+    ),
     "clock": (
         Rank.LOOK,
         "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",

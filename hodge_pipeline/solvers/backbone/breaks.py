@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, student
-from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, linearise, shifted, without_run
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, shifted, without_run
 from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS, SEEDS = 8, 16
@@ -233,12 +233,13 @@ def unusual_breaks(usual: Usual) -> list[Break]:
     return [Break(int(at), usual.centre, usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
 
 
-def strained_break(chain: Chain, used: Reduced, linear: Linear, usual: Usual) -> Break | None:
+def strained_break(fit: Fit, usual: Usual) -> Break | None:
     """The likeliest broken step of the runs between used loops, each run held against all else; None where none is
     strained. Loops hide a break where they are many: each agrees with those beside it, and the run gives way.
     """
+    chain, used, linear = fit.linear.chain, fit.reduced, fit.linear
     low, high = used.ends[used.runs].T
-    residual, total, prior = without_run(used, linear)
+    residual, total, prior = without_run(fit)
     chi2, size = student(residual, total)[1], residual.shape[1]
     tense = max(1.0, float(np.median(chi2)) / size)  # as if the steps' scale were too small by the usual run
     total, prior = tense * total, tense * prior

@@ -19,7 +19,7 @@ from hodge_pipeline.solvers.backbone.breaks import (
 )
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import Wrong
-from hodge_pipeline.solvers.backbone.fit import linearise, settled
+from hodge_pipeline.solvers.backbone.fit import Fit, linearise, settled
 from hodge_pipeline.solvers.backbone.inference import (
     BY_CHANCE,
     MOST_STEPS,
@@ -77,7 +77,8 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     worth = [(each, least) for each in agreed[:MOST_TRIED]]
     reduced = thinned(scaled, np.flatnonzero(found.used))
     if len(reduced.runs):
-        strained = strained_break(scaled, reduced, settled(scaled, reduced, found.poses, MOST_STEPS, TOLERANCE), usual)
+        fit = settled(Fit(reduced, linearise(scaled, found.poses)), MOST_STEPS, TOLERANCE)
+        strained = strained_break(fit, usual)
         if strained is not None and strained.log_evidence > BY_CHANCE:
             worth.append((strained, BY_CHANCE - strained.log_evidence))
     return worth + [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]

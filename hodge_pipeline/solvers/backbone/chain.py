@@ -56,7 +56,8 @@ class Chain:
 
     def adjoint(self, poses: Floats) -> Floats:
         """Ad (..., p, p) of the free axes."""
-        return np.asarray(se3.adjoint(poses)[..., self.axes[:, None], self.axes])
+        whole = se3.adjoint(poses)
+        return whole if len(self.axes) == 6 else np.asarray(whole[..., self.axes[:, None], self.axes])
 
     def log(self, motions: Floats) -> Floats:
         """Twists (..., p) of the free axes."""

@@ -2,35 +2,46 @@
 
 In the world frame a step's residual ρ and covariance C add up along a path, so that a run of steps between two ends of
 loops is one edge (Σρ, ΣC), and the poses inside follow from those of its ends. Loops, ends and what is solved for are
-in axes parallel to the world's with the origin at the pose itself: far from the world's origin, its own lever arm would
-make every block of the normal equations ill-conditioned.
+in axes parallel to the world's with the origin at the pose itself, runs with the origin at their later ends: far from
+the world's origin, its own lever arm would make every block of the normal equations ill-conditioned.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.sparse import Factored, Network
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
 
 @dataclass(frozen=True)
 class Linear:
-    """The chain at some poses, in world axes: sums over positions of the steps' residuals `residual (n, p)` and
-    covariances `covariance (n, p, p)`; of each loop, at its later end, `loop_residual (M, p)` and `loop_covariance
-    (M, p, p)`; `shift (n, p, p)` takes a twist from the world's origin to a pose's own.
+    """The chain at some poses (n, 4, 4), in world axes: the steps' residuals summed over positions `residual (n, p)`;
+    `shift (n, p, p)` takes a twist from the world's origin to a pose's own.
     """
 
+    chain: Chain
     poses: Floats
     residual: Floats
-    covariance: Floats
-    loop_residual: Floats
-    loop_covariance: Floats
     shift: Floats
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """The steps' covariances summed over positions (n, p, p), about the world's origin: in extended precision."""
+        frame = self.chain.adjoint(self.poses)
+        each = frame @ self.chain.step_covariance @ np.swapaxes(frame, 1, 2)
+        by_entry = np.ascontiguousarray(each.reshape(len(each), -1).T)
+        return np.asarray(np.cumsum(by_entry, axis=1, dtype=np.longdouble).T.reshape(each.shape))
+
+    @cached_property
+    def loops(self) -> tuple[Floats, Floats]:
+        """Residuals (M, p) and covariances (M, p, p) of all loops, at their later ends."""
+        return loops_at(self.chain, self.poses, np.arange(len(self.chain.ends)))
 
     def path(self, a: Ints, b: Ints, at: Ints | None = None) -> Floats:
         """The covariance (K, p, p) of the path between two positions of one path, in either order: in the axes of a
@@ -63,33 +74,21 @@ def shifted(covariance: Floats, shift: Floats) -> Floats:
 def linearise(chain: Chain, poses: Floats) -> Linear:
     """The chain's sums at these poses (n, 4, 4)."""
     before = np.concatenate([poses[:1], poses[:-1]])
-    inner = chain.inner[:, None]
-    frame = chain.adjoint(poses)
     moved_origin = np.broadcast_to(np.eye(4), poses.shape).copy()
     moved_origin[:, :3, 3] = -poses[:, :3, 3]
-    shift = chain.adjoint(moved_origin)
     left = chain.log(se3.inverse(chain.step) @ se3.inverse(before) @ poses)
-    residual = np.where(inner, np.einsum("nij,nj->ni", frame, left), 0.0)
-    covariance = frame @ chain.step_covariance @ np.swapaxes(frame, 1, 2)
-    loop_residual, loop_covariance = loops_at(chain, poses)
-    return Linear(
-        poses,
-        np.cumsum(residual, axis=0),
-        np.cumsum(covariance, axis=0, dtype=np.longdouble),
-        loop_residual,
-        loop_covariance,
-        shift,
-    )
+    residual = np.where(chain.inner[:, None], np.einsum("nij,nj->ni", chain.adjoint(poses), left), 0.0)
+    return Linear(chain, poses, np.cumsum(residual, axis=0), chain.adjoint(moved_origin))
 
 
-def loops_at(chain: Chain, poses: Floats) -> tuple[Floats, Floats]:
-    """Residuals (M, p) and covariances (M, p, p) of the loops, in the world's directions at their later ends."""
-    a, b = chain.ends.T
+def loops_at(chain: Chain, poses: Floats, rows: Ints) -> tuple[Floats, Floats]:
+    """Residuals (K, p) and covariances (K, p, p) of loops, in the world's directions at their later ends."""
+    a, b = chain.ends[rows].T
     turned = poses[b].copy()
     turned[:, :3, 3] = 0.0
-    left = chain.log(se3.inverse(chain.motion) @ se3.inverse(poses[a]) @ poses[b])
+    left = chain.log(se3.inverse(chain.motion[rows]) @ se3.inverse(poses[a]) @ poses[b])
     turned = chain.adjoint(turned)
-    return np.einsum("nij,nj->ni", turned, left), turned @ chain.covariance @ np.swapaxes(turned, 1, 2)
+    return np.einsum("nij,nj->ni", turned, left), turned @ chain.covariance[rows] @ np.swapaxes(turned, 1, 2)
 
 
 ROUNDING = 1e-12
@@ -133,95 +132,128 @@ class Reduced:
         loops = np.searchsorted(ends, chain.ends[active])
         return cls(ends, runs, loops, active, Network.of(np.concatenate([runs, loops]), len(ends)))
 
-    def precisions(self, linear: Linear) -> tuple[Floats, Floats]:
-        """Of the runs (S, p, p) and the active loops (L, p, p)."""
-        runs = linear.path(*self.ends[self.runs].T)
-        return inverse(runs), inverse(linear.loop_covariance[self.active])
-
-    def residuals(self, linear: Linear) -> tuple[Floats, Floats]:
-        """Of the runs (S, p) and the active loops (L, p)."""
+    @cached_property
+    def inside(self) -> tuple[Ints, Ints]:
+        """Positions (K,) that the steps of runs lead to, and the run of each, ascending."""
         low, high = self.ends[self.runs].T
+        run = np.repeat(np.arange(len(low)), high - low)
+        return low[run] + 1 + np.arange(len(run)) - self.first[run], run
+
+    @cached_property
+    def first(self) -> Ints:
+        """The first row (S,) of each run among those positions."""
+        length = self.ends[self.runs[:, 1]] - self.ends[self.runs[:, 0]]
+        return np.asarray(np.cumsum(length) - length)
+
+    def anchor(self, chain: Chain) -> tuple[Ints, Bools]:
+        """The row (n,) of the end that each position follows, the one before it or else the next, and whether its path
+        has one.
+        """
+        where = np.arange(chain.size)
+        right = np.searchsorted(self.ends, where)
+        left, right = np.maximum(right - 1, 0), np.minimum(right, len(self.ends) - 1)
+        has_left = (chain.path[self.ends[left]] == chain.path) & (self.ends[left] <= where)
+        return np.where(has_left, left, right), has_left | (chain.path[self.ends[right]] == chain.path)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The network of some loops at some poses: its runs and, after them, its loops."""
+
+    reduced: Reduced
+    linear: Linear
+
+    @cached_property
+    def steps(self) -> Floats:
+        """The covariance (K, p, p) of each step of a run, about the run's later end."""
+        chain, (at, run) = self.linear.chain, self.reduced.inside
+        frame = self.linear.poses[at]
+        frame[:, :3, 3] -= self.linear.poses[self.reduced.ends[self.reduced.runs[:, 1]][run], :3, 3]
+        into = chain.adjoint(frame)
+        return np.asarray(into @ chain.step_covariance[at] @ np.swapaxes(into, 1, 2))
+
+    @cached_property
+    def runs(self) -> Floats:
+        """The covariance (S, p, p) of each run, at its later end."""
+        return np.add.reduceat(self.steps, self.reduced.first, axis=0) if len(self.reduced.first) else self.steps
+
+    @cached_property
+    def loops(self) -> tuple[Floats, Floats]:
+        """Residuals (L, p) and covariances (L, p, p) of the active loops, at their later ends."""
+        return loops_at(self.linear.chain, self.linear.poses, self.reduced.active)
+
+    @cached_property
+    def precision(self) -> Floats:
+        """Of the runs and the active loops (S + L, p, p)."""
+        return inverse(np.concatenate([self.runs, self.loops[1]]))
+
+    @cached_property
+    def residual(self) -> Floats:
+        """Of the runs and the active loops (S + L, p)."""
+        linear, (low, high) = self.linear, self.reduced.ends[self.reduced.runs].T
         along = linear.shift[high] @ (linear.residual[high] - linear.residual[low])[..., None]
-        return along[..., 0], linear.loop_residual[self.active]
+        return np.concatenate([along[..., 0], self.loops[0]])
 
-    def carry(self, linear: Linear) -> Floats:
+    @cached_property
+    def carry(self) -> Floats:
         """From the first end of each run and active loop to its second (S + L, p, p)."""
-        return linear.carry(*self.ends[self.network.edges].T)
+        return self.linear.carry(*self.reduced.ends[self.reduced.network.edges].T)
 
-    def factor(self, linear: Linear) -> Factored:
+    @cached_property
+    def factor(self) -> Factored:
         """The factorised normal equations."""
-        return self.network.factor(np.concatenate(self.precisions(linear)), self.carry(linear))
+        return self.reduced.network.factor(self.precision, self.carry)
 
-    def force(self, linear: Linear, pushed: Floats) -> Floats:
+    def force(self, pushed: Floats) -> Floats:
         """Minus half the gradient (R, p, c) for residuals times precisions (S + L, p, c)."""
-        out = np.zeros((len(self.ends), *pushed.shape[1:]))
-        np.add.at(out, self.network.edges[:, 0], np.swapaxes(self.carry(linear), 1, 2) @ pushed)
-        np.add.at(out, self.network.edges[:, 1], -pushed)
+        edges = self.reduced.network.edges
+        out = np.zeros((len(self.reduced.ends), *pushed.shape[1:]))
+        np.add.at(out, edges[:, 0], np.swapaxes(self.carry, 1, 2) @ pushed)
+        np.add.at(out, edges[:, 1], -pushed)
         return out
 
-    def cost(self, linear: Linear) -> float:
+    @cached_property
+    def cost(self) -> float:
         """χ² of the chain and the active loops."""
-        residual, precision = np.concatenate(self.residuals(linear)), np.concatenate(self.precisions(linear))
-        return float(np.einsum("mi,mij,mj->", residual, precision, residual))
+        return float(np.einsum("mi,mij,mj->", self.residual, self.precision, self.residual))
 
-    def moves(self, linear: Linear) -> Floats:
+    def moves(self) -> Floats:
         """The Gauss–Newton move (R, p) of the ends, about the world's origin."""
-        precision = np.concatenate(self.precisions(linear))
-        residual = np.concatenate(self.residuals(linear))
-        factored = self.network.factor(precision, self.carry(linear))
-        at_ends = factored.solve(self.force(linear, precision @ residual[..., None]))
-        return np.asarray((np.linalg.inv(linear.shift[self.ends]) @ at_ends)[..., 0])
+        at_ends = self.factor.solve(self.force(self.precision @ self.residual[..., None]))
+        return np.asarray((np.linalg.inv(self.linear.shift[self.reduced.ends]) @ at_ends)[..., 0])
+
+    def moved(self, moves: Floats) -> Floats:
+        """The poses (n, 4, 4) after a move (R, p) of the loops' ends: runs bend by their covariance, what lies beyond
+        the outermost ends follows them rigidly.
+        """
+        reduced, linear = self.reduced, self.linear
+        (at, run), (begin, end), (first, second) = reduced.inside, reduced.ends[reduced.runs].T, reduced.runs.T
+        anchor, touched = reduced.anchor(linear.chain)
+        out = moves[anchor] - (linear.residual - linear.residual[reduced.ends[anchor]])
+        out[~touched] = 0.0
+        gap = moves[second] - moves[first] + linear.residual[end] - linear.residual[begin]
+        pull = self.precision[: len(gap)] @ linear.shift[end] @ gap[..., None]
+        bent = np.concatenate([np.zeros((1, gap.shape[1])), np.cumsum((self.steps @ pull[run])[..., 0], axis=0)])
+        back = 2 * np.eye(gap.shape[1]) - linear.shift[end]
+        out[at] += (back[run] @ (bent[1:] - bent[reduced.first[run]])[..., None])[..., 0]
+        return np.asarray(linear.chain.exp(out) @ linear.poses)
 
 
-def moved(chain: Chain, reduced: Reduced, linear: Linear, moves: Floats) -> Floats:
-    """The poses (n, 4, 4) after a move (R, p) of the loops' ends: runs bend by their covariance, what lies beyond the
-    outermost ends follows them rigidly.
-    """
-    count, ends = chain.size, reduced.ends
-    where = np.arange(count)
-    right = np.searchsorted(ends, where)
-    left = np.maximum(right - 1, 0)
-    right = np.minimum(right, len(ends) - 1)
-    has_left = chain.path[ends[left]] == chain.path
-    has_left &= ends[left] <= where
-    has_right = (chain.path[ends[right]] == chain.path) & (ends[right] >= where)
-    left, right = np.where(has_left, left, right), np.where(has_right, right, left)
-    low, high = ends[left], ends[right]
-    touched = has_left | has_right
-    bent = has_left & has_right & (low < high)
-    out = moves[left] - (linear.residual - linear.residual[low])
-    out[~touched] = 0.0
-    k = np.flatnonzero(bent)
-    begin, end = ends[reduced.runs].T
-    first, second = reduced.runs.T
-    gap = moves[second] - moves[first] + linear.residual[end] - linear.residual[begin]
-    pull = np.empty((len(ends), gap.shape[1], 1))
-    pull[first] = inverse(linear.path(begin, end)) @ linear.shift[end] @ gap[..., None]
-    back = 2 * np.eye(gap.shape[1]) - linear.shift[k]
-    along = np.swapaxes(linear.carry(k, high[k]), 1, 2) @ pull[left[k]]
-    out[k] += (back @ linear.path(low[k], k) @ along)[..., 0]
-    return np.asarray(chain.exp(out) @ linear.poses)
-
-
-def settled(chain: Chain, reduced: Reduced, poses: Floats, steps: int, tolerance: float) -> Linear:
-    """The chain at the poses of least cost with the active loops, or after as many steps: until a step wins less than
+def settled(fit: Fit, steps: int, tolerance: float) -> Fit:
+    """The fit at the poses of least cost with the active loops, or after as many steps: until a step wins less than
     this share of the cost. A step that wins nothing is halved.
     """
-    linear = linearise(chain, poses)
-    if not len(reduced.active):
-        return linear
-    cost = reduced.cost(linear)
-    for _ in range(steps):
-        moves, before = reduced.moves(linear), cost
+    for _ in range(steps if len(fit.reduced.active) else 0):
+        moves, before = fit.moves(), fit.cost
         for _ in range(HALVINGS):
-            tried = linearise(chain, moved(chain, reduced, linear, moves))
-            if (found := reduced.cost(tried)) < cost:
-                linear, cost = tried, found
+            tried = replace(fit, linear=linearise(fit.linear.chain, fit.moved(moves)))
+            if tried.cost < before:
+                fit = tried
                 break
             moves = moves / 2
-        if not cost < (1 - tolerance) * before:
+        if not fit.cost < (1 - tolerance) * before:
             break
-    return linear
+    return fit
 
 
 HALVINGS = 4
@@ -241,11 +273,11 @@ def without(own: Floats, across: Floats) -> Floats:
     return np.asarray((wide / left[:, None]) @ np.swapaxes(wide, 1, 2))
 
 
-def without_run(reduced: Reduced, linear: Linear) -> tuple[Floats, Floats, Floats]:
+def without_run(fit: Fit) -> tuple[Floats, Floats, Floats]:
     """The residual (S, p) of each run at poses solved without it, its covariance (S, p, p), and that part of it which
     is of these poses.
     """
-    own = np.asarray(linear.path(*reduced.ends[reduced.runs].T), float)
-    total = without(own, reduced.factor(linear).across()[: len(own)])
-    ahead = np.linalg.solve(own, reduced.residuals(linear)[0][..., None])
+    own = fit.runs
+    total = without(own, fit.factor.across()[: len(own)])
+    ahead = np.linalg.solve(own, fit.residual[: len(own), :, None])
     return (total @ ahead)[..., 0], total, total - own

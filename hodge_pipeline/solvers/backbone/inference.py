@@ -8,10 +8,9 @@ import numpy as np
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import Wrong, student
-from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, inverse, linearise, scaled, settled, without
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, inverse, linearise, scaled, settled, without
 from hodge_pipeline.solvers.backbone.polish import LOCAL, polished
 from hodge_pipeline.solvers.backbone.scales import EVEN, Scales, learn_scales, mixture
-from hodge_pipeline.solvers.backbone.sparse import Factored
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -65,7 +64,7 @@ def infer(
     scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
     chain = scales.applied(chain)
     linear = start = linearise(chain, poses)
-    judged = _judge(chain, start, None, shares, wrong)
+    judged = _judge(start, None, shares, wrong)
     limit = np.log(max(len(always), 1))
     used = (judged.factor > limit) | always
     best, top, seen = (judged, start), -np.inf, b""
@@ -73,8 +72,9 @@ def infer(
         reduced = thinned(chain, np.flatnonzero(used))
         if not thin and len(reduced.active) < used.sum():
             return None
-        linear = settled_globally(chain, reduced, linear.poses)
-        judged = _judge(chain, linear, reduced, shares, wrong)
+        fit = settled_globally(Fit(reduced, linear))
+        linear = fit.linear
+        judged = _judge(linear, fit, shares, wrong)
         shares, likelihood = mixture(judged.log_density)
         likelihood -= float(judged.log_density[1].sum())
         if number >= SETTLING and likelihood > top:
@@ -89,7 +89,7 @@ def infer(
     confirmed = _confirmed(judged.factor[used], len(used))
     used = (used & confirmed) | always
     rows = thinned(chain, np.flatnonzero(used)).active
-    linear, width = polished(chain, rows, linear if used.any() else start)
+    linear, width = polished(rows, linear if used.any() else start)
     return Inferred(used, judged, linear.poses, scales, LOCAL, width, top, confirmed)
 
 
@@ -107,9 +107,10 @@ def thinned(chain: Chain, rows: Ints) -> Reduced:
     while True:
         chosen = spread[np.linspace(0, len(spread) - 1, count).astype(np.int64)]
         reduced = Reduced.of(chain, np.sort(chosen))
-        if reduced.network.core_size * len(chain.axes) <= MOST_UNKNOWNS:
+        unknowns = reduced.network.core_size * len(chain.axes)
+        if unknowns <= MOST_UNKNOWNS:
             return reduced
-        count = round(THINNING * count)
+        count = round(THINNING * count * MOST_UNKNOWNS / unknowns)
 
 
 MOST_UNKNOWNS = 1500
@@ -117,7 +118,7 @@ MOST_UNKNOWNS = 1500
 MOST_ACTIVE = 2000
 """Loops at the most: between their ends even a long path drifts by little."""
 THINNING = 0.8
-"""Of the loops that are left where these leave too many unknowns."""
+"""Of as many loops as would leave `MOST_UNKNOWNS` if these grew in proportion to the loops."""
 
 
 def _confirmed(factor: Floats, count: int) -> bool:
@@ -130,13 +131,11 @@ def by_chance(count: int) -> float:
     return BY_CHANCE + BY_CHANCE_EACH_FOLD * float(np.log(max(count, 1)))
 
 
-def settled_globally(chain: Chain, reduced: Reduced, poses: Floats) -> Linear:
-    """The chain at the poses of least cost: from these, and from chordal rotations where that ends too high."""
-    linear = settled(chain, reduced, poses, MOST_STEPS, TOLERANCE)
-    dof = len(chain.axes) * len(reduced.active)
-    cost = reduced.cost(linear) if dof else 0.0
-    if cost <= TOO_HIGH * dof:
-        return linear
+def settled_globally(fit: Fit) -> Fit:
+    """The fit at the poses of least cost: from its own, and from chordal rotations where that ends too high."""
+    fit, chain, reduced = settled(fit, MOST_STEPS, TOLERANCE), fit.linear.chain, fit.reduced
+    if not len(reduced.active) or fit.cost <= TOO_HIGH * len(chain.axes) * len(reduced.active):
+        return fit
     rows = np.flatnonzero(chain.inner)
     edges = np.concatenate([np.stack([rows - 1, rows], axis=1), chain.ends[reduced.active]])
     axes = np.ix_(np.arange(len(edges)), chain.axes, chain.axes)
@@ -149,9 +148,9 @@ def settled_globally(chain: Chain, reduced: Reduced, poses: Floats) -> Linear:
         information,
         dimension=2 if len(chain.axes) == 3 else 3,
     )
-    start = solve(graph, start=linear.poses, objective="isotropic", max_iterations=CHORDAL_STEPS).world_from_cam
-    other = settled(chain, reduced, start, MOST_STEPS, TOLERANCE)
-    return other if reduced.cost(other) < cost else linear
+    start = solve(graph, start=fit.linear.poses, objective="isotropic", max_iterations=CHORDAL_STEPS).world_from_cam
+    other = settled(Fit(reduced, linearise(chain, start)), MOST_STEPS, TOLERANCE)
+    return other if other.cost < fit.cost else fit
 
 
 TOO_HIGH = 2.0
@@ -159,40 +158,37 @@ TOO_HIGH = 2.0
 CHORDAL_STEPS = 10
 
 
-def _judge(chain: Chain, linear: Linear, reduced: Reduced | None, shares: Floats, wrong: Wrong) -> Judged:
-    covariance = uncertainty(chain, linear, reduced)
+def _judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong) -> Judged:
+    covariance = uncertainty(linear, fit)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
-    residual = linear.loop_residual.copy()
-    if reduced is not None and len(reduced.active):
-        residual[reduced.active] = left_out(linear, reduced, residual, covariance)
+    residual = linear.loops[0].copy()
+    if fit is not None:
+        residual[fit.reduced.active] = left_out(fit, covariance)
     log_density = np.zeros((2, len(covariance)))
     chi2 = np.full(len(covariance), np.nan)
     log_density[0, known], chi2[known] = student(residual[known], covariance[known])
-    log_density[1, known] = wrong.log_density(chain, linear.poses)[known]
+    log_density[1, known] = wrong.log_density(linear.chain, linear.poses)[known]
     factor = log_density[0] - log_density[1]
     return Judged(factor + np.log(shares[0] / shares[1]), factor, chi2, log_density)
 
 
-def left_out(linear: Linear, reduced: Reduced, residual: Floats, covariance: Floats) -> Floats:
+def left_out(fit: Fit, covariance: Floats) -> Floats:
     """Residuals of the active loops at poses solved without them: `V S⁻¹ r` with the covariances V there and S of r."""
-    own = linear.loop_covariance[reduced.active]
-    ahead = np.linalg.solve(own, residual[reduced.active][..., None])
-    return np.asarray((covariance[reduced.active] @ ahead)[..., 0])
+    residual, own = fit.loops
+    return np.asarray((covariance[fit.reduced.active] @ np.linalg.solve(own, residual[..., None]))[..., 0])
 
 
-def uncertainty(chain: Chain, linear: Linear, reduced: Reduced | None) -> Floats:
+def uncertainty(linear: Linear, fit: Fit | None) -> Floats:
     """The covariance (M, p, p) of each loop's residual at poses solved without it; infinite where nothing tells."""
-    own = linear.loop_covariance
+    chain, own = linear.chain, linear.loops[1]
     a, b = chain.ends.T
     same = chain.path[a] == chain.path[b]
     out = np.where(same[:, None, None], linear.path(a, b), np.inf)
-    if reduced is None or not len(reduced.active):
+    if fit is None or not len(fit.reduced.active):
         return out + own
-    factored = reduced.factor(linear)
-    through = _between(chain, linear, reduced, factored)
+    through = _between(fit)
     out = np.where((_size(through) < _size(out))[:, None, None], through, out) + own
-    across = factored.across()[len(reduced.runs) :]
-    out[reduced.active] = without(own[reduced.active], across)
+    out[fit.reduced.active] = without(fit.loops[1], fit.factor.across()[len(fit.reduced.runs) :])
     return out
 
 
@@ -201,10 +197,10 @@ def _size(covariance: Floats) -> Floats:
         return np.where(np.isfinite(covariance[:, 0, 0]), np.einsum("mii->m", covariance), np.inf)
 
 
-def _between(chain: Chain, linear: Linear, reduced: Reduced, factored: Factored) -> Floats:
+def _between(fit: Fit) -> Floats:
     """The covariance of the motion between the ends of every loop by the nearest ends of active ones."""
-    samples = _samples(linear, reduced, factored)
-    near, gap = [], np.zeros_like(linear.loop_covariance)
+    linear, reduced, samples = fit.linear, fit.reduced, _samples(fit)
+    chain, near, gap = linear.chain, [], np.zeros_like(linear.loops[1])
     for end in chain.ends.T:
         right = np.clip(np.searchsorted(reduced.ends, end), 0, len(reduced.ends) - 1)
         left = np.maximum(right - 1, 0)
@@ -219,19 +215,21 @@ def _between(chain: Chain, linear: Linear, reduced: Reduced, factored: Factored)
         near.append(nearest)
     component = reduced.network.component
     at = chain.ends[:, 1]
-    first, second = (linear.carry(reduced.ends[end], at) @ samples[end] for end in near)
-    difference = second - first
-    joint = difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
-    out = joint + gap
-    out[component[near[0]] != component[near[1]]] = np.inf
-    return np.asarray(out)
+    for rows in np.split(np.arange(len(gap)), np.arange(BATCH, len(gap), BATCH)):
+        first, second = (linear.carry(reduced.ends[end[rows]], at[rows]) @ samples[end[rows]] for end in near)
+        difference = second - first
+        gap[rows] += difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
+    gap[component[near[0]] != component[near[1]]] = np.inf
+    return gap
 
 
-def _samples(linear: Linear, reduced: Reduced, factored: Factored) -> Floats:
+BATCH = 500
+"""Loops whose samples fit in a processor's cache."""
+
+
+def _samples(fit: Fit) -> Floats:
     """Moves (R, p, SAMPLES) of the ends drawn from their joint distribution: solves with noisy measurements."""
-    precision = np.concatenate(reduced.precisions(linear))
-    noise = np.random.default_rng(0).standard_normal((len(precision), precision.shape[-1], SAMPLES))
-    ones, unit = scaled(precision)
+    size = (len(fit.precision), fit.precision.shape[-1], SAMPLES)
+    ones, unit = scaled(fit.precision)
     factor = np.linalg.cholesky(ones) * unit[:, :, None]
-    force = reduced.force(linear, factor @ noise)
-    return factored.solve(force)
+    return fit.factor.solve(fit.force(factor @ np.random.default_rng(0).standard_normal(size)))

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, turns
-from hodge_pipeline.solvers.backbone.fit import Linear, Reduced, settled
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, settled
 from hodge_pipeline.types import Floats, Ints
 
 LOCAL = 0.5
@@ -26,9 +26,9 @@ SAME_WEIGHT = 0.01
 """Loops whose weights change by less are not solved for again."""
 
 
-def polished(chain: Chain, rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
+def polished(rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
     """The chain at the poses of the loops of these rows, and the factors (M,) on the standard deviations of all."""
-    count = len(chain.ends)
+    chain, count = linear.chain, len(linear.chain.ends)
     if not len(rows):
         return linear, np.ones(count)
     reduced = Reduced.of(chain, rows)
@@ -39,8 +39,9 @@ def polished(chain: Chain, rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
     weights = np.ones(count)
     for _ in range(ROUNDS):
         weighted = replace(chain, covariance=chain.covariance / weights[:, None, None])
-        linear = settled(weighted, reduced, linear.poses, STEPS, TOLERANCE)
-        _, chi2 = gaussian(linear.loop_residual[rows], linear.loop_covariance[rows] * weights[rows, None, None])
+        fit = settled(Fit(reduced, replace(linear, chain=weighted)), STEPS, TOLERANCE)
+        linear, (residual, covariance) = fit.linear, fit.loops
+        chi2 = gaussian(residual, covariance * weights[rows, None, None])[1]
         before = weights[rows]
         weights[rows] = (FREEDOM + len(chain.axes)) / (FREEDOM + chi2)
         if np.abs(weights[rows] - before).max() < SAME_WEIGHT:

@@ -118,11 +118,11 @@ class _Model:
         for step in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
             part = Scales(*step, *step).applied(chain)
             linear = linearise(part, poses)
-            parts.append((linear.path(a[rows], b[rows]), linear.loop_covariance[rows]))
+            parts.append((linear.path(a[rows], b[rows]), linear.loops[1][rows]))
         path, own = (np.stack(each) for each in zip(*parts, strict=True))
         for parted in (path, own):
             parted[2] -= parted[0] + parted[1]
-        return cls(linear.loop_residual[rows], fixed, path, own, wrong.log_density(chain, poses)[rows])
+        return cls(linear.loops[0][rows], fixed, path, own, wrong.log_density(chain, poses)[rows])
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""

@@ -1,0 +1,120 @@
+"""Moving objects: the camera's motion is the one that most of the image follows, not that of most corners.
+
+Corners lie where there is texture, often on a person or a box that moves. A motion predicts the depth and the grey
+value of every pixel; where it fails over much of the image, other corners are followed, and tiles of the image vote.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, follow
+from hodge_pipeline.registration.resection import DEPTH_SIGMAS, GATE_PX, PIXEL_SIGMA, back_project, project
+from hodge_pipeline.registration.visual import depth_sigma
+from hodge_pipeline.types import Bytes, Floats, Floats32, Ints
+
+CELLS = 80
+"""Across the image: pixels at which a motion is tested, one in 8 of 640; they cost a millisecond."""
+TILES = 10
+"""Across the image and down it: each votes once, however much texture it has."""
+MUCH = 0.1
+"""Share of the tested pixels that contradict a motion, below which no other is sought: 0.05 would name 3 blurred frames
+of the 60 of fr1/rpy, where nothing moves.
+"""
+GREY_LEVELS, BLUR_PX = 20.0, 5
+"""Grey values, of 256, of the mean of so many pixels: more than noise and interpolation change in a static scene."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another motion that much of the image follows, and the key frame's corners that do.
+
+    `fits_better`: in more tiles than the first motion does; `moving (H, W)`: not 0 where the key frame's image follows
+    the motion that fits fewer tiles.
+    """
+
+    corners: Corners
+    followed: Followed
+    fits_better: bool
+    moving: Bytes
+
+
+def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floats) -> Rival | None:
+    """The motion of corners where the one found has none; None where little contradicts it, or nothing else agrees."""
+    key = corners.image
+    pixels = _tested(key)
+    misfit = _misfit(key, view, found.key_from_view, pixels)
+    compared = np.isfinite(misfit)
+    if np.count_nonzero(misfit[compared] >= 1) <= MUCH * compared.sum():
+        return None
+    own = _tiles_with(key, corners.pixels[found.rows])
+    others = find_corners(key, 1 - own)
+    other = follow(others, view, guess)
+    if other is None:
+        return None
+    gain = misfit - _misfit(key, view, other.key_from_view, pixels)
+    compared = np.isfinite(gain)
+    votes = np.bincount(_tile(key, pixels)[compared], gain[compared], minlength=TILES**2)
+    fits_better = bool((votes > 1).sum() > (votes < -1).sum())
+    return Rival(others, other, fits_better, own if fits_better else _tiles_with(key, others.pixels[other.rows]))
+
+
+def _tested(image: FlowImage) -> Floats:
+    """Pixels (n, 2) of a regular grid."""
+    height, width = image.depth.shape
+    step = max(1, width // CELLS)
+    v, u = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+    return np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
+
+
+def _misfit(key: FlowImage, view: FlowImage, key_from_view: Floats, pixels: Floats) -> Floats:
+    """Of pixels (n, 2) of the key frame: how far depth and grey value in the view are off what the motion predicts, 1:
+    by as much as may be or more; NaN where not both frames have a depth.
+    """
+    expected = project(se3.transform(se3.inverse(key_from_view), _points(key, pixels)), view.camera)
+    actual = _points(view, expected[:, :2])[:, 2]
+    sigma = DEPTH_SIGMAS * view.unit_m * depth_sigma(expected[:, 2] / view.unit_m)
+    off = (actual - expected[:, 2]) / (GATE_PX / PIXEL_SIGMA * sigma)
+    change = _grey(view, expected[:, :2]) - _grey(key, pixels)
+    seen = np.isfinite(actual)
+    exposure = float(np.median(change[seen])) if seen.any() else 0.0
+    return np.asarray(np.minimum(1, off**2 + ((change - exposure) / GREY_LEVELS) ** 2))
+
+
+def _tile(image: FlowImage, pixels: Floats) -> Ints:
+    height, width = image.depth.shape
+    column, row = np.clip(pixels * TILES / [width, height], 0, TILES - 1).astype(np.int64).T
+    return np.asarray(row * TILES + column)
+
+
+def _tiles_with(image: FlowImage, pixels: Floats) -> Bytes:
+    """1 in the tiles of an image (H, W) that hold one of these pixels."""
+    height, width = image.depth.shape
+    tiles = np.zeros(TILES**2, np.uint8)
+    tiles[_tile(image, pixels)] = 1
+    rows, columns = np.arange(height) * TILES // height, np.arange(width) * TILES // width
+    return np.ascontiguousarray(tiles.reshape(TILES, TILES)[rows[:, None], columns])
+
+
+def _at(values: Floats32, pixels: Floats) -> Floats:
+    """The values (n,) of an image at pixels (n, 2); NaN outside it."""
+    height, width = values.shape
+    rounded = np.round(np.where(np.isfinite(pixels), pixels, -1)).astype(np.int64)
+    inside = np.asarray(((rounded >= 0) & (rounded < [width, height])).all(axis=1))
+    u, v = np.where(inside[:, None], rounded, 0).T
+    return np.where(inside, values[v, u], np.nan)
+
+
+def _points(image: FlowImage, pixels: Floats) -> Floats:
+    """Points (n, 3) in the camera's axes; NaN where there is no depth."""
+    z = _at(image.depth, pixels)
+    z = np.where((z >= image.range_m[0]) & (z <= image.range_m[1]), z, np.nan)
+    return back_project(np.column_stack([pixels, z]), image.camera)
+
+
+def _grey(image: FlowImage, pixels: Floats) -> Floats:
+    return _at(cv2.blur(image.grey, (BLUR_PX, BLUR_PX)).astype(np.float32), pixels)

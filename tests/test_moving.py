@@ -1,0 +1,106 @@
+"""Objects that move before the camera: the poses stay those of the camera, and the report names the frames."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hodge_adapters.tum.reader import TumReader
+from hodge_pipeline import se3
+from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.executors.local import InProcess
+from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.registration.flow import find_corners, flow_image, follow
+from hodge_pipeline.registration.moving import rival_motion
+from hodge_pipeline.stages import Step, no_progress
+from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, track
+from hodge_pipeline.types import Frame, Source
+from hodge_pipeline.types.notes import Note
+
+WIDTH, HEIGHT, FRAMES = 320, 240, 16
+RANGE_M = (0.2, 8.0)
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Source:
+    options = DemoOptions(frames=FRAMES, width=WIDTH, height=HEIGHT, stride=1, turns=0.04)
+    return TumReader().open(make_sequence(tmp_path_factory.mktemp("moving") / "sequence", options))
+
+
+def with_block(source: Source, share: float, distance_m: float = 0.8, step_px: int = 3) -> Source:
+    """A textured board of this share of the image before the camera, `step_px` further to the right in each frame."""
+    side = int(np.sqrt(share * WIDTH * HEIGHT))
+    coarse = np.random.default_rng(7).integers(0, 255, (side // 5 + 1, side // 5 + 1, 3), dtype=np.uint8)
+    board = np.kron(coarse, np.ones((5, 5, 1), np.uint8))[:side, :side]
+
+    def pasted(read: Callable[[], Any], value: Any, left: int) -> Callable[[], Any]:
+        def show() -> Any:
+            image = np.array(read())
+            image[20 : 20 + side, left : left + side] = value
+            return image
+
+        return show
+
+    def changed(place: int, frame: Frame) -> Frame:
+        assert frame.read_colour is not None and frame.read_depth is not None
+        left = 20 + step_px * place
+        return replace(
+            frame,
+            read_colour=pasted(frame.read_colour, board, left),
+            read_depth=pasted(frame.read_depth, np.float32(distance_m), left),
+        )
+
+    return replace(source, frames=tuple(changed(place, frame) for place, frame in enumerate(source.frames)))
+
+
+def tracked(source: Source, folder: Path) -> tuple[Tracked, list[Note]]:
+    recipe, notes = load_recipe("demo", ["start.whole_up_to=5"], source.path), list[Note]()
+    assert isinstance(recipe.start, KeyFrameStart)
+    folder.mkdir()
+    step = Step(folder, no_progress, lambda *told: notes.extend(told))
+    return track(source, recipe.start._tracking(recipe.clouds), workers=InProcess(), step=step), notes
+
+
+def largest_error_m(source: Source, found: Tracked) -> float:
+    """Of the frames' positions in the axes of the first, each by tracking and by the truth."""
+    poses = found.world_from_key[found.anchors] @ found.key_from_frame
+    true = np.array([frame.true_world_from_cam for frame in source.frames])
+    by_tracking, by_truth = se3.inverse(poses[0]) @ poses, se3.inverse(true[0]) @ true
+    return float(np.linalg.norm(by_tracking[:, :3, 3] - by_truth[:, :3, 3], axis=1).max())
+
+
+@pytest.mark.parametrize(("share", "distance_m"), [(0.2, 0.5), (0.2, 1.2)])
+def test_the_camera_is_tracked_past_a_moving_object(
+    still: Source, tmp_path: Path, share: float, distance_m: float
+) -> None:
+    source = with_block(still, share, distance_m)
+    found, notes = tracked(source, tmp_path / "block")
+    assert largest_error_m(source, found) < 0.08
+    (note,) = [note for note in notes if note.kind == "moving objects"]
+    assert note.count > FRAMES / 2
+
+
+def test_nothing_moves_in_a_still_scene(still: Source, tmp_path: Path) -> None:
+    found, notes = tracked(still, tmp_path / "still")
+    assert "moving objects" not in {note.kind for note in notes}
+    assert largest_error_m(still, found) < 0.03
+
+
+def test_the_vote_is_by_area_whichever_motion_is_found_first(still: Source) -> None:
+    first, later = (flow_image(frame, RANGE_M) for frame in with_block(still, 0.2).frames[::4][:2])
+    assert first is not None and later is not None
+    corners = find_corners(first)
+    by_board = follow(corners, later, np.eye(4))
+    assert by_board is not None
+    rival = rival_motion(corners, later, by_board, np.eye(4))
+    assert rival is not None and rival.fits_better
+    board = np.zeros((HEIGHT, WIDTH), bool)
+    side = int(np.sqrt(0.2 * WIDTH * HEIGHT))
+    board[20 : 20 + side, 20 : 20 + side] = True
+    assert rival.moving[board].mean() > 0.7
+    assert rival.moving[~board].mean() < 0.2
+    back = rival_motion(rival.corners, later, rival.followed, np.eye(4))
+    assert back is not None and not back.fits_better
