@@ -6,6 +6,7 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import fundamental_loops, spanning_forest
 from hodge_pipeline.diagnosis.confirmation import cycle_lengths
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
@@ -92,10 +93,25 @@ def test_a_wrong_sequential_edge_is_not_trusted():
 def test_smooth_weights_lie_between():
     graph, truth = band(20, 6, 4)
     graph, wrong = spoiled(graph, 0.2, 5)
+    graph = dataclasses.replace(graph, information=4 * graph.information)  # which the errors of right edges belie
     weights = solve_robust(graph, start=truth).weights
     assert weights[wrong].max() == 0
     assert np.median(weights[~wrong]) > 0.9
     assert ((weights > 0.05) & (weights < 0.95)).any()
+
+
+@pytest.mark.parametrize("stated", [1.0, 0.1])
+@pytest.mark.parametrize("trust", ["auto", "none"])  # on a backbone, and judged by cycles
+def test_a_graph_whose_information_explains_it_is_solved_as_stated(trust, stated):
+    graph, _ = rings(200, 40)
+    graph = dataclasses.replace(graph, information=stated * graph.information)
+    solution = solve_robust(graph, diagnosis=DiagnosisOptions(trust=trust))
+    used = solution.weights > 0
+    assert used.mean() > 0.95
+    np.testing.assert_array_equal(solution.weights[used], 1)
+    plain = solve(graph.select(np.flatnonzero(used))).world_from_cam
+    from_first = se3.inverse(solution.world_from_cam[0]) @ solution.world_from_cam
+    np.testing.assert_allclose(from_first, se3.inverse(plain[0]) @ plain, atol=1e-3)
 
 
 def test_what_only_wrong_edges_join_falls_apart():

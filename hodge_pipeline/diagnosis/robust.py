@@ -22,6 +22,7 @@ from hodge_pipeline.solvers.backbone.trust import NONE, find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.setup import held_rows
+from hodge_pipeline.solvers.stated import is_explained
 from hodge_pipeline.solvers.weights import edge_weights, is_planar
 from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
 
@@ -41,7 +42,8 @@ def solve_robust(
     """The poses of the edges that agree, with `weights` 0 for the others and from 0 to 1 for those.
 
     `diagnosis`: how the edges are judged first, and which of them are trusted as a backbone. Where there is one, the
-    loops that it and each other confirm are kept; else an edge that is kept weighs by Student's t what it leaves over,
+    loops that it and each other confirm are kept. Where the information explains what the kept edges leave over, the
+    poses are the maximum-likelihood ones of these; else an edge that is kept weighs by Student's t what it leaves over,
     and nothing beyond the gate of `student_weight`. The graph's fixed vertices stay at their start. The components are
     those of the edges that are kept. `confirmed` is False where edges are left out and the cycles of those kept close
     no better than by chance.
@@ -74,7 +76,7 @@ def solve_robust(
     kept = found.kept & graph.information.any(axis=(1, 2))
     weights = kept.astype(float)
     final = solved(weights, found.world_from_cam)
-    for _ in range(ROUNDS):
+    for _ in range(0 if is_explained(graph.select(np.flatnonzero(kept)), final) else ROUNDS):
         new = np.where(kept, _weights(known, final, kept), 0.0)
         if np.abs(new - weights).max(initial=0.0) < SETTLED:
             break
