@@ -143,7 +143,7 @@ def test_a_bad_loop_is_seen_whatever_the_information_states(deviation_rad: float
     assert set(found.verdict.tolist()) == {UNTESTABLE}
     assert all("the loop 5-6-7-8-9-0-1-2-3-4 fails by" in reason for reason in found.reason)
     doubted = deviation_rad != 0.005
-    assert any("the information states errors of" in note for note in found.notes) == doubted
+    assert any("the information states errors that" in note for note in found.notes) == doubted
 
 
 def test_a_good_loop_closes_though_the_information_states_errors_far_too_large() -> None:

@@ -110,10 +110,10 @@ def _credible(stated: float, usual: float, shown: float) -> float:
 
 
 def _doubt(stated: tuple[float, float], taken: tuple[float, float]) -> str:
-    before, after = (f"{np.degrees(turn):.2g}° and {shift:.2g} m" for turn, shift in (stated, taken))
+    turn, shift = (own / before for own, before in zip(taken, stated, strict=True))
     return (
-        f"the information states errors of {before} an edge, and too few short cycles close to tell: "
-        f"judged with {after}"
+        "the information states errors that the graph does not show, and too few short cycles close to tell: judged "
+        f"with {turn:.2g} times these in rotation, {shift:.2g} times in translation"
     )
 
 
