@@ -33,7 +33,7 @@ from hodge_pipeline.diagnosis.testing_cycles import (
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.diagnosis.working_point import recentred, working_point
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.solvers.backbone.trust import find_backbone
+from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -52,6 +52,25 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     graph = replace(graph, dimension=2) if is_planar(graph) else graph
     if (backbone := find_backbone(graph, options.trust)) is not None:
         return judged_on_backbone(graph, backbone, options)
+    found = _by_cycles(graph, options)
+    backbone = lattice_backbone(graph, found, options)
+    return found if backbone is None else judged_on_backbone(graph, backbone, options)
+
+
+def lattice_backbone(graph: ViewGraph, found: Diagnosis, options: DiagnosisOptions) -> Backbone | None:
+    """The backbone of a large lattice where more edges agree with it than `found` keeps: of two scenes that edges may
+    agree on, that of most. None elsewhere, and where no edge is left out.
+    """
+    if options.trust != AUTO or found.kept.all():
+        return None
+    backbone = find_backbone(graph, lattice=True)
+    if backbone is None or not backbone.found.confirmed or backbone.used.sum() <= found.kept.sum():
+        return None
+    return backbone
+
+
+def _by_cycles(graph: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
+    """The diagnosis that trusts no edge."""
     stated, (graph, turned) = graph, in_vertex_order(graph)
     prior = np.full(graph.edge_count, 0.5)
     if options.order_prior:

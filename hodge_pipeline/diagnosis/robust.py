@@ -14,7 +14,7 @@ from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.judging import chi2_by_information, has_unit_information, student_weight
 from hodge_pipeline.diagnosis.confirmation import confirmed
-from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, diagnose
+from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, diagnose, lattice_backbone
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
 from hodge_pipeline.solvers.backbone.solve import solve_on_backbone
@@ -51,11 +51,14 @@ def solve_robust(
     check_choice("objective", objective, ObjectiveName)
     start = None if start is None else np.asarray(start, float)
     check_graph(graph, start)
-    if (backbone := find_backbone(graph, diagnosis.trust)) is not None:
+    backbone = find_backbone(graph, diagnosis.trust)
+    if backbone is None:
+        found = diagnose(graph, replace(diagnosis, trust=NONE))
+        backbone = lattice_backbone(graph, found, diagnosis)
+    if backbone is not None:
         return solve_on_backbone(
             graph, backbone, start=start, objective=objective, dimension=dimension, certificate=certificate
         )
-    found = diagnose(graph, replace(diagnosis, trust=NONE))
     fixed, unheld = held_rows(graph, start)
     known = replace(graph, information=found.information) if has_unit_information(graph) else graph
 

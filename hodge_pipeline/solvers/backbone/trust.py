@@ -86,8 +86,9 @@ class Backbone:
         return f"{trusted}{said}, {used} of {loops} loops confirmed"
 
 
-def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
-    """The backbone of a graph, None where it has none that should be trusted.
+def find_backbone(graph: ViewGraph, trust: str = AUTO, *, lattice: bool = False) -> Backbone | None:
+    """The backbone of a graph, None where it has none that should be trusted; `auto` takes none of a large lattice, in
+    which loops suffice, unless it is asked for those of a `lattice` alone.
 
     `trust`: `auto` learns from the graph whether its consecutive edges are one; `sequential` trusts them, `none` no
     edge; any other word those edges whose `source` it is. Raises `GraphError` where no edge is meant.
@@ -107,8 +108,11 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO) -> Backbone | None:
         return None
     if trust == AUTO and tested_steps(chain, chain.poses()).sum() > TESTED * steps.sum():
         return None
+    many_loops = _many_loops(chain, steps)
+    if lattice and not many_loops:
+        return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
-    inferred = infer_bridged(chain, always, trust != AUTO or not _many_loops(chain, steps))
+    inferred = infer_bridged(chain, always, trust != AUTO or lattice or not many_loops)
     if inferred is None:
         return None
     chain, found = inferred
