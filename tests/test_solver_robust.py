@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_pipeline import se3
+from hodge_pipeline import open_source, se3
 from hodge_pipeline.complex.cycles import fundamental_loops, spanning_forest
 from hodge_pipeline.diagnosis.confirmation import cycle_lengths
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
@@ -12,7 +12,6 @@ from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.sources.opening import open_source
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import ViewGraph
 
@@ -241,7 +240,7 @@ def test_the_lengths_of_cycles_are_those_of_their_edges():
 
 
 def test_random_loops_in_a_large_lattice_are_left_out(data_dir: Path) -> None:
-    """Too many loops for all to count at once, of which a tenth are random: 7 of these were kept, 14 right ones lost."""
+    """Too many loops to count at once, a tenth of them random: 7 of these were kept, 14 right ones lost."""
     graph = open_source(data_dir / "pose_graphs/sesync/sphere2500.g2o").graph
     assert graph is not None
     rng, count = np.random.default_rng(0), 272
