@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(why_no_browser()), reaso
 PLANTED = {f"{i}-{j}" for i, j in MISTAKEN}
 SMALL = (
     "outer_iterations=1", "edges={stage: sequential, reach: 3}", "evaluation.tables=false", "clouds.voxel_m=0.06",
-    "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary",
+    "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary", "start.revisits=null", "solve_with=all",
 )  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def test_three_wrong_edges_taken_out_by_mouse_and_the_run_solved(
 ) -> None:
     session, before_m = review.session, error_of(run_folder)
     page = Page(browser, review)
-    assert set(page.rows()) == PLANTED
+    assert set(page.rows()) >= PLANTED
     page.sort("gap")
     page.sort("score")
     for name in sorted(PLANTED):
