@@ -282,7 +282,7 @@ def register_steps(
     step: Step,
 ) -> Odometry:
     """Step: each key frame joined to the one before it by the motion that the map gave, which is more exact than a
-    registration of the two clouds; how well these fit there is the edge's information.
+    registration of the two clouds; fitness and information are those of that registration.
     """
     assert clouds.folder is not None
     pairs = np.concatenate([np.stack([rows[:-1], rows[1:]], axis=1) for rows in sequences]).astype(np.int64)
