@@ -157,7 +157,9 @@ def test_an_edge_added_by_three_clicked_points(browser: Any, review: Review, run
     assert np.abs(off).max() < 0.25, off
     page.click("#register")
     page.until(lambda: session.candidate is not None and session.candidate.found is not None)
-    assert session.candidate.residual_m < 0.1 and not session.candidate.rejected
+    assert session.candidate.found is not None and not session.candidate.rejected
+    off = se3.log(se3.inverse(motion) @ session.candidate.found.i_from_j)
+    assert np.abs(off).max() < 0.05, off
     page.decided(lambda: page.click("#accept"))
     assert session.settled.weights[session.rows_of(f"{i}-{j}")[0]] == 1
     assert read_history(run_folder).registered == (f"{i}-{j}",)
