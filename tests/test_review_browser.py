@@ -180,7 +180,9 @@ def test_a_first_guess_by_the_handles_of_the_second_cloud(browser: Any, review: 
     ways = np.outer([0.5, 0.6, 0.7, 0.9], [handle.scale, 0, 0])  # along the arrow of x
     pose = se3.from_quat_xyzw(np.array(handle.position), np.array(handle.wxyz)[[1, 2, 3, 0]])
     time.sleep(2)  # the handles are drawn a few frames after the server has made them
-    page.click_scene(*se3.transform(pose, ways))
+    arrow = se3.transform(pose, ways)
+    page.until(lambda: all(page.place(point) is not None for point in arrow))  # the camera has arrived
+    page.click_scene(*arrow)
     page.until(lambda: "the place it was put at" in page.text("found"))
     moved = se3.log(se3.inverse(before) @ session.candidate.guess)  # type: ignore[union-attr]
     assert moved[3] == pytest.approx(ways[-1, 0] - ways[0, 0], rel=0.2) and np.abs(np.delete(moved, 3)).max() < 1e-6
