@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass as stage
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import chi2_by_information, has_unit_information, student_weight
+from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.diagnosis.confirmation import confirmed
 from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, diagnose, lattice_backbone
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
@@ -21,13 +21,11 @@ from hodge_pipeline.solvers.backbone.solve import solve_on_backbone
 from hodge_pipeline.solvers.backbone.trust import NONE, find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.options import check_choice
+from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import held_rows
 from hodge_pipeline.solvers.stated import is_explained
 from hodge_pipeline.solvers.weights import edge_weights, is_planar
-from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
-
-ROUNDS, SETTLED = 4, 1e-2
-"""Rounds of weights at most, and the change of them that ends the rounds: beyond, no edge goes or comes."""
+from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 
 def solve_robust(
@@ -79,11 +77,8 @@ def solve_robust(
     kept = found.kept & graph.information.any(axis=(1, 2))
     weights = kept.astype(float)
     final = solved(weights, found.world_from_cam)
-    for _ in range(0 if is_explained(graph.select(np.flatnonzero(kept)), final) else ROUNDS):
-        new = np.where(kept, _weights(known, final, kept), 0.0)
-        if np.abs(new - weights).max(initial=0.0) < SETTLED:
-            break
-        weights, final = new, solved(new, final.world_from_cam)
+    if not is_explained(graph.select(np.flatnonzero(kept)), final):
+        weights, final = reweighted(known, weights, final, solved)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
     on_information = edge_weights(graph, 2 if graph.dimension == 2 or is_planar(graph) else 3).notes
@@ -99,13 +94,6 @@ def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:
     first = np.unique(component, return_index=True)[1]
     start = np.broadcast_to(np.eye(4), poses.shape) if start is None else start
     return np.asarray((start[first] @ se3.inverse(poses[first]))[component] @ poses)
-
-
-def _weights(graph: ViewGraph, solution: Solution, kept: Bools) -> Floats:
-    """The weight (E,) of each edge at a solution, its information taken to be right in its proportions."""
-    size = 3 if graph.dimension == 2 or is_planar(graph) else 6
-    chi2 = np.maximum(chi2_by_information(graph, solution.world_from_cam), 0.0)
-    return student_weight(chi2, size, usual=chi2[kept])
 
 
 def _told(found: Diagnosis, weights: Floats) -> str:
