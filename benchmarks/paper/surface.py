@@ -15,12 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.paper.sequences import recipe_file
+from hodge_paper.solver import PaperSolver
 from hodge_pipeline.evaluation.scores import score_table
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
-from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import Floats, Solution, ViewGraph
@@ -81,7 +82,7 @@ def main() -> None:
     sets = {"truth": problem.truth}
     for name, (solutions, _) in found.items():
         sets |= {f"{name} {seed}": solution.world_from_cam for seed, solution in enumerate(solutions[:SCORED_SEEDS])}
-    with load_recipe("paper_distance").executor.open() as workers:
+    with load_recipe(recipe_file("distance")).executor.open() as workers:
         table = score_table(problem.clouds, sets, "truth", workers)
     scores = {graph.kind: dict(zip(table.names, graph.mean_score, strict=True)) for graph in table.graphs}
     truth = ", ".join(f"{kind} {score['truth']:.4f}" for kind, score in scores.items())

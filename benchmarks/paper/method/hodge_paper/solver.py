@@ -6,19 +6,19 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.complex.checks import NO_EDGES, check_graph, refuse_priors
-from hodge_pipeline.complex.components import describe_components
-from hodge_pipeline.complex.cycles import Loops, loop_deviation
-from hodge_pipeline.complex.minimum_cycles import MOST_CANDIDATES
-from hodge_pipeline.complex.one_form import Logarithm
-from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem
-from hodge_pipeline.solvers.paper_surface import (
+from hodge_paper.problem import PaperProblem, make_problem
+from hodge_paper.surface import (
     MOST_CHECKED_EDGES,
     PaperSurface,
     RotationSystem,
     homology_metrics,
     make_surface,
 )
+from hodge_pipeline.complex.checks import NO_EDGES, check_graph, refuse_priors
+from hodge_pipeline.complex.components import describe_components
+from hodge_pipeline.complex.cycles import Loops, loop_deviation
+from hodge_pipeline.complex.minimum_cycles import MOST_CANDIDATES
+from hodge_pipeline.complex.one_form import Logarithm
 from hodge_pipeline.solvers.potential import (
     AroundLoops,
     deviation_metrics,
