@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 
 from betti import betti_numbers
 from complex_graphs import SQUARE, TWO_TRIANGLES, complete, graphs, torus_grid, torus_rotation
+from hodge_paper.cotangent import cotangent_weights
+from hodge_paper.embedding import Surface, embed, triangulate
+from hodge_paper.homology import homology_generators
+from hodge_paper.rotation import random_rotation
+from hodge_paper.shortest_paths import surface_form
 from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.coboundary import coboundary_0
-from hodge_pipeline.complex.cotangent import cotangent_weights
 from hodge_pipeline.complex.decomposition import HodgeDecomposition, hodge_decomposition
-from hodge_pipeline.complex.embedding import Surface, embed, triangulate
-from hodge_pipeline.complex.homology import homology_generators
-from hodge_pipeline.complex.one_form import surface_form
-from hodge_pipeline.complex.rotation import random_rotation
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from benchmarks.paper.__main__ import paper
 from benchmarks.paper.picture import draw_comparison
-from benchmarks.paper.sequences import find_sequences, peer_poses
+from benchmarks.paper.sequences import find_sequences, peer_poses, recipe_file
 from benchmarks.paper.tables import (
     PAPER_SCORES,
     SEQUENCES,
@@ -103,7 +103,7 @@ def test_every_format_holds_every_table() -> None:
 
 @pytest.mark.parametrize("kind", ["distance", "iou", "sift"])
 def test_the_papers_recipes_reject_no_registered_pair(kind: str) -> None:
-    recipe = load_recipe(f"paper_{kind}", [], "frames")
+    recipe = load_recipe(recipe_file(kind), [], "frames")
     assert recipe.start.relocalise is False and recipe.start.tail is None  # type: ignore[attr-defined]
     count = 3
     poor = Edges.of(np.array([[0, 2], [0, 3], [1, 3]])).put(

@@ -9,14 +9,14 @@ from typing import Literal
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from hodge_paper.cotangent import cotangent_weights
+from hodge_paper.embedding import Embedding, Surface, embed, triangulate
+from hodge_paper.homology import homology_generators, motion_deviation
+from hodge_paper.rotation import angular_rotation, random_rotation
+from hodge_paper.shortest_paths import surface_form
 from hodge_pipeline.complex.coboundary import coboundary_0
-from hodge_pipeline.complex.cotangent import cotangent_weights
 from hodge_pipeline.complex.cycles import Loops, loop_products
 from hodge_pipeline.complex.decomposition import hodge_decomposition
-from hodge_pipeline.complex.embedding import Embedding, Surface, embed, triangulate
-from hodge_pipeline.complex.homology import homology_generators, motion_deviation
-from hodge_pipeline.complex.one_form import surface_form
-from hodge_pipeline.complex.rotation import angular_rotation, random_rotation
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.types import Floats, Ints
 
