@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.paper.sequences import recipe_file
+from hodge_paper.minimum_cycles import shortest_loops
 from hodge_paper.solver import PaperSolver
 from hodge_pipeline.evaluation.scores import score_table
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
+from hodge_pipeline.solvers import poisson
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import Floats, Solution, ViewGraph
@@ -69,6 +71,7 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="a finished run")
     parser.add_argument("round", type=int, nargs="?", default=1)
     given = parser.parse_args()
+    poisson.tree_loops = shortest_loops  # D of both solvers over the same loops
     problem = read_problem(given.run, given.round)
     makers: dict[str, tuple[Callable[[int], ConsistencySolver], int]] = {
         "graph, pairing": (lambda seed: PoissonSolver(log="pairing"), 1),

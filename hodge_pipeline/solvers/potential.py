@@ -16,10 +16,8 @@ from hodge_pipeline.complex.cycles import (
     adjusted_edges,
     fundamental_products,
     loop_deviation,
-    loop_products,
     spanning_forest,
 )
-from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
 from hodge_pipeline.complex.one_form import Logarithm, residual_form, shifted
 from hodge_pipeline.solvers.linear import factorise
 from hodge_pipeline.solvers.problem import pinned_vertices
@@ -72,12 +70,8 @@ class CentredProblem:
         return (f"{count} edges disagree with the start by a half turn: the sign of their ω is arbitrary",)
 
 
-def loops_of(edges: Ints, vertex_count: int, affordable: int) -> AroundLoops:
-    """The products around the shortest cycle basis, mostly triangles, up to so many vertices times edges; beyond that
-    around the loops of a breadth-first tree. D grows with the loops' length; the poses do not depend on the basis.
-    """
-    if vertex_count * len(edges) <= affordable:
-        return partial(loop_products, minimum_cycle_basis(edges, vertex_count))
+def tree_loops(edges: Ints, vertex_count: int) -> AroundLoops:
+    """The products around the loops of a breadth-first tree: D grows with their length, poses do not depend on it."""
     return partial(fundamental_products, spanning_forest(edges, vertex_count))
 
 
