@@ -117,8 +117,8 @@ class GivenStart:
         return Scene(whole, keys, key_frames, made, first, is_given=True, given=file)
 
     def _at_jumps(self, poses: Floats, sequences: Sequence[Ints]) -> Ints:
-        """The rows at both ends of a step that is unlike the one before and the one after it: what mends a jump must not
-        be spread over the frames around it.
+        """The rows at both ends of a step that is unlike the one before and the one after it: what mends a jump is not
+        to be spread over the frames around it.
         """
         found = [np.zeros(0, np.int64)]
         for rows in sequences:

@@ -83,9 +83,9 @@ def refine_trajectory(
     """Poses made better by the frames they belong to, one pose for each frame.
 
     `poses`: world_from_cam (N, 4, 4), or an `open3d.camera.PinholeCameraTrajectory`. `frames`: a path that a reader
-    opens, or frames (see `frames_from_images`). `recipe`: slam_refine, slam_refine_tum for TUM's folders, slam_refine_scans for scans. `out`
-    keeps the run folder with report and recording; `dask` is as of `run`. Files of poses go to `hodge refine
-    trajectory`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
+    opens, or frames (see `frames_from_images`). `recipe`: slam_refine, slam_refine_tum for TUM's folders,
+    slam_refine_scans for scans. `out` keeps the run folder with report and recording; `dask` is as of `run`. Files of
+    poses go to `hodge refine trajectory`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     open3d = not isinstance(poses, (np.ndarray, list, tuple))
     given = poses_of(poses) if open3d else np.asarray(poses, float)
