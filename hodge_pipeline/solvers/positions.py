@@ -207,8 +207,8 @@ def _untorn(
     graph: ViewGraph, weights: Floats, fixes: Fixes, settled: _Settled, settle: Callable[[Bools], _Settled]
 ) -> _Settled:
     """The same without the positions of a stretch whose two ends tear edges, where those before and after it then
-    agree along the edges: a receiver that is off by the same for a while agrees with itself. Edges torn in one place alone
-    may be at fault themselves: then all positions stay.
+    agree along the edges: a receiver that is off by the same for a while agrees with itself. Edges torn in one place
+    alone may be at fault themselves: then all positions stay.
     """
     for _ in range(MOST_STRETCHES):
         torn = _torn(graph, weights, settled.world_from_cam)
