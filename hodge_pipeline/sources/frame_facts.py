@@ -54,7 +54,7 @@ def frame_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
     without = len(frames) - facts["frames with depth"]
     if 0 < without < len(frames) and not facts["frames with points"]:
         bare = [str(frame.frame_id) for frame in frames if frame.read_depth is None]
-        oddities.append(f"{without} of {len(frames)} frames have no depth: {_listed(bare)}")
+        oddities.append(f"{without} of {len(frames)} frames have no depth: {listed(bare)}")
     return {**facts, **_depth_facts(frames, oddities), **_scanner_facts(frames)}
 
 
@@ -91,7 +91,7 @@ def stamp_facts(stamps_s: Floats, together: Bools, names: Sequence[str], odditie
     after = np.flatnonzero(together)
     if (steps == 0).any():
         same = [names[row] for row in after[steps == 0]]
-        oddities.append(f"{len(same)} stamps are that of the one before: after {_listed(same)}")
+        oddities.append(f"{len(same)} stamps are that of the one before: after {listed(same)}")
     if (steps < 0).any():
         oddities.append(f"{int((steps < 0).sum())} stamps are before the one before them: not in order of time")
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -137,7 +137,7 @@ def _note_ids(frames: Sequence[Frame], oddities: list[str]) -> None:
     counts = Counter((frame.sequence, frame.frame_id) for frame in frames)
     twice = [str(name) for (_, name), count in counts.items() if count > 1]
     if twice:
-        oddities.append(f"{len(twice)} frame ids are given more than once: {_listed(twice)}")
+        oddities.append(f"{len(twice)} frame ids are given more than once: {listed(twice)}")
 
 
 def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
@@ -186,5 +186,6 @@ def _colour_fault(frame: Frame) -> list[str]:
     return []
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:LISTED]) + (" …" if len(names) > LISTED else "")
+def listed(names: Sequence[object]) -> str:
+    """The first few, and a sign that there are more."""
+    return ", ".join(map(str, names[:LISTED])) + (" …" if len(names) > LISTED else "")
