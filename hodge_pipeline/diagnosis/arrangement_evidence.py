@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hodge_pipeline.diagnosis.cuts import PlacementCriteria, placement_criteria
+from hodge_pipeline.diagnosis.cuts import PlacementCriteria
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.scene_model import SceneModel
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -19,7 +19,7 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 def arrangement_log_evidence(evidence: Evidence, poses: Floats, piece: Ints, models: Sequence[SceneModel]) -> float:
     """Log-evidence for poses (V, 4, 4) in pieces (V,), the mean over several scene models."""
-    criteria = [placement_criteria(evidence, model, poses, piece) for model in models]
+    criteria = [PlacementCriteria.of(evidence, model, poses, piece) for model in models]
     return sum(_log_evidence(each, poses, piece) for each in criteria) / len(models)
 
 
@@ -28,7 +28,7 @@ def _log_evidence(criteria: PlacementCriteria, poses: Floats, piece: Ints) -> fl
     upright_evidence = float(upright.log_evidence(rotations, upright.world_up(rotations, piece)).sum())
     together = piece[:, None] == piece[None]
     np.fill_diagonal(together, False)
-    layers = criteria.layers(poses, poses) * together
+    layers = criteria.layers(np.eye(4)) * together
     return upright_evidence + _merged(criteria, (layers + layers.swapaxes(1, 2)) / 2, together)
 
 

@@ -25,6 +25,7 @@ FAIR_SHARE, SHARE_SPREAD = 0.75, 0.35
 """Of the edges expected under a placement, the share from which on it has evidence in its favour, and its spread."""
 PER_EXPECTED_FOLD = 1.0
 """Nats for each e-fold of expected edges, at one spread from the usual share."""
+ROUNDING = 1e-9
 JUMP = 1e-4
 """Share of consecutive views that do not see the same place."""
 SURE = 5.0
@@ -35,15 +36,28 @@ UNSUPPORTED, SUPPORTED = 0.05, 0.3
 
 @dataclass(frozen=True)
 class PlacementCriteria:
-    """The model and thresholds that a placement is scored with.
+    """What moves of poses (V, 4, 4) are scored by.
 
     - `model`: the probability of edges by poses, and the distribution of up.
     - `usual`: the mean probability that views of one piece are joined, 0 where views have no order.
+    - `proposed (2 E, 3, 3)`: the rotation of the world that makes each edge agree when its second end moves, and then
+      that for its first end.
     """
 
     evidence: Evidence
     model: SceneModel
+    poses: Floats
     usual: float
+    proposed: Floats
+
+    @classmethod
+    def of(cls, evidence: Evidence, model: SceneModel, poses: Floats, piece: Ints) -> PlacementCriteria:
+        """The criteria for moves of poses (V, 4, 4) in pieces (V,)."""
+        same = piece[:, None] == piece[None]
+        usual = float(model.joining.between(poses, poses)[same].mean()) if np.ptp(evidence.prior) > 0 else 0.0
+        rotations, (i, j) = poses[:, :3, :3], evidence.edges.T
+        second = rotations[i] @ evidence.i_from_j[:, :3, :3] @ np.swapaxes(rotations[j], 1, 2)
+        return cls(evidence, model, poses, usual, np.concatenate([second, np.swapaxes(second, 1, 2)]))
 
     def log_evidence(self, sums: Floats) -> Floats:
         """Log-evidence for cuts with these sums (3, ...) of their layers."""
@@ -51,11 +65,12 @@ class PlacementCriteria:
         share = np.clip((agreeing / np.maximum(expected, 1e-9) - FAIR_SHARE) / SHARE_SPREAD, -1, 1)
         return np.asarray(PER_FOLD * np.log1p(agreeing) + PER_EXPECTED_FOLD * share * np.log1p(expected) + order)
 
-    def layers(self, still: Floats, moved: Floats) -> Floats:
-        """For each ordered pair of views (3, V, V), the first where it is and the second moved: whether an edge agrees
-        (from 1 down to 0), the probability that one would, and the log-evidence of their order.
+    def layers(self, motion: Floats) -> Floats:
+        """For each ordered pair of views (3, V, V), the first where it is and the second moved by (4, 4): whether an
+        edge agrees (from 1 down to 0), the probability that one would, and the log-evidence of their order.
         """
-        agreeing, expected = self._agreeing(still, moved), self.model.joining.between(still, moved)
+        moved = motion @ self.poses
+        agreeing, expected = self._agreeing(motion, moved), self.model.joining.between(self.poses, moved)
         order = np.zeros_like(expected)
         if self.usual:
             rows = np.flatnonzero(np.abs(self.evidence.edges[:, 1] - self.evidence.edges[:, 0]) == 1)
@@ -64,32 +79,27 @@ class PlacementCriteria:
             for pair in ((i, j), (j, i)):
                 np.maximum.at(sure, pair, consecutive_log_evidence(self.evidence)[rows])
             order = sure * agreeing
-            first = np.arange(len(still) - 1)
+            first = np.arange(len(moved) - 1)
             for pair in ((first, first + 1), (first + 1, first)):
                 order[pair] += np.log(JUMP + (1 - JUMP) * expected[pair] / self.usual)
         return np.stack([agreeing, expected, order])
 
-    def _agreeing(self, still: Floats, moved: Floats) -> Floats:
-        out = np.zeros((len(still), len(still)))
-        i, j = self.evidence.edges.T
-        np.maximum.at(out, (i, j), self.agreement(still[i], moved[j]))
-        np.maximum.at(out, (j, i), self.agreement(moved[i], still[j]))
+    def _agreeing(self, motion: Floats, moved: Floats) -> Floats:
+        """From 1 down to 0 (V, V) how well the edge of each pair agrees with the first one's pose and the second's moved."""
+        edges, measured, noise = self.evidence.edges, self.evidence.i_from_j, self.evidence.noise
+        widest = np.minimum(np.sqrt(GATE) * noise.rotation_rad, np.pi)
+        alike = self.proposed.reshape(-1, 9) @ motion[:3, :3].ravel() > np.tile(1 + 2 * np.cos(widest), 2) - ROUNDING
+        second, first = (np.flatnonzero(half) for half in np.split(alike, 2))
+        row = np.concatenate([second, first])
+        tails = np.concatenate([self.poses[edges[second, 0]], moved[edges[first, 0]]])
+        heads = np.concatenate([moved[edges[second, 1]], self.poses[edges[first, 1]]])
+        left = se3.log(se3.inverse(measured[row]) @ se3.inverse(tails) @ heads)
+        turned, shifted = squares_at_both_ends(measured[row], left)
+        chi2 = turned / noise.rotation_rad[row] ** 2 + shifted / noise.translation_m[row] ** 2
+        out = np.zeros((len(moved), len(moved)))
+        pairs = np.concatenate([edges[second], edges[first, ::-1]])
+        np.maximum.at(out, tuple(pairs.T), np.sqrt(np.maximum(0.0, 1 - chi2 / GATE)))
         return out
-
-    def agreement(self, tails: Floats, heads: Floats) -> Floats:
-        """From 1 down to 0 (E,) how well each edge agrees with the poses of its ends."""
-        noise, measured = self.evidence.noise, self.evidence.i_from_j
-        left = se3.log(se3.inverse(measured) @ se3.inverse(tails) @ heads)
-        turned, shifted = squares_at_both_ends(measured, left)
-        squares = turned / noise.rotation_rad**2 + shifted / noise.translation_m**2
-        return np.asarray(np.sqrt(np.maximum(0.0, 1 - squares / GATE)))
-
-
-def placement_criteria(evidence: Evidence, model: SceneModel, poses: Floats, piece: Ints) -> PlacementCriteria:
-    """The criteria for moves of poses (V, 4, 4) in pieces (V,)."""
-    same = piece[:, None] == piece[None]
-    usual = float(model.joining.between(poses, poses)[same].mean()) if np.ptp(evidence.prior) > 0 else 0.0
-    return PlacementCriteria(evidence, model, usual)
 
 
 def consecutive_log_evidence(evidence: Evidence) -> Floats:
@@ -103,12 +113,14 @@ def sums_of(layers: Floats, inside: Bools) -> Floats:
     return np.asarray(layers[:, ~inside][:, :, inside].sum((1, 2)))
 
 
-def interval_sums(layers: Floats) -> tuple[Ints, Ints, Floats]:
-    """The first view, the one after the last, and the sums (3, I) of every run of consecutive views and the rest."""
+def run_sums(layers: Floats) -> Floats:
+    """The sums (3, V + 1, V + 1) over the pairs of a view outside and one inside of every run of consecutive views, from
+    the first, the row, to the one before the last, the column, which must be larger.
+    """
     count = layers.shape[1]
-    low, high = np.triu_indices(count + 1, 1)
     column, block = np.zeros((3, count + 1)), np.zeros((3, count + 1, count + 1))
     column[:, 1:] = layers.sum(1).cumsum(1)
     block[:, 1:, 1:] = layers.cumsum(1).cumsum(2)
-    within = block[:, high, high] - block[:, low, high] - block[:, high, low] + block[:, low, low]
-    return low, high, column[:, high] - column[:, low] - within
+    rest = column - block[:, range(count + 1), range(count + 1)]
+    first = column + block[:, range(count + 1), range(count + 1)]
+    return np.triu(rest[:, None] - first[:, :, None] + block + block.swapaxes(1, 2), 1)

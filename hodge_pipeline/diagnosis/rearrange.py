@@ -14,8 +14,7 @@ import numpy as np
 from hodge_pipeline.diagnosis.cuts import (
     PlacementCriteria,
     consecutive_log_evidence,
-    interval_sums,
-    placement_criteria,
+    run_sums,
     sums_of,
 )
 from hodge_pipeline.diagnosis.evidence import Evidence
@@ -52,12 +51,13 @@ class _Move:
 
 @dataclass(frozen=True)
 class _Now:
-    """A solution before a move: its layers (3, V, V), the direction of up (V, 3), and the log-evidence (V,) of each
-    camera's orientation.
+    """A solution before a move: its layers (3, V, V), the log-evidence (V + 1, V + 1) of runs of views where they are,
+    the direction of up (V, 3), and the log-evidence (V,) of each camera's orientation.
     """
 
     found: Fit
     layers: Floats
+    runs: Floats
     up: Floats
     upright: Floats
 
@@ -67,7 +67,7 @@ def rearranged(evidence: Evidence, graph: ViewGraph, start: Fit) -> list[Fit]:
     found, model = [start], None
     for _ in range(ROUNDS):
         model = learn_scene_model(evidence, found[-1], model)
-        criteria = placement_criteria(evidence, model, found[-1].poses, found[-1].component)
+        criteria = PlacementCriteria.of(evidence, model, found[-1].poses, found[-1].component)
         best = _best_move(criteria, found[-1])
         if best is None or best.gain <= LEAST_GAIN:
             break
@@ -97,7 +97,9 @@ def _before(criteria: PlacementCriteria, found: Fit) -> _Now:
     poses, piece, upright = found.poses, found.component, criteria.model.upright
     together = (piece[:, None] == piece[None]) & ~np.eye(len(piece), dtype=bool)
     up = upright.world_up(poses[:, :3, :3], piece)
-    return _Now(found, criteria.layers(poses, poses) * together, up, upright.log_evidence(poses[:, :3, :3], up))
+    layers = criteria.layers(np.eye(4)) * together
+    held = upright.log_evidence(poses[:, :3, :3], up)
+    return _Now(found, layers, criteria.log_evidence(run_sums(layers)), up, held)
 
 
 def _moved(criteria: PlacementCriteria, now: _Now, proposals: Proposals, row: int) -> _Move:
@@ -105,13 +107,13 @@ def _moved(criteria: PlacementCriteria, now: _Now, proposals: Proposals, row: in
     poses, piece = now.found.poses, now.found.component
     home, movable = piece[proposals.stayer[row]], piece == piece[proposals.mover[row]]
     motion = proposals.mean_motion(*proposals.group(row), poses)
-    moved = criteria.layers(poses, motion @ poses) * ((piece == home)[:, None] & ~np.eye(len(piece), dtype=bool))
+    moved = criteria.layers(motion) * ((piece == home)[:, None] & ~np.eye(len(piece), dtype=bool))
     then = np.where(movable[None, None], moved, now.layers)
     up = np.broadcast_to(now.up[proposals.stayer[row]], now.up.shape)
     held = criteria.model.upright.log_evidence(motion[:3, :3] @ poses[:, :3, :3], up) - now.upright
     sets = [movable] if not movable[proposals.stayer[row]] else []
     if criteria.usual:
-        sets.append(_best_run(criteria, then, now.layers, held, movable))
+        sets.append(_best_run(criteria, now, then, held, movable))
     gains = [_gain(criteria, now.layers, then, held, inside) for inside in sets] or [0.0]
     best = int(np.argmax(gains))
     return _Move(gains[best], sets[best] if sets else np.zeros(len(piece), bool), motion, int(home))
@@ -124,13 +126,12 @@ def _gain(criteria: PlacementCriteria, now: Floats, then: Floats, held: Floats, 
     return float(change + held[inside].sum())
 
 
-def _best_run(criteria: PlacementCriteria, then: Floats, now: Floats, held: Floats, movable: Bools) -> Bools:
-    low, high, after = interval_sums(then)
+def _best_run(criteria: PlacementCriteria, now: _Now, then: Floats, held: Floats, movable: Bools) -> Bools:
     blocked = np.concatenate([[0], np.cumsum(~movable)])
     upright = np.concatenate([[0.0], np.cumsum(held)])
-    gain = criteria.log_evidence(after) - criteria.log_evidence(interval_sums(now)[2]) + upright[high] - upright[low]
-    gain = np.where(blocked[high] > blocked[low], -np.inf, gain)
-    best, inside = int(np.argmax(gain)), np.zeros(len(movable), bool)
-    if np.isfinite(gain[best]):
-        inside[low[best] : high[best]] = True
+    possible = (blocked[:, None] == blocked) & np.triu(np.ones_like(now.runs, bool), 1)
+    gain = criteria.log_evidence(run_sums(then)) - now.runs + upright - upright[:, None]
+    low, high = divmod(int(np.argmax(np.where(possible, gain, -np.inf))), len(blocked))
+    inside = np.zeros(len(movable), bool)
+    inside[low:high] = possible[low, high]
     return inside
