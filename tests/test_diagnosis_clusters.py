@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from diagnosis_graphs import SIGMA, measured, near_pairs, poses_on_a_ring
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.diagnosis import clusters
-from hodge_pipeline.diagnosis.clusters import Quotient, clustered
+from hodge_pipeline.diagnosis import robust_poses
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.result import CONSISTENT
+from hodge_pipeline.diagnosis.robust_poses import Quotient, clustered
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import ViewGraph
 
@@ -32,7 +32,7 @@ def test_clusters_that_were_moved_are_moved_back(seed: int) -> None:
 
 
 def test_clusters_hold_together_and_none_reaches_over_an_edge_that_is_not_firm(monkeypatch) -> None:
-    monkeypatch.setattr(clusters, "CLUSTERS", 6)
+    monkeypatch.setattr(robust_poses, "CLUSTERS", 6)
     edges, firm = near_pairs(60, 2), np.ones(120, bool)
     firm[(edges.min(axis=1) < 30) != (edges.max(axis=1) < 30)] = False
     found = clustered(edges, firm, 60)
@@ -42,7 +42,7 @@ def test_clusters_hold_together_and_none_reaches_over_an_edge_that_is_not_firm(m
 
 
 def test_a_long_loop_that_drifted_is_closed_and_nobody_blamed(monkeypatch) -> None:
-    monkeypatch.setattr(clusters, "CLUSTERS", 60)
+    monkeypatch.setattr(robust_poses, "CLUSTERS", 60)
     k = np.arange(600)
     angle = 2 * np.pi * k / 600
     turn = se3.so3_exp(np.outer(angle, [0, 0, 1]))

@@ -1,8 +1,13 @@
-"""A solution improved by moving runs of views to where their log-evidence is larger, until no move gains enough.
+"""The best of several arrangements of a scene in which every pair was tried.
 
 Pieces that were merged greedily are never parted again, even where one wrong edge between consecutive views came
 before many right ones. Here each edge that disagrees proposes a motion; edges that propose the same motion together
-propose a new place for a run of consecutive views, or for a whole piece.
+propose a new place for a run of consecutive views, or for a whole piece, until no move gains enough.
+
+Growing pieces best first can take a place for another that looks like it, and from there no single move leads back. So
+a second start uses only the edges between consecutive views, which are wrong more rarely. Of all arrangements on the
+way the one with the largest log-evidence is taken. Its pieces then grow into one another wherever edges agree on it:
+what keeps two pieces apart is no evidence on where they lie.
 """
 
 from __future__ import annotations
@@ -11,19 +16,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hodge_pipeline.diagnosis.cuts import (
+from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.growth import Alignment, align
+from hodge_pipeline.diagnosis.placement import (
     PlacementCriteria,
+    arrangement_log_evidence,
     consecutive_log_evidence,
     run_sums,
     sums_of,
 )
-from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.pieces import Alignment
 from hodge_pipeline.diagnosis.proposals import Proposals
-from hodge_pipeline.diagnosis.robust_poses import ONCE, Fit, fit
+from hodge_pipeline.diagnosis.robust_poses import ONCE, TWICE, Fit, fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats
 
+LARGEST = 150
+"""Views: with more, all pairs of them would cost too much."""
 ROUNDS = 10
 TRIED = 60
 """Motions in each round."""
@@ -44,7 +52,7 @@ class _Move:
 
     def made(self, found: Fit) -> Alignment:
         """The alignment after the move."""
-        poses, piece = found.poses.copy(), found.component.copy()
+        poses, piece = found.poses.copy(), found.piece.copy()
         poses[self.inside], piece[self.inside] = self.motion @ poses[self.inside], self.piece
         return Alignment(piece, poses)
 
@@ -62,16 +70,32 @@ class _Now:
     upright: Floats
 
 
-def rearranged(evidence: Evidence, graph: ViewGraph, start: Fit) -> list[Fit]:
-    """The solutions after each move, `start` first; `graph` has the recentred edges."""
+def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
+    """The arrangement with the largest log-evidence, from `start` and, where it is informative, the order; `start`
+    itself where there are too many views.
+    """
+    if not 2 < evidence.vertex_count <= LARGEST:
+        return start
+    starts = [start]
+    if np.ptp(evidence.prior) > 0:
+        chain = evidence.select(np.flatnonzero(np.abs(evidence.edges[:, 1] - evidence.edges[:, 0]) == 1))
+        starts.append(fit(evidence, fit(chain, align(chain), ONCE), TWICE))
+    found = [one for begun in starts for one in rearranged(evidence, begun)]
+    models = [learn_scene_model(evidence, found[0]), learn_scene_model(evidence, found[-1])]
+    values = [arrangement_log_evidence(evidence, one.poses, one.piece, models) for one in found]
+    return fit(evidence, align(evidence, found[int(np.argmax(values))]), ONCE)
+
+
+def rearranged(evidence: Evidence, start: Fit) -> list[Fit]:
+    """The solutions after each move, `start` first."""
     found, model = [start], None
     for _ in range(ROUNDS):
         model = learn_scene_model(evidence, found[-1], model)
-        criteria = PlacementCriteria.of(evidence, model, found[-1].poses, found[-1].component)
+        criteria = PlacementCriteria.of(evidence, model, found[-1].poses, found[-1].piece)
         best = _best_move(criteria, found[-1])
         if best is None or best.gain <= LEAST_GAIN:
             break
-        found.append(fit(evidence, graph, best.made(found[-1]), ONCE))
+        found.append(fit(evidence, best.made(found[-1]), ONCE))
     return found
 
 
@@ -94,7 +118,7 @@ def _best_move(criteria: PlacementCriteria, found: Fit) -> _Move | None:
 
 
 def _before(criteria: PlacementCriteria, found: Fit) -> _Now:
-    poses, piece, upright = found.poses, found.component, criteria.model.upright
+    poses, piece, upright = found.poses, found.piece, criteria.model.upright
     together = (piece[:, None] == piece[None]) & ~np.eye(len(piece), dtype=bool)
     up = upright.world_up(poses[:, :3, :3], piece)
     layers = criteria.layers(np.eye(4)) * together
@@ -104,7 +128,7 @@ def _before(criteria: PlacementCriteria, found: Fit) -> _Now:
 
 def _moved(criteria: PlacementCriteria, now: _Now, proposals: Proposals, row: int) -> _Move:
     """The best run of views to move as one proposal has it, or their whole piece."""
-    poses, piece = now.found.poses, now.found.component
+    poses, piece = now.found.poses, now.found.piece
     home, movable = piece[proposals.stayer[row]], piece == piece[proposals.mover[row]]
     motion = proposals.mean_motion(*proposals.group(row), poses)
     moved = criteria.layers(motion) * ((piece == home)[:, None] & ~np.eye(len(piece), dtype=bool))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from hodge_pipeline.complex.cycles import Loops, fundamental_loops, spanning_forest
+from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.result import WITNESSES, Cycles
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Floats, Ints
 
 GATE = 30.0
-LONGEST_ENTRIES = 5_000_000
 
 
 def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
@@ -41,38 +40,6 @@ def closing_support(cycles: Cycles, prior: Floats) -> Floats:
     others = np.exp(total[row] - np.log(prior[edge]))
     strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)[row]
     return np.bincount(edge, strength * others, len(prior)).astype(float)
-
-
-def in_no_cycle(edges: Ints, vertex_count: int, cycles: Cycles) -> Bools:
-    """Where (E,) no listed cycle passes an edge: bridges, edges of loops too long to list, and self-loops, which are no
-    measurement of anything.
-    """
-    unlisted = np.ones(len(edges), bool)
-    unlisted[cycles.loops.edge] = False
-    return unlisted
-
-
-def unattributable(edges: Ints, vertex_count: int, cycles: Cycles) -> Ints:
-    """For each edge (E,) the row of the failing cycle that is the only test of all its edges; −1 where there is none.
-    One of these edges is wrong, and no other cycle decides which.
-    """
-    forest = spanning_forest(edges, vertex_count)
-    depth = forest.depth[edges[forest.chords]].sum(axis=1) + 1
-    out = np.full(len(edges), -1, np.int64)
-    failing = np.flatnonzero(~cycles.closes)
-    if depth.sum() > LONGEST_ENTRIES or not len(failing):
-        return out
-    basis = fundamental_loops(forest)
-    passes = np.bincount(basis.edge, minlength=len(edges))
-    # a loop of the basis that shares no edge with another is a block of its own: no other cycle passes its edges
-    single = np.bincount(_rows(basis), passes[basis.edge] == 1, len(basis)) == basis.lengths
-    in_block = np.zeros(len(edges), bool)
-    in_block[basis.edge[single[_rows(basis)]]] = True
-    chosen = cycles.loops.select(failing)
-    row = _rows(chosen)
-    once = np.bincount(row, in_block[chosen.edge], len(chosen)) == chosen.lengths
-    out[chosen.edge[once[row]]] = failing[row[once[row]]]
-    return out
 
 
 def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:

@@ -1,5 +1,9 @@
 """Log-evidence for a relative placement of two sets of views: sums over the pairs that the cut between them separates.
 
+A whole arrangement of views is worth what greedy merges of them are, the two sets whose placement has the largest
+log-evidence first, each counted as one cut. So a hundred wrong edges that agree weigh little more than ten right ones,
+as they do when a single set of views is moved. The log-evidence of each camera's orientation is added.
+
 Edges that agree on one placement are one event, since places that look alike give many wrong edges that agree: they
 count by the logarithm of their number. Evidence against a placement are pairs of views that it makes overlap and that
 were tried but have no edge. Consecutive views of a sequence are near each other.
@@ -7,6 +11,7 @@ were tried but have no edge. Consecutive views of a sequence are near each other
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +31,7 @@ FAIR_SHARE, SHARE_SPREAD = 0.75, 0.35
 PER_EXPECTED_FOLD = 1.0
 """Nats for each e-fold of expected edges, at one spread from the usual share."""
 ROUNDING = 1e-9
+"""Of a trace."""
 JUMP = 1e-4
 """Share of consecutive views that do not see the same place."""
 SURE = 5.0
@@ -85,7 +91,7 @@ class PlacementCriteria:
         return np.stack([agreeing, expected, order])
 
     def _agreeing(self, motion: Floats, moved: Floats) -> Floats:
-        """From 1 down to 0 (V, V) how well the edge of each pair agrees with the first one's pose and the second's moved."""
+        """From 1 down to 0 (V, V) how well the edge of each pair agrees, the first view still, the second moved."""
         edges, measured, noise = self.evidence.edges, self.evidence.i_from_j, self.evidence.noise
         widest = np.minimum(np.sqrt(GATE) * noise.rotation_rad, np.pi)
         alike = self.proposed.reshape(-1, 9) @ motion[:3, :3].ravel() > np.tile(1 + 2 * np.cos(widest), 2) - ROUNDING
@@ -114,8 +120,8 @@ def sums_of(layers: Floats, inside: Bools) -> Floats:
 
 
 def run_sums(layers: Floats) -> Floats:
-    """The sums (3, V + 1, V + 1) over the pairs of a view outside and one inside of every run of consecutive views, from
-    the first, the row, to the one before the last, the column, which must be larger.
+    """The sums (3, V + 1, V + 1) over the pairs of a view outside and one inside of every run of consecutive views: its
+    first is the row, the one after its last the column.
     """
     count = layers.shape[1]
     column, block = np.zeros((3, count + 1)), np.zeros((3, count + 1, count + 1))
@@ -124,3 +130,37 @@ def run_sums(layers: Floats) -> Floats:
     rest = column - block[:, range(count + 1), range(count + 1)]
     first = column + block[:, range(count + 1), range(count + 1)]
     return np.triu(rest[:, None] - first[:, :, None] + block + block.swapaxes(1, 2), 1)
+
+
+def arrangement_log_evidence(evidence: Evidence, poses: Floats, piece: Ints, models: Sequence[SceneModel]) -> float:
+    """Log-evidence for poses (V, 4, 4) in pieces (V,), the mean over several scene models."""
+    criteria = [PlacementCriteria.of(evidence, model, poses, piece) for model in models]
+    return sum(_log_evidence(each, poses, piece) for each in criteria) / len(models)
+
+
+def _log_evidence(criteria: PlacementCriteria, poses: Floats, piece: Ints) -> float:
+    rotations, upright = poses[:, :3, :3], criteria.model.upright
+    upright_evidence = float(upright.log_evidence(rotations, upright.world_up(rotations, piece)).sum())
+    together = piece[:, None] == piece[None]
+    np.fill_diagonal(together, False)
+    layers = criteria.layers(np.eye(4)) * together
+    return upright_evidence + _merged(criteria, (layers + layers.swapaxes(1, 2)) / 2, together)
+
+
+def _merged(criteria: PlacementCriteria, sums: Floats, possible: Bools) -> float:
+    """Log-evidence summed over greedy merges, the strongest of the `possible (V, V)` ones first; `sums (3, V, V)` of
+    the layers between any two sets are added up on the way.
+    """
+    count, total = sums.shape[1], 0.0
+    value = np.where(possible, criteria.log_evidence(sums), -np.inf)
+    for _ in range(count - 1):
+        first, second = divmod(int(np.argmax(value)), count)
+        if np.isneginf(value[first, second]):
+            break
+        total += float(value[first, second])
+        sums[:, first] += sums[:, second]
+        sums[:, :, first] += sums[:, :, second]
+        value[second] = value[:, second] = -np.inf
+        merged = criteria.log_evidence(sums[:, first])
+        value[first] = value[:, first] = np.where(np.isneginf(value[first]), -np.inf, merged)
+    return total
