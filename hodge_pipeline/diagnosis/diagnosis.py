@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
-from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.diagnosis.consensus import find_consensus
@@ -17,13 +17,20 @@ from hodge_pipeline.diagnosis.evidence import Evidence, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
+from hodge_pipeline.diagnosis.result import (
+    CONSISTENT,
+    SUSPECT,
+    UNTESTABLE,
+    WRONG,
+    Cycles,
+    Diagnosis,
+    count_verdicts,
+    residuals_in_pieces,
+)
 from hodge_pipeline.diagnosis.robust_poses import Fit
 from hodge_pipeline.diagnosis.shared_blame import share_blame
-from hodge_pipeline.diagnosis.short_cycles import cycle_errors, with_cycles_of
-from hodge_pipeline.diagnosis.testing_cycles import judge_cycles, witnesses
+from hodge_pipeline.diagnosis.short_cycles import cycle_errors, judge_cycles, with_cycles_of, witnesses
 from hodge_pipeline.diagnosis.wording import reasons
-from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -113,18 +120,14 @@ def _report(
     world_from_cam: Floats,
 ) -> Diagnosis:
     kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
-    piece = connected_components(graph.edges[kept], graph.vertex_count)
-    same = piece[graph.edges[:, 0]] == piece[graph.edges[:, 1]]
-    displacement_m, angle = edge_residuals(graph, world_from_cam)
-    residual = np.where(same, displacement_m, np.nan), np.where(same, np.degrees(angle), np.nan)
+    piece, *residual = residuals_in_pieces(graph, kept, world_from_cam)
     telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
     share = 1 - 1 / (1 + fit.resistance)
-    counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
     tested = f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close"
     return Diagnosis(
         verdict=verdict,
         probability=probability,
-        reason=reasons(graph, cycles, verdict, residual, telling, undecided, fit.bridge),
+        reason=reasons(graph, cycles, verdict, (residual[0], residual[1]), telling, undecided, fit.bridge),
         kept=kept,
         residual_m=residual[0],
         residual_deg=residual[1],
@@ -135,5 +138,5 @@ def _report(
         witnesses_against=telling[1],
         piece=piece,
         world_from_cam=world_from_cam,
-        notes=(f"edges: {counts}", tested, *describe_components(piece, graph.vertex_ids)),
+        notes=(f"edges: {count_verdicts(verdict)}", tested, *describe_components(piece, graph.vertex_ids)),
     )

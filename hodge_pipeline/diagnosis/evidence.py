@@ -11,8 +11,7 @@ from hodge_pipeline.diagnosis.noise import Noise, edge_noise
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior, prior_by_cycles, right_by_gap
 from hodge_pipeline.diagnosis.result import Cycles
-from hodge_pipeline.diagnosis.short_cycles import cycle_errors, short_cycles
-from hodge_pipeline.diagnosis.testing_cycles import closing_support, judge_cycles, usual_share
+from hodge_pipeline.diagnosis.short_cycles import closing_support, cycle_errors, judge_cycles, short_cycles, usual_share
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 ROUNDS = 20

@@ -183,32 +183,7 @@ def learn_scene_model(evidence: Evidence, found: Fit, before: SceneModel | None 
     i, j = evidence.edges[found.used].T
     joined[i, j] = joined[j, i] = True
     joining = learn_joining(found.poses, found.piece, joined, evidence.reach_m, before.joining if before else None)
-    return SceneModel(joining, learn_upright(found.poses[:, :3, :3], found.piece, _neighbours(evidence, found)))
-
-
-def _neighbours(evidence: Evidence, found: Fit) -> Ints:
-    """Groups (V,) of up to NEIGHBOURS views: each grows along the edges in use that are the likeliest to be right."""
-    group = np.full(evidence.vertex_count, -1)
-    tie = _tie(evidence, found)
-    for seed in range(evidence.vertex_count):
-        if group[seed] >= 0:
-            continue
-        members: list[int] = []
-        view = seed
-        while len(members) < NEIGHBOURS:
-            group[view] = seed
-            members.append(view)
-            strongest = (tie[members] * (group < 0)).max(0)
-            view = int(np.argmax(strongest))
-            if strongest[view] <= 0:
-                break
-    return group
-
-
-def _tie(evidence: Evidence, found: Fit) -> Floats:
-    """How strongly each two views (V, V) are tied: by order and by cycles, 0 without an edge in use."""
-    i, j = evidence.edges[found.used].T
-    odds = (evidence.prior / (1 - evidence.prior) * evidence.support)[found.used]
-    tie = np.zeros((evidence.vertex_count, evidence.vertex_count))
-    np.maximum.at(tie, (i, j), odds + 1e-3)
-    return np.asarray(np.maximum(tie, tie.T))
+    # consecutive views of a piece, which are placed rightly more often than all of it
+    groups = found.piece * len(found.piece) + np.arange(len(found.piece)) // NEIGHBOURS
+    groups = np.unique(groups, return_inverse=True)[1].reshape(-1)
+    return SceneModel(joining, learn_upright(found.poses[:, :3, :3], found.piece, groups))

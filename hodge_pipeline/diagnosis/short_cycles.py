@@ -1,4 +1,6 @@
-"""The cycles that test edges: triangles where there are any, then squares, then the shortest loops of a tree."""
+"""The cycles that test edges: triangles where there are any, then squares, then the shortest loops of a tree; which of
+them close, and which are evidence for or against each edge.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +9,16 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import flag_complex, orient_edges
 from hodge_pipeline.complex.cycles import Loops, fundamental_loops, loop_products, spanning_forest
+from hodge_pipeline.diagnosis.noise import Noise
+from hodge_pipeline.diagnosis.result import WITNESSES, Cycles
 from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS = 8
 """Of each end of an edge that are tried for a square."""
 EDGES_AT_ONCE = 20_000
 LONGEST_ENTRIES = 5_000_000
+GATE = 30.0
+"""χ² over six dimensions of a cycle that closes."""
 
 
 def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
@@ -21,14 +27,12 @@ def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     Pairs of parallel edges, triangles (thinned evenly where there are very many), squares for edges that have none
     of these, and for the rest the loops that their chords close in a breadth-first tree.
     """
-    found = [_parallel_pairs(edges, vertex_count), _triangles(edges, vertex_count, most_per_edge)]
-    covered = _covered(found, len(edges))
-    if not covered.all():
-        found.append(_squares(edges, vertex_count, np.flatnonzero(~covered)))
-        covered |= _covered(found[-1:], len(edges))
-    if not covered.all():
-        found.append(_tree_loops(edges, vertex_count, covered))
-    return _distinct(_joined(found), len(edges))
+    loops = _joined([_parallel_pairs(edges, vertex_count), _triangles(edges, vertex_count, most_per_edge)])
+    if (bare := _uncovered(loops, len(edges))).any():
+        loops = _joined([loops, _squares(edges, vertex_count, np.flatnonzero(bare))])
+    if _uncovered(loops, len(edges)).any():
+        loops = _joined([loops, _tree_loops(edges, vertex_count)])
+    return _distinct(loops, len(edges))
 
 
 def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, wanted: Bools) -> Loops:
@@ -37,7 +41,7 @@ def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, 
     Two cycles that fail over one edge make a third without it, which may be the only one that closes.
     """
     rows = np.flatnonzero(chosen)
-    more = _tree_loops(edges[rows], vertex_count, np.zeros(len(rows), bool))
+    more = _tree_loops(edges[rows], vertex_count)
     more = Loops(more.offsets, rows[more.edge], more.sign)
     passes = np.add.reduceat(wanted[more.edge], more.offsets[:-1]) > 0 if len(more) else np.zeros(0, bool)
     return _distinct(_joined([loops, more.select(np.flatnonzero(passes))]), len(edges))
@@ -68,11 +72,10 @@ def _middles(loops: Loops, i_from_j: Floats) -> Floats:
     return total / np.maximum(np.minimum(lengths, 4), 1)[:, None]
 
 
-def _covered(found: list[Loops], edge_count: int) -> Bools:
-    covered = np.zeros(edge_count, bool)
-    for loops in found:
-        covered[loops.edge] = True
-    return covered
+def _uncovered(loops: Loops, edge_count: int) -> Bools:
+    out = np.ones(edge_count, bool)
+    out[loops.edge] = False
+    return out
 
 
 def _joined(found: list[Loops]) -> Loops:
@@ -178,11 +181,61 @@ def _row_of_pair(a: Ints, b: Ints, keys: Ints, count: int) -> Ints:
     return np.where(keys[place] == key, place, -1)
 
 
-def _tree_loops(edges: Ints, vertex_count: int, covered: Bools) -> Loops:
-    """The loops of uncovered chords; where tree edges stay uncovered, of all chords, if they are not too long."""
+def _tree_loops(edges: Ints, vertex_count: int) -> Loops:
+    """The loops of the chords of a tree, the shortest of them, as long as together they are not too long."""
     forest = spanning_forest(edges, vertex_count)
     chords = forest.chords[edges[forest.chords, 0] != edges[forest.chords, 1]]
     depth = forest.depth[edges[chords]].sum(axis=1)
     affordable = np.cumsum(np.sort(depth + 1)) <= LONGEST_ENTRIES
     order = np.argsort(depth, kind="stable")[affordable]
     return fundamental_loops(forest, chords[np.sort(order)])
+
+
+def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
+    """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
+    row = _rows(loops)
+    turn = np.bincount(row, noise.rotation_rad[loops.edge] ** 2, len(loops))
+    shift = np.bincount(row, noise.translation_m[loops.edge] ** 2, len(loops))
+    swing = turn * (reach_m * loops.lengths) ** 2 / 12
+    chi2 = angle**2 / np.maximum(turn, 1e-300) + displacement_m**2 / np.maximum(shift + swing, 1e-300)
+    return Cycles(loops, angle, displacement_m, chi2, chi2 < GATE)
+
+
+def usual_share(cycles: Cycles) -> float:
+    """The share of right edges, estimated from the share of closing cycles; 1 where there is no cycle.
+
+    A cycle closes where all its edges are right: p to the power of its length.
+    """
+    if not len(cycles.loops):
+        return 1.0
+    closing = float(cycles.closes.mean())
+    return float(max(closing, 1 / (len(cycles.loops) + 1)) ** (1 / float(cycles.loops.lengths.mean())))
+
+
+def closing_support(cycles: Cycles, prior: Floats) -> Floats:
+    """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
+    row, edge = _rows(cycles.loops), cycles.loops.edge
+    total = np.bincount(row, np.log(prior[edge]), len(cycles.loops))
+    others = np.exp(total[row] - np.log(prior[edge]))
+    strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)[row]
+    return np.bincount(edge, strength * others, len(prior)).astype(float)
+
+
+def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
+    """For each edge (E, 3) the closing, or failing, cycles whose other edges are the likeliest; −1 for none."""
+    wanted = np.flatnonzero(cycles.closes == closing)
+    loops = cycles.loops.select(wanted)
+    row, edge = _rows(loops), loops.edge
+    logs = np.log(np.clip(np.nan_to_num(probability, nan=0.5), 1e-3, 1.0))
+    others = np.bincount(row, logs[edge], len(loops))[row] - logs[edge]
+    order = np.lexsort((row, -others, edge))
+    ranked = edge[order]
+    rank = np.arange(len(order)) - np.searchsorted(ranked, ranked)
+    out = np.full((len(probability), WITNESSES), -1, np.int64)
+    top = rank < WITNESSES
+    out[ranked[top], rank[top]] = wanted[row[order[top]]]
+    return out
+
+
+def _rows(loops: Loops) -> Ints:
+    return np.repeat(np.arange(len(loops)), loops.lengths)
