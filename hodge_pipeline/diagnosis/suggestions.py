@@ -97,8 +97,8 @@ def _across_pieces(piece: Ints) -> Ints:
 
 
 def _contains(edges: Ints, pairs: Ints, count: int) -> Bools:
-    keys = (np.sort(each, axis=1) @ [count, 1] for each in (pairs, edges))
-    return np.isin(*keys)
+    wanted, there = (np.sort(each, axis=1) @ [count, 1] for each in (pairs, edges))
+    return np.isin(wanted, there)
 
 
 def _best_first(pairs: Ints, kept: Ints, untestable: Ints, count: int, most: int) -> Suggestions:
