@@ -116,35 +116,38 @@ def _parallel_pairs(edges: Ints, vertex_count: int) -> Loops:
 def _triangles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     """Triangles of the first of parallel edges, thinned by a stride where an edge would be in too many."""
     complex_ = flag_complex(edges, vertex_count)
-    corners, measured = complex_.simplices[2], _first_measured(edges, vertex_count)
-    limit = max(most_per_edge * len(measured) // 3, 1)
-    corners = corners[:: max(-(-len(corners) // limit), 1)]
-    sides = [complex_.rows_of(corners[:, pair]) for pair in ([0, 1], [1, 2], [0, 2])]
-    edge = np.stack([measured[side] for side in sides], axis=1)
-    forward = np.where(edges[edge, 0] < edges[edge, 1], 1, -1)
-    return _of_equal_length(edge, forward * np.array([1, 1, -1]))
+    corners = complex_.simplices[2]
+    limit = max(most_per_edge * len(complex_.simplices[1]) // 3, 1)
+    return _along(corners[:: max(-(-len(corners) // limit), 1)], edges, vertex_count)
 
 
-def _first_measured(edges: Ints, vertex_count: int) -> Ints:
-    """The first measured edge of each edge of the simple graph."""
-    oriented = orient_edges(edges, vertex_count)
-    first = np.full(len(oriented.edges), -1, np.int64)
-    real = np.flatnonzero(oriented.row >= 0)[::-1]
-    first[oriented.row[real]] = real
-    return first
+def _along(corners: Ints, edges: Ints, vertex_count: int) -> Loops:
+    """The loops that pass corners (N, K) in order along the first of parallel edges, where all are joined."""
+    simple = orient_edges(edges, vertex_count)
+    real = np.flatnonzero(simple.row >= 0)
+    measured = real[np.unique(simple.row[real], return_index=True)[1]]
+    keys = simple.edges @ [vertex_count, 1]
+    sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=2), axis=2) @ [vertex_count, 1]
+    place = np.minimum(np.searchsorted(keys, sides), len(keys) - 1)
+    joined = (keys[place] == sides).all(axis=1)
+    edge = measured[place[joined]]
+    return _of_equal_length(edge, np.where(edges[edge, 0] == corners[joined], 1, -1))
 
 
 def _squares(edges: Ints, vertex_count: int, wanted: Ints) -> Loops:
     """Cycles i–j–b–a–i for the wanted edges (i, j), over some neighbours a of i and b of j."""
-    oriented = orient_edges(edges, vertex_count)
-    measured = _first_measured(edges, vertex_count)
-    neighbours = _some_neighbours(oriented.edges, vertex_count)
-    keys = oriented.edges[:, 0] * vertex_count + oriented.edges[:, 1]
-    parts = [
-        _squares_of(edges, wanted[start : start + EDGES_AT_ONCE], neighbours, keys, measured, vertex_count)
-        for start in range(0, len(wanted), EDGES_AT_ONCE)
-    ]
-    return _joined([_of_equal_length(np.zeros((0, 4), np.int64), np.zeros((0, 4), np.int64)), *parts])
+    neighbours = _some_neighbours(orient_edges(edges, vertex_count).edges, vertex_count)
+    found = []
+    for start in range(0, len(wanted), EDGES_AT_ONCE):
+        rows = np.repeat(wanted[start : start + EDGES_AT_ONCE], NEIGHBOURS**2)
+        i, j = edges[rows].T
+        a, b = (
+            neighbours[i, np.arange(len(rows)) // NEIGHBOURS % NEIGHBOURS],
+            neighbours[j, np.arange(len(rows)) % NEIGHBOURS],
+        )
+        possible = (a >= 0) & (b >= 0) & (a != j) & (b != i) & (a != b) & (i != j)
+        found.append(_along(np.stack([i, j, b, a], axis=1)[possible], edges, vertex_count))
+    return _joined(found)
 
 
 def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
@@ -157,28 +160,6 @@ def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
     few = rank < NEIGHBOURS
     out[tail[few], rank[few]] = head[few]
     return out
-
-
-def _squares_of(edges: Ints, rows: Ints, neighbours: Ints, keys: Ints, measured: Ints, count: int) -> Loops:
-    i, j = edges[rows].T
-    a = np.repeat(neighbours[i], NEIGHBOURS, axis=1).ravel()
-    b = np.tile(neighbours[j], (1, NEIGHBOURS)).ravel()
-    row, i, j = (np.repeat(x, NEIGHBOURS**2) for x in (rows, i, j))
-    possible = (a >= 0) & (b >= 0) & (a != j) & (b != i) & (a != b) & (i != j)
-    row, i, j, a, b = (x[possible] for x in (row, i, j, a, b))
-    across = _row_of_pair(b, a, keys, count)
-    there = across >= 0
-    row, i, j, a, b, across = (x[there] for x in (row, i, j, a, b, across))
-    sides = np.stack([row, measured[_row_of_pair(j, b, keys, count)], measured[across]], axis=1)
-    edge = np.column_stack([sides, measured[_row_of_pair(a, i, keys, count)]])
-    tails = np.stack([i, j, b, a], axis=1)
-    return _of_equal_length(edge, np.where(edges[edge, 0] == tails, 1, -1))
-
-
-def _row_of_pair(a: Ints, b: Ints, keys: Ints, count: int) -> Ints:
-    key = np.minimum(a, b) * count + np.maximum(a, b)
-    place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
-    return np.where(keys[place] == key, place, -1)
 
 
 def _tree_loops(edges: Ints, vertex_count: int) -> Loops:
