@@ -53,9 +53,9 @@ def _mended(evidence: Evidence, grown: Alignment) -> Fit:
         # where nearly all edges are right, none of them is left behind by a piece that drifted while it grew
         found = solve(graph, objective="isotropic", max_iterations=STEPS)
         best = max(best, rough_fit(evidence, Alignment(found.component, found.world_from_cam)), key=_used)
-    if graph.edge_count > LARGE:  # one exact solve is all that there is time for
-        return fit(evidence, mend(evidence, best), (GATE,))
     best = fit(evidence, best, (GATE,))
+    if graph.edge_count > LARGE:  # one exact solve is all that there is time for
+        return best
     if not best.used.all() and graph.vertex_count <= SMALL:
         # an error that is spread over a loop in annealing can put all of its edges out of use
         best = max(best, fit(evidence, grown, TWICE), key=_used)

@@ -16,13 +16,11 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment
 from hodge_pipeline.diagnosis.proposals import Proposals
-from hodge_pipeline.diagnosis.robust_poses import GATE, GENTLE, LARGE, TWICE, Fit, chi2_at, fit, rough_fit
+from hodge_pipeline.diagnosis.robust_poses import GATE, TWICE, Fit, chi2_at, fit
 from hodge_pipeline.types import Bools, Floats, Ints
 
 ROUNDS, MOVES = 4, 40
 """Solves at most, and sets of views that move before each."""
-SWEEPS_OF_LARGE, PROPOSALS_OF_LARGE = 2, 500
-"""Times that edges of a large graph are compared, for the one solve that it has time for, and how many."""
 MOST_PROPOSALS = 1200
 """Edges left out that are compared with each other; of more, evenly spread ones."""
 TRIED = 40
@@ -34,17 +32,14 @@ UNIT = 1000
 
 
 def mend(evidence: Evidence, start: Fit) -> Fit:
-    """The solution after the moves, a rough one of a large graph. The log-evidence of an edge is AGREES and −log of its
-    probability of being wrong.
-    """
+    """The solution after the moves. An edge's log-evidence is AGREES and −log of its probability of being wrong."""
     log_evidence = AGREES - np.log1p(-evidence.prior)
     found = start
-    solver, gates = (rough_fit, GENTLE) if len(log_evidence) > LARGE else (fit, TWICE)
-    for _ in range(ROUNDS if len(log_evidence) <= LARGE else 1):
+    for _ in range(ROUNDS):
         poses = _after_moves(evidence, found, log_evidence)
         if poses is None:
             break
-        tried = solver(evidence, Alignment(found.piece, poses), gates)
+        tried = fit(evidence, Alignment(found.piece, poses), TWICE)
         if log_evidence[tried.used].sum() <= log_evidence[found.used].sum():
             break
         found = tried
@@ -54,20 +49,18 @@ def mend(evidence: Evidence, start: Fit) -> Fit:
 def _after_moves(evidence: Evidence, found: Fit, log_evidence: Floats) -> Floats | None:
     """Poses (V, 4, 4) after all moves that gain LEAST_GAIN; None where none does."""
     poses, moves = found.poses, 0
-    for _ in range(MOVES if len(log_evidence) <= LARGE else SWEEPS_OF_LARGE):
+    while moves < MOVES:
         agreeing = np.maximum(0.0, 1 - chi2_at(evidence, poses, found.piece, found.resistance) / GATE)
         i, j = found.piece[evidence.edges].T
         rows = np.flatnonzero((agreeing == 0) & (i == j) & (evidence.edges[:, 0] != evidence.edges[:, 1]))
-        most = MOST_PROPOSALS if len(agreeing) <= LARGE else PROPOSALS_OF_LARGE
-        proposals = Proposals.of(evidence, poses, rows[:: max(-(-len(rows) // most), 1)])
+        rows = rows[:: max(-(-len(rows) // MOST_PROPOSALS), 1)]
+        proposals = Proposals.of(evidence, poses, rows)
         found_now = _good_moves(evidence, poses, found.piece, agreeing, log_evidence, proposals)
         if not found_now:
             break
         poses, moves = poses.copy(), moves + len(found_now)
         for inside, motion in found_now:
             poses[inside] = motion @ poses[inside]
-        if moves >= MOVES:
-            break
     return poses if moves else None
 
 

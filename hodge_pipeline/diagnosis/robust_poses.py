@@ -24,8 +24,6 @@ ANNEALED = (1e4, 1e3, 300.0)
 """Gates for poses that drifted while they grew: edges that they miss by far pull them into place (graduated
 non-convexity, Yang et al. 2020), and what does not follow falls out.
 """
-GENTLE = ANNEALED[-1:]
-"""For poses that are near already."""
 DIMENSION = 6.0
 """Of a pose."""
 FULLY, ROUGHLY, QUICKLY = (4, Limits(20, 1e-6)), (4, Limits(6, 1e-4)), (4, Limits(10, 1e-4))
@@ -64,10 +62,10 @@ def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...]) -> F
     return found
 
 
-def rough_fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...] = ANNEALED) -> Fit:
+def rough_fit(evidence: Evidence, alignment: Alignment) -> Fit:
     """The same with errors as large as each gate allows: near the robust solution, whatever the drift, and quick."""
     found = _as_grown(evidence, alignment)
-    for gate, following in zip(gates, (*gates[1:], GATE), strict=True):
+    for gate, following in zip(ANNEALED, (*ANNEALED[1:], GATE), strict=True):
         used, widened = found.chi2 < gate, gate / GATE
         if not np.array_equal(used, found.chi2 < following):
             poses = _solve(evidence, found.poses, used, found.chi2 / widened, QUICKLY, widened)
