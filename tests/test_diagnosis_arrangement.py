@@ -53,7 +53,7 @@ def test_a_scene_is_worth_less_with_a_part_of_it_elsewhere_or_apart(solved: tupl
 def test_a_part_that_lies_elsewhere_is_laid_back(solved: tuple[Evidence, Fit], in_one_piece: bool) -> None:
     evidence, found = solved
     moved = np.where(PART[:, None, None], ASIDE @ found.poses, found.poses)
-    i, j = evidence.edges.T
+    i, j = evidence.graph.edges.T
     wrong = replace(found, poses=moved, piece=PART * int(not in_one_piece), used=found.used & (PART[i] == PART[j]))
     back = rearranged(evidence, wrong)[-1]
     assert np.ptp(back.piece) == 0

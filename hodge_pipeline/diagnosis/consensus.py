@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment, align
 from hodge_pipeline.diagnosis.mending import mend
 from hodge_pipeline.diagnosis.rearrange import best_arrangement
-from hodge_pipeline.diagnosis.robust_poses import GATE, LARGE, TWICE, Fit, fit, rough_fit
+from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, LARGE, TWICE, Fit, fit
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Floats
 
@@ -30,29 +28,22 @@ SMALL = 3000
 """Vertices, up to which another solve costs little."""
 
 
-@dataclass(frozen=True)
-class Consensus:
-    """The solution, and the probability (E,) that each edge is right."""
-
-    fit: Fit
-    probability: Floats
-
-
-def find_consensus(evidence: Evidence) -> Consensus:
-    """The alignment with the largest log-evidence."""
+def find_consensus(evidence: Evidence) -> tuple[Fit, Floats]:
+    """The solution that most edges agree with, and the probability (E,) that each edge is right, given it."""
     grown = align(evidence)
     best = best_arrangement(evidence, fit(evidence, grown, TWICE)) if evidence.exhaustive else _mended(evidence, grown)
     agreeing = np.sqrt(np.maximum(0.0, 1 - best.chi2 / GATE))
-    return Consensus(best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence))
+    return best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence)
 
 
 def _mended(evidence: Evidence, grown: Alignment) -> Fit:
     """The solution that grown pieces lead to where the order tells nothing of pairs that were tried."""
-    graph, best = evidence.graph, _regrown(evidence, rough_fit(evidence, grown))
+    graph, best = evidence.graph, _regrown(evidence, fit(evidence, grown, ANNEALED, rough=True))
     if 0 < (~best.used).sum() <= FEW * len(best.used):
         # where nearly all edges are right, none of them is left behind by a piece that drifted while it grew
         found = solve(graph, objective="isotropic", max_iterations=STEPS)
-        best = max(best, rough_fit(evidence, Alignment(found.component, found.world_from_cam)), key=_used)
+        of_all = Alignment(found.component, found.world_from_cam)
+        best = max(best, fit(evidence, of_all, ANNEALED, rough=True), key=_used)
     best = fit(evidence, best, (GATE,))
     if graph.edge_count > LARGE:  # one exact solve is all that there is time for
         return best
@@ -68,12 +59,12 @@ def _used(found: Fit) -> int:
 
 def _regrown(evidence: Evidence, best: Fit) -> Fit:
     """The solution whose pieces, as the edges hold them, no longer grow into any that more edges agree on."""
-    worth = WORTH * len(evidence.edges)
+    worth = WORTH * len(evidence.graph.edges)
     for _ in range(MOST_GROWTHS):
-        ends = best.piece[evidence.edges]
+        ends = best.piece[evidence.graph.edges]
         if (ends[:, 0] != ends[:, 1]).sum() < worth:
             break
-        found = rough_fit(evidence, align(evidence, best))
+        found = fit(evidence, align(evidence, best), ANNEALED, rough=True)
         won = _used(found) - _used(best)
         best = found if won > 0 else best
         if won < worth:

@@ -71,20 +71,20 @@ def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
     """The diagnosis that trusts no edge."""
     graph, turned = in_vertex_order(stated)
     evidence, cycles, point = gather(graph, options)
-    consensus = find_consensus(evidence)
-    cycles = _with_witnesses(cycles, consensus.fit.used, evidence)
-    blame = share_blame(cycles, consensus.fit, evidence)
-    unvouched = blame.unvouched & (consensus.probability >= LIKELIER_RIGHT)
+    fit, agreeing = find_consensus(evidence)
+    cycles = _with_witnesses(cycles, fit.used, evidence)
+    blame = share_blame(cycles, fit, evidence)
+    unvouched = blame.unvouched & (agreeing >= LIKELIER_RIGHT)
     untestable = evidence.in_no_listed_cycle | (blame.undecided >= 0) | unvouched
-    probability = np.where(untestable, np.nan, np.maximum(consensus.probability, blame.probability))
+    probability = np.where(untestable, np.nan, np.maximum(agreeing, blame.probability))
     undecided = np.where(unvouched | (blame.probability > 0), blame.cycle, -1)
     undecided = np.where(blame.undecided >= 0, blame.undecided, undecided)
-    right = (probability >= options.consistent_from) & consensus.fit.used
+    right = (probability >= options.consistent_from) & fit.used
     wrong = probability < options.wrong_below
     verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
-    world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
+    world_from_cam = fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
     cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))
-    found = _report(stated, cycles, probability, verdict, undecided, consensus.fit, world_from_cam)
+    found = _report(stated, cycles, probability, verdict, undecided, fit, world_from_cam)
     information = _of_noise(evidence.noise, point, graph.dimension == 2)
     notes = (*found.notes, *evidence.noise.doubts, *free_direction_notes(stated))
     return replace(found, information=information, notes=notes)
@@ -97,8 +97,8 @@ def _with_witnesses(cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
     wanted = used & ~told & ~evidence.in_no_listed_cycle
     if not wanted.any():
         return cycles
-    loops = with_cycles_of(used, cycles.loops, evidence.edges, evidence.vertex_count, wanted)
-    return judge_cycles(loops, *cycle_errors(loops, evidence.i_from_j), evidence.noise, evidence.reach_m)
+    loops = with_cycles_of(used, cycles.loops, evidence.graph.edges, evidence.graph.vertex_count, wanted)
+    return judge_cycles(loops, *cycle_errors(loops, evidence.graph.i_from_j), evidence.noise, evidence.reach_m)
 
 
 def _of_noise(noise: Noise, point: Floats, planar: bool) -> Floats:

@@ -43,21 +43,6 @@ class Evidence:
     cluster_gain: float
     exhaustive: bool
 
-    @property
-    def edges(self) -> Ints:
-        """Rows (E, 2) of the vertices."""
-        return self.graph.edges
-
-    @property
-    def vertex_count(self) -> int:
-        """V."""
-        return self.graph.vertex_count
-
-    @property
-    def i_from_j(self) -> Floats:
-        """The motions (E, 4, 4) at the working point."""
-        return self.graph.i_from_j
-
     def select(self, rows: Ints) -> Evidence:
         """That of these edges among all vertices."""
         edges = {name: getattr(self, name)[rows] for name in ("prior", "support", "in_no_listed_cycle", "weight")}

@@ -40,7 +40,7 @@ class Alignment:
 
 def align(evidence: Evidence, start: Alignment | None = None) -> Alignment:
     """The alignment that the edges' weights lead to, from vertices on their own or from the pieces of a start."""
-    count, weight = evidence.vertex_count, evidence.weight
+    count, weight = evidence.graph.vertex_count, evidence.weight
     piece, poses = np.arange(count), np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
     if start is not None:
         piece, poses = start.piece.copy(), start.poses.copy()
@@ -126,22 +126,22 @@ class Votes:
 
 def collect_votes(evidence: Evidence, piece: Ints, piece_from: Floats) -> Votes | None:
     """The votes of all edges between two pieces; None where there is none."""
-    edge = np.flatnonzero(piece[evidence.edges[:, 0]] != piece[evidence.edges[:, 1]])
+    edge = np.flatnonzero(piece[evidence.graph.edges[:, 0]] != piece[evidence.graph.edges[:, 1]])
     if not len(edge):
         return None
-    tail, head = evidence.edges[edge].T
+    tail, head = evidence.graph.edges[edge].T
     swapped = piece[tail] > piece[head]
-    motion = piece_from[tail] @ evidence.i_from_j[edge] @ se3.inverse(piece_from[head])
+    motion = piece_from[tail] @ evidence.graph.i_from_j[edge] @ se3.inverse(piece_from[head])
     motion[swapped] = se3.inverse(motion[swapped])
     point = piece_from[np.where(swapped, tail, head), :3, 3]
     low, high = np.minimum(piece[tail], piece[head]), np.maximum(piece[tail], piece[head])
-    key = low * evidence.vertex_count + high
+    key = low * evidence.graph.vertex_count + high
     order = np.lexsort((-evidence.weight[edge], key))
     edge, motion, point, key = edge[order], motion[order], point[order], key[order]
     names, start, pair, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
     hypothesis, vote = _compared(pair.reshape(-1), start, count)
     agreement = agreement_of(evidence, edge, motion, point, hypothesis, vote)
-    low, high = names // evidence.vertex_count, names % evidence.vertex_count
+    low, high = names // evidence.graph.vertex_count, names % evidence.graph.vertex_count
     return Votes(edge, motion, point, pair.reshape(-1), low, high, start, count, hypothesis, vote, agreement)
 
 

@@ -51,8 +51,8 @@ def _after_moves(evidence: Evidence, found: Fit, log_evidence: Floats) -> Floats
     poses, moves = found.poses, 0
     while moves < MOVES:
         agreeing = np.maximum(0.0, 1 - chi2_at(evidence, poses, found.piece, found.resistance) / GATE)
-        i, j = found.piece[evidence.edges].T
-        rows = np.flatnonzero((agreeing == 0) & (i == j) & (evidence.edges[:, 0] != evidence.edges[:, 1]))
+        i, j = found.piece[evidence.graph.edges].T
+        rows = np.flatnonzero((agreeing == 0) & (i == j) & (evidence.graph.edges[:, 0] != evidence.graph.edges[:, 1]))
         rows = rows[:: max(-(-len(rows) // MOST_PROPOSALS), 1)]
         proposals = Proposals.of(evidence, poses, rows)
         found_now = _good_moves(evidence, poses, found.piece, agreeing, log_evidence, proposals)
@@ -98,10 +98,10 @@ def _cut(evidence: Evidence, held: Floats, proposals: Proposals, group: Ints, sh
 
     An edge of the group whose ends are not parted counts as lost, as does each used edge that is.
     """
-    count = evidence.vertex_count
+    count = evidence.graph.vertex_count
     source, sink = count, count + 1
     used = np.flatnonzero(held > 0)
-    i, j = evidence.edges[used].T
+    i, j = evidence.graph.edges[used].T
     mover, stayer = proposals.mover[group], proposals.stayer[group]
     tail = np.concatenate([i, j, np.full(len(group), source), mover])
     head = np.concatenate([j, i, stayer, np.full(len(group), sink)])

@@ -61,8 +61,8 @@ class PlacementCriteria:
         """The criteria for moves of poses (V, 4, 4) in pieces (V,)."""
         same = piece[:, None] == piece[None]
         usual = float(model.joining.between(poses, poses)[same].mean()) if np.ptp(evidence.prior) > 0 else 0.0
-        rotations, (i, j) = poses[:, :3, :3], evidence.edges.T
-        second = rotations[i] @ evidence.i_from_j[:, :3, :3] @ np.swapaxes(rotations[j], 1, 2)
+        rotations, (i, j) = poses[:, :3, :3], evidence.graph.edges.T
+        second = rotations[i] @ evidence.graph.i_from_j[:, :3, :3] @ np.swapaxes(rotations[j], 1, 2)
         return cls(evidence, model, poses, usual, np.concatenate([second, np.swapaxes(second, 1, 2)]))
 
     def log_evidence(self, sums: Floats) -> Floats:
@@ -79,9 +79,9 @@ class PlacementCriteria:
         agreeing, expected = self._agreeing(motion, moved), self.model.joining.between(self.poses, moved)
         order = np.zeros_like(expected)
         if self.usual:
-            rows = np.flatnonzero(np.abs(self.evidence.edges[:, 1] - self.evidence.edges[:, 0]) == 1)
+            rows = np.flatnonzero(np.abs(self.evidence.graph.edges[:, 1] - self.evidence.graph.edges[:, 0]) == 1)
             sure = np.zeros_like(expected)
-            i, j = self.evidence.edges[rows].T
+            i, j = self.evidence.graph.edges[rows].T
             for pair in ((i, j), (j, i)):
                 np.maximum.at(sure, pair, consecutive_log_evidence(self.evidence)[rows])
             order = sure * agreeing
@@ -92,7 +92,7 @@ class PlacementCriteria:
 
     def _agreeing(self, motion: Floats, moved: Floats) -> Floats:
         """From 1 down to 0 (V, V) how well the edge of each pair agrees, the first view still, the second moved."""
-        edges, measured, noise = self.evidence.edges, self.evidence.i_from_j, self.evidence.noise
+        edges, measured, noise = self.evidence.graph.edges, self.evidence.graph.i_from_j, self.evidence.noise
         widest = np.minimum(np.sqrt(GATE) * noise.rotation_rad, np.pi)
         alike = self.proposed.reshape(-1, 9) @ motion[:3, :3].ravel() > np.tile(1 + 2 * np.cos(widest), 2) - ROUNDING
         second, first = (np.flatnonzero(half) for half in np.split(alike, 2))

@@ -31,8 +31,8 @@ class Proposals:
     @classmethod
     def of(cls, evidence: Evidence, poses: Floats, rows: Ints) -> Proposals:
         """Those of these edges (rows) at poses (V, 4, 4)."""
-        i, j = evidence.edges[rows].T
-        motion = poses[i] @ evidence.i_from_j[rows] @ se3.inverse(poses[j])
+        i, j = evidence.graph.edges[rows].T
+        motion = poses[i] @ evidence.graph.i_from_j[rows] @ se3.inverse(poses[j])
         motion = np.concatenate([motion, se3.inverse(motion)])
         edge, mover, stayer = np.tile(rows, 2), np.concatenate([j, i]), np.concatenate([i, j])
         first, second = _near_in_angle(evidence, edge, motion)

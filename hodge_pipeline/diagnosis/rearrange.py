@@ -74,11 +74,11 @@ def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
     """The arrangement with the largest log-evidence, from `start` and, where it is informative, the order; `start`
     itself where there are too many views.
     """
-    if not 2 < evidence.vertex_count <= LARGEST:
+    if not 2 < evidence.graph.vertex_count <= LARGEST:
         return start
     starts = [start]
     if np.ptp(evidence.prior) > 0:
-        chain = evidence.select(np.flatnonzero(np.abs(evidence.edges[:, 1] - evidence.edges[:, 0]) == 1))
+        chain = evidence.select(np.flatnonzero(np.abs(evidence.graph.edges[:, 1] - evidence.graph.edges[:, 0]) == 1))
         starts.append(fit(evidence, fit(chain, align(chain), ONCE), TWICE))
     found = [one for begun in starts for one in rearranged(evidence, begun)]
     models = [learn_scene_model(evidence, found[0]), learn_scene_model(evidence, found[-1])]
@@ -102,7 +102,7 @@ def rearranged(evidence: Evidence, start: Fit) -> list[Fit]:
 def _best_move(criteria: PlacementCriteria, found: Fit) -> _Move | None:
     """Of all motions that are proposed the one that gains most with its best set of views; None where none is."""
     evidence, now = criteria.evidence, _before(criteria, found)
-    i, j = evidence.edges.T
+    i, j = evidence.graph.edges.T
     rows = np.flatnonzero((now.layers[0][i, j] == 0) & (i != j))
     sure = consecutive_log_evidence(evidence)
     rows = np.sort(rows[np.argsort(-sure[rows], kind="stable")[:MOST_PROPOSALS]])

@@ -48,35 +48,29 @@ class Fit(Alignment):
         return self.used & np.isinf(self.resistance)
 
 
-def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...]) -> Fit:
-    """The robust solution that an alignment leads to.
+def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], *, rough: bool = False) -> Fit:
+    """The robust solution that an alignment leads to: for each gate in turn, the edges of a smaller χ² are solved.
 
-    For one gate after the other, the edges of a smaller χ² are solved.
+    `rough`: quickly and with errors as large as each gate allows, which leads near it whatever the drift.
     """
     found = _as_grown(evidence, alignment)
-    for gate, following in zip(gates, (*gates[1:], math.inf), strict=True):
+    for gate, following in zip(gates, (*gates[1:], GATE if rough else math.inf), strict=True):
         used = found.chi2 < gate
-        if following > gate or not np.array_equal(used, found.chi2 < following):
+        if following < gate and np.array_equal(used, found.chi2 < following):
+            continue
+        if rough:
+            poses = _solve(evidence, found.poses, used, found.chi2 * GATE / gate, QUICKLY, gate / GATE)
+            found = _refitted(evidence, poses, used, gate / GATE)
+        else:
             how = ROUGHLY if len(used) > LARGE else FULLY
             found = _refitted(evidence, _solve(evidence, found.poses, used, np.full(len(used), DIMENSION), how), used)
     return found
 
 
-def rough_fit(evidence: Evidence, alignment: Alignment) -> Fit:
-    """The same with errors as large as each gate allows: near the robust solution, whatever the drift, and quick."""
-    found = _as_grown(evidence, alignment)
-    for gate, following in zip(ANNEALED, (*ANNEALED[1:], GATE), strict=True):
-        used, widened = found.chi2 < gate, gate / GATE
-        if not np.array_equal(used, found.chi2 < following):
-            poses = _solve(evidence, found.poses, used, found.chi2 / widened, QUICKLY, widened)
-            found = _refitted(evidence, poses, used, widened)
-    return found
-
-
 def _as_grown(evidence: Evidence, alignment: Alignment) -> Fit:
     poses, piece = alignment.poses, alignment.piece
-    used = piece[evidence.edges[:, 0]] == piece[evidence.edges[:, 1]]
-    resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
+    used = piece[evidence.graph.edges[:, 0]] == piece[evidence.graph.edges[:, 1]]
+    resistance = effective_resistance(evidence.graph.edges, evidence.graph.vertex_count, used)
     chi2 = chi2_at(evidence, poses, piece, resistance)
     return Fit(piece, poses, chi2, chi2 < GATE, resistance)
 
@@ -84,8 +78,8 @@ def _as_grown(evidence: Evidence, alignment: Alignment) -> Fit:
 def _refitted(evidence: Evidence, poses: Floats, used: Bools, widened: float = 1.0) -> Fit:
     squares = _squares(evidence, poses) / widened
     student_weight = np.where(used, FREEDOM / (FREEDOM + squares), 0.0)
-    piece = connected_components(evidence.edges[used], evidence.vertex_count)
-    resistance = effective_resistance(evidence.edges, evidence.vertex_count, used)
+    piece = connected_components(evidence.graph.edges[used], evidence.graph.vertex_count)
+    resistance = effective_resistance(evidence.graph.edges, evidence.graph.vertex_count, used)
     chi2 = chi2_at(evidence, poses, piece, resistance, student_weight)
     return Fit(piece, poses, chi2, chi2 < GATE, resistance)
 
@@ -111,7 +105,7 @@ def _solve(
 
 def _squares(evidence: Evidence, poses: Floats) -> Floats:
     """χ² (E,) by the noise of the edges, without that of the poses."""
-    motions, noise = evidence.i_from_j, evidence.noise
+    motions, noise = evidence.graph.i_from_j, evidence.noise
     turned, shifted = squares_at_both_ends(motions, left_over(evidence.graph, poses))
     return np.asarray(turned / noise.rotation_rad**2 + shifted / noise.translation_m**2)
 

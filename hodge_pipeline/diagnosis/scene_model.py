@@ -179,8 +179,8 @@ class SceneModel:
 
 def learn_scene_model(evidence: Evidence, found: Fit, before: SceneModel | None = None) -> SceneModel:
     """The model fitted to the poses of a solution and the edges it uses, started at `before`."""
-    joined = np.zeros((evidence.vertex_count, evidence.vertex_count), bool)
-    i, j = evidence.edges[found.used].T
+    joined = np.zeros((evidence.graph.vertex_count, evidence.graph.vertex_count), bool)
+    i, j = evidence.graph.edges[found.used].T
     joined[i, j] = joined[j, i] = True
     joining = learn_joining(found.poses, found.piece, joined, evidence.reach_m, before.joining if before else None)
     # consecutive views of a piece, which are placed rightly more often than all of it

@@ -33,11 +33,11 @@ class SharedBlame:
 
 def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
     """Who shares the blame, in this alignment."""
-    loops, count = cycles.loops, len(evidence.edges)
+    loops, count = cycles.loops, len(evidence.graph.edges)
     row, edge = np.repeat(np.arange(len(loops)), loops.lengths), loops.edge
     untold = np.bincount(edge, cycles.closes[row], count) == 0
     untold &= ~evidence.in_no_listed_cycle
-    classes = series_classes(evidence.edges, evidence.vertex_count)
+    classes = series_classes(evidence.graph.edges, evidence.graph.vertex_count)
     doubted = _in_series_with(~fit.used, classes)
     unvouched = fit.used & ((np.isinf(fit.resistance) & untold) | doubted)
     holds = np.bincount(row, unvouched[edge], len(loops)) > 0
