@@ -22,11 +22,11 @@ help:
 	@echo "make dist    sdist and wheel: dist"
 	@echo "make lint    ruff, mypy, import directions"
 
-$(STAMP): pyproject.toml constraints.txt tools/system-libraries.sh
+$(STAMP): pyproject.toml benchmarks/paper/method/pyproject.toml constraints.txt tools/system-libraries.sh
 	sh tools/system-libraries.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "no venv: apt-get install python3-venv"; exit 1; }
 	@echo "into $(VENV): about 3 GB with all libraries, of which 1 GB is downloaded; some minutes"
-	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[dev]' -e benchmarks/paper/method
 	touch $@
 
 setup: $(STAMP)

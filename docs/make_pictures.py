@@ -12,10 +12,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
+from hodge_paper.embedding import Embedding, embed
+from hodge_paper.rotation import angular_rotation, random_rotation
 from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.decomposition import hodge_decomposition
-from hodge_pipeline.complex.embedding import Embedding, embed
-from hodge_pipeline.complex.rotation import angular_rotation, random_rotation
 from hodge_pipeline.types import Floats, Ints
 
 HERE = Path(__file__).parent / "pictures"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from hodge_pipeline.complex.parts import decompose, energies, one_form
+from hodge_pipeline.complex.parts import decompose, one_form
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.evaluate import score_rounds
 from hodge_pipeline.evaluation.scores import ScoreTable
@@ -94,7 +94,7 @@ def consistent(work: Work, registered: Registered) -> Round:
     try:
         complex_ = work.recipe.complex.of(graph, work.scene.clouds, judged.start)
         omega = one_form(graph, judged.start)
-        found = energies(complex_, decompose(complex_, omega))
+        found = decompose(complex_, omega).energies(complex_.counts)
     except GraphError as error:  # the poses do not depend on it
         work.steps.note(Note("no decomposition", detail=f"{judged.name}: without its decomposition: {error}"))
     return work.solve(judged, found)

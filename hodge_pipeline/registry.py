@@ -93,6 +93,8 @@ FORMER_NAMES = {
 
 def suggestion(given: str, known: list[str]) -> str:
     """`" (did you mean 'x'?)"`, or the known names where nothing is close."""
+    if given.startswith("paper"):
+        return " (the paper's own solver and recipes are a plugin: pip install ./benchmarks/paper/method)"
     renamed = [name for name in (FORMER_NAMES.get(given),) if name in known]
     close = renamed or difflib.get_close_matches(given, known, n=1)
     return f" (did you mean '{close[0]}'?)" if close else f" (known: {', '.join(known) or 'none'})"

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import sys
+import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
+from plugin_metadata import write_metadata
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, which says why
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.append(str(REPOSITORY))  # for benchmarks/, which is no part of the package
+if find_spec("hodge_paper") is None:  # the plugin with the paper's solver: `make setup` installs it
+    PLUGIN = REPOSITORY / "benchmarks" / "paper" / "method"
+    sys.path += [str(PLUGIN), found := tempfile.mkdtemp(prefix="hodge-paper-")]
+    atexit.register(shutil.rmtree, found)
+    write_metadata(PLUGIN, Path(found))
 
 
 def find_data_dir() -> Path:

@@ -17,11 +17,11 @@ from complex_graphs import (
     torus_grid,
     torus_rotation,
 )
+from hodge_paper.embedding import Embedding, embed, triangulate
+from hodge_paper.homology import homology_generators, motion_deviation
+from hodge_paper.rotation import angular_rotation, random_rotation
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.cycles import loop_products
-from hodge_pipeline.complex.embedding import Embedding, embed, triangulate
-from hodge_pipeline.complex.homology import homology_generators, motion_deviation
-from hodge_pipeline.complex.rotation import angular_rotation, random_rotation
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Ints
 

@@ -5,7 +5,7 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex import parts
-from hodge_pipeline.complex.parts import ComplexOptions, decompose, energies, one_form
+from hodge_pipeline.complex.parts import ComplexOptions, decompose, one_form
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import CloudSet, PointCloud, ViewGraph
 
@@ -31,7 +31,7 @@ def clouds_at(*places: float) -> CloudSet:
 
 def shares(graph: ViewGraph, poses: np.ndarray) -> dict[str, tuple[float, float]]:
     flag = ComplexOptions().of(graph, clouds_at(*range(len(poses))), poses)
-    return energies(flag, decompose(flag, one_form(graph, poses))).shares
+    return decompose(flag, one_form(graph, poses)).energies(flag.counts).shares
 
 
 def test_poses_that_are_off_are_exact_and_a_wrong_edge_of_a_triangle_is_not_harmonic() -> None:

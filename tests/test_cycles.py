@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from betti import sparse_rank
 from complex_graphs import FIGURE_EIGHT, SQUARE, TRIANGLE, complete, graphs, random_motions, torus_grid
+from hodge_paper.minimum_cycles import minimum_cycle_basis
 from hodge_pipeline import se3
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.components import connected_components, describe_components
@@ -20,7 +21,6 @@ from hodge_pipeline.complex.cycles import (
     loop_products,
     spanning_forest,
 )
-from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints
 

@@ -276,9 +276,9 @@ def test_two_scanners_in_a_folder_are_followed_apart(tmp_path: Path) -> None:
         assert absolute_error(done.poses[names == name], true).max_m < 0.5
 
 
-def sweeps_as(layout: str, folder: Path, count: int) -> Path:
+def sweeps_as(layout: str, folder: Path, count: int, speed_m_s: float = 10.0) -> Path:
     """Sweeps of the street as a folder in KITTI's layout, or as a recording."""
-    log, own = Log(), SpinningScanner(Road(10.0), 0, beams=16, columns=360, noise=1.0)
+    log, own = Log(), SpinningScanner(Road(speed_m_s), 0, beams=16, columns=360, noise=1.0)
     (folder / "velodyne").mkdir()
     for number in range(count):
         points = own.sweep(number).points
@@ -301,3 +301,15 @@ def test_a_trajectory_of_sweeps_is_refined_by_default(layout: str, tmp_path: Pat
     refined = refine_trajectory(given, frames, overrides=["recording.level=off"])
     before, after = (absolute_error(poses, exact).rmse_m for poses in (given, refined.poses))
     assert before > 0.1 and after < before / 2
+
+
+@pytest.mark.parametrize("kind", ["right", "jump", "axes of a camera"])
+def test_poses_of_sweeps_are_never_worse_than_they_came(kind: str, tmp_path: Path) -> None:
+    exact = Road(7.0).world_from_car(np.arange(16) * REVOLUTION_S)
+    given = exact.copy()
+    if kind == "jump":
+        given[8:, :3, 3] += [0.6, 0.8, 0.0]
+    if kind == "axes of a camera":  # x right, y down, z ahead
+        given = exact @ se3.from_parts(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+    refined = refine_trajectory(given, sweeps_as("kitti", tmp_path, 16, 7.0), overrides=["recording.level=off"])
+    assert absolute_error(refined.poses, exact).max_m < 0.05

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ import pytest
 from hodge_pipeline import registry
 from hodge_pipeline.cli.new_plugin import EXAMPLES, plugin_files, write_plugin
 from hodge_pipeline.errors import RecipeError, WorkspaceError
+from plugin_metadata import write_metadata
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "writing-a-plugin.md"
@@ -41,13 +41,7 @@ def hodge(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 def made(folder: Path, name: str, kind: str) -> Path:
     """A new package, with the metadata that pip would write of it beside it."""
     write_plugin(name, kind, folder)
-    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
-    metadata = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n")
-    groups = project["entry-points"].items()
-    lines = [f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in names.items()) for group, names in groups]
-    (metadata / "entry_points.txt").write_text("\n".join(lines))
+    write_metadata(folder, folder)
     return folder
 
 

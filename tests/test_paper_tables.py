@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from benchmarks.paper.__main__ import paper
 from benchmarks.paper.picture import draw_comparison
-from benchmarks.paper.sequences import find_sequences, peer_poses
+from benchmarks.paper.sequences import find_sequences, peer_poses, recipe_file
 from benchmarks.paper.tables import (
     PAPER_SCORES,
     SEQUENCES,
@@ -27,7 +27,7 @@ from benchmarks.paper.tables import (
     tables,
 )
 from complex_graphs import random_motions
-from hodge_pipeline import se3
+from hodge_pipeline import registry, se3
 from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.types import Bytes, Camera, Edges, Floats32, Frame
@@ -103,7 +103,7 @@ def test_every_format_holds_every_table() -> None:
 
 @pytest.mark.parametrize("kind", ["distance", "iou", "sift"])
 def test_the_papers_recipes_reject_no_registered_pair(kind: str) -> None:
-    recipe = load_recipe(f"paper_{kind}", [], "frames")
+    recipe = load_recipe(recipe_file(kind), [], "frames")
     assert recipe.start.relocalise is False and recipe.start.tail is None  # type: ignore[attr-defined]
     count = 3
     poor = Edges.of(np.array([[0, 2], [0, 3], [1, 3]])).put(
@@ -211,3 +211,9 @@ def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
     for peer, message in (("bundlefusion", "NAME=DIR"), (f"x={tmp_path / 'none'}", "no such folder")):
         refused = runner.invoke(app, ["--data", str(tmp_path / "data"), "--peer", peer])
         assert isinstance(refused.exception, RecipeError) and message in str(refused.exception)
+
+
+def test_who_asks_for_the_papers_method_is_told_of_its_plugin() -> None:
+    for name in ("paper", "paper_iou"):
+        assert "pip install ./benchmarks/paper/method" in registry.suggestion(name, ["poisson"])
+    assert registry.suggestion("poison", ["poisson"]) == " (did you mean 'poisson'?)"

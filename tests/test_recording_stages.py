@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -136,3 +137,20 @@ def test_a_point_grows_with_the_frame_that_saw_it_first(tmp_path: Path) -> None:
     (first,) = rows(part, layout.growth(0), "Points3D:positions")[:1]
     np.testing.assert_array_equal(np.float32(first), points[[1, 2]])
     np.testing.assert_array_equal(rgb(rows(part, layout.growth(0), "Points3D:colors")[0]), colours[[1, 2]])
+
+
+def test_growth_holds_one_cloud_at_a_time() -> None:
+    """Two million points of 40 frames that walk on: what is held grows with the model's points alone."""
+    rng = np.random.default_rng(0)
+    cloud = PointCloud(rng.uniform(-1, 1, (50_000, 3)).astype(np.float32))
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, 0, 3] = np.arange(40)
+    seen = CloudSet.from_clouds([cloud] * 40)
+    tracemalloc.start()
+    try:
+        first = first_frame(poses[:, :3, 3].astype(np.float32), seen, poses)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert first.tolist() == [0, 0, *range(1, 39)]
+    assert peak < 10 * cloud.points_in_cam.nbytes

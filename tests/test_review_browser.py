@@ -188,6 +188,16 @@ def test_a_first_guess_by_the_handles_of_the_second_cloud(browser: Any, review: 
     assert moved[3] == pytest.approx(ways[-1, 0] - ways[0, 0], rel=0.2) and np.abs(np.delete(moved, 3)).max() < 1e-6
 
 
+def test_a_page_that_comes_later_looks_at_the_same_pair(browser: Any, review: Review) -> None:
+    page, session = Page(browser, review), review.session
+    page.choose(sorted(PLANTED)[0])
+    session.show(mode="edge")
+    browser.get("about:blank")
+    later = Page(browser, review)
+    middle = shown_pair(session, False).middle  # type: ignore[union-attr]
+    later.until(lambda: np.allclose(later.scene.camera.look_at, middle, atol=1e-3))
+
+
 def test_the_second_cloud_fades_from_the_edges_place_to_the_solutions(browser: Any, review: Review) -> None:
     page, session = Page(browser, review), review.session
     page.choose(sorted(PLANTED)[0])

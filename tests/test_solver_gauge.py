@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from hodge_paper.solver import PaperSolver
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.robust import RobustSolver
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.editing import GraphEditor
 from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver, solve
-from hodge_pipeline.solvers.paper import PaperSolver
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import Priors, ViewGraph

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from complex_graphs import TRIANGLE, complete, graphs, random_motions
+from hodge_paper.solver import PaperSolver
+from hodge_paper.surface import make_surface
 from hodge_pipeline import se3
 from hodge_pipeline.complex.decomposition import gradient_fit
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.paper import PaperSolver
-from hodge_pipeline.solvers.paper_surface import make_surface
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 

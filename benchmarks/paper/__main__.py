@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.paper import tables as paper_tables
-from benchmarks.paper.sequences import Found, find_sequences, peer_poses
+from benchmarks.paper.sequences import Found, find_sequences, peer_poses, recipe_file
 from benchmarks.paper.tables import NAN, Measured, Results
 from hodge_pipeline.cli.console import ProgressBars
 from hodge_pipeline.cli.options import Dask
@@ -102,7 +102,7 @@ def _peer_of(option: str | None) -> tuple[str, Path | None]:
 def _run(sequence: Found, kind: GraphKind, out: Path, overrides: list[str], dask: str | None) -> tuple[Run, float]:
     reader = f"source.reader={{stage: {sequence.reader}, every: {sequence.every}}}"
     fixed = [reader, f"outer_iterations={OUTER_ITERATIONS}", "recording.level=off", "fusion=[]"]
-    recipe = load_recipe(f"paper-{kind}", [*fixed, *overrides], sequence.folder)
+    recipe = load_recipe(recipe_file(kind), [*fixed, *overrides], sequence.folder)
     begin = time.perf_counter()
     with ProgressBars(quiet=False) as terminal:
         terminal.say(f"{sequence.name}, {kind} graph: {sequence.folder}")
@@ -147,7 +147,7 @@ def _peer_score(run: Run, kind: GraphKind, peer: Floats) -> float:
     """The peer's score on the pairs of the true poses, or of our result where there are none."""
     reference = true_poses(run.source) if has_truth(run.source) else run.poses
     sets = {"reference": reference, "peer": peer}
-    with load_recipe(f"paper-{kind}").executor.open() as workers:
+    with load_recipe(recipe_file(kind)).executor.open() as workers:
         table = score_table(run.clouds.folder, sets, "reference", workers, kinds=(kind,))
     return float(table.graphs[0].mean_score[1])
 

@@ -20,6 +20,12 @@ SCENES = ("chess", "fire", "redkitchen", "stairs")
 COLLECTIONS = ("", "seven_scenes", "7scenes", "7-scenes", "icl_nuim", "icl-nuim")
 POSE_FILE = re.compile(r"frame-(\d+)\.pose\.txt")
 MAX_STAMP_DIFFERENCE_S = 0.02
+RECIPES = Path(__file__).parent / "recipes"
+
+
+def recipe_file(kind: str) -> str:
+    """The recipe of the paper's method on a kind of graph."""
+    return str(RECIPES / f"paper_{kind}.yaml")
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.paper.sequences import recipe_file
+from hodge_paper.minimum_cycles import shortest_loops
+from hodge_paper.solver import PaperSolver
 from hodge_pipeline.evaluation.scores import score_table
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
-from hodge_pipeline.solvers.paper import PaperSolver
+from hodge_pipeline.solvers import poisson
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import Floats, Solution, ViewGraph
@@ -68,6 +71,7 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="a finished run")
     parser.add_argument("round", type=int, nargs="?", default=1)
     given = parser.parse_args()
+    poisson.tree_loops = shortest_loops  # D of both solvers over the same loops
     problem = read_problem(given.run, given.round)
     makers: dict[str, tuple[Callable[[int], ConsistencySolver], int]] = {
         "graph, pairing": (lambda seed: PoissonSolver(log="pairing"), 1),
@@ -81,7 +85,7 @@ def main() -> None:
     sets = {"truth": problem.truth}
     for name, (solutions, _) in found.items():
         sets |= {f"{name} {seed}": solution.world_from_cam for seed, solution in enumerate(solutions[:SCORED_SEEDS])}
-    with load_recipe("paper_distance").executor.open() as workers:
+    with load_recipe(recipe_file("distance")).executor.open() as workers:
         table = score_table(problem.clouds, sets, "truth", workers)
     scores = {graph.kind: dict(zip(table.names, graph.mean_score, strict=True)) for graph in table.graphs}
     truth = ", ".join(f"{kind} {score['truth']:.4f}" for kind, score in scores.items())

@@ -1,4 +1,4 @@
-"""The Lie-algebra valued 1-form of the viewing graph, and Algorithm 2: its extension to the embedding surface."""
+"""The Lie-algebra valued 1-form of the viewing graph."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from typing import Literal
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.embedding import Surface
-from hodge_pipeline.complex.shortest_paths import path_integrals
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints
 
 Logarithm = Literal["se3", "pairing"]
@@ -38,16 +35,3 @@ def shifted(world_from_cam: Floats, offset: Floats) -> Floats:
     out = np.array(world_from_cam, float)
     out[:, :3, 3] += offset
     return out
-
-
-def surface_form(surface: Surface, omega: Floats) -> Floats:
-    """ω (E + D, k) on every edge of the surface, from ω (E, k) on the graph's (Algorithm 2, Eq. (5)).
-
-    A diagonal gets the sum of ω along a path of the graph with the fewest edges. One that joins a vertex to itself gets
-    0, one parallel to an edge that edge's ω (of several, the first). Where paths tie, the vertices' order decides.
-    """
-    count = surface.graph_edge_count
-    if omega.shape[0] != count:
-        raise GraphError(f"ω has {omega.shape[0]} rows, but the embedded graph has {count} edges")
-    graph_edges, diagonals = surface.edges[:count], surface.edges[count:]
-    return np.concatenate([omega, path_integrals(graph_edges, surface.vertex_count, omega, diagonals)])

@@ -17,7 +17,7 @@ from hodge_pipeline.complex.cech import (
     voxel_occupancy,
 )
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.decomposition import Energies, HodgeDecomposition, hodge_decomposition
+from hodge_pipeline.complex.decomposition import HodgeDecomposition, hodge_decomposition
 from hodge_pipeline.complex.one_form import centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import CloudSet, Floats, Ints, ViewGraph
@@ -73,8 +73,3 @@ def one_form(graph: ViewGraph, world_from_cam: Floats, component: Ints | None = 
 def decompose(complex_: SimplicialComplex, omega: OneForm) -> HodgeDecomposition:
     """The Helmholtz–Hodge decomposition of ω on a complex (Theorem 4, Eq. (6))."""
     return hodge_decomposition(complex_.coboundary(0), complex_.coboundary(1), omega.values, omega.weights)
-
-
-def energies(complex_: SimplicialComplex, parts: HodgeDecomposition) -> Energies:
-    """How much of ω each part holds."""
-    return parts.energies(complex_.counts)

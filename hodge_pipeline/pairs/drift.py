@@ -66,7 +66,7 @@ class DriftEdges:
         if len(rows) < 2:
             return NOTHING, np.zeros(0)
         own, poses = [clouds[int(row)] for row in rows], world_from_cam[rows]
-        way_m = _path_length_m(poses, _median_range_m(clouds, rows))
+        way_m = path_length_m(poses, median_range_m(clouds, rows))
         pairs, overlap = [NOTHING], [np.zeros(0)]
         for octave in range(OCTAVES):
             voxel_m = self.voxel_m * 2**octave
@@ -96,13 +96,18 @@ def best_of_each(pairs: Ints, scores: Floats, most: int, reach: int) -> Ints:
     return np.sort(np.array(kept, np.int64))
 
 
-def _path_length_m(world_from_cam: Floats, range_m: float) -> Floats:
+def path_length_m(world_from_cam: Floats, range_m: float) -> Floats:
     """The path length (N,) up to each pose: steps, and turns as the arc at the scene's median distance."""
     motions = se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:]
-    turns = se3.rotation_angle(motions)
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(motions[:, :3, 3], axis=1) + range_m * turns)])
+    return np.concatenate([[0.0], np.cumsum(displacement_m(motions, range_m))])
 
 
-def _median_range_m(clouds: CloudSet, rows: Ints) -> float:
+def displacement_m(motions: Floats, range_m: float) -> Floats:
+    """How far (...,) motions move what is seen at a distance, metres: their shift, and their turn as an arc."""
+    return np.asarray(np.linalg.norm(motions[..., :3, 3], axis=-1) + range_m * se3.rotation_angle(motions))
+
+
+def median_range_m(clouds: CloudSet, rows: Ints) -> float:
+    """How far what these rows see is from their cameras; 1 where none sees anything."""
     some = rows[:: max(1, len(rows) // SAMPLED_FRAMES)].tolist()
-    return float(np.median([np.median(np.linalg.norm(clouds[row].points_in_cam, axis=1)) for row in some]))
+    return float(np.median([np.median(np.linalg.norm(clouds[row].points_in_cam, axis=1)) for row in some] or [1.0]))

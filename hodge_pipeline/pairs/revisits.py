@@ -13,6 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from hodge_pipeline import se3
+from hodge_pipeline.pairs.drift import displacement_m, median_range_m, path_length_m
 from hodge_pipeline.pairs.overlap import voxels
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import PreparedClouds
@@ -21,7 +22,6 @@ from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
 REVISIT = "revisit"
 """Why a pair is proposed."""
-SAMPLED_CLOUDS = 50
 LOOP_RANGES = 4.0
 """Median ranges of the path, a turn as the arc at that range, between two views that close a loop: two thirds of a full
 turn. Nearer ones the edge builders find."""
@@ -47,8 +47,8 @@ class Revisits:
     most_m: float = Field(
         default=1.5,
         gt=0,
-        description="metres that a place may be off: beyond it none is looked for, since rooms that look alike may lie "
-        "so near",
+        description="metres that a place may be off: beyond it none is looked for by the poses, since rooms that look "
+        "alike may lie so near; where a path is so long that more is possible, frames that look alike are matched",
     )
     agree_m: float = Field(
         default=0.2,
@@ -64,38 +64,48 @@ class Revisits:
         description="how a view is registered to one of before, from a guess that may be half a metre off",
     )
 
+    @property
+    def longest_way_m(self) -> float:
+        """The path over which odometry may drift by `most_m`."""
+        return (self.most_m - self.agree_m) / self.drift_share
+
 
 def find_revisits(
-    clouds: CloudSet, world_from_cam: Floats, part: Ints, options: Revisits, advance: Advance = no_progress
+    clouds: CloudSet,
+    world_from_cam: Floats,
+    part: Ints,
+    options: Revisits,
+    advance: Advance = no_progress,
+    known: Edges | None = None,
 ) -> Edges:
     """The pairs that close loops, registered, from poses (K, 4, 4) in the order of the path; `advance` counts poses.
 
     Between two parts (K,) odometry says nothing, and no loop is looked for. A view is believed to be at a place of
     before where two views there put it at the same spot, no farther off than odometry drifts along the shortest way of
-    steps and loops between them.
+    steps and loops between them. The loops that are `known` come first.
     """
-    return _Path(clouds, world_from_cam, part, options).found(advance)
+    return _Path(clouds, world_from_cam, part, options, known or Edges.of(np.zeros((0, 2), np.int64))).found(advance)
 
 
 class _Path:
     """The path so far: its poses as the loops found put them, and the ways between its views."""
 
-    def __init__(self, clouds: CloudSet, world_from_cam: Floats, part: Ints, options: Revisits) -> None:
+    def __init__(self, clouds: CloudSet, world_from_cam: Floats, part: Ints, options: Revisits, known: Edges) -> None:
         assert clouds.folder is not None
         self._options = options
         self._prepared, self._has_points = PreparedClouds(clouds.folder, options.registration), clouds.sizes > 0
-        self._clouds, self._range_m = clouds, _median_range_m(clouds)
+        self._clouds, self._range_m = clouds, median_range_m(clouds, np.flatnonzero(self._has_points))
         self._steps = se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:]
-        step_m = self._far(self._steps)
-        self._at_m = np.concatenate([[0.0], np.cumsum(step_m)])
-        self._way_m = np.where(part[1:] == part[:-1], step_m, np.inf)
+        self._at_m = path_length_m(world_from_cam, self._range_m)
+        self._way_m = np.where(part[1:] == part[:-1], np.diff(self._at_m), np.inf)
         self._poses = world_from_cam.copy()
+        self._known = known
         self._loops: list[tuple[int, int, Registration]] = []
 
     def found(self, advance: Advance) -> Edges:
         tried_m = 0.0
         for row in range(1, len(self._poses)):
-            self._poses[row] = self._poses[row - 1] @ self._steps[row - 1]
+            self._poses[row] = self._by_known(row)
             advance(1)
             if self._at_m[row] - tried_m < self._options.every_m or not self._has_points[row]:
                 continue
@@ -106,13 +116,21 @@ class _Path:
                 self._clouds.forget()
                 self._prepared.clouds.forget()
         pairs = np.array([(i, j) for i, j, _ in self._loops], np.int64).reshape(-1, 2)
-        return Edges.of(pairs, REVISIT).with_registrations([loop for _, _, loop in self._loops])
+        found = Edges.of(pairs, REVISIT).with_registrations([loop for _, _, loop in self._loops])
+        return Edges.joined([self._known.put(slice(None), proposed_by=REVISIT), found])
+
+    def _by_known(self, row: int) -> Floats:
+        """The pose that a known loop, or else the step from the pose before, leads to."""
+        ending = np.flatnonzero(self._known.pairs[:, 1] == row)
+        if len(ending):
+            return np.asarray(self._poses[self._known.pairs[ending[0], 0]] @ self._known.i_from_j[ending[0]])
+        return np.asarray(self._poses[row - 1] @ self._steps[row - 1])
 
     def _candidates(self, row: int) -> tuple[Ints, Floats]:
         """The two views of before that share most with this one, and how far off each may be, metres."""
         options = self._options
         before = int(np.searchsorted(self._at_m, self._at_m[row] - LOOP_RANGES * self._range_m))
-        way_m = self._ways(row, (options.most_m - options.agree_m) / options.drift_share)[:before]
+        way_m = self._ways(row, options.longest_way_m)[:before]
         allowed_m = options.agree_m + options.drift_share * way_m
         shift_m = np.linalg.norm(self._poses[:before, :3, 3] - self._poses[row, :3, 3], axis=1)
         usable = np.flatnonzero(
@@ -138,9 +156,10 @@ class _Path:
     def _ways(self, row: int, limit_m: float) -> Floats:
         """The shortest way (row + 1,) by steps and loops from a view to each one before it; infinite beyond a limit."""
         i, j = np.arange(row), np.arange(1, row + 1)
-        a = np.concatenate([i, np.array([loop[0] for loop in self._loops], np.int64)])
-        b = np.concatenate([j, np.array([loop[1] for loop in self._loops], np.int64)])
-        cost = np.concatenate([self._way_m[:row], np.zeros(len(self._loops))]) + 1e-9
+        loops = np.array([loop[:2] for loop in self._loops], np.int64).reshape(-1, 2)
+        loops = np.concatenate([loops, self._known.pairs[self._known.pairs[:, 1] <= row]])
+        a, b = np.concatenate([i, loops[:, 0]]), np.concatenate([j, loops[:, 1]])
+        cost = np.concatenate([self._way_m[:row], np.zeros(len(loops))]) + 1e-9
         ways = csr_matrix((cost, (a, b)), shape=(row + 1, row + 1))
         return np.asarray(dijkstra(ways, directed=False, indices=row, limit=limit_m))
 
@@ -163,8 +182,7 @@ class _Path:
 
     def _far(self, motions: Floats) -> Floats:
         """How far (...,) motions move what is seen, metres."""
-        shift_m = np.linalg.norm(motions[..., :3, 3], axis=-1)
-        return np.asarray(shift_m + self._range_m * se3.rotation_angle(motions))
+        return displacement_m(motions, self._range_m)
 
 
 def _spaced(rows: Ints) -> Ints:
@@ -176,9 +194,3 @@ def _spaced(rows: Ints) -> Ints:
         if len(kept) == COMPARED:
             break
     return np.array(kept, np.int64)
-
-
-def _median_range_m(clouds: CloudSet) -> float:
-    rows = np.flatnonzero(clouds.sizes > 0)
-    some = rows[:: max(1, len(rows) // SAMPLED_CLOUDS)].tolist()
-    return float(np.median([np.median(np.linalg.norm(clouds[row].points_in_cam, axis=1)) for row in some] or [1.0]))

@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 
 from hodge_pipeline.complex.cech import SimplicialComplex
-from hodge_pipeline.complex.parts import decompose, energies, flag_of, one_form
+from hodge_pipeline.complex.parts import decompose, flag_of, one_form
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
@@ -68,7 +68,7 @@ def _energy(graph: ViewGraph, start: Floats, solution: Solution) -> list[str]:
     for when, poses in (("before", start), ("after", solution.world_from_cam)):
         if not np.isfinite(poses).all():
             continue
-        found = energies(complex_, decompose(complex_, one_form(used, poses, solution.component)))
+        found = decompose(complex_, one_form(used, poses, solution.component)).energies(complex_.counts)
         rows += [f"| {when} | {part} | {100 * r:.2f} % | {100 * t:.2f} % |" for part, (r, t) in found.shares.items()]
     return rows
 

@@ -50,30 +50,30 @@ def log_growth(
 
 
 def first_frame(points: Floats32, clouds: CloudSet, world_from_cam: Floats) -> Ints:
-    """The row of the first frame whose cloud reaches the cell of each point (P,) or one beside it; else the last."""
-    frames = np.repeat(np.arange(len(clouds)), clouds.sizes)
-    known = shapes.is_drawable(world_from_cam)[frames]
-    seen = _in_world(clouds, world_from_cam)[known]
-    every = np.concatenate([seen, points]) if len(seen) else points
-    low = np.floor(every.min(axis=0) / CELL_M).astype(np.int64) - 1
-    size = np.floor(every.max(axis=0) / CELL_M).astype(np.int64) - low + 2
-    cells = np.floor(seen / CELL_M).astype(np.int64) - low
-    keys, first = np.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_index=True)
+    """The row of the first frame whose cloud reaches the cell of each point (P,) or one beside it; else the last.
+
+    Memory holds the cells of the points and one cloud.
+    """
     found = np.full(len(points), len(clouds) - 1)
-    if not len(keys):
+    known = np.flatnonzero(shapes.is_drawable(world_from_cam) & (clouds.sizes > 0))
+    if not len(points) or not len(known):
         return found
-    own = np.floor(points / CELL_M).astype(np.int64) - low
-    for step in np.array([[0, 0, 0], *np.eye(3, dtype=int), *-np.eye(3, dtype=int)]):
-        cell = own + step
-        wanted = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-        place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        hit = keys[place] == wanted
-        found[hit] = np.minimum(found[hit], frames[known][first[place[hit]]])
-    return found
+    cells = np.floor(points.astype(float) / CELL_M).astype(np.int64)
+    low = cells.min(axis=0) - 1
+    size = cells.max(axis=0) + 2 - low
+    around = (cells[:, None] + [[0, 0, 0], *np.eye(3, dtype=int), *-np.eye(3, dtype=int)]).reshape(-1, 3)
+    keys, cell_of = np.unique(_keys(around - low, size), return_inverse=True)
+    first = np.full(len(keys), len(clouds) - 1)
+    for row in known[::-1].tolist():
+        seen = se3.transform(world_from_cam[row], np.asarray(clouds[row].points_in_cam, float))
+        own = np.floor(seen / CELL_M).astype(np.int64) - low
+        own = _keys(own[((own >= 0) & (own < size)).all(axis=1)], size)
+        place = np.minimum(np.searchsorted(keys, own), len(keys) - 1)
+        first[place[keys[place] == own]] = row
+    clouds.forget()
+    return np.asarray(first[cell_of.reshape(len(points), -1)].min(axis=1))
 
 
-def _in_world(clouds: CloudSet, world_from_cam: Floats) -> Floats32:
-    parts = [
-        se3.transform(world_from_cam[row], np.asarray(clouds[row].points_in_cam, float)) for row in range(len(clouds))
-    ]
-    return np.concatenate([np.zeros((0, 3)), *parts]).astype(np.float32)
+def _keys(cells: Ints, size: Ints) -> Ints:
+    """A number (N,) for each cell (N, 3) of a grid."""
+    return np.asarray((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2])

@@ -42,11 +42,6 @@ class ModelRefinement:
         description="of the solved positions in the bundle adjustment, against the tracks; 0: tracks alone. Used only "
         "where depth took part in the solve, since tracks know all that edges from the same images know",
     )
-    reprojection_tolerance: float = Field(
-        default=0.005,
-        ge=0,
-        description="relative: a capped mean reprojection error that grows by more is worse",
-    )
 
 
 def load_model_refinement(name_or_path: str = RECIPE, overrides: Sequence[str] = ()) -> ModelRefinement:

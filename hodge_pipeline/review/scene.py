@@ -43,7 +43,9 @@ class Scene:
         self._shown: dict[str, tuple[Any, ...]] = {}
         self._closed = threading.Event()
         self._looked: dict[int, tuple[Any, Any]] = {}
+        self._eyes: dict[int, tuple[int, int, int]] = {}
         self._begin()
+        server.on_client_connect(lambda _: session.bump())
         server.scene.on_click()(lambda event: self._clicked(event, shift=False))
         server.scene.on_click(modifier="shift")(lambda event: self._clicked(event, shift=True))
         self._thread = threading.Thread(target=self._follow, name="scene", daemon=True)
@@ -173,10 +175,15 @@ class Scene:
         )
 
     def _turn_to(self, pair: Shown | None, home: int) -> None:
-        """Let every page look at the pair; at what it saw before when that is left; at all when `home` grew."""
-        if self._same("eye", np.array([-1, -1, home] if pair is None else [pair.i, pair.j, pair.wants_points])):
-            return
+        """Let every page look at the pair; at what it saw before when that is left; at all when `home` grew.
+
+        A page that has just come, or come back after its connection broke, sees all until it is told otherwise.
+        """
+        eye = (-1, -1, home) if pair is None else (pair.i, pair.j, int(pair.wants_points))
         for number, client in self._server.get_clients().items():
+            before, self._eyes[number] = self._eyes.get(number, (-1, -1, home)), eye
+            if before == eye:
+                continue
             if pair is not None:
                 self._looked.setdefault(number, (client.camera.position, client.camera.look_at))
                 back = pair.world_from_i[:3, 3] - pair.middle

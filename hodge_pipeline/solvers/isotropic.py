@@ -16,7 +16,7 @@ from hodge_pipeline.solvers.cg import CgResult
 from hodge_pipeline.solvers.direct import DirectSolver
 from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.newton import Point, Step
-from hodge_pipeline.solvers.objective import Residuals, curvature, gradient, residuals
+from hodge_pipeline.solvers.objective import IsotropicPoint, Residuals, curvature, gradient, residuals
 from hodge_pipeline.solvers.problem import Problem
 from hodge_pipeline.solvers.rotations import axial, lever
 from hodge_pipeline.solvers.translations import TranslationSolver
@@ -58,13 +58,6 @@ def step_solver(problem: Problem) -> DirectSolver | IterativeSolver:
 
 
 @dataclass(frozen=True)
-class JointPoint(Point):
-    """A point with its residuals."""
-
-    left: Residuals
-
-
-@dataclass(frozen=True)
 class JointObjective:
     """F as a function of rotations and translations.
 
@@ -83,16 +76,16 @@ class JointObjective:
         matching = None if precondition is None else TranslationSolver.of(problem, precondition)
         return cls(problem, step_solver(problem), matching)
 
-    def at(self, rotations: Floats, translations: Floats) -> JointPoint:
+    def at(self, rotations: Floats, translations: Floats) -> IsotropicPoint:
         """The point at these poses."""
         if self.matching is not None:
             translations = self.matching.matching(rotations, translations)
         left = residuals(self.problem, rotations, translations)
-        return JointPoint(rotations, translations, left.cost, left)
+        return IsotropicPoint(rotations, translations, left.cost, left)
 
     def step(self, point: Point, tolerance: float, enough: float) -> Step:
         """A Gauss-Newton step."""
-        assert isinstance(point, JointPoint)
+        assert isinstance(point, IsotropicPoint)
         slopes, near = gradient(self.problem, point.left).reshape(-1), tolerance < NEWTON_FROM
         if isinstance(self.direct, IterativeSolver):
             found = self._iterated(self.direct, point, slopes, tolerance, enough, near)
@@ -104,12 +97,18 @@ class JointObjective:
         slope = 2 * float(slopes @ found.x)
         return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), found.steps)
 
-    def moved(self, point: Point, direction: Floats) -> JointPoint:
+    def moved(self, point: Point, direction: Floats) -> IsotropicPoint:
         """The point whose free poses are moved by a direction (free · (p + d),)."""
         return self.at(*self.problem.moved(point.rotations, point.translations, direction))
 
     def _iterated(
-        self, solver: IterativeSolver, point: JointPoint, slopes: Floats, tolerance: float, enough: float, near: bool
+        self,
+        solver: IterativeSolver,
+        point: IsotropicPoint,
+        slopes: Floats,
+        tolerance: float,
+        enough: float,
+        near: bool,
     ) -> CgResult:
         """The step by the exact Hessian near a minimum, elsewhere or where it is not definite by Gauss-Newton's, which
         alone gives a preconditioner.

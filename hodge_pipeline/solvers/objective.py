@@ -118,7 +118,7 @@ def curvature(problem: Problem, left: Residuals, edges: slice, exact: bool = Tru
 
 @dataclass(frozen=True)
 class IsotropicPoint(Point):
-    """A point whose translations are the best for its rotations, with its residuals."""
+    """A point with its residuals."""
 
     left: Residuals
 

@@ -21,12 +21,10 @@ from hodge_pipeline.solvers.potential import (
     CentredProblem,
     deviation_metrics,
     iterate,
-    loops_of,
+    tree_loops,
     unconverged_notes,
 )
 from hodge_pipeline.types import Bools, Floats, Solution, SolverIteration, ViewGraph
-
-AFFORDABLE_BASIS = 1_000_000  # vertices times edges: a few tenths of a second
 
 
 @plain_dataclass(frozen=True)
@@ -90,7 +88,7 @@ class PoissonSolver:
         proper = graph.edges[:, 0] != graph.edges[:, 1]
         used = proper & (base_weights > 0)
         problem = _problem(graph, used, base_weights, world_from_cam)
-        around_loops = loops_of(problem.edges, len(problem.component), AFFORDABLE_BASIS)
+        around_loops = tree_loops(problem.edges, len(problem.component))
         history = self._iterate(problem, around_loops)
         measured = loop_deviation(around_loops(problem.i_from_j))
         metrics = {

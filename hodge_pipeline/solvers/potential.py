@@ -16,10 +16,8 @@ from hodge_pipeline.complex.cycles import (
     adjusted_edges,
     fundamental_products,
     loop_deviation,
-    loop_products,
     spanning_forest,
 )
-from hodge_pipeline.complex.minimum_cycles import minimum_cycle_basis
 from hodge_pipeline.complex.one_form import Logarithm, residual_form, shifted
 from hodge_pipeline.solvers.linear import factorise
 from hodge_pipeline.solvers.problem import pinned_vertices
@@ -72,12 +70,8 @@ class CentredProblem:
         return (f"{count} edges disagree with the start by a half turn: the sign of their ω is arbitrary",)
 
 
-def loops_of(edges: Ints, vertex_count: int, affordable: int) -> AroundLoops:
-    """The products around the shortest cycle basis, mostly triangles, up to so many vertices times edges; beyond that
-    around the loops of a breadth-first tree. D grows with the loops' length; the poses do not depend on the basis.
-    """
-    if vertex_count * len(edges) <= affordable:
-        return partial(loop_products, minimum_cycle_basis(edges, vertex_count))
+def tree_loops(edges: Ints, vertex_count: int) -> AroundLoops:
+    """The products around the loops of a breadth-first tree: D grows with their length, poses do not depend on it."""
     return partial(fundamental_products, spanning_forest(edges, vertex_count))
 
 
@@ -104,7 +98,6 @@ def iterate(
         omega = problem.form(poses, log)
         step = float(np.sqrt((correction**2).sum(axis=1).mean()))
         metrics = {
-            **residual_metrics(problem.edges, problem.i_from_j, poses),
             "step_rms": step,
             **deviation_metrics(deviation, "loop_deviation"),
             **more(adjusted),
@@ -164,27 +157,3 @@ def moved(poses: Floats, correction: Floats, start: Floats, component: Ints, fix
     gauge = pinned_vertices(component, fixed)
     out[gauge] = start[gauge]
     return out
-
-
-def residuals(edges: Ints, i_from_j: Floats, poses: Floats) -> tuple[Floats, Floats]:
-    """Translation (E,) in metres and angle (E,) in radians of each edge's disagreement with the poses.
-
-    The translation is the RMS of those that the two cameras see, so it does not depend on the edge's direction.
-    """
-    i, j = edges.T
-    poses_say = se3.inverse(poses[i]) @ poses[j]
-    j_from_i = se3.inverse(i_from_j)
-    at_i, at_j = poses_say @ j_from_i, j_from_i @ poses_say
-    translation = np.sqrt(((at_i[:, :3, 3] ** 2).sum(axis=1) + (at_j[:, :3, 3] ** 2).sum(axis=1)) / 2)
-    return translation, se3.rotation_angle(at_j)
-
-
-def residual_metrics(edges: Ints, i_from_j: Floats, poses: Floats) -> Mapping[str, float]:
-    """Mean and median disagreement of the edges, of which there is at least one, with the poses; metres and radians."""
-    translation, angle = residuals(edges, i_from_j, poses)
-    return {
-        "translation_residual_mean_m": float(translation.mean()),
-        "translation_residual_median_m": float(np.median(translation)),
-        "rotation_residual_mean_rad": float(angle.mean()),
-        "rotation_residual_median_rad": float(np.median(angle)),
-    }

@@ -27,7 +27,7 @@ def clouds(source: Source, options: CloudOptions, *, workers: Workers, step: Ste
 def with_landmarks(
     source: Source, made: CloudSet, options: CloudOptions, matching: GlobalStart, steps: Steps, workers: Workers
 ) -> CloudSet:
-    """The clouds, made by these options, with landmarks where matching without a guess wants some.
+    """The clouds, made by these options, with landmarks of frames that are matched without a guess.
 
     Only then: SIFT costs more than all else of a key frame.
     """

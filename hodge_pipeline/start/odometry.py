@@ -20,6 +20,7 @@ from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import make_clouds, with_landmarks
 from hodge_pipeline.start.unordered.join import join_parts
+from hodge_pipeline.start.unordered.loops import find_loops, is_long, is_worth_it
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of
@@ -34,7 +35,8 @@ class OdometryStart(OdometryOptions):
     relocalise: bool | Literal["auto"] = Field(
         default=False,
         description="join what odometry leaves apart, by `unordered`: after lost tracking, or several sequences; "
-        "auto: only where it left something apart, true: always, which closes loops that have drifted too far as well",
+        "auto: only where it left something apart, true: always. auto also matches frames that look alike along a path "
+        "so long that it may have drifted by more than `revisits.most_m`; true matches more of them",
     )
     unordered: GlobalStart = Field(default=GlobalStart(), description="how parts are joined without a guess")
     revisits: Revisits | None = Field(
@@ -81,16 +83,27 @@ class OdometryStart(OdometryOptions):
             first = join_parts(keys, clouds, first, drift, self.unordered, steps, workers)
         closed = None
         if self.revisits is not None and first.name != START:
-            total = len(found.world_from_cam)
+            known, count = None, len(found.world_from_cam)
+            if self.relocalise == "auto" and is_long(clouds, found.steps, drift, self.revisits):
+                clouds = with_landmarks(keys, clouds, options, self.unordered, steps, workers)
+            if self.relocalise == "auto" and is_worth_it(clouds, found.steps, drift, self.revisits, self.unordered):
+                known = steps.step(
+                    find_loops, keys, clouds, found.steps, drift, self.revisits, self.unordered,
+                    title="loops by what frames look like", total=count, workers=workers,
+                )  # fmt: skip
             closed = steps.step(
-                close_loops, clouds, first, drift.part, self.revisits, title="loops along the path", total=total
+                close_loops, clouds, first, drift.part, self.revisits, known, title="loops along the path", total=count
             )
         return Scene(source, keys, key_frames, clouds, first, None if self.tail is None else drift, closed=closed)
 
 
-def close_loops(clouds: CloudSet, first: Round, part: Ints, options: Revisits, *, step: Step) -> Closed:
-    """Step: the first poses, where the path of a part (K,) comes back to a place moved to agree with it."""
-    found = find_revisits(clouds, first.world_from_cam, part, options, step.advance)
+def close_loops(
+    clouds: CloudSet, first: Round, part: Ints, options: Revisits, known: Edges | None = None, *, step: Step
+) -> Closed:
+    """Step: the first poses, where the path of a part (K,) comes back to a place moved to agree with it; some loops may
+    be `known`.
+    """
+    found = find_revisits(clouds, first.world_from_cam, part, options, step.advance, known)
     if not len(found):
         return Closed(first.world_from_cam, found.pairs)
     graph = Edges.joined([first.edges, found]).as_graph(np.arange(len(clouds)))

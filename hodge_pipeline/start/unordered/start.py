@@ -60,10 +60,35 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     `scratch` is a folder for the descriptions. Frames that nothing joins are pieces of their own, and said.
     """
     clouds = CloudSet.open(scene.clouds)
-    rows = np.flatnonzero(clouds.sizes > 0)
+    by_image = uses_images(clouds, options)
+    notes = [] if by_image or scene.given is not None else [*check_scans(clouds, scene.vertex_ids)]
+    hypotheses, views = weighed_matches(scene, np.flatnonzero(clouds.sizes > 0), options, scratch, workers, advance)
+    notes.append(tried(int((clouds.sizes > 0).sum()), hypotheses))
+    measured = hypotheses.select(hypotheses.counts).as_graph(scene.vertex_ids)
+    graph = measured
+    if scene.given is not None:
+        graph = ViewGraph.joined([scene.given.as_graph(scene.vertex_ids), measured])
+    found = diagnose(graph, options.diagnosis)
+    notes += [f"{int((~found.kept).sum())} of {graph.edge_count} edges are distrusted"]
+    given = int(found.kept[: graph.edge_count - measured.edge_count].sum())
+    pieces = Pieces.kept(graph, found)
+    pieces = unfolded(clouds, pieces, given, views, options.limits, options.diagnosis)
+    notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
+    advance(len(scene.frames))
+    poses = laid_apart(pieces.piece, pieces.poses, clouds)
+    return Start(poses, Edges.measured(pieces.graph), pieces.piece, tuple(notes))
+
+
+def weighed_matches(
+    scene: Frames, rows: Ints, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance
+) -> tuple[Edges, Views]:
+    """The pairs of these rows that were matched, of which those count that may be edges; and the views of the frames.
+
+    `advance` counts frames as they are described into the folder `scratch`.
+    """
+    clouds = CloudSet.open(scene.clouds)
     by_image = uses_images(clouds, options)
     registrar: GlobalRegistrar = options.images if by_image else options.registrar
-    notes = [] if by_image or scene.given is not None else [*check_scans(clouds, scene.vertex_ids)]
     describe = partial(describe_clouds, scene.clouds, registrar, out=scratch / DESCRIBED, workers=workers)
     if options.similar_per_frame:
         describe(rows, advance=advance)
@@ -77,21 +102,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
         counted = np.flatnonzero(hypotheses.counts)
         far = counted[contradicts_odometry(hypotheses.select(counted), scene.drift)]
         hypotheses = hypotheses.put(far, status=REJECTED, why=CONTRADICTS)
-    notes.append(_tried(len(rows), pairs, hypotheses))
-    labelled = hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features")
-    measured = labelled.select(labelled.counts).as_graph(scene.vertex_ids)
-    graph = measured
-    if scene.given is not None:
-        graph = ViewGraph.joined([scene.given.as_graph(scene.vertex_ids), measured])
-    found = diagnose(graph, options.diagnosis)
-    notes += [f"{int((~found.kept).sum())} of {graph.edge_count} edges are distrusted"]
-    given = int(found.kept[: graph.edge_count - measured.edge_count].sum())
-    pieces = Pieces.kept(graph, found)
-    pieces = unfolded(clouds, pieces, given, views, options.limits, options.diagnosis)
-    notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
-    advance(len(scene.frames))
-    poses = laid_apart(pieces.piece, pieces.poses, clouds)
-    return Start(poses, Edges.measured(pieces.graph), pieces.piece, tuple(notes))
+    return hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features"), views
 
 
 def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
@@ -115,8 +126,9 @@ def propose(scene: Frames, clouds: CloudSet, rows: Ints, described: Path, option
     return np.unique(np.concatenate([pairs, *found]), axis=0)
 
 
-def _tried(count: int, pairs: Ints, hypotheses: Edges) -> str:
+def tried(count: int, hypotheses: Edges) -> str:
+    """How many pairs of so many frames were matched, and what became of them."""
     every = count * (count - 1) // 2
     refused = ", ".join(f"{number} {reason}" for reason, number in hypotheses.rejected_counts.items())
-    text = f"{len(pairs)} of {every} pairs were matched, {int(hypotheses.counts.sum())} may be edges"
+    text = f"{len(hypotheses)} of {every} pairs were matched, {int(hypotheses.counts.sum())} may be edges"
     return f"{text} ({refused})" if refused else text

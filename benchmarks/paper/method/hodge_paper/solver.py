@@ -6,24 +6,23 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.complex.checks import NO_EDGES, check_graph, refuse_priors
-from hodge_pipeline.complex.components import describe_components
-from hodge_pipeline.complex.cycles import Loops, loop_deviation
-from hodge_pipeline.complex.minimum_cycles import MOST_CANDIDATES
-from hodge_pipeline.complex.one_form import Logarithm
-from hodge_pipeline.solvers.paper_problem import PaperProblem, make_problem
-from hodge_pipeline.solvers.paper_surface import (
+from hodge_paper.minimum_cycles import shortest_loops
+from hodge_paper.problem import PaperProblem, make_problem
+from hodge_paper.surface import (
     MOST_CHECKED_EDGES,
     PaperSurface,
     RotationSystem,
     homology_metrics,
     make_surface,
 )
+from hodge_pipeline.complex.checks import NO_EDGES, check_graph, refuse_priors
+from hodge_pipeline.complex.components import describe_components
+from hodge_pipeline.complex.cycles import Loops, loop_deviation
+from hodge_pipeline.complex.one_form import Logarithm
 from hodge_pipeline.solvers.potential import (
     AroundLoops,
     deviation_metrics,
     iterate,
-    loops_of,
     unconverged_notes,
 )
 from hodge_pipeline.types import Floats, Solution, SolverIteration, ViewGraph
@@ -78,7 +77,7 @@ class PaperSolver:
             notes = (*problem.notes(), *pieces, NO_EDGES)
             return Solution(world_from_cam.copy(), problem.component, np.zeros(graph.edge_count), notes=notes)
         surface = make_surface(problem.edges, problem.start, self.rotation, self.seed)
-        around_loops = loops_of(problem.edges, len(problem.component), MOST_CANDIDATES)
+        around_loops = shortest_loops(problem.edges, len(problem.component))
         generators = surface.generators() if surface.is_checked else None
         history = self._iterate(problem, surface, around_loops, generators)
         measured = loop_deviation(around_loops(problem.i_from_j))

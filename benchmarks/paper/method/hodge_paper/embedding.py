@@ -8,10 +8,10 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components as csgraph_components
 
+from hodge_paper.rotation import check_rotation, dart_sources
 from hodge_pipeline.complex.coboundary import check_edges
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import Loops
-from hodge_pipeline.complex.rotation import check_rotation, dart_sources
 from hodge_pipeline.types import Ints
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hodge_pipeline.complex.embedding import Surface
+from hodge_paper.embedding import Surface
 from hodge_pipeline.types import Floats
 
 COT_60_DEG = 1 / np.sqrt(3)

@@ -1,4 +1,4 @@
-"""Integrals of a 1-form along shortest paths of a graph, for many pairs of vertices at once (Eq. (5))."""
+"""Algorithm 2: the 1-form on the surface's diagonals, its integrals along shortest paths of the graph (Eq. (5))."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from hodge_paper.embedding import Surface
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -33,6 +34,19 @@ class _Lookup:
         place = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
         edge = np.where(self.keys[place] == wanted, self.edge[place], -1)
         return edge, np.where((a < b) == self.forward[place], 1, -1)
+
+
+def surface_form(surface: Surface, omega: Floats) -> Floats:
+    """ω (E + D, k) on every edge of the surface, from ω (E, k) on the graph's (Algorithm 2, Eq. (5)).
+
+    A diagonal gets the sum of ω along a path of the graph with the fewest edges. One that joins a vertex to itself gets
+    0, one parallel to an edge that edge's ω (of several, the first). Where paths tie, the vertices' order decides.
+    """
+    count = surface.graph_edge_count
+    if omega.shape[0] != count:
+        raise GraphError(f"ω has {omega.shape[0]} rows, but the embedded graph has {count} edges")
+    graph_edges, diagonals = surface.edges[:count], surface.edges[count:]
+    return np.concatenate([omega, path_integrals(graph_edges, surface.vertex_count, omega, diagonals)])
 
 
 def path_integrals(edges: Ints, vertex_count: int, omega: Floats, pairs: Ints) -> Floats:

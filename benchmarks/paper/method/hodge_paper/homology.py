@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from hodge_paper.embedding import Embedding
 from hodge_pipeline.complex.cycles import Loops, fundamental_loops, spanning_forest
-from hodge_pipeline.complex.embedding import Embedding
 from hodge_pipeline.types import Floats
 
 

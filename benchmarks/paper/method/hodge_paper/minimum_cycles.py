@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from hodge_pipeline.complex.coboundary import check_edges
-from hodge_pipeline.complex.cycles import Loops, spanning_forest
+from hodge_pipeline.complex.cycles import Loops, loop_products, spanning_forest
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.potential import AroundLoops, tree_loops
 from hodge_pipeline.types import Ints
 
 MOST_CANDIDATES = 2_000_000
@@ -29,6 +32,13 @@ def minimum_cycle_basis(edges: Ints, vertex_count: int) -> Loops:
             "fundamental loops of a spanning tree"
         )
     return _independent(_Horton(edges, vertex_count), edges, vertex_count)
+
+
+def shortest_loops(edges: Ints, vertex_count: int) -> AroundLoops:
+    """The products around the shortest cycle basis, mostly triangles; where that takes too long, around a tree's."""
+    if vertex_count * len(edges) > MOST_CANDIDATES:
+        return tree_loops(edges, vertex_count)
+    return partial(loop_products, minimum_cycle_basis(edges, vertex_count))
 
 
 class _Horton:
