@@ -6,9 +6,8 @@ import pytest
 
 from hodge_pipeline import open_source, se3
 from hodge_pipeline.complex.cycles import fundamental_loops, spanning_forest
-from hodge_pipeline.diagnosis.confirmation import cycle_lengths
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
+from hodge_pipeline.diagnosis.robust import RobustSolver, cycle_lengths, solve_robust
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
 from hodge_pipeline.solvers.maximum_likelihood import solve

@@ -70,9 +70,8 @@ def in_vertex_order(graph: ViewGraph) -> tuple[ViewGraph, Bools]:
     edges[turned] = edges[turned, ::-1]
     motions[turned] = se3.inverse(motions[turned])
     if not has_unit_information(graph):
-        back = se3.adjoint(motions[turned])
         information = information.copy()
-        information[turned] = np.swapaxes(back, 1, 2) @ information[turned] @ back
+        information[turned] = se3.pull_back(motions[turned], information[turned])
     return replace(graph, edges=edges, i_from_j=motions, information=information), turned
 
 

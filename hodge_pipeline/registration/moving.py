@@ -34,33 +34,60 @@ class Rival:
     """Another motion that much of the image follows, and the key frame's corners that do.
 
     `fits_better`: in more tiles than the first motion does; `moving (H, W)`: not 0 where the key frame's image follows
-    the motion that fits fewer tiles.
+    the motion that fits fewer tiles; `contradicting`: the share of the tested pixels that contradict the other motion.
     """
 
     corners: Corners
     followed: Followed
     fits_better: bool
     moving: Bytes
+    contradicting: float
 
 
-def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floats) -> Rival | None:
-    """The motion of corners where the one found has none; None where little contradicts it, or nothing else agrees."""
+def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floats) -> tuple[float, Rival | None]:
+    """The share of the tested pixels that contradict the motion found, and the motion of corners where that has none;
+    None where little contradicts it, or no other motion agrees.
+    """
     key = corners.image
     pixels = _tested(key)
     misfit = _misfit(key, view, found.key_from_view, pixels)
-    compared = np.isfinite(misfit)
-    if np.count_nonzero(misfit[compared] >= 1) <= MUCH * compared.sum():
-        return None
+    share = _contradicting(misfit)
+    if share <= MUCH:
+        return share, None
     own = _tiles_with(key, corners.pixels[found.rows])
     others = find_corners(key, 1 - own)
     other = follow(others, view, guess)
     if other is None:
-        return None
-    gain = misfit - _misfit(key, view, other.key_from_view, pixels)
+        return share, None
+    others_misfit = _misfit(key, view, other.key_from_view, pixels)
+    won, lost = _votes(key, misfit - others_misfit)
+    if won == lost == 0:  # the same motion
+        return share, None
+    fits_better = won > lost
+    moving = own if fits_better else _tiles_with(key, others.pixels[other.rows])
+    return share, Rival(others, other, fits_better, moving, _contradicting(others_misfit))
+
+
+def fits_most(key: FlowImage, view: FlowImage, key_from_view: Floats, other: Floats) -> tuple[bool, float]:
+    """Whether another motion fits most tiles of the image better than the first one, and the share of the pixels that
+    contradict it.
+    """
+    pixels = _tested(key)
+    first, misfit = _misfit(key, view, key_from_view, pixels), _misfit(key, view, other, pixels)
+    won, _ = _votes(key, first - misfit)
+    return 2 * won > TILES**2, _contradicting(misfit)
+
+
+def _votes(key: FlowImage, gain: Floats) -> tuple[int, int]:
+    """The tiles that another motion fits better by so much (n,) at each pixel, and those that it fits worse."""
     compared = np.isfinite(gain)
-    votes = np.bincount(_tile(key, pixels)[compared], gain[compared], minlength=TILES**2)
-    fits_better = bool((votes > 1).sum() > (votes < -1).sum())
-    return Rival(others, other, fits_better, own if fits_better else _tiles_with(key, others.pixels[other.rows]))
+    votes = np.bincount(_tile(key, _tested(key))[compared], gain[compared], minlength=TILES**2)
+    return int((votes > 1).sum()), int((votes < -1).sum())
+
+
+def _contradicting(misfit: Floats) -> float:
+    compared = misfit[np.isfinite(misfit)]
+    return float((compared >= 1).mean()) if len(compared) else 0.0
 
 
 def _tested(image: FlowImage) -> Floats:
