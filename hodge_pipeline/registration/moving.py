@@ -68,12 +68,14 @@ def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floa
     return share, Rival(others, other, fits_better, moving, _contradicting(others_misfit))
 
 
-def fits_more(key: FlowImage, view: FlowImage, key_from_view: Floats, other: Floats) -> tuple[bool, float]:
-    """Whether another motion fits more tiles than the first one, and the share of the pixels that contradict it."""
+def fits_most(key: FlowImage, view: FlowImage, key_from_view: Floats, other: Floats) -> tuple[bool, float]:
+    """Whether another motion fits most tiles of the image better than the first one, and the share of the pixels that
+    contradict it.
+    """
     pixels = _tested(key)
     first, misfit = _misfit(key, view, key_from_view, pixels), _misfit(key, view, other, pixels)
-    won, lost = _votes(key, first - misfit)
-    return won > lost, _contradicting(misfit)
+    won, _ = _votes(key, first - misfit)
+    return 2 * won > TILES**2, _contradicting(misfit)
 
 
 def _votes(key: FlowImage, gain: Floats) -> tuple[int, int]:
