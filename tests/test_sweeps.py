@@ -56,13 +56,15 @@ def broken(cloud: PointCloud) -> PointCloud:
     raise SourceError("cut off")
 
 
-def followed(frames: list[Frame], sequences: tuple[Ints, ...] | None = None) -> tuple[Sweeps, str]:
+def followed(
+    frames: list[Frame], sequences: tuple[Ints, ...] | None = None, max_range_m: float = FARTHEST_M
+) -> tuple[Sweeps, str]:
     """What is found, and what is said."""
     said: list[str] = []
     step = Step(Path(), no_progress, lambda *notes: said.extend(map(str, notes)))
     source = Source("street", Path("street"), tuple(frames))
     every = (np.arange(len(frames)),) if sequences is None else sequences
-    return follow(source, every, CloudOptions(max_range_m=FARTHEST_M), None, step=step), "\n".join(said)
+    return follow(source, every, CloudOptions(max_range_m=max_range_m, voxel_m=0.5), None, step=step), "\n".join(said)
 
 
 @pytest.mark.parametrize("lost", [1, 5])
@@ -117,11 +119,13 @@ def test_after_a_minute_without_sweeps_a_scanner_may_have_stopped() -> None:
     assert np.linalg.norm(moved) < 2 * NEAR_M
 
 
-def test_a_sweep_in_millimetres_among_others_is_left_out_and_named() -> None:
+@pytest.mark.parametrize("reach_m", [FARTHEST_M, 40 * FARTHEST_M])  # a few of its points are in range then
+def test_a_sweep_in_millimetres_among_others_is_left_out_and_named(reach_m: float) -> None:
     frames = street().copy()
     frames[12] = changed(frames[12], lambda cloud: replace(cloud, points_in_cam=cloud.points_in_cam * 1000))
-    found, said = followed(frames)
-    assert not found.found[12] and "12.pcd" in said and "millimetres? then source.reader.units_per_metre=1000" in said
+    found, said = followed(frames, max_range_m=reach_m)
+    assert (~found.found).nonzero()[0].tolist() == [12]
+    assert "12.pcd" in said and "millimetres" in said and "1 sweeps are left out" in said
 
 
 def test_a_scanner_whose_sweeps_cannot_be_read_leaves_the_other_be() -> None:

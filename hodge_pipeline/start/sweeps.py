@@ -40,6 +40,7 @@ from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
+from hodge_pipeline.start.unordered.scan_checks import FACTOR_OF_UNITS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Floats32, Frame, Ints, PointCloud, Source
 from hodge_pipeline.types.notes import Note, notes_of
 
@@ -60,6 +61,7 @@ WARM_UP, MOST_PASSES = 20, 4
 """Sweeps that the first velocity is found on, and how often at most they are followed forth and back for it."""
 MOST_DESKEWS, FARTHER = 3, 0.9
 """A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
+LEFT_OUT = "the sweep is left out"
 LOOKS = 9
 """Sweeps, spread over a sequence, that tell how far its scanner sees: any one may face a wall."""
 MOST_SKIPPED = 20
@@ -109,13 +111,13 @@ class SweepsStart(OdometryStart):
         steps.remember(keys, steps.key([whole, rows]))
         steps.note(Note("key frames", len(rows), str(len(frames))))
         made = make_clouds(keys, clouds, steps, workers)
-        steps_of = tuple(np.flatnonzero(np.isin(rows, part)) for part in sequences)
+        steps_of = tuple(own for part in sequences if len(own := np.flatnonzero(np.isin(rows, part))))
         joined = steps.step(
             register_steps, made, steps_of, found.world_from_scan[rows], self.odometry,
             title="odometry", total=max(1, len(rows) - len(sequences)), workers=workers,
         )  # fmt: skip
         key_frames = _followers(whole, rows, found, joined, sequences)
-        return self.joined(whole, made, joined, key_frames, steps, workers)
+        return self.joined(whole, made, clouds, joined, key_frames, steps, workers)
 
 
 def follow(
@@ -132,10 +134,10 @@ def follow(
         reaches_m.append(reach_m)
         times = _times(stamps[rows], usual_turn_s)
         voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-        first = list(zip(times, _sweeps(frames[:WARM_UP], clouds), strict=False))
+        first = list(zip(times, _sweeps(frames[:WARM_UP], clouds, reach_m), strict=False))
         tracker = _Tracker(voxel, LEVELS, _first_velocity(voxel, first))
         followed = []
-        for place, (row, sweep) in enumerate(zip(rows, _sweeps(frames, clouds), strict=True)):
+        for place, (row, sweep) in enumerate(zip(rows, _sweeps(frames, clouds, reach_m), strict=True)):
             if sweep.cloud is not None:
                 tracker.follow(sweep.cloud, times[place])
                 followed.append(place)
@@ -150,6 +152,8 @@ def follow(
     if not found.any():
         raise SourceError(f"{source.path}: none of the {count} sweeps gave points in range; the first: {odd[0]}")
     step.note(*notes_of("clouds", shortened(odd)))
+    if not found.all():
+        step.note(Note("sweeps left out", int((~found).sum()), next(one.why for one in odd if one.what == LEFT_OUT)))
     if not turn_s.any():
         step.note(Note("sweeps untimed"))
     return Sweeps(poses, velocity, found, min(reaches_m))
@@ -163,7 +167,8 @@ class _Sweep(NamedTuple):
     is_copy: bool = False
 
 
-def _sweeps(frames: Iterable[Frame], clouds: CloudOptions) -> Iterator[_Sweep]:
+def _sweeps(frames: Iterable[Frame], clouds: CloudOptions, usual_m: float | None = None) -> Iterator[_Sweep]:
+    """Each sweep; one whose reach is far from the `usual_m` is left out too, since it has other units."""
     before: Frame | None = None
     points: Floats32 = np.zeros((0, 3), np.float32)
     for frame in frames:
@@ -172,10 +177,13 @@ def _sweeps(frames: Iterable[Frame], clouds: CloudOptions) -> Iterator[_Sweep]:
             cloud = make_cloud(frame, clouds)[0] if frame.read_points is None else frame.read_points()
             near = in_range(cloud, clouds)
         except (SourceError, OSError) as error:
-            yield _Sweep(None, Oddity(frame.frame_id, "the sweep is left out", str(error)))
+            yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, str(error)))
             continue
         if not len(near):
-            yield _Sweep(None, Oddity(frame.frame_id, "the sweep is left out", out_of_range(cloud, clouds)))
+            yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, out_of_range(cloud, clouds)))
+        elif usual_m is not None and not 1 / FACTOR_OF_UNITS < (reach_m := _reach_m(cloud)) / usual_m < FACTOR_OF_UNITS:
+            why = f"it reaches {reach_m:.3g} m, the others {usual_m:.3g} m: has it other units (millimetres)?"
+            yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, why))
         elif before is not None and np.array_equal(near.points_in_cam, points):
             why = f"it is given the pose of {before.frame_id}"
             yield _Sweep(None, Oddity(frame.frame_id, "holds the same points as the sweep before it", why), True)
@@ -192,8 +200,13 @@ def _first_look(frames: list[Frame], clouds: CloudOptions) -> tuple[float, float
     looks = looks or [s.cloud for s in _sweeps(frames, clouds) if s.cloud is not None][:1]
     if not looks:
         return clouds.max_range_m, 0.0
-    reach_m = np.median([np.quantile(np.linalg.norm(look.points_in_cam, axis=1), REACH_QUANTILE) for look in looks])
+    reach_m = np.median([_reach_m(look) for look in looks])
     return float(reach_m), float(np.median([0.0 if look.times_s is None else look.times_s.max() for look in looks]))
+
+
+def _reach_m(cloud: PointCloud) -> float:
+    ranges = np.linalg.norm(cloud.points_in_cam, axis=1)
+    return float(np.quantile(ranges[np.isfinite(ranges) & (ranges > 0)], REACH_QUANTILE))
 
 
 def _times(stamps_s: Floats, turn_s: float) -> Floats:

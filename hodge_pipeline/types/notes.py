@@ -74,6 +74,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
         "odometry slid unnoticed at {count} frames ({detail}): the pairs over these steps agree on where they lead, "
         "and count in its place",
     ),
+    "sweeps left out": (
+        Rank.LOOK,
+        "{count} sweeps are left out, and posed by their neighbours where these are known; the first: {detail}",
+    ),
     "sweeps untimed": (
         Rank.FACT,
         "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an instant",
