@@ -30,6 +30,7 @@ from hodge_pipeline.start.sweeps import follow
 from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
 from hodge_pipeline.uses.recipe_run import run
 from hodge_pipeline.uses.trajectory import refine_trajectory
+from lidar_worlds import scanner_in
 from mcap_data import SECOND, Log, point_cloud, ros_header
 from mcap_encoding import CDR
 
@@ -313,3 +314,16 @@ def test_poses_of_sweeps_are_never_worse_than_they_came(kind: str, tmp_path: Pat
         given = exact @ se3.from_parts(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
     refined = refine_trajectory(given, sweeps_as("kitti", tmp_path, 16, 7.0), overrides=["recording.level=off"])
     assert absolute_error(refined.poses, exact).max_m < 0.05
+
+
+@pytest.mark.parametrize("name", ["forest", "hill", "office", "field"])
+def test_other_worlds_are_followed(name: str, tmp_path: Path) -> None:
+    own, count = scanner_in(name, seed=0), 30
+    frames = tuple(
+        Frame(row, row * REVOLUTION_S, read_points=partial(cloud_of, own.sweep(row))) for row in range(count)
+    )
+    step = Step(tmp_path, no_progress, lambda *notes: None)
+    found = follow(Source(name, tmp_path, frames), (np.arange(count),), CloudOptions(max_range_m=80.0), None, step=step)
+    exact = own.road.world_from_car(np.arange(count) * REVOLUTION_S)
+    path_m = np.linalg.norm(np.diff(exact[:, :3, 3], axis=0), axis=1).sum()
+    assert absolute_error(found.world_from_scan, exact).rmse_m < 0.02 * path_m  # of the field: 1.3 %

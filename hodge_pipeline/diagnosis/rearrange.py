@@ -5,9 +5,9 @@ before many right ones. Here each edge that disagrees proposes a motion; edges t
 propose a new place for a run of consecutive views, or for a whole piece, until no move gains enough.
 
 Growing pieces best first can take a place for another that looks like it, and from there no single move leads back. So
-a second start uses only the edges between consecutive views, which are wrong more rarely. Of all arrangements on the
-way the one with the largest log-evidence is taken. Its pieces then grow into one another wherever edges agree on it:
-what keeps two pieces apart is no evidence on where they lie.
+a second start uses only the edges between consecutive views, which are wrong more rarely. The pieces of both then grow
+into one another wherever edges agree on it, since what keeps two pieces apart is no evidence on where they lie, and the
+one with the larger log-evidence is taken.
 """
 
 from __future__ import annotations
@@ -80,22 +80,21 @@ def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
     if np.ptp(evidence.prior) > 0:
         chain = evidence.select(np.flatnonzero(np.abs(evidence.graph.edges[:, 1] - evidence.graph.edges[:, 0]) == 1))
         starts.append(fit(evidence, fit(chain, align(chain), ONCE), TWICE))
-    found = [one for begun in starts for one in rearranged(evidence, begun)]
-    models = [learn_scene_model(evidence, found[0]), learn_scene_model(evidence, found[-1])]
+    found = [fit(evidence, align(evidence, rearranged(evidence, begun)), ONCE) for begun in starts]
+    models = [learn_scene_model(evidence, one) for one in found]
     values = [arrangement_log_evidence(evidence, one.poses, one.piece, models) for one in found]
-    return fit(evidence, align(evidence, found[int(np.argmax(values))]), ONCE)
+    return found[int(np.argmax(values))]
 
 
-def rearranged(evidence: Evidence, start: Fit) -> list[Fit]:
-    """The solutions after each move, `start` first."""
-    found, model = [start], None
+def rearranged(evidence: Evidence, found: Fit) -> Fit:
+    """The solution after the best move, after the best one then, and so on."""
+    model = None
     for _ in range(ROUNDS):
-        model = learn_scene_model(evidence, found[-1], model)
-        criteria = PlacementCriteria.of(evidence, model, found[-1].poses, found[-1].piece)
-        best = _best_move(criteria, found[-1])
+        model = learn_scene_model(evidence, found, model)
+        best = _best_move(PlacementCriteria.of(evidence, model, found.poses, found.piece), found)
         if best is None or best.gain <= LEAST_GAIN:
             break
-        found.append(fit(evidence, best.made(found[-1]), ONCE))
+        found = fit(evidence, best.made(found), ONCE)
     return found
 
 

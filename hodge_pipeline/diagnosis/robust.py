@@ -31,8 +31,6 @@ from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
 LEVEL = 0.01
 """Choices of edges that agree so well by chance, expected among all: as the gate of the edges, which 1 % miss."""
-MEDIAN_CHI2_ONE = 0.4549
-"""Of χ² with one degree of freedom."""
 UNIFORM_RAD2 = (8 * math.pi**2) ** (2 / 3) / (2 * math.pi)
 """Variance of an axis at which a Gaussian is as dense at 0 as uniform rotations, which spread no wider."""
 
@@ -130,16 +128,15 @@ def _with_confirmation(graph: ViewGraph, found: Diagnosis, solution: Solution) -
 def confirmed(graph: ViewGraph, kept: Ints) -> bool:
     """Whether the cycles of the kept edges (rows) close so well that no choice of random edges is expected to.
 
-    Around a cycle of random edges the motion is a walk of steps as large as the measured ones, and the probability of
-    a nearer end is uniform; of C cycles, minus the sum of the logarithms is gamma distributed. Every choice of as many
+    Around a cycle of edges in random directions the motion is a walk of their lengths, and the probability of a nearer
+    end is uniform; of C cycles, minus the sum of the logarithms is gamma distributed. Every choice of as many
     of the edges counts, whichever the solver made: so that it chose the best makes nothing look better than it is.
     """
     forest = spanning_forest(graph.edges[kept], graph.vertex_count)
     chords = forest.chords[forest.edges[forest.chords, 0] != forest.edges[forest.chords, 1]]
     if not len(chords):
         return False
-    left = se3.log(fundamental_products(forest, graph.i_from_j[kept], chords))
-    log_chance = _log_chance(graph, left, cycle_lengths(forest, chords))
+    log_chance = _log_chance(graph, kept, forest, chords)
     every, out, cycles = graph.edge_count, graph.edge_count - len(kept), len(chords)
     log_choices = gammaln(every + 1) - gammaln(out + 1) - gammaln(len(kept) + 1) + math.log(every)
     mean = -float(log_chance.sum()) / cycles
@@ -147,26 +144,33 @@ def confirmed(graph: ViewGraph, kept: Ints) -> bool:
     return mean > 1 and cycles * (1 + math.log(mean) - mean) + log_choices < math.log(LEVEL)
 
 
-def _log_chance(graph: ViewGraph, left: Floats, lengths: Ints) -> Floats:
-    """The logarithm of how likely (C,) a random cycle as long leaves less; axes without motion do not count.
-
-    The median of the measured motions gives a step's spread on each axis, in spite of a few long ones.
+def _log_chance(graph: ViewGraph, kept: Ints, forest: SpanningForest, chords: Ints) -> Floats:
+    """The logarithm of how likely (C,) a cycle of such edges in random directions leaves less; axes along which most
+    edges do not move do not count.
     """
-    step = np.median(se3.log(graph.i_from_j) ** 2, axis=0) / MEDIAN_CHI2_ONE
-    axes = step > 0
+    left = se3.log(fundamental_products(forest, graph.i_from_j[kept], chords))
+    squares = se3.log(graph.i_from_j[kept]) ** 2
+    axes = np.median(squares, axis=0) > 0
     if not axes.any():
         return np.zeros(len(left))
-    spread = np.outer(lengths, step)
+    spread = around_cycles(forest, chords, squares)
     spread[:, :3] = np.minimum(spread[:, :3], UNIFORM_RAD2)
-    chance = gammainc(axes.sum() / 2, (left[:, axes] ** 2 / spread[:, axes]).sum(axis=1) / 2)
+    spread = np.maximum(spread[:, axes], np.finfo(float).tiny)
+    chance = gammainc(axes.sum() / 2, (left[:, axes] ** 2 / spread).sum(axis=1) / 2)
     return np.asarray(np.log(np.maximum(chance, np.finfo(float).tiny)))
 
 
-def cycle_lengths(forest: SpanningForest, chords: Ints) -> Ints:
-    """The number of edges (C,) of each chord's cycle, by jumps of doubled length to where its two tree paths meet."""
-    jumps = [np.where(forest.parent < 0, np.arange(len(forest.parent)), forest.parent)]
+def around_cycles(forest: SpanningForest, chords: Ints, values: Floats) -> Floats:
+    """The sum (C, k) of the values (E, k) of the edges of each chord's cycle, by jumps of doubled length to where its
+    two tree paths meet.
+    """
+    is_root = forest.parent < 0
+    jumps = [np.where(is_root, np.arange(len(is_root)), forest.parent)]
+    above = np.where(is_root[:, None], 0.0, values[forest.parent_edge])
     while (jumps[-1] != jumps[-1][jumps[-1]]).any():
+        above = above + above[jumps[-1]]
         jumps.append(jumps[-1][jumps[-1]])
+    above = above + above[jumps[-1]]
     ends = forest.edges[chords]
     deep = np.take_along_axis(ends, forest.depth[ends].argmax(axis=1)[:, None], axis=1)[:, 0]
     other = ends.sum(axis=1) - deep
@@ -177,7 +181,7 @@ def cycle_lengths(forest: SpanningForest, chords: Ints) -> Ints:
         apart = jump[deep] != jump[other]
         deep, other = np.where(apart, jump[deep], deep), np.where(apart, jump[other], other)
     meeting = np.where(deep == other, deep, jumps[0][deep])
-    return np.asarray(forest.depth[ends].sum(axis=1) - 2 * forest.depth[meeting] + 1)
+    return np.asarray(np.maximum(above[ends].sum(axis=1) - 2 * above[meeting], 0.0) + values[chords])
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

@@ -113,6 +113,11 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), odd)
 
 
+def landmarks_of(options: CloudOptions, frames: Sequence[Frame]) -> list[Landmarks]:
+    """The landmarks of each frame of a block."""
+    return [_landmarks(frame, options) for frame in frames]
+
+
 def _landmarks(frame: Frame, options: CloudOptions) -> Landmarks:
     """The frame's landmarks; none where they are not wanted, or it has no image that can be read."""
     if not options.landmarks:

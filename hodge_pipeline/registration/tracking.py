@@ -17,7 +17,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
-from hodge_pipeline.registration.moving import MUCH, fits_more, rival_motion
+from hodge_pipeline.registration.moving import fits_most, rival_motion
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registry import plugin_errors
@@ -246,7 +246,7 @@ class _Tracker:
 
     def _flowed(self, key: _View, view: _View, guess: Floats) -> Registration | None:
         """The motion by optical flow, None where it finds none; what the view saw is kept. The motion of the clouds
-        where that fits more of the image: the corners of a bare room lie on what moves.
+        where these fit most of the image better: the corners of a bare room lie on what moves.
         """
         if key.corners is None or key.image is None or view.image is None:
             return None
@@ -256,9 +256,9 @@ class _Tracker:
             found, against = self._of_most_area(key, view, found, guess)
         if found is None or len(found.rows) < FEWEST_FOLLOWED or found.share < self._limits.min_fitness:
             return None
-        if against > MUCH:
+        if against > DOUBTFUL:
             by_clouds = self._registrar.register(key.prepared, view.prepared, guess)
-            fits, left = fits_more(key.image, view.image, found.key_from_view, by_clouds.i_from_j)
+            fits, left = fits_most(key.image, view.image, found.key_from_view, by_clouds.i_from_j)
             if self._good(by_clouds) and fits:
                 self._doubt(view, max(left, key.left_out))
                 return by_clouds

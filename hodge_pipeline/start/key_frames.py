@@ -97,7 +97,7 @@ class KeyFrameStart(OdometryStart):
         found = steps.step(track, source, options, title="tracking", total=len(source.frames), workers=workers)
         steps.remember(found.clouds, steps.key(found) + "clouds")
         odometry = Odometry(found.world_from_key, found.steps, ())
-        scene = self.joined(source, found.clouds, odometry, followers(source, found), steps, workers)
+        scene = self.joined(source, found.clouds, clouds, odometry, followers(source, found), steps, workers)
         steps.remember(found.sightings, steps.key(found) + "sightings")
         return replace(scene, sightings=found.sightings if self.repose else None)
 
@@ -109,7 +109,7 @@ class KeyFrameStart(OdometryStart):
     def _tracking(self, clouds: CloudOptions) -> TrackingOptions:
         """How frames are followed."""
         return TrackingOptions(
-            clouds=self.cloud_options(clouds, apart=True),
+            clouds=clouds,
             odometry=self.odometry,
             distance_m=self.distance_m,
             angle_rad=float(np.deg2rad(self.angle_deg)),
