@@ -54,12 +54,12 @@ class Inferred:
 
 
 def infer(
-    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None
+    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None, sure: bool = True
 ) -> Inferred | None:
     """Judge the loops of a chain; those of `always (M,)` count whatever they say. Where they would leave more than
     `MOST_UNKNOWNS`, all are judged at the poses of some of the right ones, or None comes back without `thin`.
 
-    `scales`: of the errors; learned from the loops where none are given.
+    `scales`: of the errors; learned from the loops where none are given. `sure`: use none that are not confirmed.
     """
     poses = chain.poses()
     scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
@@ -88,7 +88,7 @@ def infer(
     judged, linear = best
     used = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
     confirmed = _confirmed(linear, np.flatnonzero(used), wrong)
-    used = (used & confirmed) | always
+    used = (used & (confirmed or not sure)) | always
     rows = thinned(chain, np.flatnonzero(used)).active
     linear, width = polished(rows, linear if used.any() else start)
     return Inferred(used, judged, linear.poses, scales, LOCAL, width, top, confirmed)
@@ -132,15 +132,16 @@ def _confirmed(linear: Linear, rows: Ints, wrong: Wrong) -> bool:
     places lead to.
 
     Loops of one place agree also where it is mistaken for another: only the backbone and other places confirm them.
+    Each must say more than the best of all loops does by chance, used or not: they were chosen from these.
     """
     if not len(rows):
         return False
     chain, ends = linear.chain, places_along(linear.chain)
-    count, chosen = len(one_of_each_place(ends)), rows[one_of_each_place(ends[rows])]
+    places, chosen = len(one_of_each_place(ends)), rows[one_of_each_place(ends[rows])]
     reduced = thinned(chain, chosen)
     fit = settled_globally(Fit(reduced, linear))
     factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[reduced.active]
-    return float(np.maximum(factor - np.log(count), 0.0).sum()) > by_chance(count)
+    return float(np.maximum(factor - np.log(len(ends)), 0.0).sum()) > by_chance(places)
 
 
 def by_chance(count: int) -> float:
