@@ -78,9 +78,10 @@ def errors(report: dict[str, Any]) -> str:
     """The cells of a result's errors and scores; a dash where there is no truth."""
     row = {row["name"]: row for row in report["trajectories"]}.get("result")
     if row is None:
-        return "– | – | – | –"
+        return "– | – | – | – | –"
     return (
         f"{100 * row['ate_rmse_m']:.2f} | {100 * row['ate_max_m']:.1f} | {1e3 * row['rpe_translation_m']:.1f} | "
+        f"{row['rpe_rotation_deg']:.2f} | "
         f"{scores(report)}"
     )
 
@@ -119,11 +120,11 @@ def main() -> None:
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     options = parser.parse_args()
     print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}\n")
-    print(
-        "| frames | CPU s | CPU ms a frame | wall s | peak MB | page, recording MB | ATE cm | largest cm | RPE mm |",
-        end="",
+    header = (
+        *("frames", "CPU s", "CPU ms a frame", "wall s", "peak MB", "page, recording MB"),
+        *("ATE cm", "largest cm", "RPE mm", "RPE °", "scores (truth's)"),
     )
-    print(" scores (truth's) |\n|---|---|---|---|---|---|---|---|---|---|")
+    print(f"| {' | '.join(header)} |\n{'|---' * len(header)}|")
     last: dict[str, Any] = {}
     points: list[tuple[int, float, float]] = []
     for frames in options.frames:

@@ -27,7 +27,8 @@ def open3d_row(source: Source) -> str:
     note = f", {lost} pairs lost" if lost else ""
     return (
         f"| {count}, Open3D's odometry{note} | {cpu_s:.1f} | {1e3 * cpu_s / count:.0f} | – | – | – | "
-        f"{100 * error.rmse_m:.2f} | {100 * error.max_m:.1f} | {1e3 * step.translation_rmse_m:.1f} | – |"
+        f"{100 * error.rmse_m:.2f} | {100 * error.max_m:.1f} | {1e3 * step.translation_rmse_m:.1f} | "
+        f"{step.rotation_rmse_deg:.2f} | – |"
     )
 
 

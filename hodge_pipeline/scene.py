@@ -206,7 +206,11 @@ def stamps_of(source: Source) -> Floats:
 
 def has_real_stamps(frames: Sequence[Frame]) -> bool:
     """Whether the stamps are a clock's: finite, not all one value, and not merely numbers of frames or of rows."""
-    stamps = np.array([frame.stamp_s for frame in frames])
+    return is_clock(np.array([frame.stamp_s for frame in frames]))
+
+
+def is_clock(stamps: Floats) -> bool:
+    """Whether stamps (N,) are seconds of a clock, as `has_real_stamps` has it."""
     if not len(stamps) or not np.isfinite(stamps).all() or not np.ptp(stamps) > 0:
         return False
     return bool(stamps.min() > UNIX_STAMP_S or (np.mod(stamps, 1) != 0).any())

@@ -168,6 +168,12 @@ def adjoint(b_from_a: Floats) -> Floats:
     return out
 
 
+def pull_back(b_from_a: Floats, information: Floats) -> Floats:
+    """Information (..., 6, 6) on motions ξ of a, `b_from_a exp(ξ)`, from that on motions of b, `exp(ξ) b_from_a`."""
+    into = adjoint(b_from_a)
+    return np.asarray(np.swapaxes(into, -1, -2) @ information @ into)
+
+
 def transform(b_from_a: Floats, points_in_a: Floats) -> Floats:
     """Points (..., N, 3) in b; the batch shapes broadcast."""
     rotated = np.asarray(points_in_a) @ np.swapaxes(b_from_a[..., :3, :3], -1, -2)

@@ -1,6 +1,7 @@
 """A right odometry and loops of which many are wrong."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone import inference
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, settled
@@ -105,6 +107,28 @@ def test_where_all_loops_are_wrong_the_backbone_comes_back(dimension: int, in_gr
         assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
         assert any("100 loops that nothing confirms" in note for note in found.notes)
         assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
+
+
+MISLEADING = [
+    {"seed": 7132, "dimension": 3, "loops": 480, "wrong": 1.0, "in_groups": True, "misstated": (0.3, 1.0)},
+    {"seed": 7262, "dimension": 3, "loops": 240, "wrong": 1.0, "misstated": (10.0, 0.1), "turned": True},
+]
+
+
+@pytest.mark.parametrize("kind", MISLEADING)
+def test_wrong_loops_that_agree_at_one_place_alone_confirm_nothing(kind: dict[str, Any]) -> None:
+    made = drive(count=800, **kind)
+    found = diagnose(made.graph)
+    assert not (found.kept & ~made.right).any() and found.kept[made.right].all()
+    assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+
+
+@pytest.mark.parametrize("name", ["manhattan", "MIT"])
+def test_loops_that_are_stated_to_be_exact_refute_no_others(name: str, data_dir: Path) -> None:
+    graph = read_graph(data_dir / f"pose_graphs/sesync/{name}.g2o").graph
+    assert graph is not None
+    backbone = find_backbone(graph)
+    assert backbone is not None and backbone.used.all()
 
 
 @pytest.mark.parametrize(("world", "count", "loops", "group"), [("ring", 150, 90, 12), ("town", 250, 150, 60)])

@@ -14,6 +14,7 @@ from hodge_paper.embedding import Surface, embed, triangulate
 from hodge_paper.homology import homology_generators
 from hodge_paper.rotation import random_rotation
 from hodge_paper.shortest_paths import surface_form
+from hodge_paper.surface import surface_decomposition
 from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.decomposition import HodgeDecomposition, hodge_decomposition
@@ -26,7 +27,7 @@ def random_surface(graph: tuple[Ints, int], seed: int) -> Surface:
 
 
 def decomposed(surface: Surface, omega: Floats, weights: Floats) -> HodgeDecomposition:
-    return hodge_decomposition(coboundary_0(surface.edges, surface.vertex_count), surface.d1, omega, weights)
+    return surface_decomposition(coboundary_0(surface.edges, surface.vertex_count), surface.d1, omega, weights)
 
 
 def check_parts(parts: HodgeDecomposition, omega: Floats) -> None:
@@ -154,10 +155,10 @@ def test_self_loops_and_parallels_among_the_diagonals() -> None:
 
 
 def test_numbers_that_cannot_be_used_are_named() -> None:
-    surface = random_surface((complete(4), 4), 0)
+    surface, flag = random_surface((complete(4), 4), 0), flag_complex(complete(4), 4)
     with pytest.raises(GraphError, match="positive weights: 1 of"):
-        weights = np.ones(len(surface.edges))
+        weights = np.ones(6)
         weights[2] = -1.0
-        decomposed(surface, np.zeros((len(surface.edges), 6)), weights)
+        hodge_decomposition(flag.coboundary(0), flag.coboundary(1), np.zeros((6, 6)), weights)
     with pytest.raises(GraphError, match="embedded graph has 6 edges"):
         surface_form(surface, np.zeros((5, 6)))

@@ -143,6 +143,38 @@ def test_neighbouring_frames_coincide_under_the_true_poses_only(
         assert warped_error(one, other, se3.inverse(i_from_j)) > 0.05
 
 
+# Video
+
+
+def test_rows_of_a_rolling_shutter_are_those_of_images_at_their_own_times(room: Room) -> None:
+    renderer, poses = Renderer(room, CAMERA), np.broadcast_to(np.eye(4), (CAMERA.height, 4, 4)).copy()
+    begin, end = HandHeldLoop(0, 4.0, turns=0.3).world_from_cam(np.array([1.0, 1.02]))
+    poses[:60], poses[60:] = begin, end
+    for make in (renderer.colour, lambda pose: renderer.depth(pose)[0]):
+        rolled, first, last = (make(pose) for pose in (poses, begin, end))
+        for own, other, rows in ((first, last, slice(0, 60)), (last, first, slice(60, None))):
+            assert np.mean(np.abs(rolled[rows] - own[rows]) > 0.01) < 0.01
+            assert np.mean(np.abs(rolled[rows] - other[rows]) > 0.01) > 0.05
+
+
+def test_blur_is_the_mean_over_the_exposure(room: Room) -> None:
+    renderer, times_s = Renderer(room, CAMERA), np.linspace(0.98, 1.02, 21)
+    poses = HandHeldLoop(0, 4.0, turns=0.3).world_from_cam(times_s)
+    mean = np.mean([renderer.colour(pose) for pose in poses], axis=0)
+    blurred = renderer.colour(poses[10], se3.log(se3.inverse(poses[0]) @ poses[-1]))
+    sharp = renderer.colour(poses[10])
+    assert np.abs(blurred - mean).mean() < 0.5 * np.abs(sharp - mean).mean()
+
+
+def test_a_video_says_how_its_shutter_rolls(tmp_path: Path) -> None:
+    options = DemoOptions.video(frames=2, width=32, height=24)
+    camera = TumReader().open(make_sequence(tmp_path / "video", options)).frames[0].camera
+    assert camera == options.camera and camera.readout_s == 0.0225
+    (tmp_path / "video/intrinsics.txt").write_text("fx: 525\nfy: 525\ncx: 320\ncy: 240\nreadout_s: 22.5\n")
+    with pytest.raises(SourceError, match="readout_s 22.5 is no time in seconds"):
+        TumReader().open(tmp_path / "video")
+
+
 # Path
 
 

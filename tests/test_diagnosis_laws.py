@@ -222,3 +222,13 @@ def test_a_reason_names_what_spoke_against_an_edge_whose_cycles_all_close() -> N
     for row in (48, 49):
         assert found.verdict[row] == WRONG
         assert found.reason[row].startswith("1 of 1 cycles close, each over another edge that is left out; against it")
+
+
+def test_a_long_loop_that_drifted_is_closed_and_nobody_blamed() -> None:
+    k = np.arange(600)
+    angle = 2 * np.pi * k / 600
+    turn = se3.so3_exp(np.outer(angle, [0, 0, 1]))
+    poses = se3.from_parts(turn, 60 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1))
+    graph = measured(poses, near_pairs(600, 2), noise=2.0)
+    found = diagnose(ViewGraph.from_edges(k, graph.edges, graph.i_from_j))
+    assert set(found.verdict) == {CONSISTENT} and found.piece.max() == 0

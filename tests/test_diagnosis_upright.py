@@ -7,7 +7,7 @@ from benchmarks.edge_scores import precision_and_recall
 from diagnosis_graphs import every_pair_tried
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.upright import learn_upright
+from hodge_pipeline.diagnosis.scene_model import learn_upright
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 DOWN = np.array([0.0, 1.0, 0.0])

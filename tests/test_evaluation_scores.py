@@ -215,3 +215,23 @@ def test_residuals_vanish_at_the_poses_and_measure_what_is_left() -> None:
     translation_m, angle_rad = edge_residuals(ViewGraph.from_edges(np.arange(6), edges, measured), poses)
     np.testing.assert_allclose(translation_m, [0.05, 0.05, 0.05, np.nan])
     np.testing.assert_allclose(angle_rad, [0.2, 0.2, 0.2, np.nan])
+
+
+def test_a_scene_eight_times_as_large_has_the_same_scores_in_another_unit(tmp_path: Path) -> None:
+    squares = [square(0.0), square(0.03), square(0.0), square(0.5, 0.1)]
+    large = [PointCloud(8 * one.points_in_cam, one.normals_in_cam) for one in squares]
+    for name in ("small", "large"):
+        (tmp_path / name).mkdir()
+    small = saved(CloudSet.from_clouds(squares), tmp_path / "small")
+    one = score_table(small, {"result": identities(4)}, "result", Inline())
+    other = score_table(
+        saved(CloudSet.from_clouds(large), tmp_path / "large"), {"result": identities(4)}, "result", Inline(), scale=8.0
+    )
+    assert other.scale == 8.0
+    for graph, scaled in zip(one.graphs, other.graphs, strict=True):
+        assert len(graph.pairs)
+        np.testing.assert_array_equal(scaled.pairs, graph.pairs)
+        np.testing.assert_allclose(scaled.distances_m, 8 * graph.distances_m, rtol=1e-6)
+        np.testing.assert_allclose(scaled.scores, graph.scores, rtol=1e-6)
+    there = edge_distances(tmp_path / "large", np.array([(0, 3)]), identities(4), Inline(), scale=8.0)
+    np.testing.assert_allclose(there, [8 * NO_NEIGHBOUR_M])

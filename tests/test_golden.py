@@ -23,7 +23,3 @@ def test_a_recipe_reaches_its_golden_numbers(name: str, data_dir: Path, tmp_path
     expected = golden["ate_rmse_m"]
     assert rows["result"] == pytest.approx(expected["value"], abs=expected["tolerance"])
     assert rows["result"] < rows["odometry"]
-    assert run.result.solution is not None
-    deviations = [step.metrics["loop_deviation_mean"] for step in run.result.solution.history]
-    for found, limit in zip(deviations, golden["loop_deviation_mean"], strict=True):
-        assert found < limit

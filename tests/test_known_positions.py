@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -214,3 +215,27 @@ def test_points_are_aligned_in_spite_of_wrong_ones() -> None:
     aligned, inliers = align_positions(found, known, np.full(40, 0.05), motion[:3, 2])
     assert inliers[12:].all() and not inliers[:12].any()
     assert se3.transform(aligned, found[12:]) == pytest.approx(known[12:], abs=1e-6)
+
+
+@pytest.mark.parametrize("bias_m", [5.0, 20.0])
+def test_positions_that_are_off_by_the_same_for_long_are_rejected(bias_m: float) -> None:
+    graph, odometry, true = drifting_loop(frames=150)
+    fixes = fixes_at(true, np.arange(150))
+    off = (np.arange(150) >= 50) & (np.arange(150) < 100)
+    fixes.points[off] += [bias_m, 0, 0]
+    found = place(graph, odometry, np.zeros(150, np.int64), np.ones(graph.edge_count), fixes, UP)
+    assert np.array_equal(~found.fit.used, off)
+    assert np.linalg.norm((found.world_from_cam - true)[:, :3, 3], axis=1).max() < 3 * SIGMA_M
+
+
+def test_positions_stay_where_odometry_slipped() -> None:
+    graph, odometry, true = drifting_loop(frames=150)
+    slip = np.eye(4)
+    slip[0, 3] = 8.0
+    over = (graph.edges[:, 0] < 75) & (graph.edges[:, 1] >= 75)
+    motions = np.where(over[:, None, None], graph.i_from_j @ slip, graph.i_from_j)
+    odometry = np.concatenate([odometry[:75], odometry[75:] @ slip])
+    fixes = fixes_at(true, np.arange(150))
+    slipped = replace(graph, i_from_j=motions)
+    found = place(slipped, odometry, np.zeros(150, np.int64), np.ones(graph.edge_count), fixes, UP)
+    assert found.fit.used.mean() > 0.95

@@ -30,6 +30,7 @@ from hodge_pipeline.start.sweeps import follow
 from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
 from hodge_pipeline.uses.recipe_run import run
 from hodge_pipeline.uses.trajectory import refine_trajectory
+from lidar_worlds import scanner_in
 from mcap_data import SECOND, Log, point_cloud, ros_header
 from mcap_encoding import CDR
 
@@ -276,9 +277,9 @@ def test_two_scanners_in_a_folder_are_followed_apart(tmp_path: Path) -> None:
         assert absolute_error(done.poses[names == name], true).max_m < 0.5
 
 
-def sweeps_as(layout: str, folder: Path, count: int) -> Path:
+def sweeps_as(layout: str, folder: Path, count: int, speed_m_s: float = 10.0) -> Path:
     """Sweeps of the street as a folder in KITTI's layout, or as a recording."""
-    log, own = Log(), SpinningScanner(Road(10.0), 0, beams=16, columns=360, noise=1.0)
+    log, own = Log(), SpinningScanner(Road(speed_m_s), 0, beams=16, columns=360, noise=1.0)
     (folder / "velodyne").mkdir()
     for number in range(count):
         points = own.sweep(number).points
@@ -301,3 +302,28 @@ def test_a_trajectory_of_sweeps_is_refined_by_default(layout: str, tmp_path: Pat
     refined = refine_trajectory(given, frames, overrides=["recording.level=off"])
     before, after = (absolute_error(poses, exact).rmse_m for poses in (given, refined.poses))
     assert before > 0.1 and after < before / 2
+
+
+@pytest.mark.parametrize("kind", ["right", "jump", "axes of a camera"])
+def test_poses_of_sweeps_are_never_worse_than_they_came(kind: str, tmp_path: Path) -> None:
+    exact = Road(7.0).world_from_car(np.arange(16) * REVOLUTION_S)
+    given = exact.copy()
+    if kind == "jump":
+        given[8:, :3, 3] += [0.6, 0.8, 0.0]
+    if kind == "axes of a camera":  # x right, y down, z ahead
+        given = exact @ se3.from_parts(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+    refined = refine_trajectory(given, sweeps_as("kitti", tmp_path, 16, 7.0), overrides=["recording.level=off"])
+    assert absolute_error(refined.poses, exact).max_m < 0.05
+
+
+@pytest.mark.parametrize("name", ["forest", "hill", "office", "field"])
+def test_other_worlds_are_followed(name: str, tmp_path: Path) -> None:
+    own, count = scanner_in(name, seed=0), 30
+    frames = tuple(
+        Frame(row, row * REVOLUTION_S, read_points=partial(cloud_of, own.sweep(row))) for row in range(count)
+    )
+    step = Step(tmp_path, no_progress, lambda *notes: None)
+    found = follow(Source(name, tmp_path, frames), (np.arange(count),), CloudOptions(max_range_m=80.0), None, step=step)
+    exact = own.road.world_from_car(np.arange(count) * REVOLUTION_S)
+    path_m = np.linalg.norm(np.diff(exact[:, :3, 3], axis=0), axis=1).sum()
+    assert absolute_error(found.world_from_scan, exact).rmse_m < 0.02 * path_m  # of the field: 1.3 %

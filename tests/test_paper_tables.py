@@ -27,7 +27,7 @@ from benchmarks.paper.tables import (
     tables,
 )
 from complex_graphs import random_motions
-from hodge_pipeline import se3
+from hodge_pipeline import registry, se3
 from hodge_pipeline.errors import RecipeError, SourceError
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.types import Bytes, Camera, Edges, Floats32, Frame
@@ -211,3 +211,9 @@ def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
     for peer, message in (("bundlefusion", "NAME=DIR"), (f"x={tmp_path / 'none'}", "no such folder")):
         refused = runner.invoke(app, ["--data", str(tmp_path / "data"), "--peer", peer])
         assert isinstance(refused.exception, RecipeError) and message in str(refused.exception)
+
+
+def test_who_asks_for_the_papers_method_is_told_of_its_plugin() -> None:
+    for name in ("paper", "paper_iou"):
+        assert "pip install ./benchmarks/paper/method" in registry.suggestion(name, ["poisson"])
+    assert registry.suggestion("poison", ["poisson"]) == " (did you mean 'poisson'?)"

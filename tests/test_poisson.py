@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +9,6 @@ from hypothesis import strategies as st
 
 from hodge_paper.minimum_cycles import shortest_loops
 from hodge_pipeline import se3
-from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers import poisson
 from hodge_pipeline.solvers.poisson import PoissonSolver
@@ -173,46 +170,6 @@ def test_without_edges_every_pose_stays(count: int) -> None:
     np.testing.assert_array_equal(solution.world_from_cam, start)
     assert solution.history == ()
     assert any("no edge" in note for note in solution.notes)
-
-
-def test_information_weights_trust_the_better_edge() -> None:
-    edges = np.array([[0, 1], [0, 1]])
-    motion = np.broadcast_to(np.eye(4), (2, 4, 4)).copy()
-    motion[:, 0, 3] = [1.0, 2.0]
-    information = np.stack([np.eye(6) * 3.0, np.eye(6)])
-    graph = ViewGraph.from_edges(np.arange(2), edges, motion, information)
-    start = np.broadcast_to(np.eye(4), (2, 4, 4)).copy()
-    solution = PoissonSolver(weights="information").solve(graph, start)
-    assert solution.world_from_cam[1, 0, 3] == pytest.approx(1.25)
-
-
-def test_an_edge_without_information_is_ignored_and_an_indefinite_one_is_noted() -> None:
-    edges = np.array([[0, 1], [0, 1], [0, 1]])
-    motion = np.broadcast_to(np.eye(4), (3, 4, 4)).copy()
-    motion[:, 0, 3] = [1.0, 2.0, 9.0]
-    information = np.stack([np.eye(6), np.diag([2.0, 2, 2, 2, 2, -4]), np.zeros((6, 6))])
-    graph = ViewGraph.from_edges(np.arange(2), edges, motion, information)
-    start = np.broadcast_to(np.eye(4), (2, 4, 4)).copy()
-    solution = PoissonSolver(weights="information").solve(graph, start)
-    assert solution.world_from_cam[1, 0, 3] == pytest.approx(1.0, abs=0.02), "what it does not measure weighs little"
-    assert solution.weights.tolist() == [1.0, 1.0, 0.0]
-    assert any("1 edges hardly measure some direction" in note for note in solution.notes)
-    assert any("weight 0" in note for note in solution.notes)
-
-
-def test_a_frame_that_only_sees_a_wall_is_named_with_the_way_it_slides() -> None:
-    rng = np.random.default_rng(1)
-    graph = measured(np.array([[0, 1], [1, 2], [0, 2], [2, 3]]), motions(rng, 4), rng)
-    bare = np.diag([9.0, 9, 9, 4, 4, 4])
-    information = np.tile(bare, (4, 1, 1))
-    information[3, 4, 4] = 0  # frame 3 lies against a wall: nothing holds it along its own y
-    graph = replace(graph, information=information)
-    notes = PoissonSolver(weights="information").solve(graph, np.tile(np.eye(4), (4, 1, 1))).notes
-    (told,) = (note for note in notes if note.startswith("no edge measures"))
-    assert "1 frames" in told and f"{graph.vertex_ids[3]} (sliding along (0.00, 1.00, 0.00))" in told
-    held = replace(graph, information=np.tile(bare, (4, 1, 1)))
-    assert free_direction_notes(held) == ()
-    assert free_direction_notes(replace(held, information=np.tile(np.eye(6), (4, 1, 1)))) == ()
 
 
 def good_graph() -> tuple[ViewGraph, Floats]:

@@ -28,7 +28,7 @@ from hodge_pipeline.scene import Round
 from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.types import Edges
-from hodge_pipeline.types.notes import Rank
+from hodge_pipeline.types.notes import Note, Rank
 from report_data import circle, make_report, read_page, ring, scored, told
 
 
@@ -125,6 +125,13 @@ def test_pieces_come_first_in_the_headline(
     assert headline in read_page(page)[0]
     assert json.loads(numbers.read_text("utf-8"))["verdict"]["sentence"].startswith(headline)
     assert headline in " ".join(line.strip() for line in brief(shown, "runs/a")), "the terminal says the same"
+
+
+def test_a_path_in_doubt_says_so_first(report: Report) -> None:
+    """Whatever fits better: clouds of an object that was followed fit each other."""
+    verdict = judge(replace(report, notes=(Note("camera or object", 9, "20 frames, 1–9"),)))
+    assert verdict.headline == "In doubt, since much of the image moves: improved against odometry"
+    assert verdict.mark == "mixed"
 
 
 def test_a_refinement_whose_error_against_the_truth_rose_is_mixed() -> None:

@@ -59,6 +59,17 @@ def test_adjoint_moves_a_twist_to_the_left(xi: np.ndarray) -> None:
 
 @settings(deadline=None)
 @given(twists())
+def test_information_pulled_back_weighs_a_motion_as_on_the_other_side(xi: np.ndarray) -> None:
+    motion, small = se3.exp(xi), np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6]) / 10
+    left = se3.log(motion @ se3.exp(small) @ se3.inverse(motion))
+    factor = np.random.default_rng(0).normal(size=(6, 6))
+    of_left = np.einsum("...i,ij,...j->...", left, factor @ factor.T, left)
+    of_right = np.einsum("i,...ij,j->...", small, se3.pull_back(motion, factor @ factor.T), small)
+    np.testing.assert_allclose(of_right, of_left, rtol=1e-6)
+
+
+@settings(deadline=None)
+@given(twists())
 def test_quaternions_round_trip(xi: np.ndarray) -> None:
     motion = se3.exp(xi)
     quat = se3.to_quat_xyzw(motion)

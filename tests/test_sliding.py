@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.registration.pairs import Acceptance, held_where_sliding
-from hodge_pipeline.types import Edges, Floats, Frame, PointCloud, Registration
+from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver
+from hodge_pipeline.types import Edges, Floats, Frame, PointCloud, Registration, ViewGraph
 from hodge_pipeline.uses.trajectory import refine_trajectory
 
 WEAK_X = np.diag([100.0, 100, 100, 1, 40, 40])
@@ -63,3 +65,19 @@ def test_a_tunnel_makes_a_trajectory_no_worse(solver: str) -> None:
     error_m, before_m = (np.abs(poses[:, :3, 3] - truth[:, :3, 3]) for poses in (np.asarray(found.poses), given))
     assert found.decision.change is not None and found.decision.change.translation_m < 0.1  # metres, where they slid
     assert error_m[:, along].max() < before_m[:, along].max() + 1e-3 and error_m[:, aside].max() < 0.055
+
+
+@pytest.mark.parametrize("tails", ["gaussian", "student"])
+def test_a_frame_that_only_sees_a_wall_is_named_with_the_way_it_slides(tails: str) -> None:
+    poses = se3.exp(np.random.default_rng(1).normal(size=(4, 6)))
+    edges = np.array([[0, 1], [1, 2], [0, 2], [2, 3]])
+    held = np.tile(np.diag([9.0, 9, 9, 4, 4, 4]), (4, 1, 1))
+    bare = held.copy()
+    bare[3, 4, 4] = 0  # frame 3 lies against a wall: nothing holds it along its own y
+    motions = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]]
+    graph = ViewGraph.from_edges(np.arange(4), edges, motions, bare)
+    notes = MaximumLikelihoodSolver(tails=tails).solve(graph, poses).notes
+    (told,) = (note for note in notes if note.startswith("no edge measures"))
+    assert "1 frames" in told and "3 (sliding along (0.00, 1.00, 0.00))" in told
+    for known in (held, np.tile(np.eye(6), (4, 1, 1))):
+        assert free_direction_notes(ViewGraph.from_edges(np.arange(4), edges, motions, known)) == ()

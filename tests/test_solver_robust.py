@@ -6,12 +6,11 @@ import pytest
 
 from hodge_pipeline import open_source, se3
 from hodge_pipeline.complex.cycles import fundamental_loops, spanning_forest
-from hodge_pipeline.diagnosis.confirmation import cycle_lengths
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
+from hodge_pipeline.diagnosis.robust import RobustSolver, around_cycles, solve_robust
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
-from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver, solve
 from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import ViewGraph
 
@@ -113,6 +112,23 @@ def test_a_graph_whose_information_explains_it_is_solved_as_stated(trust, stated
     plain = solve(graph.select(np.flatnonzero(used))).world_from_cam
     from_first = se3.inverse(solution.world_from_cam[0]) @ solution.world_from_cam
     np.testing.assert_allclose(from_first, se3.inverse(plain[0]) @ plain, atol=1e-3)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("stated", [1.0, 0.01])  # whatever the scale of the information
+def test_tails_of_registered_edges_are_weighed(planar, stated):
+    graph, truth = band(40, 6, 7, planar)
+    rng = np.random.default_rng(8)
+    long = rng.random(graph.edge_count) < 0.1
+    more = rng.normal(size=(graph.edge_count, 6)) * np.repeat([SIGMA_RAD, SIGMA_M], 3) * 8 * long[:, None]
+    if planar:
+        more[:, [0, 1, 5]] = 0
+    spread = dataclasses.replace(graph, i_from_j=graph.i_from_j @ se3.exp(more), information=stated * graph.information)
+    found = {tails: MaximumLikelihoodSolver(tails=tails).solve(spread, truth) for tails in ("gaussian", "student")}
+    error = {tails: np.abs(se3.inverse(truth) @ one.world_from_cam - np.eye(4)).mean() for tails, one in found.items()}
+    assert error["student"] < 0.7 * error["gaussian"]
+    weights = found["student"].weights
+    assert weights.min() > 0 and np.median(weights[long]) < 0.3 and np.median(weights[~long]) > 0.9
 
 
 def test_what_only_wrong_edges_join_falls_apart():
@@ -231,11 +247,17 @@ def test_a_tree_is_tested_by_nothing_and_refuted_by_nothing():
     assert solve_robust(wrong, start=truth).confirmed is False
 
 
-def test_the_lengths_of_cycles_are_those_of_their_edges():
+def test_edges_of_very_different_lengths_are_confirmed(data_dir: Path) -> None:
+    graph = open_source(data_dir / "pose_graphs/sesync/cubicle.g2o").graph
+    assert solve_robust(graph).confirmed is True
+
+
+def test_sums_around_cycles_are_those_over_their_edges():
     edges = random_edges(0).edges
     forest = spanning_forest(np.concatenate([edges, edges + 10]), 20)
     lengths = fundamental_loops(forest).lengths
-    assert cycle_lengths(forest, forest.chords).tolist() == lengths.tolist()
+    ones = np.ones((len(forest.edges), 1))
+    np.testing.assert_allclose(around_cycles(forest, forest.chords, ones)[:, 0], lengths)
     assert len(set(lengths.tolist())) > 2
 
 

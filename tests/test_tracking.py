@@ -22,6 +22,7 @@ from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration import tracking
+from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import TrackingOptions, frame_blocks, track_block
@@ -30,6 +31,7 @@ from hodge_pipeline.sources.opening import fingerprints, remembered
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start import key_frames as tracked
 from hodge_pipeline.start import odometry as odometry_start
+from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, followers, is_video
 from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.start.unordered.join import _stays
@@ -224,9 +226,25 @@ def test_relocalisation_is_automatic_where_odometry_left_parts(
     found = Odometry(poses, Edges.measured(graph), ())
     for relocalise, expected in (("auto", apart), (True, True), (False, False)):
         scene = OdometryStart(relocalise=relocalise).joined(  # type: ignore[arg-type]
-            source, CloudSet.from_clouds([]), found, KeyFrames.all_of(source, poses), Told(None), InProcess()
-        )  # type: ignore[arg-type]
+            source, CloudSet.from_clouds([]), CloudOptions(), found, KeyFrames.all_of(source, poses), Told(None),
+            InProcess(),
+        )  # type: ignore[arg-type]  # fmt: skip
         assert (scene.first is joined) == expected
+
+
+def test_landmarks_are_made_where_parts_are_joined_alone(tmp_path: Path) -> None:
+    reader = TumReader()
+    opened = reader.open(make_sequence(tmp_path / "demo", DemoOptions(frames=2, width=160, height=120)))
+    poses, edges = np.tile(np.eye(4), (2, 1, 1)), np.array([[0, 1]])
+    for pairs, expected in ((edges, False), (edges[:0], True)):
+        store, options = Store(tmp_path / f"store-{expected}"), CloudOptions()
+        source = remembered(opened, reader, store, fingerprints(opened.files))
+        found = Odometry(poses, Edges.measured(ViewGraph.from_edges(np.arange(2), pairs, poses[: len(pairs)])), ())
+        made = make_clouds(source, options, store, InProcess())
+        key_frames = KeyFrames.all_of(source, poses)
+        scene = OdometryStart(relocalise=expected).joined(source, made, options, found, key_frames, store, InProcess())
+        assert (len(scene.clouds.mark_points) > 0) == expected and len(scene.clouds) == 2
+        np.testing.assert_array_equal(scene.clouds.points, made.points)
 
 
 def source_at(stamps_s: list[float]) -> Source:

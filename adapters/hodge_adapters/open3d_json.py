@@ -107,8 +107,7 @@ class Open3dTrajectoryWriter:
 
 def information_of_open3d(j_from_i: Floats, information: Floats) -> Floats:
     """Ours, over `j_from_i · exp(ξ)`, of Open3D's (E, 6, 6), over `exp(ξ) · j_from_i`: ξ_left = Ad ξ_right."""
-    adjoint = se3.adjoint(j_from_i)
-    moved = np.swapaxes(adjoint, -1, -2) @ information @ adjoint
+    moved = se3.pull_back(j_from_i, information)
     return np.asarray((moved + np.swapaxes(moved, -1, -2)) / 2)
 
 

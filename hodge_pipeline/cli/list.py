@@ -37,7 +37,7 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None) -> str:
     from hodge_pipeline.recipe.recipe_file import recipe_names
 
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
-    recipe = {"clouds": "scans"}.get(name, name)
+    recipe = "lidar" if facts.get("scanner") and not reader else {"clouds": "scans"}.get(name, name)
     if recipe in recipe_names():
         return f"hodge run {recipe} --source {path} --out runs/{path.stem}"
     recipe = "seven_scenes" if facts["frames with depth"] else "clouds"

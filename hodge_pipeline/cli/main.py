@@ -118,6 +118,10 @@ def demo(
     rooms: Annotated[
         int, typer.Option("--rooms", min=1, help="A walk through so many rooms and back, about 450 frames a room.")
     ] = 1,
+    video: Annotated[
+        bool,
+        typer.Option("--video", help="The room as a video of 640x480 at 30 Hz, with rolling shutter and motion blur."),
+    ] = False,
     overrides: Overrides = None,
     overwrite: Overwrite = False,
     dask: Dask = None,
@@ -127,10 +131,10 @@ def demo(
     """Make a furnished room with Kinect-like noise and run the recipe `demo` on it (or a street: --lidar)."""
     from hodge_pipeline.cli import run as running
 
-    if lidar and rooms > 1:
-        raise typer.BadParameter("--rooms and --lidar are two demos: give one of them")
+    if lidar + video + (rooms > 1) > 1:
+        raise typer.BadParameter("--rooms, --video and --lidar are demos of their own: give one of them")
     shown = Shown(quiet, verbose=verbose)
-    running.demo(out, overrides or [], shown, lidar=lidar, rooms=rooms, overwrite=overwrite, dask=dask)
+    running.demo(out, overrides or [], shown, lidar=lidar, rooms=rooms, video=video, overwrite=overwrite, dask=dask)
 
 
 @app.command()

@@ -43,7 +43,7 @@ def trajectory(
     truth: Truth = None,
     force: Force = False,
     recipe: Annotated[
-        str, typer.Option("--recipe", help="A recipe like slam_refine, which is the default; for TUM slam_refine_tum.")
+        str, typer.Option("--recipe", help="A recipe like slam_refine; none: by the frames, also _tum or _scans.")
     ] = "",
     overrides: Overrides = None,
     dask: Dask = None,

@@ -109,20 +109,23 @@ def demo(
     *,
     lidar: bool,
     rooms: int,
+    video: bool,
     overwrite: bool,
     dask: str | None,
 ) -> None:
-    """Make the demo's room, building or street, or find it in the cache, and run `demo`, or `lidar`, on it."""
+    """Make the demo's room, building or street, or find it in the cache, and run `demo`, `tum` or `lidar` on it."""
     from hodge_pipeline.demo.sequence import BuildingOptions, DemoOptions, World, demo_source
     from hodge_pipeline.demo.sweeps import TRUTH_FILE, StreetOptions
 
-    room: World = DemoOptions() if rooms == 1 else BuildingOptions(rooms=rooms)
-    options: World = StreetOptions() if lidar else room
+    room: World = DemoOptions.video() if video else DemoOptions()
+    indoors: World = room if rooms == 1 else BuildingOptions(rooms=rooms)
+    options: World = StreetOptions() if lidar else indoors
+    recipe = "lidar" if lidar else "tum" if video else "demo"
     title = "scan the demo street" if lidar else f"render the demo's {'room' if rooms == 1 else f'{rooms} rooms'}"
     with ProgressBars.of(shown) as terminal, terminal.stage(title, options.frames) as advance:
         folder = demo_source(options=options, advance=advance)
     truth = named_truth(str(folder / TRUTH_FILE)) if lidar else []
-    run("lidar" if lidar else "demo", folder, out, [*truth, *overrides], shown, overwrite=overwrite, dask=dask)
+    run(recipe, folder, out, [*truth, *overrides], shown, overwrite=overwrite, dask=dask)
 
 
 def refine_trajectory(

@@ -67,9 +67,8 @@ class HodgeDecomposition:
 def hodge_decomposition(d0: csr_matrix, d1: csr_matrix, omega: Floats, weights: Floats) -> HodgeDecomposition:
     """`ω = d0 f + W⁻¹ d1ᵀ g + h` (Eq. (6)) of ω (E, k), for d0 (E, V), d1 (T, E) and positive weights (E,).
 
-    The exact part costs one sparse factorisation for all columns and components. So does the co-exact part of a closed
-    surface, through its dual graph; on any other complex it is found by conjugate gradients. Raises `GraphError` for
-    weights that are not positive, or where they do not converge.
+    The exact part costs one sparse factorisation for all columns and components; the co-exact part is found by
+    conjugate gradients. Raises `GraphError` for weights that are not positive, or where they do not converge.
     """
     weights = np.asarray(weights, float)
     if not (np.isfinite(weights) & (weights > 0)).all():
@@ -80,12 +79,7 @@ def hodge_decomposition(d0: csr_matrix, d1: csr_matrix, omega: Floats, weights: 
     exact = np.asarray(d0 @ potential)
     rest = omega - exact
     dual = csr_matrix(d1.T, dtype=float)
-    if _is_gradient(dual):
-        # on the dual graph W⁻¹ d1ᵀ g is a gradient again, fitted to W (ω − d0 f) in the weights 1 / w
-        face_potential = gradient_fit(dual, weights[:, None] * rest, 1.0 / weights)
-    else:
-        face_potential = _conjugate_gradients(dual, rest, weights)
-    coexact = np.asarray(dual @ face_potential) / weights[:, None]
+    coexact = np.asarray(dual @ _conjugate_gradients(dual, rest, weights)) / weights[:, None]
     return HodgeDecomposition(potential, exact, coexact, rest - coexact, weights)
 
 
@@ -109,15 +103,6 @@ def _ends(d: csr_matrix) -> Ints:
     d = csr_matrix(d)
     d.eliminate_zeros()
     return np.asarray(d.indices.reshape(-1, 2), np.int64)
-
-
-def _is_gradient(d: csr_matrix) -> bool:
-    """Whether every row has one −1 and one +1, or nothing: then `d` is the d0 of a graph."""
-    d = csr_matrix(d, copy=True)
-    d.sum_duplicates()
-    d.eliminate_zeros()
-    entries = np.diff(d.indptr)
-    return bool(np.isin(entries, (0, 2)).all() and (np.abs(d.data) == 1).all() and not np.asarray(d.sum(axis=1)).any())
 
 
 def _conjugate_gradients(dual: csr_matrix, rest: Floats, weights: Floats) -> Floats:

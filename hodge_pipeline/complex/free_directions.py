@@ -50,8 +50,7 @@ def free_direction_notes(graph: ViewGraph) -> tuple[str, ...]:
 
 def _held(graph: ViewGraph) -> Floats:
     """The information (V, 6, 6) of all edges on each frame's own motion."""
-    back = se3.adjoint(se3.inverse(graph.i_from_j))
     held = np.zeros((graph.vertex_count, 6, 6))
     np.add.at(held, graph.edges[:, 1], graph.information)
-    np.add.at(held, graph.edges[:, 0], np.swapaxes(back, 1, 2) @ graph.information @ back)
+    np.add.at(held, graph.edges[:, 0], se3.pull_back(se3.inverse(graph.i_from_j), graph.information))
     return held

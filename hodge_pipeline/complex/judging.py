@@ -17,6 +17,10 @@ FREEDOM = 4.0
 """Degrees of freedom of Student's t, the tails of real registration errors: of nine graphs of fragments of rooms."""
 STUDENT_99 = {3: 50.08, 6: 91.24}
 """The 99 % quantiles of its χ² with 3 and 6 axes, that of Fisher's F times the axes: beyond, an edge is no error."""
+REGISTERED_FREEDOM = 30.0
+"""As `FREEDOM`, of edges that a run registered, accepted and kept: red kitchen, fr1/xyz, fr1/rpy, rendered rooms. 10 to
+100 do as well; a gate makes fr1 worse, and 4 makes red kitchen's rotations from frame to frame worse.
+"""
 MEDIAN_CHI2 = {3: 2.366, 6: 5.348}
 EXACT = 1e-9
 """Of the largest χ²: edges in no cycle fit exactly, and tell nothing about the usual χ²."""
@@ -36,14 +40,16 @@ def chi2_by_information(graph: ViewGraph, world_from_cam: Floats) -> Floats:
     return np.asarray(np.einsum("ea,eab,eb->e", xi, graph.information, xi))
 
 
-def student_weight(chi2: Floats, axes: int, *, usual: Floats) -> Floats:
+def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool = False) -> Floats:
     """The weight (E,) of each χ² in a robust solve: that of Student's t, 1 up to the expected χ² and 0 beyond its 99 %
-    quantile. The median of `usual (N,)` gives the χ² their scale.
+    quantile. The median of `usual (N,)` gives the χ² their scale. Edges that are `registered` and kept have lighter
+    tails, and none weighs 0.
     """
     voting = usual[usual > EXACT * usual.max(initial=0.0)]
     scale = float(np.median(voting)) / MEDIAN_CHI2[axes] if len(voting) else 1.0
     scaled = chi2 / max(scale, np.finfo(float).tiny)
-    return np.where(scaled <= STUDENT_99[axes], np.minimum((FREEDOM + axes) / (FREEDOM + scaled), 1.0), 0.0)
+    freedom, gate = (REGISTERED_FREEDOM, np.inf) if registered else (FREEDOM, STUDENT_99[axes])
+    return np.where(scaled <= gate, np.minimum((freedom + axes) / (freedom + scaled), 1.0), 0.0)
 
 
 def squares_at_both_ends(i_from_j: Floats, xi: Floats) -> tuple[Floats, Floats]:
@@ -70,9 +76,8 @@ def in_vertex_order(graph: ViewGraph) -> tuple[ViewGraph, Bools]:
     edges[turned] = edges[turned, ::-1]
     motions[turned] = se3.inverse(motions[turned])
     if not has_unit_information(graph):
-        back = se3.adjoint(motions[turned])
         information = information.copy()
-        information[turned] = np.swapaxes(back, 1, 2) @ information[turned] @ back
+        information[turned] = se3.pull_back(motions[turned], information[turned])
     return replace(graph, edges=edges, i_from_j=motions, information=information), turned
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import open3d as o3d
 
@@ -15,6 +16,8 @@ HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 """open3d sends the ray of pixel (0, 0) through (0.5, 0.5); in `Camera` the centres of pixels are whole numbers."""
 SHADOW_GAP_M = 0.01
 AMBIENT, SKYLIGHT, LAMPLIGHT = 0.42, 0.16, 0.62
+BLUR_SAMPLES, EDGE = 7, cv2.BORDER_REPLICATE
+"""Along the way of a pixel while the shutter is open, which is a few pixels long."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Hits:
 
 
 class Renderer:
-    """Renders one room with one camera."""
+    """Renders one room with one camera, at one pose (4, 4) or at a pose (H, 4, 4) of each row of the image."""
 
     def __init__(self, room: Room, camera: Camera) -> None:
         self.room, self.camera = room, camera
@@ -54,22 +57,37 @@ class Renderer:
         facing.ravel()[hits.pixel] = hits.facing
         return depth_m, facing
 
-    def colour(self, world_from_cam: Floats) -> Floats32:
-        """The lit image (H, W, 3), RGB in 0..1."""
+    def colour(self, world_from_cam: Floats, moved: Floats | None = None) -> Floats32:
+        """The lit image (H, W, 3), RGB in 0..1; blurred where the camera has `moved` by a twist (6,) in its own axes
+        while the shutter was open.
+        """
         hits = self._cast(world_from_cam)
         room, image = self.room, np.zeros((self.camera.height * self.camera.width, 3), np.float32)
         albedo = self._texture(hits) * room.tint[hits.part]
         glow = room.glow[hits.part][:, None]
         image[hits.pixel] = albedo * (glow + (1 - glow) * self._light(hits)[:, None])
-        return np.clip(image, 0, 1).reshape(self.camera.height, self.camera.width, 3)
+        whole = np.clip(image, 0, 1).reshape(self.camera.height, self.camera.width, 3)
+        return whole if moved is None else self._blurred(whole, hits, moved)
+
+    def _blurred(self, image: Floats32, hits: Hits, moved: Floats) -> Floats32:
+        """The mean of the image along the way of each pixel."""
+        camera, row, column = self.camera, *np.divmod(hits.pixel, self.camera.width)
+        slope_x, slope_y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+        slopes = np.stack([slope_x, slope_y, np.ones(len(row))], axis=1)
+        way = -(np.cross(moved[:3], slopes) + moved[3:] / hits.depth_m[:, None])
+        ways = np.zeros((2, camera.height * camera.width), np.float32)
+        ways[:, hits.pixel] = ((way[:, :2] - slopes[:, :2] * way[:, 2:]) * [camera.fx, camera.fy]).T
+        across, down = ways.reshape(2, camera.height, camera.width)
+        v, u = np.indices(across.shape, np.float32)
+        shares = (np.arange(BLUR_SAMPLES, dtype=np.float32) + 0.5) / BLUR_SAMPLES - 0.5
+        seen = [
+            cv2.remap(image, u + share * across, v + share * down, cv2.INTER_LINEAR, borderMode=EDGE)
+            for share in shares
+        ]
+        return np.asarray(np.mean(seen, axis=0), np.float32)
 
     def _cast(self, world_from_cam: Floats) -> Hits:
-        rays = self._scene.create_rays_pinhole(
-            intrinsic_matrix=o3d.core.Tensor.from_numpy(self.camera.matrix + HALF_PIXEL),
-            extrinsic_matrix=o3d.core.Tensor.from_numpy(se3.inverse(world_from_cam)),
-            width_px=self.camera.width,
-            height_px=self.camera.height,
-        )
+        rays = self._rays(world_from_cam)
         found = self._scene.cast_rays(rays)
         depth_m = found["t_hit"].numpy().ravel()
         pixel = np.flatnonzero(np.isfinite(depth_m))
@@ -78,8 +96,24 @@ class Renderer:
         normals = self._normals(triangle, found["primitive_uvs"].numpy().reshape(-1, 2)[pixel])
         facing = -np.einsum("ij,ij->i", normals, direction) / np.linalg.norm(direction, axis=1)
         normals *= np.sign(facing)[:, None]
-        points = world_from_cam[:3, 3] + depth_m[pixel, None] * direction
+        of_rows = np.broadcast_to(world_from_cam, (self.camera.height, 4, 4))
+        points = of_rows[pixel // self.camera.width, :3, 3] + depth_m[pixel, None] * direction
         return Hits(pixel, depth_m[pixel], points, normals, np.abs(facing), self.room.part_of_triangle[triangle])
+
+    def _rays(self, world_from_cam: Floats) -> o3d.core.Tensor:
+        """Origin and direction (H, W, 6) of the ray of each pixel, its direction of unit depth."""
+        rolling = world_from_cam.ndim == 3
+        rays = self._scene.create_rays_pinhole(
+            intrinsic_matrix=o3d.core.Tensor.from_numpy(self.camera.matrix + HALF_PIXEL),
+            extrinsic_matrix=o3d.core.Tensor.from_numpy(np.eye(4) if rolling else se3.inverse(world_from_cam)),
+            width_px=self.camera.width,
+            height_px=self.camera.height,
+        )
+        if not rolling:
+            return rays
+        directions = rays.numpy()[..., 3:] @ np.swapaxes(world_from_cam[:, :3, :3], 1, 2)
+        origins = np.broadcast_to(world_from_cam[:, None, :3, 3], directions.shape)
+        return o3d.core.Tensor.from_numpy(np.concatenate([origins, directions], axis=2).astype(np.float32))
 
     def _normals(self, triangle: Ints, uv: Floats32) -> Floats:
         """Unit normals (P, 3), interpolated between the corners so that round bodies look round."""

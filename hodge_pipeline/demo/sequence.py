@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
-from typing import Protocol
+from typing import Any, ClassVar, Protocol
 
 import cv2
 import numpy as np
@@ -61,12 +61,22 @@ class DemoOptions:
         "back; none: 1.12, or, with too few frames for that, as far as neighbours stay 3 degrees apart",
     )
     stride: int = Field(default=5, ge=1, description="of a 30 Hz camera's images every stride-th is kept")
+    readout_s: float = Field(
+        default=0.0, ge=0, description="how much later the last row is read than the first one: a rolling shutter"
+    )
+    exposure_s: float = Field(default=0.0, ge=0, description="of the colour image, which blurs it")
+
+    @classmethod
+    def video(cls, **changed: Any) -> DemoOptions:
+        """Every image of a camera like the first Kinect, in poor light: ten seconds, of which these are `changed`."""
+        of_kinect = {"width": 640, "height": 480, "stride": 1, "readout_s": 0.0225, "exposure_s": 0.015}
+        return cls(**({"frames": 300, "turns": 0.4} | of_kinect | changed))
 
     @property
     def camera(self) -> Camera:
         """The camera, 63 degrees wide."""
-        focal = FOCAL_SHARE_OF_WIDTH * self.width
-        return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
+        focal, centre = FOCAL_SHARE_OF_WIDTH * self.width, ((self.width - 1) / 2, (self.height - 1) / 2)
+        return Camera(self.width, self.height, focal, focal, *centre, self.readout_s)
 
     @property
     def rounds(self) -> float:
@@ -87,7 +97,8 @@ class DemoOptions:
 
     def write(self, draft: Path, advance: Advance) -> None:
         """The sequence in the TUM layout: `rgb/*.jpg`, `depth/*.png` (16 bit, 5000 a metre), `rgb.txt`, `depth.txt`,
-        `groundtruth.txt` (poses at 100 Hz) and `intrinsics.txt` (`fx fy cx cy width height`).
+        `groundtruth.txt` (poses at 100 Hz) and `intrinsics.txt` (`fx fy cx cy width height`; of a rolling shutter as
+        `fx: …` lines, with `readout_s`).
         """
         _write(draft, self, advance)
 
@@ -102,6 +113,7 @@ class BuildingOptions:
     seed: int = Field(default=0, ge=0, description="of textures, paint, pictures, books, tremor and noise")
     noise: float = Field(default=1.0, ge=0, description="scale of every error of the camera; 0 gives exact images")
     stride: int = Field(default=1, ge=1, description="of a 30 Hz camera's images every stride-th is kept")
+    exposure_s: ClassVar[float] = 0.0
 
     @property
     def camera(self) -> Camera:
@@ -244,14 +256,30 @@ class _Recorder:
     def record(self, number: int, colour_s: float, depth_s: float) -> tuple[str, str]:
         """The names of the colour and the depth image, below the sequence's folder."""
         rng = np.random.default_rng([self.options.seed, 3, number])
-        colour_pose, depth_pose = self.path.world_from_cam(np.array([colour_s, depth_s]))
-        image = photographed(self.renderer.colour(colour_pose), rng, self.options.noise)
-        depth_m = measured_depth(*self.renderer.depth(depth_pose), rng, self.options.noise)
+        image = photographed(
+            self.renderer.colour(self._poses(colour_s), self._moved(colour_s)), rng, self.options.noise
+        )
+        depth_m = measured_depth(*self.renderer.depth(self._poses(depth_s)), rng, self.options.noise)
         colour_name, depth_name = f"rgb/{_at(colour_s)}.jpg", f"depth/{_at(depth_s)}.png"
         jpeg = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         _write_image(self.folder / colour_name, image[..., ::-1], jpeg)
         _write_image(self.folder / depth_name, np.rint(depth_m * UNITS_PER_METRE).astype(np.uint16), [])
         return colour_name, depth_name
+
+    def _poses(self, time_s: float) -> Floats:
+        """The camera's pose (4, 4), or those (H, 4, 4) of rows of a rolling shutter, whose middle is at this time."""
+        camera = self.options.camera
+        if not camera.readout_s:
+            return np.asarray(self.path.world_from_cam(np.array([time_s]))[0])
+        return self.path.world_from_cam(time_s + camera.readout_s * (np.arange(camera.height) / camera.height - 0.5))
+
+    def _moved(self, time_s: float) -> Floats | None:
+        """The camera's motion (6,) while its shutter is open, in its own axes; None of one that takes no time."""
+        half_s = self.options.exposure_s / 2
+        if not half_s:
+            return None
+        begin, end = self.path.world_from_cam(np.array([time_s - half_s, time_s + half_s]))
+        return se3.log(se3.inverse(begin) @ end)
 
 
 def _at(time_s: float) -> str:
@@ -282,5 +310,8 @@ def _write_truth(path: Path, loop: HandHeldLoop | Walk) -> None:
 
 
 def _write_intrinsics(path: Path, camera: Camera) -> None:
+    if camera.readout_s:
+        path.write_text("".join(f"{name}: {value}\n" for name, value in asdict(camera).items()))
+        return
     values = f"{camera.fx} {camera.fy} {camera.cx} {camera.cy} {camera.width} {camera.height}"
     path.write_text(f"# fx fy cx cy width height\n{values}\n")

@@ -92,7 +92,7 @@ def build_street(seed: int) -> tuple[Floats, Ints]:
     north = [mesh.moved(half_turn) for mesh in south]
     east = [mesh.moved(motion(0, 0, yaw_deg=90)) for mesh in _side(rng, HALF_WIDTH_M, HALF_LENGTH_M)]
     ground = box(GROUND_M, GROUND_M, 1.0).moved(motion(0, 0, -1.0))
-    return _joined([ground, *south, *north, *east, *_tunnel()])
+    return joined([ground, *south, *north, *east, *_tunnel()])
 
 
 def _side(rng: np.random.Generator, half_length_m: float, away_m: float) -> Iterator[Mesh]:
@@ -140,7 +140,8 @@ def _tunnel() -> list[Mesh]:
     return [*sides, ceiling]
 
 
-def _joined(meshes: list[Mesh]) -> tuple[Floats, Ints]:
+def joined(meshes: list[Mesh]) -> tuple[Floats, Ints]:
+    """Vertices (V, 3) and triangles (T, 3) of all of them."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     triangles = [mesh.triangles + start for mesh, start in zip(meshes, starts, strict=True)]
     return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles)

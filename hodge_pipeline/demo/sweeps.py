@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline import se3
 from hodge_pipeline.demo.street import CAR, Road, build_street
 from hodge_pipeline.stages import Advance
-from hodge_pipeline.types import Floats, Floats32
+from hodge_pipeline.types import Floats, Floats32, Ints
 
 REVOLUTION_S = 0.1
 LOWEST_DEG, HIGHEST_DEG = -24.0, 6.0
@@ -32,12 +32,18 @@ class Sweep:
 
 
 class SpinningScanner:
-    """A scanner of `beams` and `columns` on a car that drives the road."""
+    """A scanner of `beams` and `columns` on a car that drives the road, past the street or another mesh (vertices,
+    triangles).
+    """
 
-    def __init__(self, road: Road, seed: int, beams: int, columns: int, noise: float) -> None:
+    nearest_m = NEAREST_M
+
+    def __init__(
+        self, road: Road, seed: int, beams: int, columns: int, noise: float, mesh: tuple[Floats, Ints] | None = None
+    ) -> None:
         self.road, self.seed, self.noise = road, seed, noise
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        vertices, triangles = build_street(seed)
+        vertices, triangles = build_street(seed) if mesh is None else mesh
         self._scene.add_triangles(
             o3d.core.Tensor.from_numpy(vertices.astype(np.float32)),
             o3d.core.Tensor.from_numpy(triangles.astype(np.uint32)),
@@ -64,7 +70,7 @@ class SpinningScanner:
         hit = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays.astype(np.float32)), nthreads=1)
         ranges = np.minimum(hit["t_hit"].numpy().astype(float), self._to_cars(rays, begin_s))
         ranges += self.noise * RANGE_NOISE_M * rng.standard_normal(ranges.shape)
-        seen = (ranges > NEAREST_M) & (ranges < FARTHEST_M) & (rng.random(ranges.shape) >= LOST_SHARE * self.noise)
+        seen = (ranges > self.nearest_m) & (ranges < FARTHEST_M) & (rng.random(ranges.shape) >= LOST_SHARE * self.noise)
         points = self._directions * np.where(seen, ranges, 0.0)[:, :, None]
         times = np.broadcast_to(self._column_s[:, None], seen.shape)
         return Sweep(points[seen].astype(np.float32), times[seen].astype(np.float32))

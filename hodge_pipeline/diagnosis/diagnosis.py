@@ -9,30 +9,28 @@ from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
-from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.diagnosis.consensus import find_consensus
-from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.noise import Noise, edge_noise
+from hodge_pipeline.diagnosis.evidence import Evidence, gather
+from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.order import every_pair_tried, order_prior, prior_by_cycles, right_by_gap
-from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
+from hodge_pipeline.diagnosis.result import (
+    CONSISTENT,
+    SUSPECT,
+    UNTESTABLE,
+    WRONG,
+    Cycles,
+    Diagnosis,
+    count_verdicts,
+    residuals_in_pieces,
+)
 from hodge_pipeline.diagnosis.robust_poses import Fit
 from hodge_pipeline.diagnosis.shared_blame import share_blame
-from hodge_pipeline.diagnosis.short_cycles import cycle_errors, short_cycles, with_cycles_of
-from hodge_pipeline.diagnosis.testing_cycles import (
-    closing_support,
-    in_no_cycle,
-    judge_cycles,
-    unattributable,
-    usual_share,
-    witnesses,
-)
+from hodge_pipeline.diagnosis.short_cycles import cycle_errors, judge_cycles, with_cycles_of, witnesses
 from hodge_pipeline.diagnosis.wording import reasons
-from hodge_pipeline.diagnosis.working_point import recentred, working_point
-from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -69,70 +67,38 @@ def lattice_backbone(graph: ViewGraph, found: Diagnosis, options: DiagnosisOptio
     return backbone
 
 
-def _by_cycles(graph: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
+def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
     """The diagnosis that trusts no edge."""
-    stated, (graph, turned) = graph, in_vertex_order(graph)
-    prior = np.full(graph.edge_count, 0.5)
-    if options.order_prior:
-        prior = order_prior(graph.edges, graph.vertex_count)
-    point, reach_m = working_point(graph.i_from_j, prior)
-    motions = recentred(graph.i_from_j, point)
-    loops = short_cycles(graph.edges, graph.vertex_count, options.max_cycles_per_edge)
-    angle, displacement_m = cycle_errors(loops, motions)
-    noise = edge_noise(graph, loops, angle, displacement_m, prior, reach_m)
-    cycles = judge_cycles(loops, angle, displacement_m, noise, reach_m)
-    exhaustive = every_pair_tried(graph.edges, graph.vertex_count)
-    if exhaustive and options.order_prior and np.ptp(prior) == 0:
-        prior = prior_by_cycles(graph.edges, graph.vertex_count, cycles)
-        noise = edge_noise(graph, loops, angle, displacement_m, prior, reach_m)
-        cycles = judge_cycles(loops, angle, displacement_m, noise, reach_m)
-    if not exhaustive:
-        # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
-        usual = usual_share(cycles)
-        prior = np.minimum(prior, usual)
-        if options.order_prior:
-            prior = right_by_gap(graph.edges, graph.vertex_count, cycles, usual)
-    evidence = Evidence(
-        edges=graph.edges,
-        vertex_count=graph.vertex_count,
-        i_from_j=motions,
-        prior=prior,
-        noise=noise,
-        support=closing_support(cycles, prior),
-        in_no_listed_cycle=in_no_cycle(graph.edges, graph.vertex_count, cycles),
-        exhaustive=exhaustive,
-        reach_m=reach_m,
-    )
-    consensus = find_consensus(evidence, _with_noise(graph, motions, noise), options)
-    cycles = _with_witnesses(graph, cycles, consensus.fit.used, evidence)
-    undecided = unattributable(graph.edges, graph.vertex_count, cycles)
-    blame = share_blame(cycles, consensus.fit, evidence)
-    unvouched = blame.unvouched & (consensus.probability >= LIKELIER_RIGHT)
-    untestable = evidence.in_no_listed_cycle | (undecided >= 0) | unvouched
-    probability = np.where(untestable, np.nan, np.maximum(consensus.probability, blame.probability))
-    undecided = np.where(undecided >= 0, undecided, np.where(unvouched | (blame.probability > 0), blame.cycle, -1))
-    verdict = _verdicts(probability, untestable, consensus.fit.used, options)
-    kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
-    world_from_cam = consensus.fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
+    graph, turned = in_vertex_order(stated)
+    evidence, cycles, point = gather(graph, options)
+    fit, agreeing = find_consensus(evidence)
+    cycles = _with_witnesses(cycles, fit.used, evidence)
+    blame = share_blame(cycles, fit, evidence)
+    unvouched = blame.unvouched & (agreeing >= LIKELIER_RIGHT)
+    untestable = evidence.in_no_listed_cycle | (blame.undecided >= 0) | unvouched
+    probability = np.where(untestable, np.nan, np.maximum(agreeing, blame.probability))
+    undecided = np.where(unvouched | (blame.probability > 0), blame.cycle, -1)
+    undecided = np.where(blame.undecided >= 0, blame.undecided, undecided)
+    right = (probability >= options.consistent_from) & fit.used
+    wrong = probability < options.wrong_below
+    verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
+    world_from_cam = fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
     cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))
-    found = _report(stated, cycles, probability, verdict, kept, undecided, consensus.fit, world_from_cam)
-    information = _of_noise(noise, point, graph.dimension == 2)
-    return replace(found, information=information, notes=(*found.notes, *noise.doubts, *free_direction_notes(stated)))
+    found = _report(stated, cycles, probability, verdict, undecided, fit, world_from_cam)
+    information = _of_noise(evidence.noise, point, graph.dimension == 2)
+    notes = (*found.notes, *evidence.noise.doubts, *free_direction_notes(stated))
+    return replace(found, information=information, notes=notes)
 
 
-def _with_witnesses(graph: ViewGraph, cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
+def _with_witnesses(cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
     """The cycles, and more where none that closes passes an edge in use, though others in use close one over it."""
-    told = np.zeros(graph.edge_count, bool)
+    told = np.zeros(len(used), bool)
     told[cycles.loops.select(np.flatnonzero(cycles.closes)).edge] = True
     wanted = used & ~told & ~evidence.in_no_listed_cycle
     if not wanted.any():
         return cycles
-    loops = with_cycles_of(used, cycles.loops, graph.edges, graph.vertex_count, wanted)
-    return judge_cycles(loops, *cycle_errors(loops, evidence.i_from_j), evidence.noise, evidence.reach_m)
-
-
-def _with_noise(graph: ViewGraph, motions: Floats, noise: Noise) -> ViewGraph:
-    return replace(graph, i_from_j=motions, information=noise.information)
+    loops = with_cycles_of(used, cycles.loops, evidence.graph.edges, evidence.graph.vertex_count, wanted)
+    return judge_cycles(loops, *cycle_errors(loops, evidence.graph.i_from_j), evidence.noise, evidence.reach_m)
 
 
 def _of_noise(noise: Noise, point: Floats, planar: bool) -> Floats:
@@ -144,34 +110,24 @@ def _of_noise(noise: Noise, point: Floats, planar: bool) -> Floats:
     return np.asarray(information)
 
 
-def _verdicts(probability: Floats, untestable: Bools, used: Bools, options: DiagnosisOptions) -> NDArray[np.str_]:
-    right = (probability >= options.consistent_from) & used
-    wrong = probability < options.wrong_below
-    return np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
-
-
 def _report(
     graph: ViewGraph,
     cycles: Cycles,
     probability: Floats,
     verdict: NDArray[np.str_],
-    kept: Bools,
     undecided: Ints,
     fit: Fit,
     world_from_cam: Floats,
 ) -> Diagnosis:
-    piece = connected_components(graph.edges[kept], graph.vertex_count)
-    same = piece[graph.edges[:, 0]] == piece[graph.edges[:, 1]]
-    displacement_m, angle = edge_residuals(graph, world_from_cam)
-    residual = np.where(same, displacement_m, np.nan), np.where(same, np.degrees(angle), np.nan)
+    kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
+    piece, *residual = residuals_in_pieces(graph, kept, world_from_cam)
     telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
     share = 1 - 1 / (1 + fit.resistance)
-    counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
     tested = f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close"
     return Diagnosis(
         verdict=verdict,
         probability=probability,
-        reason=reasons(graph, cycles, verdict, residual, telling, undecided, fit.bridge),
+        reason=reasons(graph, cycles, verdict, (residual[0], residual[1]), telling, undecided, fit.bridge),
         kept=kept,
         residual_m=residual[0],
         residual_deg=residual[1],
@@ -182,5 +138,5 @@ def _report(
         witnesses_against=telling[1],
         piece=piece,
         world_from_cam=world_from_cam,
-        notes=(f"edges: {counts}", tested, *describe_components(piece, graph.vertex_ids)),
+        notes=(f"edges: {count_verdicts(verdict)}", tested, *describe_components(piece, graph.vertex_ids)),
     )

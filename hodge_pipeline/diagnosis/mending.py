@@ -14,15 +14,13 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.pieces import Alignment
+from hodge_pipeline.diagnosis.growth import Alignment
 from hodge_pipeline.diagnosis.proposals import Proposals
-from hodge_pipeline.diagnosis.robust_poses import GATE, GENTLE, LARGE, TWICE, Fit, chi2_at, fit, rough_fit
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.diagnosis.robust_poses import GATE, TWICE, Fit, chi2_at, fit
+from hodge_pipeline.types import Bools, Floats, Ints
 
 ROUNDS, MOVES = 4, 40
 """Solves at most, and sets of views that move before each."""
-SWEEPS_OF_LARGE, PROPOSALS_OF_LARGE = 2, 500
-"""Times that edges of a large graph are compared, for the one solve that it has time for, and how many."""
 MOST_PROPOSALS = 1200
 """Edges left out that are compared with each other; of more, evenly spread ones."""
 TRIED = 40
@@ -33,46 +31,41 @@ UNIT = 1000
 """Of a nat, since flows are whole numbers."""
 
 
-def mend(evidence: Evidence, graph: ViewGraph, start: Fit) -> Fit:
-    """The solution after the moves, a rough one of a large graph; `graph` has the recentred edges. The log-evidence of
-    an edge is −log of its probability of being wrong, and AGREES.
-    """
+def mend(evidence: Evidence, start: Fit) -> Fit:
+    """The solution after the moves. An edge's log-evidence is AGREES and −log of its probability of being wrong."""
     log_evidence = AGREES - np.log1p(-evidence.prior)
     found = start
-    solver, gates = (rough_fit, GENTLE) if len(log_evidence) > LARGE else (fit, TWICE)
-    for _ in range(ROUNDS if len(log_evidence) <= LARGE else 1):
-        poses = _after_moves(evidence, graph, found, log_evidence)
+    for _ in range(ROUNDS):
+        poses = _after_moves(evidence, found, log_evidence)
         if poses is None:
             break
-        tried = solver(evidence, graph, Alignment(found.component, poses), gates)
+        tried = fit(evidence, Alignment(found.piece, poses), TWICE)
         if log_evidence[tried.used].sum() <= log_evidence[found.used].sum():
             break
         found = tried
     return found
 
 
-def _after_moves(evidence: Evidence, graph: ViewGraph, found: Fit, log_evidence: Floats) -> Floats | None:
+def _after_moves(evidence: Evidence, found: Fit, log_evidence: Floats) -> Floats | None:
     """Poses (V, 4, 4) after all moves that gain LEAST_GAIN; None where none does."""
     poses, moves = found.poses, 0
-    for _ in range(MOVES if len(log_evidence) <= LARGE else SWEEPS_OF_LARGE):
-        agreeing = np.maximum(0.0, 1 - chi2_at(evidence, graph, poses, found.component, found.resistance) / GATE)
-        i, j = found.component[evidence.edges].T
-        rows = np.flatnonzero((agreeing == 0) & (i == j) & (evidence.edges[:, 0] != evidence.edges[:, 1]))
-        most = MOST_PROPOSALS if len(agreeing) <= LARGE else PROPOSALS_OF_LARGE
-        proposals = Proposals.of(evidence, poses, rows[:: max(-(-len(rows) // most), 1)])
-        found_now = _good_moves(evidence, poses, found.component, agreeing, log_evidence, proposals)
+    while moves < MOVES:
+        agreeing = np.maximum(0.0, 1 - chi2_at(evidence, poses, found.piece, found.resistance) / GATE)
+        i, j = found.piece[evidence.graph.edges].T
+        rows = np.flatnonzero((agreeing == 0) & (i == j) & (evidence.graph.edges[:, 0] != evidence.graph.edges[:, 1]))
+        rows = rows[:: max(-(-len(rows) // MOST_PROPOSALS), 1)]
+        proposals = Proposals.of(evidence, poses, rows)
+        found_now = _good_moves(evidence, poses, found.piece, agreeing, log_evidence, proposals)
         if not found_now:
             break
         poses, moves = poses.copy(), moves + len(found_now)
         for inside, motion in found_now:
             poses[inside] = motion @ poses[inside]
-        if moves >= MOVES:
-            break
     return poses if moves else None
 
 
 def _good_moves(
-    evidence: Evidence, poses: Floats, component: Ints, agreeing: Floats, log_evidence: Floats, proposals: Proposals
+    evidence: Evidence, poses: Floats, piece: Ints, agreeing: Floats, log_evidence: Floats, proposals: Proposals
 ) -> list[tuple[Bools, Floats]]:
     """The groups that outweigh their cuts, the weightiest first: the views (V,) that move, and how. No group has to do
     with views that move for another.
@@ -90,7 +83,7 @@ def _good_moves(
         inside = _cut(evidence, agreeing * log_evidence, proposals, group, share)
         if inside is None:
             continue
-        whole = component == component[proposals.mover[row]]
+        whole = piece == piece[proposals.mover[row]]
         inside, motion = inside & whole, proposals.mean_motion(group, share, poses)
         if 2 * inside.sum() > whole.sum():  # the smaller part moves, so that others can at the same time
             inside, motion = whole & ~inside, se3.inverse(motion)
@@ -105,10 +98,10 @@ def _cut(evidence: Evidence, held: Floats, proposals: Proposals, group: Ints, sh
 
     An edge of the group whose ends are not parted counts as lost, as does each used edge that is.
     """
-    count = evidence.vertex_count
+    count = evidence.graph.vertex_count
     source, sink = count, count + 1
     used = np.flatnonzero(held > 0)
-    i, j = evidence.edges[used].T
+    i, j = evidence.graph.edges[used].T
     mover, stayer = proposals.mover[group], proposals.stayer[group]
     tail = np.concatenate([i, j, np.full(len(group), source), mover])
     head = np.concatenate([j, i, stayer, np.full(len(group), sink)])

@@ -6,15 +6,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.resistance import effective_resistance
-from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WITNESSES, WRONG, Cycles, Diagnosis
+from hodge_pipeline.diagnosis.result import (
+    CONSISTENT,
+    SUSPECT,
+    UNTESTABLE,
+    WITNESSES,
+    WRONG,
+    Cycles,
+    Diagnosis,
+    count_verdicts,
+    residuals_in_pieces,
+)
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors
 from hodge_pipeline.diagnosis.wording import distance
-from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -37,14 +46,9 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisO
     untestable = np.isnan(probability)
     wrong = ~kept & (probability < options.wrong_below) & (backbone.steps | backbone.found.confirmed)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
-    piece = connected_components(graph.edges[kept], graph.vertex_count)
-    displacement_m, angle = edge_residuals(graph, backbone.world_from_cam)
-    apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
-    residual_m = np.where(apart, np.nan, displacement_m)
-    residual_deg = np.where(apart, np.nan, np.degrees(angle))
+    piece, residual_m, residual_deg = residuals_in_pieces(graph, kept, backbone.world_from_cam)
     resistance = effective_resistance(graph.edges, graph.vertex_count, kept)
     cycles, cycle = _cycles(graph, backbone, in_loop)
-    counts = ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
     return Diagnosis(
         verdict=verdict,
         probability=probability,
@@ -59,7 +63,7 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisO
         witnesses_against=_witnesses(np.where(kept, -1, cycle)),
         piece=piece,
         world_from_cam=backbone.world_from_cam,
-        notes=(f"edges: {counts}", backbone.note, *describe_components(piece, graph.vertex_ids)),
+        notes=(f"edges: {count_verdicts(verdict)}", backbone.note, *describe_components(piece, graph.vertex_ids)),
     )
 
 

@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.votes import agreement_of, mean_motion
+from hodge_pipeline.diagnosis.growth import agreement_of, mean_motions
 from hodge_pipeline.types import Bools, Floats, Ints
 
 DRIFTED_RAD, ALIKE = 0.1, 12.0
@@ -31,8 +31,8 @@ class Proposals:
     @classmethod
     def of(cls, evidence: Evidence, poses: Floats, rows: Ints) -> Proposals:
         """Those of these edges (rows) at poses (V, 4, 4)."""
-        i, j = evidence.edges[rows].T
-        motion = poses[i] @ evidence.i_from_j[rows] @ se3.inverse(poses[j])
+        i, j = evidence.graph.edges[rows].T
+        motion = poses[i] @ evidence.graph.i_from_j[rows] @ se3.inverse(poses[j])
         motion = np.concatenate([motion, se3.inverse(motion)])
         edge, mover, stayer = np.tile(rows, 2), np.concatenate([j, i]), np.concatenate([i, j])
         first, second = _near_in_angle(evidence, edge, motion)
@@ -56,7 +56,8 @@ class Proposals:
 
     def mean_motion(self, group: Ints, share: Floats, poses: Floats) -> Floats:
         """The mean (4, 4) of the motions of a group, each counting its share."""
-        return mean_motion(self.motion[group], poses[self.mover[group], :3, 3], share)
+        one = np.zeros(len(group), np.int64)
+        return np.asarray(mean_motions(one, self.motion[group], poses[self.mover[group], :3, 3], share, 1)[0])
 
 
 def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints, Ints]:

@@ -8,8 +8,10 @@ import numpy as np
 from numpy import str_
 from numpy.typing import NDArray
 
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import Loops
-from hodge_pipeline.types import Bools, Edges, Floats, Ints
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.types import Bools, Edges, Floats, Ints, ViewGraph
 
 CONSISTENT, SUSPECT, WRONG, UNTESTABLE = "consistent", "suspect", "wrong", "untestable"
 WITNESSES = 3
@@ -60,9 +62,7 @@ class Diagnosis:
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
-        verdicts = (CONSISTENT, SUSPECT, WRONG, UNTESTABLE)
-        counts = ", ".join(f"{int((self.verdict == name).sum())} {name}" for name in verdicts)
-        return f"Diagnosis({len(self.verdict)} edges: {counts})"
+        return f"Diagnosis({len(self.verdict)} edges: {count_verdicts(self.verdict)})"
 
     def put_into(self, edges: Edges) -> Edges:
         """The table with the verdict on each edge of its graph, and why."""
@@ -73,3 +73,18 @@ class Diagnosis:
             leverage=self.leverage,
             why=np.array(self.reason, dtype=np.str_),
         )
+
+
+def count_verdicts(verdict: NDArray[str_]) -> str:
+    """How many edges have each verdict, in words."""
+    return ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
+
+
+def residuals_in_pieces(graph: ViewGraph, kept: Bools, world_from_cam: Floats) -> tuple[Ints, Floats, Floats]:
+    """The piece (V,) of each vertex, by the kept edges (E,), and how far each edge is from the poses (V, 4, 4), metres
+    and degrees; NaN between two pieces.
+    """
+    piece = connected_components(graph.edges[kept], graph.vertex_count)
+    displacement_m, angle = edge_residuals(graph, world_from_cam)
+    apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
+    return piece, np.where(apart, np.nan, displacement_m), np.where(apart, np.nan, np.degrees(angle))

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
+from scipy.special import gammainc, gammaln
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import chi2_by_information, has_unit_information, student_weight
-from hodge_pipeline.diagnosis.confirmation import confirmed
+from hodge_pipeline.complex.cycles import SpanningForest, fundamental_products, spanning_forest
+from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, diagnose, lattice_backbone
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
@@ -21,13 +23,16 @@ from hodge_pipeline.solvers.backbone.solve import solve_on_backbone
 from hodge_pipeline.solvers.backbone.trust import NONE, find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.options import check_choice
+from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import held_rows
 from hodge_pipeline.solvers.stated import is_explained
 from hodge_pipeline.solvers.weights import edge_weights, is_planar
-from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
+from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
-ROUNDS, SETTLED = 4, 1e-2
-"""Rounds of weights at most, and the change of them that ends the rounds: beyond, no edge goes or comes."""
+LEVEL = 0.01
+"""Choices of edges that agree so well by chance, expected among all: as the gate of the edges, which 1 % miss."""
+UNIFORM_RAD2 = (8 * math.pi**2) ** (2 / 3) / (2 * math.pi)
+"""Variance of an axis at which a Gaussian is as dense at 0 as uniform rotations, which spread no wider."""
 
 
 def solve_robust(
@@ -79,11 +84,8 @@ def solve_robust(
     kept = found.kept & graph.information.any(axis=(1, 2))
     weights = kept.astype(float)
     final = solved(weights, found.world_from_cam)
-    for _ in range(0 if is_explained(graph.select(np.flatnonzero(kept)), final) else ROUNDS):
-        new = np.where(kept, _weights(known, final, kept), 0.0)
-        if np.abs(new - weights).max(initial=0.0) < SETTLED:
-            break
-        weights, final = new, solved(new, final.world_from_cam)
+    if not is_explained(graph.select(np.flatnonzero(kept)), final):
+        weights, final = reweighted(known, weights, final, solved)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
     on_information = edge_weights(graph, 2 if graph.dimension == 2 or is_planar(graph) else 3).notes
@@ -99,13 +101,6 @@ def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:
     first = np.unique(component, return_index=True)[1]
     start = np.broadcast_to(np.eye(4), poses.shape) if start is None else start
     return np.asarray((start[first] @ se3.inverse(poses[first]))[component] @ poses)
-
-
-def _weights(graph: ViewGraph, solution: Solution, kept: Bools) -> Floats:
-    """The weight (E,) of each edge at a solution, its information taken to be right in its proportions."""
-    size = 3 if graph.dimension == 2 or is_planar(graph) else 6
-    chi2 = np.maximum(chi2_by_information(graph, solution.world_from_cam), 0.0)
-    return student_weight(chi2, size, usual=chi2[kept])
 
 
 def _told(found: Diagnosis, weights: Floats) -> str:
@@ -128,6 +123,65 @@ def _with_confirmation(graph: ViewGraph, found: Diagnosis, solution: Solution) -
         return replace(solution, confirmed=False, notes=(note, *solution.notes))
     note = "no edge is left out, and no cycles close better than by chance: nothing tests the edges"
     return replace(solution, notes=(*solution.notes, note))
+
+
+def confirmed(graph: ViewGraph, kept: Ints) -> bool:
+    """Whether the cycles of the kept edges (rows) close so well that no choice of random edges is expected to.
+
+    Around a cycle of edges in random directions the motion is a walk of their lengths, and the probability of a nearer
+    end is uniform; of C cycles, minus the sum of the logarithms is gamma distributed. Every choice of as many
+    of the edges counts, whichever the solver made: so that it chose the best makes nothing look better than it is.
+    """
+    forest = spanning_forest(graph.edges[kept], graph.vertex_count)
+    chords = forest.chords[forest.edges[forest.chords, 0] != forest.edges[forest.chords, 1]]
+    if not len(chords):
+        return False
+    log_chance = _log_chance(graph, kept, forest, chords)
+    every, out, cycles = graph.edge_count, graph.edge_count - len(kept), len(chords)
+    log_choices = gammaln(every + 1) - gammaln(out + 1) - gammaln(len(kept) + 1) + math.log(every)
+    mean = -float(log_chance.sum()) / cycles
+    # Chernoff's bound of the gamma distribution's tail
+    return mean > 1 and cycles * (1 + math.log(mean) - mean) + log_choices < math.log(LEVEL)
+
+
+def _log_chance(graph: ViewGraph, kept: Ints, forest: SpanningForest, chords: Ints) -> Floats:
+    """The logarithm of how likely (C,) a cycle of such edges in random directions leaves less; axes along which most
+    edges do not move do not count.
+    """
+    left = se3.log(fundamental_products(forest, graph.i_from_j[kept], chords))
+    squares = se3.log(graph.i_from_j[kept]) ** 2
+    axes = np.median(squares, axis=0) > 0
+    if not axes.any():
+        return np.zeros(len(left))
+    spread = around_cycles(forest, chords, squares)
+    spread[:, :3] = np.minimum(spread[:, :3], UNIFORM_RAD2)
+    spread = np.maximum(spread[:, axes], np.finfo(float).tiny)
+    chance = gammainc(axes.sum() / 2, (left[:, axes] ** 2 / spread).sum(axis=1) / 2)
+    return np.asarray(np.log(np.maximum(chance, np.finfo(float).tiny)))
+
+
+def around_cycles(forest: SpanningForest, chords: Ints, values: Floats) -> Floats:
+    """The sum (C, k) of the values (E, k) of the edges of each chord's cycle, by jumps of doubled length to where its
+    two tree paths meet.
+    """
+    is_root = forest.parent < 0
+    jumps = [np.where(is_root, np.arange(len(is_root)), forest.parent)]
+    above = np.where(is_root[:, None], 0.0, values[forest.parent_edge])
+    while (jumps[-1] != jumps[-1][jumps[-1]]).any():
+        above = above + above[jumps[-1]]
+        jumps.append(jumps[-1][jumps[-1]])
+    above = above + above[jumps[-1]]
+    ends = forest.edges[chords]
+    deep = np.take_along_axis(ends, forest.depth[ends].argmax(axis=1)[:, None], axis=1)[:, 0]
+    other = ends.sum(axis=1) - deep
+    ahead = forest.depth[deep] - forest.depth[other]
+    for power, jump in enumerate(jumps):
+        deep = np.where(ahead >> power & 1, jump[deep], deep)
+    for jump in reversed(jumps):
+        apart = jump[deep] != jump[other]
+        deep, other = np.where(apart, jump[deep], deep), np.where(apart, jump[other], other)
+    meeting = np.where(deep == other, deep, jumps[0][deep])
+    return np.asarray(np.maximum(above[ends].sum(axis=1) - 2 * above[meeting], 0.0) + values[chords])
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

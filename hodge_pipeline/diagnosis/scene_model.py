@@ -1,19 +1,172 @@
-"""A model of the scene fitted to a solution, by which other arrangements of the views are then judged."""
+"""A model of the scene fitted to a solution, by which other arrangements of the views are then judged.
+
+- Joining: where every pair was tried, nearly all views that look at the same place are joined, and few others are. The
+  probability is logistic in the distance between the points that two views look at, and in the angle between them.
+- Upright: people and vehicles carry cameras much the same way throughout, so that a part of the scene placed upside
+  down is nearly always wrong. Each piece has a direction that is up in the world; in the axes of its cameras it follows
+  one mixture for all pieces, von Mises and Fisher's distribution about its mean and, for the other cameras, the uniform
+  one on the sphere.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit
 
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.joining import Joining, learn_joining
 from hodge_pipeline.diagnosis.robust_poses import Fit
-from hodge_pipeline.diagnosis.upright import Upright, learn_upright
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
+CEILING = 0.97
+"""Even views that lie upon each other are not always joined."""
+USUAL = np.array([0.0, 0.0, 0.0, 6.0, np.log(2.5), np.log(2.7)])
+"""The means of the prior on the parameters of `Joining`; their standard deviations follow."""
+SPREAD = np.array([2.0, 2.0, 2.0, 2.0, 0.5, 0.5])
+DEPTHS = (0.0, 2.0, -2.0)
+"""Of the point that is seen, along the viewing axis, to begin with."""
+JOINING_STEPS = 40
+LEAST_SPREAD_RAD = 0.2
+"""Poses drift: chained edges are not upright to less, however the cameras were."""
+FEWEST = 6
+"""Views of a piece that the model is fitted to: with fewer, the unknown up of the piece fits too well."""
+ROUNDS, STEPS = 8, 5
+CLEAR_SHARE, CLEAR_SPREAD_RAD = 0.8, 0.42
+"""Of neighbours, the least share and the largest spread of a model that is used; else its share becomes 0."""
+STARTS = np.concatenate([np.eye(3), np.array([[0, 1, 1], [0, -1, 1]]) / np.sqrt(2)])
+"""Directions in camera axes from which the fit starts."""
 NEIGHBOURS = 12
 """Views of a group: few enough that nearly all groups are placed rightly."""
+
+
+@dataclass(frozen=True)
+class Joining:
+    """The model: `x` holds the point that a view looks at (in units of `reach_m`), the log odds of two views in one
+    place, and the logarithms of how they fall with each reach and each radian.
+    """
+
+    reach_m: float
+    x: Floats = field(default_factory=USUAL.copy)
+
+    def between(self, first: Floats, second: Floats) -> Floats:
+        """The probability (A, B) of a right edge for poses (A, 4, 4) and (B, 4, 4)."""
+        a, b = self._seen(first), self._seen(second)
+        squares = (a * a).sum(1)[:, None] + (b * b).sum(1)[None] - 2 * a @ b.T
+        apart = np.sqrt(np.maximum(squares, 0.0)) / self.reach_m
+        odds = self.x[3] - np.exp(self.x[4]) * apart - np.exp(self.x[5]) * _angles(first, second)
+        return np.asarray(CEILING * expit(odds))
+
+    def _seen(self, poses: Floats) -> Floats:
+        return np.asarray(poses[:, :3, :3] @ (self.reach_m * self.x[:3]) + poses[:, :3, 3])
+
+
+def learn_joining(poses: Floats, piece: Ints, joined: Bools, reach_m: float, before: Joining | None = None) -> Joining:
+    """The most probable model for poses (V, 4, 4) in pieces (V,), of which the pairs `joined (V, V)` have an edge.
+
+    The search starts at `before`, where it is given.
+    """
+    a, b = np.triu_indices(len(piece), 1)
+    inside = piece[a] == piece[b]
+    a, b = a[inside], b[inside]
+    turned, shifted = poses[a, :3, :3] - poses[b, :3, :3], (poses[a, :3, 3] - poses[b, :3, 3]) / reach_m
+    angle, there = _angles(poses, poses)[a, b], joined[a, b].astype(float)
+
+    def cost(x: Floats) -> tuple[float, Floats]:
+        """−log of the posterior, and its gradient."""
+        apart = turned @ x[:3] + shifted
+        distance = np.sqrt((apart * apart).sum(1) + 1e-12)
+        far, turn = np.exp(x[4]) * distance, np.exp(x[5]) * angle
+        odds = x[3] - far - turn
+        left = expit(odds) - there
+        at_point = -np.exp(x[4]) * np.einsum("n,nij,ni->j", left / distance, turned, apart)
+        gradient = np.array([*at_point, left.sum(), -left @ far, -left @ turn]) + (x - USUAL) / SPREAD**2
+        prior = float((((x - USUAL) / SPREAD) ** 2).sum()) / 2
+        return float((np.logaddexp(0, odds) - there * odds).sum()) + prior, gradient
+
+    starts = [before.x] if before else [USUAL + np.array([0, 0, depth, 0, 0, 0]) for depth in DEPTHS]
+    found = [minimize(cost, x, jac=True, method="L-BFGS-B", options={"maxiter": JOINING_STEPS}) for x in starts]
+    return Joining(reach_m, min(found, key=lambda result: float(result.fun)).x)
+
+
+def _angles(first: Floats, second: Floats) -> Floats:
+    trace = first[:, :3, :3].reshape(-1, 9) @ second[:, :3, :3].reshape(-1, 9).T
+    return np.asarray(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
+@dataclass(frozen=True)
+class Upright:
+    """The distribution of the world's up in camera axes: about `up (3,)` with `concentration` for a `share` of the
+    cameras, 0 where the model carries no evidence.
+    """
+
+    up: Floats
+    concentration: float
+    share: float
+
+    def log_evidence(self, rotations: Floats, up: Floats) -> Floats:
+        """Log-evidence (V,) of camera rotations (V, 3, 3) where up is (V, 3): 0 for the best, else negative."""
+        return self._log_density(self._cosine(rotations, up)) - self._log_density(np.ones(1))
+
+    def world_up(self, rotations: Floats, piece: Ints) -> Floats:
+        """The direction (V, 3) that is up where each camera is: the one of its piece that suits the cameras there."""
+        pointing, count = rotations @ self.up, int(piece.max(initial=-1)) + 1
+        weight = np.ones(len(piece))
+        for _ in range(STEPS):
+            sums = [np.bincount(piece, weight * pointing[:, axis], count) for axis in range(3)]
+            mean = np.stack(sums, axis=1)
+            mean = mean / np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+            weight = self.following(rotations, mean[piece])
+        return np.asarray(mean[piece])
+
+    def following(self, rotations: Floats, up: Floats) -> Floats:
+        """The probability (V,) that each camera follows the model."""
+        return 1 - (1 - self.share) / np.exp(self._log_density(self._cosine(rotations, up)))
+
+    def _cosine(self, rotations: Floats, up: Floats) -> Floats:
+        return np.asarray(np.einsum("nij,ni,j->n", rotations, up, self.up))
+
+    def _log_density(self, cosine: Floats) -> Floats:
+        """The logarithm of the density against the uniform one."""
+        peak = 2 * self.concentration / -np.expm1(-2 * self.concentration)
+        return np.asarray(np.log(1 - self.share + self.share * peak * np.exp(self.concentration * (cosine - 1))))
+
+
+def learn_upright(rotations: Floats, piece: Ints, neighbours: Ints) -> Upright:
+    """The model of cameras (V, 3, 3) in pieces (V,); its share is 0 unless groups (V,) of neighbours confirm it.
+
+    Pieces may be placed wrongly, so that all cameras together fit none; and cameras that turn freely may fit one by
+    chance. Groups of neighbours do neither.
+    """
+    model, nearby = _fitted(rotations, piece), _fitted(rotations, neighbours)
+    clear = nearby.share >= CLEAR_SHARE and nearby.concentration >= CLEAR_SPREAD_RAD**-2
+    return model if clear else replace(model, share=0.0)
+
+
+def _fitted(rotations: Floats, piece: Ints) -> Upright:
+    """The most probable model, by expectation and maximisation from several starts."""
+    size = np.bincount(piece)[piece]
+    enough = (size >= FEWEST) | (size == size.max())
+    rotations = rotations[enough]
+    piece = np.unique(piece[enough], return_inverse=True)[1].reshape(-1)
+    found = [_fitted_from(Upright(up, LEAST_SPREAD_RAD**-2 / 4, 0.5), rotations, piece) for up in STARTS]
+    return max(found, key=lambda each: each[0])[1]
+
+
+def _fitted_from(model: Upright, rotations: Floats, piece: Ints) -> tuple[float, Upright]:
+    """The log-likelihood, and the model that the rounds lead to."""
+    up = model.world_up(rotations, piece)
+    for _ in range(ROUNDS):
+        follows = model.following(rotations, up)
+        seen = np.einsum("nij,ni->nj", rotations, up)
+        mean = follows @ seen
+        total, length = max(float(follows.sum()), 1e-9), max(float(np.linalg.norm(mean)), 1e-12)
+        # of von Mises and Fisher's distribution the mean length is about 1 − 1 / concentration
+        spread = max(1 - length / total, 0.0) + LEAST_SPREAD_RAD**2
+        model = Upright(mean / length, 1 / spread, (total + 1) / (len(piece) + 2))
+        up = model.world_up(rotations, piece)
+    return float(model._log_density(model._cosine(rotations, up)).sum()), model
 
 
 @dataclass(frozen=True)
@@ -26,36 +179,11 @@ class SceneModel:
 
 def learn_scene_model(evidence: Evidence, found: Fit, before: SceneModel | None = None) -> SceneModel:
     """The model fitted to the poses of a solution and the edges it uses, started at `before`."""
-    joined = np.zeros((evidence.vertex_count, evidence.vertex_count), bool)
-    i, j = evidence.edges[found.used].T
+    joined = np.zeros((evidence.graph.vertex_count, evidence.graph.vertex_count), bool)
+    i, j = evidence.graph.edges[found.used].T
     joined[i, j] = joined[j, i] = True
-    joining = learn_joining(found.poses, found.component, joined, evidence.reach_m, before.joining if before else None)
-    return SceneModel(joining, learn_upright(found.poses[:, :3, :3], found.component, _neighbours(evidence, found)))
-
-
-def _neighbours(evidence: Evidence, found: Fit) -> Ints:
-    """Groups (V,) of up to NEIGHBOURS views: each grows along the edges in use that are the likeliest to be right."""
-    group = np.full(evidence.vertex_count, -1)
-    tie = _tie(evidence, found)
-    for seed in range(evidence.vertex_count):
-        if group[seed] >= 0:
-            continue
-        members: list[int] = []
-        view = seed
-        while len(members) < NEIGHBOURS:
-            group[view] = seed
-            members.append(view)
-            strongest = (tie[members] * (group < 0)).max(0)
-            view = int(np.argmax(strongest))
-            if strongest[view] <= 0:
-                break
-    return group
-
-
-def _tie(evidence: Evidence, found: Fit) -> Floats:
-    """How strongly each two views (V, V) are tied: by order and by cycles, 0 without an edge in use."""
-    i, j = evidence.edges[found.used].T
-    odds = (evidence.prior / (1 - evidence.prior) * evidence.support)[found.used]
-    tie = np.zeros((evidence.vertex_count, evidence.vertex_count))
-    np.maximum.at(tie, (i, j), odds + 1e-3)
-    return np.asarray(np.maximum(tie, tie.T))
+    joining = learn_joining(found.poses, found.piece, joined, evidence.reach_m, before.joining if before else None)
+    # consecutive views of a piece, which are placed rightly more often than all of it
+    groups = found.piece * len(found.piece) + np.arange(len(found.piece)) // NEIGHBOURS
+    groups = np.unique(groups, return_inverse=True)[1].reshape(-1)
+    return SceneModel(joining, learn_upright(found.poses[:, :3, :3], found.piece, groups))

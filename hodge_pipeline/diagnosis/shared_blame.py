@@ -22,20 +22,23 @@ class SharedBlame:
     - `cycle (E,)`: the shortest failing cycle of each such edge, and of each that was left out for it; −1 elsewhere.
     - `probability (E,)`: of being right, of an edge left out that shares the blame: by its prior among those it shares
       it with, of which one is wrong; 0 elsewhere.
+    - `undecided (E,)`: the failing cycle that is the only test of all its edges, −1 elsewhere.
     """
 
     unvouched: Bools
     cycle: Ints
     probability: Floats
+    undecided: Ints
 
 
 def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
     """Who shares the blame, in this alignment."""
-    loops, count = cycles.loops, len(evidence.edges)
+    loops, count = cycles.loops, len(evidence.graph.edges)
     row, edge = np.repeat(np.arange(len(loops)), loops.lengths), loops.edge
     untold = np.bincount(edge, cycles.closes[row], count) == 0
     untold &= ~evidence.in_no_listed_cycle
-    doubted = _in_series_with(~fit.used, evidence)
+    classes = series_classes(evidence.graph.edges, evidence.graph.vertex_count)
+    doubted = _in_series_with(~fit.used, classes)
     unvouched = fit.used & ((np.isinf(fit.resistance) & untold) | doubted)
     holds = np.bincount(row, unvouched[edge], len(loops)) > 0
     # an edge that was left out shares the blame where each of its cycles has an edge that no closing cycle confirms
@@ -47,12 +50,25 @@ def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
     probability = np.zeros(count)
     named = left_out & (cycle >= 0)  # of a large graph the longest cycles are not listed
     probability[named] = 1 - odds[named] / among[cycle[named]]
-    return SharedBlame(unvouched, cycle, probability)
+    return SharedBlame(unvouched, cycle, probability, _undecided(cycles, classes))
 
 
-def _in_series_with(chosen: Bools, evidence: Evidence) -> Bools:
+def _undecided(cycles: Cycles, classes: Ints) -> Ints:
+    """For each edge (E,) the row of the failing cycle that is the only test of all its edges, which are in series: one
+    of them is wrong, and no other cycle decides which. −1 where there is none.
+    """
+    out = np.full(len(classes), -1, np.int64)
+    failing = np.flatnonzero(~cycles.closes)
+    loops = cycles.loops.select(failing)
+    row = np.repeat(np.arange(len(loops)), loops.lengths)
+    alone = classes[loops.edge] == classes[loops.edge[loops.offsets[row]]]
+    alone = np.bincount(row, alone, len(loops)) == loops.lengths
+    out[loops.edge[alone[row]]] = failing[row[alone[row]]]
+    return out
+
+
+def _in_series_with(chosen: Bools, classes: Ints) -> Bools:
     """Edges (E,) that the same cycles pass as another one, where one of these is chosen (E,)."""
-    classes = series_classes(evidence.edges, evidence.vertex_count)
     in_class = classes >= 0
     count = int(classes.max(initial=-1)) + 1
     several = np.bincount(classes[in_class], minlength=count) > 1

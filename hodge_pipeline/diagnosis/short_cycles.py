@@ -1,4 +1,6 @@
-"""The cycles that test edges: triangles where there are any, then squares, then the shortest loops of a tree."""
+"""The cycles that test edges: triangles where there are any, then squares, then the shortest loops of a tree; which of
+them close, and which are evidence for or against each edge.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +9,16 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import flag_complex, orient_edges
 from hodge_pipeline.complex.cycles import Loops, fundamental_loops, loop_products, spanning_forest
+from hodge_pipeline.diagnosis.noise import Noise
+from hodge_pipeline.diagnosis.result import WITNESSES, Cycles
 from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS = 8
 """Of each end of an edge that are tried for a square."""
 EDGES_AT_ONCE = 20_000
 LONGEST_ENTRIES = 5_000_000
+GATE = 30.0
+"""χ² over six dimensions of a cycle that closes."""
 
 
 def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
@@ -21,14 +27,12 @@ def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     Pairs of parallel edges, triangles (thinned evenly where there are very many), squares for edges that have none
     of these, and for the rest the loops that their chords close in a breadth-first tree.
     """
-    found = [_parallel_pairs(edges, vertex_count), _triangles(edges, vertex_count, most_per_edge)]
-    covered = _covered(found, len(edges))
-    if not covered.all():
-        found.append(_squares(edges, vertex_count, np.flatnonzero(~covered)))
-        covered |= _covered(found[-1:], len(edges))
-    if not covered.all():
-        found.append(_tree_loops(edges, vertex_count, covered))
-    return _distinct(_joined(found), len(edges))
+    loops = _joined([_parallel_pairs(edges, vertex_count), _triangles(edges, vertex_count, most_per_edge)])
+    if (bare := _uncovered(loops, len(edges))).any():
+        loops = _joined([loops, _squares(edges, vertex_count, np.flatnonzero(bare))])
+    if _uncovered(loops, len(edges)).any():
+        loops = _joined([loops, _tree_loops(edges, vertex_count)])
+    return _distinct(loops, len(edges))
 
 
 def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, wanted: Bools) -> Loops:
@@ -37,7 +41,7 @@ def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, 
     Two cycles that fail over one edge make a third without it, which may be the only one that closes.
     """
     rows = np.flatnonzero(chosen)
-    more = _tree_loops(edges[rows], vertex_count, np.zeros(len(rows), bool))
+    more = _tree_loops(edges[rows], vertex_count)
     more = Loops(more.offsets, rows[more.edge], more.sign)
     passes = np.add.reduceat(wanted[more.edge], more.offsets[:-1]) > 0 if len(more) else np.zeros(0, bool)
     return _distinct(_joined([loops, more.select(np.flatnonzero(passes))]), len(edges))
@@ -68,11 +72,10 @@ def _middles(loops: Loops, i_from_j: Floats) -> Floats:
     return total / np.maximum(np.minimum(lengths, 4), 1)[:, None]
 
 
-def _covered(found: list[Loops], edge_count: int) -> Bools:
-    covered = np.zeros(edge_count, bool)
-    for loops in found:
-        covered[loops.edge] = True
-    return covered
+def _uncovered(loops: Loops, edge_count: int) -> Bools:
+    out = np.ones(edge_count, bool)
+    out[loops.edge] = False
+    return out
 
 
 def _joined(found: list[Loops]) -> Loops:
@@ -113,35 +116,38 @@ def _parallel_pairs(edges: Ints, vertex_count: int) -> Loops:
 def _triangles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     """Triangles of the first of parallel edges, thinned by a stride where an edge would be in too many."""
     complex_ = flag_complex(edges, vertex_count)
-    corners, measured = complex_.simplices[2], _first_measured(edges, vertex_count)
-    limit = max(most_per_edge * len(measured) // 3, 1)
-    corners = corners[:: max(-(-len(corners) // limit), 1)]
-    sides = [complex_.rows_of(corners[:, pair]) for pair in ([0, 1], [1, 2], [0, 2])]
-    edge = np.stack([measured[side] for side in sides], axis=1)
-    forward = np.where(edges[edge, 0] < edges[edge, 1], 1, -1)
-    return _of_equal_length(edge, forward * np.array([1, 1, -1]))
+    corners = complex_.simplices[2]
+    limit = max(most_per_edge * len(complex_.simplices[1]) // 3, 1)
+    return _along(corners[:: max(-(-len(corners) // limit), 1)], edges, vertex_count)
 
 
-def _first_measured(edges: Ints, vertex_count: int) -> Ints:
-    """The first measured edge of each edge of the simple graph."""
-    oriented = orient_edges(edges, vertex_count)
-    first = np.full(len(oriented.edges), -1, np.int64)
-    real = np.flatnonzero(oriented.row >= 0)[::-1]
-    first[oriented.row[real]] = real
-    return first
+def _along(corners: Ints, edges: Ints, vertex_count: int) -> Loops:
+    """The loops that pass corners (N, K) in order along the first of parallel edges, where all are joined."""
+    simple = orient_edges(edges, vertex_count)
+    real = np.flatnonzero(simple.row >= 0)
+    measured = real[np.unique(simple.row[real], return_index=True)[1]]
+    keys = simple.edges @ [vertex_count, 1]
+    sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=2), axis=2) @ [vertex_count, 1]
+    place = np.minimum(np.searchsorted(keys, sides), len(keys) - 1)
+    joined = (keys[place] == sides).all(axis=1)
+    edge = measured[place[joined]]
+    return _of_equal_length(edge, np.where(edges[edge, 0] == corners[joined], 1, -1))
 
 
 def _squares(edges: Ints, vertex_count: int, wanted: Ints) -> Loops:
     """Cycles i–j–b–a–i for the wanted edges (i, j), over some neighbours a of i and b of j."""
-    oriented = orient_edges(edges, vertex_count)
-    measured = _first_measured(edges, vertex_count)
-    neighbours = _some_neighbours(oriented.edges, vertex_count)
-    keys = oriented.edges[:, 0] * vertex_count + oriented.edges[:, 1]
-    parts = [
-        _squares_of(edges, wanted[start : start + EDGES_AT_ONCE], neighbours, keys, measured, vertex_count)
-        for start in range(0, len(wanted), EDGES_AT_ONCE)
-    ]
-    return _joined([_of_equal_length(np.zeros((0, 4), np.int64), np.zeros((0, 4), np.int64)), *parts])
+    neighbours = _some_neighbours(orient_edges(edges, vertex_count).edges, vertex_count)
+    found = []
+    for start in range(0, len(wanted), EDGES_AT_ONCE):
+        rows = np.repeat(wanted[start : start + EDGES_AT_ONCE], NEIGHBOURS**2)
+        i, j = edges[rows].T
+        a, b = (
+            neighbours[i, np.arange(len(rows)) // NEIGHBOURS % NEIGHBOURS],
+            neighbours[j, np.arange(len(rows)) % NEIGHBOURS],
+        )
+        possible = (a >= 0) & (b >= 0) & (a != j) & (b != i) & (a != b) & (i != j)
+        found.append(_along(np.stack([i, j, b, a], axis=1)[possible], edges, vertex_count))
+    return _joined(found)
 
 
 def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
@@ -156,33 +162,61 @@ def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
     return out
 
 
-def _squares_of(edges: Ints, rows: Ints, neighbours: Ints, keys: Ints, measured: Ints, count: int) -> Loops:
-    i, j = edges[rows].T
-    a = np.repeat(neighbours[i], NEIGHBOURS, axis=1).ravel()
-    b = np.tile(neighbours[j], (1, NEIGHBOURS)).ravel()
-    row, i, j = (np.repeat(x, NEIGHBOURS**2) for x in (rows, i, j))
-    possible = (a >= 0) & (b >= 0) & (a != j) & (b != i) & (a != b) & (i != j)
-    row, i, j, a, b = (x[possible] for x in (row, i, j, a, b))
-    across = _row_of_pair(b, a, keys, count)
-    there = across >= 0
-    row, i, j, a, b, across = (x[there] for x in (row, i, j, a, b, across))
-    sides = np.stack([row, measured[_row_of_pair(j, b, keys, count)], measured[across]], axis=1)
-    edge = np.column_stack([sides, measured[_row_of_pair(a, i, keys, count)]])
-    tails = np.stack([i, j, b, a], axis=1)
-    return _of_equal_length(edge, np.where(edges[edge, 0] == tails, 1, -1))
-
-
-def _row_of_pair(a: Ints, b: Ints, keys: Ints, count: int) -> Ints:
-    key = np.minimum(a, b) * count + np.maximum(a, b)
-    place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
-    return np.where(keys[place] == key, place, -1)
-
-
-def _tree_loops(edges: Ints, vertex_count: int, covered: Bools) -> Loops:
-    """The loops of uncovered chords; where tree edges stay uncovered, of all chords, if they are not too long."""
+def _tree_loops(edges: Ints, vertex_count: int) -> Loops:
+    """The loops of the chords of a tree, the shortest of them, as long as together they are not too long."""
     forest = spanning_forest(edges, vertex_count)
     chords = forest.chords[edges[forest.chords, 0] != edges[forest.chords, 1]]
     depth = forest.depth[edges[chords]].sum(axis=1)
     affordable = np.cumsum(np.sort(depth + 1)) <= LONGEST_ENTRIES
     order = np.argsort(depth, kind="stable")[affordable]
     return fundamental_loops(forest, chords[np.sort(order)])
+
+
+def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
+    """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
+    row = _rows(loops)
+    turn = np.bincount(row, noise.rotation_rad[loops.edge] ** 2, len(loops))
+    shift = np.bincount(row, noise.translation_m[loops.edge] ** 2, len(loops))
+    swing = turn * (reach_m * loops.lengths) ** 2 / 12
+    chi2 = angle**2 / np.maximum(turn, 1e-300) + displacement_m**2 / np.maximum(shift + swing, 1e-300)
+    return Cycles(loops, angle, displacement_m, chi2, chi2 < GATE)
+
+
+def usual_share(cycles: Cycles) -> float:
+    """The share of right edges, estimated from the share of closing cycles; 1 where there is no cycle.
+
+    A cycle closes where all its edges are right: p to the power of its length.
+    """
+    if not len(cycles.loops):
+        return 1.0
+    closing = float(cycles.closes.mean())
+    return float(max(closing, 1 / (len(cycles.loops) + 1)) ** (1 / float(cycles.loops.lengths.mean())))
+
+
+def closing_support(cycles: Cycles, prior: Floats) -> Floats:
+    """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
+    row, edge = _rows(cycles.loops), cycles.loops.edge
+    total = np.bincount(row, np.log(prior[edge]), len(cycles.loops))
+    others = np.exp(total[row] - np.log(prior[edge]))
+    strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)[row]
+    return np.bincount(edge, strength * others, len(prior)).astype(float)
+
+
+def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
+    """For each edge (E, 3) the closing, or failing, cycles whose other edges are the likeliest; −1 for none."""
+    wanted = np.flatnonzero(cycles.closes == closing)
+    loops = cycles.loops.select(wanted)
+    row, edge = _rows(loops), loops.edge
+    logs = np.log(np.clip(np.nan_to_num(probability, nan=0.5), 1e-3, 1.0))
+    others = np.bincount(row, logs[edge], len(loops))[row] - logs[edge]
+    order = np.lexsort((row, -others, edge))
+    ranked = edge[order]
+    rank = np.arange(len(order)) - np.searchsorted(ranked, ranked)
+    out = np.full((len(probability), WITNESSES), -1, np.int64)
+    top = rank < WITNESSES
+    out[ranked[top], rank[top]] = wanted[row[order[top]]]
+    return out
+
+
+def _rows(loops: Loops) -> Ints:
+    return np.repeat(np.arange(len(loops)), loops.lengths)

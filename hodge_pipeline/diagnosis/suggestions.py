@@ -56,30 +56,23 @@ def suggest_pairs(
     that were `tried` in vain are left out.
     """
     count, kept = graph.vertex_count, np.flatnonzero(diagnosis.kept)
-    joined = _adjacency(graph.edges[kept], count)
-    inside = np.concatenate([_missing_sides(joined), _near(diagnosis)]) if overlapping is None else overlapping
-    inside = inside[diagnosis.piece[inside[:, 0]] == diagnosis.piece[inside[:, 1]]]
-    pairs = np.concatenate([inside, _across_pieces(diagnosis.piece)])
+    if overlapping is None:
+        overlapping = np.concatenate([_missing_sides(graph.edges[kept], count), _near(diagnosis)])
+    inside = diagnosis.piece[overlapping[:, 0]] == diagnosis.piece[overlapping[:, 1]]
+    pairs = np.concatenate([overlapping[inside], _across_pieces(diagnosis.piece)])
     low, high = np.sort(pairs, axis=1).T
     keys = np.unique(low * count + high)
     pairs = np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     registered = graph.edges if tried is None else np.concatenate([graph.edges, tried])
     pairs = pairs[~_contains(registered, pairs, count)]
-    gains = _Gains.of(graph.edges[kept], graph.edges[diagnosis.verdict == UNTESTABLE], pairs, count)
-    return _best_first(pairs, gains, most)
+    return _best_first(pairs, graph.edges[kept], graph.edges[diagnosis.verdict == UNTESTABLE], count, most)
 
 
-def _adjacency(edges: Ints, count: int) -> csr_matrix:
-    proper = edges[edges[:, 0] != edges[:, 1]]
-    ends = np.concatenate([proper, proper[:, ::-1]])
-    matrix = csr_matrix((np.ones(len(ends), np.int32), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    matrix.data[:] = 1
-    return matrix
-
-
-def _missing_sides(joined: csr_matrix) -> Ints:
+def _missing_sides(edges: Ints, count: int) -> Ints:
     """Pairs (N, 2), i < j, with a common neighbour; they may be joined themselves."""
+    ends = np.concatenate([edges, edges[:, ::-1]])
+    joined = csr_matrix((np.ones(len(ends), np.int32), (ends[:, 0], ends[:, 1])), shape=(count, count))
     twice = (joined @ joined).tocoo()
     above = twice.row < twice.col
     return np.stack([twice.row[above], twice.col[above]], axis=1).astype(np.int64)
@@ -104,88 +97,63 @@ def _across_pieces(piece: Ints) -> Ints:
 
 
 def _contains(edges: Ints, pairs: Ints, count: int) -> Bools:
-    low, high = np.sort(edges, axis=1).T
-    return np.isin(pairs[:, 0] * count + pairs[:, 1], low * count + high)
+    wanted, there = (np.sort(each, axis=1) @ [count, 1] for each in (pairs, edges))
+    return np.isin(wanted, there)
 
 
-class _Gains:
-    """What an edge of each pair would add to the kept edges and to the pairs taken so far."""
-
-    def __init__(self, joined: csr_matrix, untestable: csr_matrix, network: Network, pairs: Ints) -> None:
-        self._joined, self._untestable, self._network, self._pairs = joined, untestable, network, pairs
-        self._taken: list[Floats] = []
-        self.resistance = network.between(pairs)
-        self.tests = self._tested(np.arange(len(pairs)))
-
-    @classmethod
-    def of(cls, kept: Ints, untestable: Ints, pairs: Ints, count: int) -> _Gains:
-        """Those of these pairs beside the kept edges."""
-        return cls(_adjacency(kept, count), _adjacency(untestable, count), Network.of(kept, count), pairs)
-
-    @property
-    def score(self) -> Floats:
-        """Nats of each pair."""
-        count = self._joined.shape[0]
-        finite_resistance = np.where(np.isfinite(self.resistance), self.resistance, count)
-        return np.asarray(np.log1p(finite_resistance) + TESTED_GAIN * self.tests)
-
-    def take(self, row: int) -> None:
-        """Count the pair among the edges: the variances fall by what it holds, and what it tests is tested."""
-        i, j = self._pairs[row].tolist()
-        if self.tests[row]:
-            self._test(i, j)
-        if np.isfinite(self.resistance[row]):
-            # L⁺ loses z zᵀ, z = L⁺ b / √(1 + bᵀ L⁺ b), by each pair taken (Sherman and Morrison 1950)
-            held = self._network.potentials(i, j)
-            for before in self._taken:
-                held -= before * (before[i] - before[j])
-            held /= np.sqrt(1 + self.resistance[row])
-            self._taken.append(held)
-            falls = (held[self._pairs[:, 0]] - held[self._pairs[:, 1]]) ** 2
-            self.resistance = np.maximum(self.resistance - falls, 0.0)
-
-    def _test(self, i: int, j: int) -> None:
-        untestable, joined = self._untestable.tolil(), self._joined
-        touched = {i, j}
-        for a, b in ((i, j), (j, i)):
-            for k in self._untestable[a].multiply(joined[b]).indices.tolist():
-                untestable[a, k] = untestable[k, a] = 0
-                untestable[b, k] = untestable[k, b] = 0
-                touched.add(k)
-        self._untestable = untestable.tocsr()
-        self._untestable.eliminate_zeros()
-        again = np.flatnonzero(np.isin(self._pairs, list(touched)).any(axis=1))
-        self.tests[again] = self._tested(again)
-
-    def _tested(self, rows: Ints) -> Ints:
-        """How many untestable edges would have a triangle with each pair (K,) and one joined side."""
-        if not self._untestable.nnz or not len(rows):
-            return np.zeros(len(rows), np.int64)
-        i, j = self._pairs[rows].T
-        # a common neighbour k over one untestable and one joined edge; both untestable counts both
-        through = np.asarray(self._untestable[i].multiply(self._joined[j]).sum(axis=1)).ravel()
-        through += np.asarray(self._joined[i].multiply(self._untestable[j]).sum(axis=1)).ravel()
-        return np.asarray(through, np.int64)
-
-
-def _best_first(pairs: Ints, gains: _Gains, most: int) -> Suggestions:
-    """The pair that adds most, then the one that adds most to it, and so on; none whose views were named too often."""
-    named = np.zeros(int(pairs.max(initial=-1)) + 1, np.int64)
-    free = np.ones(len(pairs), bool)
+def _best_first(pairs: Ints, kept: Ints, untestable: Ints, count: int, most: int) -> Suggestions:
+    """The pair that adds most to the kept edges, then the one that adds most to both, and so on; none whose views were
+    named too often.
+    """
+    network = Network.of(kept, count)
+    resistance, taken = network.between(pairs), list[Floats]()
+    pair, edge = _triangles(pairs, untestable, kept, count)
+    is_open, free, named = np.ones(len(untestable)), np.ones(len(pairs), bool), np.zeros(count, np.int64)
     rows: list[int] = []
-    gained: list[tuple[float, float, int]] = []
+    gained: list[tuple[float, float, float]] = []
     while free.any() and len(rows) < most:
-        score = np.where(free, gains.score, -np.inf)
-        row = int(np.argmax(score))
+        tests = np.bincount(pair, is_open[edge], len(pairs))
+        score = np.log1p(np.where(np.isfinite(resistance), resistance, count)) + TESTED_GAIN * tests
+        row = int(np.argmax(np.where(free, score, -np.inf)))
         rows.append(row)
-        gained.append((float(score[row]), float(gains.resistance[row]), int(gains.tests[row])))
+        gained.append((float(score[row]), float(resistance[row]), float(tests[row])))
         named[pairs[row]] += 1
         free[row] = False
         free &= (named[pairs] < EACH_VERTEX).all(axis=1)
-        gains.take(row)
+        is_open[edge[pair == row]] = 0
+        if np.isfinite(resistance[row]):
+            resistance = _with_pair(network, taken, pairs, row, resistance)
     score, resistance, tests = np.array(gained, float).reshape(-1, 3).T
     reason = np.array(_reasons(resistance, tests.astype(np.int64)), dtype=np.str_)
     return Suggestions(pairs[np.array(rows, np.int64)], score, resistance, tests.astype(np.int64), reason)
+
+
+def _triangles(pairs: Ints, untestable: Ints, kept: Ints, count: int) -> tuple[Ints, Ints]:
+    """Rows of pairs and of untestable edges that would be sides of one triangle, whose third side is kept."""
+    found = [np.zeros((2, 0), np.int64)]
+    for i, j in (pairs.T, pairs.T[::-1]):
+        for a, k in (untestable.T, untestable.T[::-1]):
+            rows = np.stack((_one_of_each(i, count) @ _one_of_each(a, count).T).nonzero()).astype(np.int64)
+            found.append(rows[:, _contains(kept, np.stack([j[rows[0]], k[rows[1]]], axis=1), count)])
+    pair, edge = np.concatenate(found, axis=1)
+    return pair, edge
+
+
+def _one_of_each(columns: Ints, count: int) -> csr_matrix:
+    ones = np.ones(len(columns), np.int32)
+    return csr_matrix((ones, (np.arange(len(columns)), columns)), shape=(len(columns), count))
+
+
+def _with_pair(network: Network, taken: list[Floats], pairs: Ints, row: int, resistance: Floats) -> Floats:
+    """The resistances (P,) with one pair more among those `taken`: variances fall by what it holds."""
+    # L⁺ loses z zᵀ, z = L⁺ b / √(1 + bᵀ L⁺ b), by each pair taken (Sherman and Morrison 1950)
+    i, j = pairs[row].tolist()
+    held = network.potentials(i, j)
+    for before in taken:
+        held -= before * (before[i] - before[j])
+    held /= np.sqrt(1 + resistance[row])
+    taken.append(held)
+    return np.maximum(resistance - (held[pairs[:, 0]] - held[pairs[:, 1]]) ** 2, 0.0)
 
 
 def _reasons(resistance: Floats, tests: Ints) -> tuple[str, ...]:

@@ -21,11 +21,15 @@ NO_NEIGHBOUR_M = 0.1
 
 @dataclass(frozen=True)
 class DistanceBlock:
-    """Pairs (P, 2) sorted by their first cloud, and their motions `i_from_j (S, P, 4, 4)` in S sets of poses."""
+    """Pairs (P, 2) sorted by their first cloud, and their motions `i_from_j (S, P, 4, 4)` in S sets of poses.
+
+    `scale`: what the reach is taken times, for scenes that are no rooms.
+    """
 
     clouds_folder: Path
     pairs: Ints
     i_from_j: Floats
+    scale: float = 1.0
 
 
 def block_distances(block: DistanceBlock) -> Floats:
@@ -36,7 +40,7 @@ def block_distances(block: DistanceBlock) -> Floats:
     clouds = CloudSet.open(block.clouds_folder)
     out = np.full(block.i_from_j.shape[:2], np.nan)
     for i, columns in _columns_by_target(block.pairs):
-        plane = TargetPlanes(clouds[i])
+        plane = TargetPlanes(clouds[i], block.scale)
         for column in columns:
             points_in_j = clouds[int(block.pairs[column, 1])].points_in_cam.astype(np.float64)
             out[:, column] = [plane.distance(points_in_j, motion) for motion in block.i_from_j[:, column]]
@@ -51,30 +55,31 @@ def _columns_by_target(pairs: Ints) -> Iterator[tuple[int, list[int]]]:
 class TargetPlanes:
     """Cloud i with its search tree, ready to be measured against many clouds."""
 
-    def __init__(self, cloud: PointCloud) -> None:
+    def __init__(self, cloud: PointCloud, scale: float = 1.0) -> None:
         if cloud.normals_in_cam is None:
             raise ValueError("the cloud has no normals, and the distance is measured along them")
+        self.reach_m, self.nothing_m = scale * REACH_M, scale * NO_NEIGHBOUR_M
         self.points: Floats = cloud.points_in_cam.astype(np.float64)
         self.normals: Floats = cloud.normals_in_cam.astype(np.float64)
         # small_gicp takes 2.9 ms for a pair of clouds of 7500 points, scipy's tree 4.0 ms.
         self.tree = small_gicp.KdTree(self.points) if len(self.points) else None
         if len(self.points):
-            self.low, self.high = self.points.min(axis=0) - REACH_M, self.points.max(axis=0) + REACH_M
+            self.low, self.high = self.points.min(axis=0) - self.reach_m, self.points.max(axis=0) + self.reach_m
 
     def distance(self, points_in_j: Floats, i_from_j: Floats) -> float:
-        """Mean |n·(p − q)| in metres over the points within reach; 0.1 m when there is none."""
+        """Mean |n·(p − q)| in metres over the points within reach; 0.1 m, times the scale, when there is none."""
         if not np.isfinite(i_from_j).all():
             return float("nan")
         if self.tree is None or not len(points_in_j):
-            return NO_NEIGHBOUR_M
+            return self.nothing_m
         points = points_in_j @ i_from_j[:3, :3].T + i_from_j[:3, 3]
         points = points[((points >= self.low) & (points <= self.high)).all(axis=1)]
         if not len(points):
-            return NO_NEIGHBOUR_M
+            return self.nothing_m
         nearest, squared = self.tree.batch_knn_search(points, 1)
-        reached = squared[:, 0] <= REACH_M**2
+        reached = squared[:, 0] <= self.reach_m**2
         if not reached.any():
-            return NO_NEIGHBOUR_M
+            return self.nothing_m
         rows = nearest[reached, 0].astype(np.intp)
         along_normal = np.einsum("ij,ij->i", self.normals[rows], points[reached] - self.points[rows])
         return float(np.abs(along_normal).mean())

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hodge_pipeline.evaluation.scaled_scores import scaled_score_table
-from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.evaluation.scores import ScoreTable, score_table
 from hodge_pipeline.scene import Round, has_truth, pose_sets, true_poses
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.types import CloudSet, Floats, Source
@@ -26,4 +25,4 @@ def evaluate(
 ) -> ScoreTable:
     """Step: the scores of each set of poses (K, 4, 4), on the pairs that overlap under the reference."""
     assert clouds.folder is not None
-    return scaled_score_table(clouds.folder, sets, reference, workers, scale, step.folder / "scaled")
+    return score_table(clouds.folder, sets, reference, workers, scale=scale)

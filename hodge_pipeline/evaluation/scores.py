@@ -38,12 +38,12 @@ PAIRS_PER_BLOCK = 96
 """About half a second of work: long against the cost of sending a block, short against a whole run."""
 
 
-def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind) -> Ints:
+def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind, scale: float = 1.0) -> Ints:
     """The edges (P, 2), i < j and sorted, on which poses are scored: near centroids, or overlapping voxels.
 
     `distance`: centroids closer than 0.2 m in the world. `iou`: intersection over union of the occupied 0.1 m voxels of
     the world above 0.5. A frame without points, or whose pose (4, 4) is not finite, has no edges. Of more than 500
-    frames the edges of 500 are found, evenly spread.
+    frames the edges of 500 are found, evenly spread. Lengths are taken times `scale`.
     """
     if len(clouds) != len(world_from_cam):
         raise GraphError(f"{len(clouds)} clouds but {len(world_from_cam)} poses: give one pose for each cloud")
@@ -54,7 +54,7 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind) 
         return np.zeros((0, 2), np.int64)
     find = _near_centroids if kind == "distance" else _overlapping_voxels
     some = some_of(np.arange(len(usable)), MOST_FRAMES)
-    found = find([clouds[int(row)] for row in usable], world_from_cam[usable], some)
+    found = find([clouds[int(row)] for row in usable], world_from_cam[usable], some, scale)
     clouds.forget()
     pairs = np.unique(np.sort(found[found[:, 0] != found[:, 1]], axis=1), axis=0)
     return np.asarray(usable[pairs], np.int64)
@@ -65,19 +65,19 @@ def has_pose(world_from_cam: Floats) -> Bools:
     return np.asarray(np.isfinite(world_from_cam).all(axis=(-1, -2)))
 
 
-def _near_centroids(clouds: Sequence[PointCloud], world_from_cam: Floats, some: Ints) -> Ints:
+def _near_centroids(clouds: Sequence[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:
     """Pairs (P, 2) of one of `some` rows and any row."""
     means = np.array([cloud.points_in_cam.mean(axis=0, dtype=float) for cloud in clouds])
     centroids = np.einsum("nij,nj->ni", world_from_cam[:, :3, :3], means) + world_from_cam[:, :3, 3]
     near = cKDTree(centroids[some]).sparse_distance_matrix(
-        cKDTree(centroids), CENTROID_DISTANCE_M, output_type="ndarray"
+        cKDTree(centroids), scale * CENTROID_DISTANCE_M, output_type="ndarray"
     )
     return np.stack([some[near["i"]], near["j"]], axis=1)
 
 
-def _overlapping_voxels(clouds: Sequence[PointCloud], world_from_cam: Floats, some: Ints) -> Ints:
+def _overlapping_voxels(clouds: Sequence[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:
     """Pairs (P, 2) of one of `some` rows and any row."""
-    iou = pairwise_iou(clouds, world_from_cam, IOU_VOXEL_M, above=IOU, partners=some).tocoo()
+    iou = pairwise_iou(clouds, world_from_cam, scale * IOU_VOXEL_M, above=IOU, partners=some).tocoo()
     return np.stack([iou.row, iou.col], axis=1)
 
 
@@ -89,19 +89,26 @@ def some_of(pairs: Ints, most: int) -> Ints:
 
 
 def edge_distances(
-    clouds_folder: Path, pairs: Ints, world_from_cam: Floats, workers: Workers, advance: Advance = no_progress
+    clouds_folder: Path,
+    pairs: Ints,
+    world_from_cam: Floats,
+    workers: Workers,
+    advance: Advance = no_progress,
+    *,
+    scale: float = 1.0,
 ) -> Floats:
     """The distance d (..., P) in metres of each pair, under each set of poses (..., N, 4, 4).
 
     `d_ij` is the mean |n·(p − q)| over the points p of cloud j whose nearest neighbour q in cloud i is within 0.1 m, n
     the normal of cloud i; 0.1 m when there is none, NaN where a pose is not finite. `clouds_folder` is what
-    `CloudSet.save` wrote. Several sets at once share the search trees. `advance` counts pairs.
+    `CloudSet.save` wrote. Several sets at once share the search trees. `advance` counts pairs. The 0.1 m
+    are taken times `scale`.
     """
     poses = world_from_cam.reshape(-1, *world_from_cam.shape[-3:])
     distances = np.full((len(poses), len(pairs)), np.nan)
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))
     cuts = [order[start : start + PAIRS_PER_BLOCK] for start in range(0, len(order), PAIRS_PER_BLOCK)]
-    blocks = [DistanceBlock(clouds_folder, pairs[cut], _relative(poses, pairs[cut])) for cut in cuts]
+    blocks = [DistanceBlock(clouds_folder, pairs[cut], _relative(poses, pairs[cut]), scale) for cut in cuts]
     for block, found in workers.map(block_distances, blocks):
         distances[:, cuts[block]] = found
         advance(len(cuts[block]))
@@ -179,18 +186,23 @@ def score_table(
     advance: Advance = no_progress,
     *,
     kinds: tuple[GraphKind, ...] = GRAPH_KINDS,
+    scale: float = 1.0,
 ) -> ScoreTable:
     """Every set of poses (N, 4, 4), scored on the graphs of the one that `reference` names.
 
     Of a graph with more than 1500 pairs so many are taken, evenly. Pairs that both graphs share are measured
-    once. Give the ground truth as the reference where there is one, else the result.
+    once. Give the ground truth as the reference where there is one, else the result. Lengths are times `scale`, for
+    scenes that are no rooms.
     """
     if reference not in pose_sets:
         raise GraphError(f"reference poses {reference!r} are not among {', '.join(pose_sets)}")
     clouds = CloudSet.open(clouds_folder)
-    graphs = [some_of(evaluation_pairs(clouds, pose_sets[reference], kind), MOST_PAIRS) for kind in kinds]
+    graphs = [some_of(evaluation_pairs(clouds, pose_sets[reference], kind, scale), MOST_PAIRS) for kind in kinds]
     union, rank = np.unique(np.concatenate(graphs), axis=0, return_inverse=True)
-    distances = edge_distances(clouds_folder, union, np.stack(list(pose_sets.values())), workers, advance)
+    poses = np.stack(list(pose_sets.values()))
+    distances = edge_distances(clouds_folder, union, poses, workers, advance, scale=scale)
     columns = np.split(rank.reshape(-1), np.cumsum([len(pairs) for pairs in graphs])[:-1])
-    scored = (GraphScores(*row) for row in zip(kinds, graphs, (distances[:, c] for c in columns), strict=True))
+    scored = (
+        GraphScores(kind, pairs, distances[:, c], scale) for kind, pairs, c in zip(kinds, graphs, columns, strict=True)
+    )
     return ScoreTable(tuple(pose_sets), reference, tuple(scored))

@@ -142,5 +142,5 @@ def _said(factor: float, voxel_m: float) -> str:
         f"the scans are {size} than a room: all lengths of the recipe are taken times {factor:g} (clouds.voxel_m is "
         f"{voxel_m * factor:.3g} m); scale=1 leaves them as they are"
     )
-    millimetres = "; if their unit is the millimetre, set source.reader.units_per_metre=1000"
-    return text + (millimetres if factor > 100 else "")
+    millimetres = "if their unit is the millimetre, set source.reader.units_per_metre=1000; else "
+    return (millimetres if factor > 100 else "") + text

@@ -11,8 +11,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.complex.parts import ComplexOptions
-from hodge_pipeline.diagnosis.options import DiagnosisOptions, SolveWith
-from hodge_pipeline.diagnosis.suggestion_options import SuggestionOptions
+from hodge_pipeline.diagnosis.options import DiagnosisOptions, SolveWith, SuggestionOptions
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.pairs.held_out import GuardOptions
 from hodge_pipeline.recipe import binding, recipe_file

@@ -95,11 +95,10 @@ def _between_bodies(model: TrackedModel, graph: ViewGraph, images: Ints) -> View
     """`B_i Z B_j⁻¹` for the bodies that carry the images; the information is carried over by the adjoint."""
     rows = images[graph.edges]
     cam_from_body = se3.inverse(model.body_from_cam[rows[:, 1]])
-    adjoint = se3.adjoint(cam_from_body)
     return replace(
         graph,
         vertex_ids=np.array(model.body_names),
         edges=model.body_of_frame[rows].reshape(-1, 2),
         i_from_j=model.body_from_cam[rows[:, 0]] @ graph.i_from_j @ cam_from_body,
-        information=np.swapaxes(adjoint, 1, 2) @ graph.information @ adjoint,
+        information=se3.pull_back(cam_from_body, graph.information),
     )

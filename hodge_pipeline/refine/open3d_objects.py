@@ -59,8 +59,7 @@ def graph_of(pose_graph: PoseGraph) -> tuple[ViewGraph, Floats]:
         raise GraphError(f"an edge names a node that is not among the {len(poses)}: mend the pose graph")
     motions = np.array([np.asarray(edge.transformation, float) for edge in edges]).reshape(-1, 4, 4)
     information = np.array([np.asarray(edge.information, float) for edge in edges]).reshape(-1, 6, 6)
-    adjoint = se3.adjoint(motions)  # Open3D's information is of a perturbation on the left: ξ_left = Ad ξ_right
-    ours = np.swapaxes(adjoint, -1, -2) @ information @ adjoint
+    ours = se3.pull_back(motions, information)  # Open3D's information is of a perturbation on the left
     ours = (ours + np.swapaxes(ours, -1, -2)) / 2
     return ViewGraph.from_edges(np.arange(len(poses)), pairs, motions, ours, source="open3d"), poses
 

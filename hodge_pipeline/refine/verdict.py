@@ -11,8 +11,7 @@ import numpy as np
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
-from hodge_pipeline.evaluation.scaled_scores import scaled_distances
-from hodge_pipeline.evaluation.scores import SIGMA_M
+from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
 from hodge_pipeline.pairs.held_out import held_out_pairs
 from hodge_pipeline.refine.guard import Decision, Measure, decide
 from hodge_pipeline.refine.uncertainty import change, mean_chi2
@@ -91,24 +90,24 @@ def _held_out(work: Work, rounds: Sequence[Round], before: Floats) -> list[Measu
         return []
     scale = float(work.recipe.scale)
     distances = work.steps.step(
-        held_out_distances, work.scene.clouds, pairs, np.stack([before, after]), scale, title="guard",
+        held_out_distances_m, work.scene.clouds, pairs, np.stack([before, after]), scale, title="guard",
         workers=work.workers,
     )  # fmt: skip
-    scores = np.exp(-distances / SIGMA_M)
+    scores = np.exp(-distances / (scale * SIGMA_M))
     error = float((scores[1] - scores[0]).std() / np.sqrt(len(pairs)))
     tolerance = max(SIGMAS * error, LEAST_TOLERANCE)
-    mean_mm, mean = distances.mean(axis=1) * scale * 1000, scores.mean(axis=1)
+    mean_mm, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_mm[0]:.3g} mm apart before, {mean_mm[1]:.3g} mm after"
     work.steps.note(Note("held out", len(pairs), apart))
     return [Measure("score of held-out edges", float(mean[0]), float(mean[1]), "higher", tolerance)]
 
 
-def held_out_distances(
+def held_out_distances_m(
     clouds: CloudSet, pairs: Ints, pose_sets: Floats, scale: float, *, workers: Workers, step: Step
 ) -> Floats:
-    """Step: how far apart (S, P) the clouds of pairs lie, in units of `scale`, under sets of poses (S, K, 4, 4)."""
+    """Step: how far apart (S, P) the clouds of pairs lie, metres, under sets of poses (S, K, 4, 4)."""
     assert clouds.folder is not None
-    return scaled_distances(clouds.folder, pairs, pose_sets, workers, scale, step.folder / "scaled")
+    return edge_distances(clouds.folder, pairs, pose_sets, workers, scale=scale)
 
 
 def _write(work: Work, folder: Path, decision: Decision, last: Round) -> Path | None:

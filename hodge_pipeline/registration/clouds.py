@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -112,6 +113,11 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), odd)
 
 
+def landmarks_of(options: CloudOptions, frames: Sequence[Frame]) -> list[Landmarks]:
+    """The landmarks of each frame of a block."""
+    return [_landmarks(frame, options) for frame in frames]
+
+
 def _landmarks(frame: Frame, options: CloudOptions) -> Landmarks:
     """The frame's landmarks; none where they are not wanted, or it has no image that can be read."""
     if not options.landmarks:
@@ -141,10 +147,10 @@ def prepare_clouds(
     if not any(counts.points for _, counts in results):
         reason = odd[0] if odd else "the source has no frames"
         raise SourceError(f"none of the {len(frames)} frames gave a point cloud; the first: {reason}")
-    return CloudSet.from_clouds([cloud for cloud, _ in results]), _shortened(odd)
+    return CloudSet.from_clouds([cloud for cloud, _ in results]), shortened(odd)
 
 
-def _shortened(odd: Sequence[Oddity]) -> tuple[str, ...]:
+def shortened(odd: Sequence[Oddity]) -> tuple[str, ...]:
     """A note for each oddity: of many with the same `what` the first ones, and how many more there are."""
     alike: dict[str, list[Oddity]] = {}
     for one in odd:
@@ -207,27 +213,42 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
 
 
 def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
-    """Points of a scanner, which sees all round: its range is the distance, not the depth, 0 for no return."""
-    points = np.asarray(cloud.points_in_cam, np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):
-        ranges = np.linalg.norm(points, axis=1)
-    kept = (ranges > 0) & (ranges >= options.min_range_m) & (ranges <= options.max_range_m)
-    colours = cloud.colours if options.colours else None
-    if not kept.all():  # a copy of what may be large
-        points, colours = points[kept], None if colours is None else colours[kept]
-    why_none = "" if kept.any() else _out_of_range(ranges, options)
-    return _Samples(points, colours, len(kept), why_none=why_none)
+    kept = in_range(cloud, options)
+    colours = kept.colours if options.colours else None
+    why_none = "" if len(kept) else out_of_range(cloud, options)
+    return _Samples(np.asarray(kept.points_in_cam, np.float32), colours, len(cloud), why_none=why_none)
 
 
-def _out_of_range(ranges: Floats32, options: CloudOptions) -> str:
+def in_range(cloud: PointCloud, options: CloudOptions) -> PointCloud:
+    """The points in range of a scanner, which sees all round: by distance, not by depth, 0 for no return."""
+    ranges = _ranges(cloud)
+    kept = (ranges > 0) & (ranges >= options.min_range_m) & (ranges <= options.max_range_m)  # false for NaN
+    if kept.all():  # no copy of what may be large
+        return cloud
+    return replace(
+        cloud,
+        points_in_cam=cloud.points_in_cam[kept],
+        normals_in_cam=None if cloud.normals_in_cam is None else cloud.normals_in_cam[kept],
+        colours=None if cloud.colours is None else cloud.colours[kept],
+        times_s=None if cloud.times_s is None else cloud.times_s[kept],
+    )
+
+
+def out_of_range(cloud: PointCloud, options: CloudOptions) -> str:
     """What to do about points none of which is in range: scanners store millimetres as often as metres."""
-    finite = ranges[np.isfinite(ranges)]
+    ranges = _ranges(cloud)
+    finite = ranges[np.isfinite(ranges) & (ranges > 0)]
     if not len(finite):
         return "there is no point in it"
     usual = float(np.median(finite))
     limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
     unit = " (millimetres? then source.reader.units_per_metre=1000)" if usual > options.max_range_m else ""
     return f"its points lie {usual:.3g} m away, in range are {limits}{unit}"
+
+
+def _ranges(cloud: PointCloud) -> Floats32:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.linalg.norm(np.asarray(cloud.points_in_cam, np.float32), axis=1))
 
 
 def _normals(points: Floats32, neighbours: int) -> Floats32:

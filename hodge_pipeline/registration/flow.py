@@ -7,6 +7,7 @@ the next one nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -24,6 +25,7 @@ CORNER_QUALITY, CORNERS_APART = 0.01, 1 / 80
 """The second: share of the image's width, 8 pixels of 640, so that a small image has as many."""
 WINDOW_PX, LEVELS = 15, 3
 """Of the flow: with a predicted motion it finds a corner within about 60 pixels of where it should be."""
+BLUR_PX = 5
 BACKWARD_PX = 0.7
 """A corner that is followed back must end this near to where it began."""
 
@@ -39,6 +41,11 @@ class FlowImage:
     camera: Camera
     range_m: tuple[float, float]
     unit_m: float = 1.0
+
+    @cached_property
+    def smooth(self) -> Bytes:
+        """The grey image (H, W), each pixel the mean of those around it."""
+        return np.asarray(cv2.blur(self.grey, (BLUR_PX, BLUR_PX)), np.uint8)
 
 
 @dataclass(frozen=True)

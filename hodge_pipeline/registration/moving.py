@@ -7,8 +7,8 @@ value of every pixel; where it fails over much of the image, other corners are f
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from hodge_pipeline import se3
@@ -25,8 +25,8 @@ MUCH = 0.1
 """Share of the tested pixels that contradict a motion, below which no other is sought: 0.05 would name 3 blurred frames
 of the 60 of fr1/rpy, where nothing moves.
 """
-GREY_LEVELS, BLUR_PX = 20.0, 5
-"""Grey values, of 256, of the mean of so many pixels: more than noise and interpolation change in a static scene."""
+GREY_LEVELS = 20.0
+"""Grey values, of 256, of the mean of a few pixels: more than noise and interpolation change in a static scene."""
 
 
 @dataclass(frozen=True)
@@ -34,49 +34,76 @@ class Rival:
     """Another motion that much of the image follows, and the key frame's corners that do.
 
     `fits_better`: in more tiles than the first motion does; `moving (H, W)`: not 0 where the key frame's image follows
-    the motion that fits fewer tiles.
+    the motion that fits fewer tiles; `contradicting`: the share of the tested pixels that contradict the other motion.
     """
 
     corners: Corners
     followed: Followed
     fits_better: bool
     moving: Bytes
+    contradicting: float
 
 
-def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floats) -> Rival | None:
-    """The motion of corners where the one found has none; None where little contradicts it, or nothing else agrees."""
+def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floats) -> tuple[float, Rival | None]:
+    """The share of the tested pixels that contradict the motion found, and the motion of corners where that has none;
+    None where little contradicts it, or no other motion agrees.
+    """
     key = corners.image
-    pixels = _tested(key)
-    misfit = _misfit(key, view, found.key_from_view, pixels)
-    compared = np.isfinite(misfit)
-    if np.count_nonzero(misfit[compared] >= 1) <= MUCH * compared.sum():
-        return None
+    misfit = _misfit(key, view, found.key_from_view)
+    share = _contradicting(misfit)
+    if share <= MUCH:
+        return share, None
     own = _tiles_with(key, corners.pixels[found.rows])
     others = find_corners(key, 1 - own)
     other = follow(others, view, guess)
     if other is None:
-        return None
-    gain = misfit - _misfit(key, view, other.key_from_view, pixels)
+        return share, None
+    others_misfit = _misfit(key, view, other.key_from_view)
+    won, lost = _votes(key, misfit - others_misfit)
+    if won == lost == 0:  # the same motion
+        return share, None
+    fits_better = won > lost
+    moving = own if fits_better else _tiles_with(key, others.pixels[other.rows])
+    return share, Rival(others, other, fits_better, moving, _contradicting(others_misfit))
+
+
+def fits_most(key: FlowImage, view: FlowImage, key_from_view: Floats, other: Floats) -> tuple[bool, float]:
+    """Whether another motion fits most tiles of the image better than the first one, and the share of the pixels that
+    contradict it.
+    """
+    first, misfit = _misfit(key, view, key_from_view), _misfit(key, view, other)
+    won, _ = _votes(key, first - misfit)
+    return 2 * won > TILES**2, _contradicting(misfit)
+
+
+def _votes(key: FlowImage, gain: Floats) -> tuple[int, int]:
+    """The tiles that another motion fits better by so much (n,) at each pixel, and those that it fits worse."""
     compared = np.isfinite(gain)
-    votes = np.bincount(_tile(key, pixels)[compared], gain[compared], minlength=TILES**2)
-    fits_better = bool((votes > 1).sum() > (votes < -1).sum())
-    return Rival(others, other, fits_better, own if fits_better else _tiles_with(key, others.pixels[other.rows]))
+    votes = np.bincount(_tile(key, tested_pixels(key.depth.shape))[compared], gain[compared], minlength=TILES**2)
+    return int((votes > 1).sum()), int((votes < -1).sum())
 
 
-def _tested(image: FlowImage) -> Floats:
-    """Pixels (n, 2) of a regular grid."""
-    height, width = image.depth.shape
+def _contradicting(misfit: Floats) -> float:
+    compared = misfit[np.isfinite(misfit)]
+    return float((compared >= 1).mean()) if len(compared) else 0.0
+
+
+@lru_cache(maxsize=4)
+def tested_pixels(shape: tuple[int, ...]) -> Floats:
+    """Pixels (n, 2) of a regular grid over an image (H, W)."""
+    height, width = shape
     step = max(1, width // CELLS)
     v, u = np.mgrid[step // 2 : height : step, step // 2 : width : step]
     return np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
 
 
-def _misfit(key: FlowImage, view: FlowImage, key_from_view: Floats, pixels: Floats) -> Floats:
-    """Of pixels (n, 2) of the key frame: how far depth and grey value in the view are off what the motion predicts, 1:
-    by as much as may be or more; NaN where not both frames have a depth.
+def _misfit(key: FlowImage, view: FlowImage, key_from_view: Floats) -> Floats:
+    """Of the tested pixels (n,) of the key frame: how far depth and grey value in the view are off what the motion
+    predicts, 1: by as much as may be or more; NaN where not both frames have a depth.
     """
-    expected = project(se3.transform(se3.inverse(key_from_view), _points(key, pixels)), view.camera)
-    actual = _points(view, expected[:, :2])[:, 2]
+    pixels = tested_pixels(key.depth.shape)
+    expected = project(se3.transform(se3.inverse(key_from_view), _points(key)), view.camera)
+    actual = _depth(view, expected[:, :2])
     sigma = DEPTH_SIGMAS * view.unit_m * depth_sigma(expected[:, 2] / view.unit_m)
     off = (actual - expected[:, 2]) / (GATE_PX / PIXEL_SIGMA * sigma)
     change = _grey(view, expected[:, :2]) - _grey(key, pixels)
@@ -100,21 +127,26 @@ def _tiles_with(image: FlowImage, pixels: Floats) -> Bytes:
     return np.ascontiguousarray(tiles.reshape(TILES, TILES)[rows[:, None], columns])
 
 
-def _at(values: Floats32, pixels: Floats) -> Floats:
+def _at(values: Floats32 | Bytes, pixels: Floats) -> Floats:
     """The values (n,) of an image at pixels (n, 2); NaN outside it."""
     height, width = values.shape
     rounded = np.round(np.where(np.isfinite(pixels), pixels, -1)).astype(np.int64)
     inside = np.asarray(((rounded >= 0) & (rounded < [width, height])).all(axis=1))
     u, v = np.where(inside[:, None], rounded, 0).T
-    return np.where(inside, values[v, u], np.nan)
+    return np.where(inside, values[v, u].astype(np.float32), np.nan)
 
 
-def _points(image: FlowImage, pixels: Floats) -> Floats:
-    """Points (n, 3) in the camera's axes; NaN where there is no depth."""
+def _points(image: FlowImage) -> Floats:
+    """The tested points (n, 3) in the camera's axes; NaN where there is no depth."""
+    pixels = tested_pixels(image.depth.shape)
+    return back_project(np.column_stack([pixels, _depth(image, pixels)]), image.camera)
+
+
+def _depth(image: FlowImage, pixels: Floats) -> Floats:
+    """The depths (n,) at pixels (n, 2); NaN where there is none in range."""
     z = _at(image.depth, pixels)
-    z = np.where((z >= image.range_m[0]) & (z <= image.range_m[1]), z, np.nan)
-    return back_project(np.column_stack([pixels, z]), image.camera)
+    return np.where((z >= image.range_m[0]) & (z <= image.range_m[1]), z, np.nan)
 
 
 def _grey(image: FlowImage, pixels: Floats) -> Floats:
-    return _at(cv2.blur(image.grey, (BLUR_PX, BLUR_PX)).astype(np.float32), pixels)
+    return _at(image.smooth, pixels)

@@ -17,7 +17,7 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 
 STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
-COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving")
+COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful")
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class BlockRows:
     key_from_row: Floats
     fitness: Floats
     moving: Ints
+    doubtful: Ints
     notes: tuple[str, ...]
 
 

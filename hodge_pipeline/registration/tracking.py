@@ -17,7 +17,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
-from hodge_pipeline.registration.moving import rival_motion
+from hodge_pipeline.registration.moving import fits_most, rival_motion
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registry import plugin_errors
@@ -31,6 +31,10 @@ FEWEST_FOLLOWED = 25
 """Corners that must agree on a motion for it to be believed; below it clouds are registered."""
 FEW_FOLLOWED, SMALL_SHARE = 60, 0.35
 """Corners, and share of the key frame's, below which the next frame is followed from this one."""
+DOUBTFUL = 0.25
+"""Share of the image that contradicts a motion, or moves otherwise, from which the motion may be an object's. Of two
+motions that of most of the image is taken, so that at a half either may be the camera's.
+"""
 CORNERS_A_SAMPLE = 75.0
 """Corners that count as one independent measurement, as matches of landmarks do."""
 
@@ -64,7 +68,8 @@ class FrameBlock:
 class TrackedBlock:
     """What became of a block: its key frames (rows, clouds), the steps from each to the next, and for every row the row
     of the key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess; and the
-    rows `moving` of frames much of which moved otherwise than the camera.
+    rows `moving` of frames much of which moved otherwise than the camera, and `doubtful` of those whose motion may be
+    that of an object.
 
     A step of fitness 0 is a guess too. The block's last row is the first of the next one.
     """
@@ -77,6 +82,7 @@ class TrackedBlock:
     key_from_row: Floats
     fitness: Floats
     moving: Ints
+    doubtful: Ints
     notes: tuple[str, ...]
     sightings: Sightings
 
@@ -108,6 +114,7 @@ class _View:
 
     def __init__(self, options: TrackingOptions, frame: Frame, place: int) -> None:
         self._options, self._frame, self.place = options, read_once(frame), place
+        self.left_out = 0.0
 
     @cached_property
     def image(self) -> FlowImage | None:
@@ -136,8 +143,11 @@ class _View:
         return self._options.odometry.registration.prepare(self.cloud)
 
     def leave_out(self, moving: Bytes, corners: Corners) -> None:
-        """From now on the frame has no depth where `moving (H, W)` is not 0, and flow follows these corners."""
+        """From now on the frame has no depth where `moving (H, W)` is not 0, the share `left_out` at most, and flow
+        follows these corners.
+        """
         assert self.image is not None
+        self.left_out = max(self.left_out, float((moving > 0).mean()))
         depth = np.where(moving, np.float32(0), self.image.depth)
         self._frame = replace(self._frame, read_depth=lambda: depth)
         for made in ("image", "cloud_and_note", "prepared"):
@@ -160,7 +170,7 @@ class _Tracker:
         self._steps: list[tuple[int, int, Registration]] = []
         self._corner_points: dict[int, Floats] = {}
         self._sightings: dict[tuple[int, int], Followed] = {}
-        self._moving = set[int]()
+        self._moving, self._doubtful = set[int](), set[int]()
         self._velocity: Floats = np.zeros(6)
         self._usual_step = float(np.median(np.diff(block.times))) if len(block.times) > 1 else 1.0
 
@@ -185,6 +195,7 @@ class _Tracker:
             key_from_row=np.array(motions),
             fitness=np.array(fitness),
             moving=rows[np.array([place for place in sorted(self._moving) if place > first], np.int64)],
+            doubtful=rows[np.array([place for place in sorted(self._doubtful) if place > first], np.int64)],
             notes=tuple(note for _, note in self._clouds.values() if note),
             sightings=self._kept_sightings(first),
         )
@@ -234,31 +245,47 @@ class _Tracker:
             self._promote(view, found)
 
     def _flowed(self, key: _View, view: _View, guess: Floats) -> Registration | None:
-        """The motion by optical flow, None where it finds none; what the view saw is kept."""
-        if key.corners is None or view.image is None:
+        """The motion by optical flow, None where it finds none; what the view saw is kept. The motion of the clouds
+        where these fit most of the image better: the corners of a bare room lie on what moves.
+        """
+        if key.corners is None or key.image is None or view.image is None:
             return None
         found = follow(key.corners, view.image, guess)
+        against = 0.0
         if found is not None:
-            found = self._of_most_area(key, view, found, guess)
+            found, against = self._of_most_area(key, view, found, guess)
         if found is None or len(found.rows) < FEWEST_FOLLOWED or found.share < self._limits.min_fitness:
             return None
+        if against > DOUBTFUL:
+            by_clouds = self._registrar.register(key.prepared, view.prepared, guess)
+            fits, left = fits_most(key.image, view.image, found.key_from_view, by_clouds.i_from_j)
+            if self._good(by_clouds) and fits:
+                self._doubt(view, max(left, key.left_out))
+                return by_clouds
+        self._doubt(view, max(against, key.left_out))
         self._corner_points[key.place] = key.corners.points
         self._sightings[key.place, view.place] = found
         information = found.information / CORNERS_A_SAMPLE
         return Registration(found.key_from_view, information, found.share, found.rmse_m, len(found.rows), 0, True)
 
-    def _of_most_area(self, key: _View, view: _View, found: Followed, guess: Floats) -> Followed:
-        """The motion found, or another one that more of the image follows; what moves leaves the key frame's cloud."""
+    def _of_most_area(self, key: _View, view: _View, found: Followed, guess: Floats) -> tuple[Followed, float]:
+        """The motion found, or another one that more of the image follows, and the share of the image that contradicts
+        it; what moves leaves the key frame's cloud.
+        """
         assert key.image is not None and key.corners is not None and view.image is not None
-        rival = rival_motion(key.corners, view.image, found, guess)
+        share, rival = rival_motion(key.corners, view.image, found, guess)
         if rival is None or len(rival.followed.rows) < FEWEST_FOLLOWED:
-            return found
+            return found, share
         self._moving.add(view.place)
         key.leave_out(rival.moving, rival.corners if rival.fits_better else key.corners)
         if not rival.fits_better:
-            return found
+            return found, share
         self._sightings = {pair: one for pair, one in self._sightings.items() if pair[0] != key.place}
-        return rival.followed
+        return rival.followed, rival.contradicting
+
+    def _doubt(self, view: _View, share: float) -> None:
+        if share > DOUBTFUL:
+            self._doubtful.add(view.place)
 
     def _flowed_from_last(self, view: _View) -> Registration | None:
         """The motion from the last frame tracked, which becomes a key frame, where flow finds this one."""

@@ -35,12 +35,14 @@ REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",
 }  # fmt: skip
+DOUBTS = {"unsettled": "Not settled", "camera or object": "In doubt, since much of the image moves"}
+"""How a headline begins where the run says that its result may be wrong, whatever was measured."""
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of all measures in one word; a headline, which begins with the pieces where there are several; the
+    """The outcome of all measures in one word; a headline, which begins with doubts and the pieces of several; the
     details, and the changes they rest on. `reason` is why a refinement, or a solve, came out as it did.
     """
 
@@ -50,6 +52,7 @@ class Verdict:
     changes: tuple[Change, ...]
     pieces: int = 1
     reason: str = ""
+    is_doubtful: bool = False
 
     @property
     def sentence(self) -> str:
@@ -65,8 +68,10 @@ class Verdict:
 
     @property
     def mark(self) -> Outcome:
-        """What the page shows at a glance: a scene in several pieces is no plain success, whatever the measures say."""
-        return "mixed" if self.pieces > 1 and self.outcome == "improved" else self.outcome
+        """What the page shows at a glance: a scene in doubt or in several pieces is no plain success, whatever the
+        measures say.
+        """
+        return "mixed" if (self.pieces > 1 or self.is_doubtful) and self.outcome == "improved" else self.outcome
 
 
 def judge(report: Report) -> Verdict:
@@ -80,7 +85,10 @@ def judge(report: Report) -> Verdict:
     if pieces:
         all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
-    return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason)
+    doubts = [DOUBTS[note.kind] for note in (*_unsettled(report), *report.notes) if note.kind in DOUBTS]
+    if doubts:
+        headline = ": ".join([*doubts, f"{headline[:1].lower()}{headline[1:]}"])
+    return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason, bool(doubts))
 
 
 def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, str]:

@@ -17,6 +17,7 @@ from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.review.viewer import Viewer
 from hodge_pipeline.run_folder import Run
+from hodge_pipeline.store.workspace import hold
 
 
 class Review:
@@ -84,18 +85,7 @@ def _alone(path: Path) -> Iterator[None]:
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be read ({error.strerror})") from error
     try:
-        _lock(held, path)
+        hold(held, f"{path}: is being reviewed already: use that page, or end it first")
         yield
     finally:
         os.close(held)
-
-
-def _lock(held: int, path: Path) -> None:
-    try:
-        import fcntl
-    except ImportError:  # without flock two reviewers find each other by their revisions alone
-        return
-    try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        raise WorkspaceError(f"{path}: is being reviewed already: use that page, or end it first") from error

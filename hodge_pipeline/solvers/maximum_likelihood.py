@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -12,6 +13,7 @@ from pydantic.dataclasses import dataclass as stage
 
 from hodge_pipeline.complex.checks import NO_EDGES, check_rows
 from hodge_pipeline.complex.components import describe_components
+from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
@@ -20,6 +22,7 @@ from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
 from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Limits, Point
 from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.priors import with_world, without_world
+from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import InitialName, Setup, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, SolverIteration, ViewGraph
 
@@ -161,6 +164,11 @@ class MaximumLikelihoodSolver:
         description="of linear systems: superlu factorises; multigrid preconditions conjugate gradients, whatever the "
         "fill; auto: what will be cheapest here",
     )
+    tails: Literal["gaussian", "student"] = Field(
+        "gaussian",
+        description="of the edges' errors: gaussian takes the information as stated; student, for edges that "
+        "a run registered, weighs those by Student's t that leave over more than the others do",
+    )
     certificate: bool = Field(False, description="test whether the isotropic minimum is the global one")
     max_iterations: int = Field(100, gt=0, description="Newton steps; real graphs need 3 to 12")
     relative_tolerance: float = Field(
@@ -170,11 +178,24 @@ class MaximumLikelihoodSolver:
 
     def solve(self, graph: ViewGraph, world_from_cam: Floats) -> Solution:
         """The poses of least cost; the first vertex of each component keeps its start pose."""
+        solution = self._solved(graph, world_from_cam, self.initial)
+        free = free_direction_notes(graph)
+        if self.tails == "gaussian" or not graph.edge_count:
+            return replace(solution, notes=(*solution.notes, *free))
+
+        def solved(weights: Floats, poses: Floats) -> Solution:
+            weighted = replace(graph, information=weights[:, None, None] * graph.information)
+            return self._solved(weighted, poses, "given")
+
+        weights, final = reweighted(graph, solution.weights, solution, solved, registered=True)
+        return replace(final, weights=weights, notes=(*final.notes, *free))
+
+    def _solved(self, graph: ViewGraph, start: Floats, initial: InitialName) -> Solution:
         return solve(
             graph,
-            start=world_from_cam,
+            start=start,
             objective=self.objective,
-            initial=self.initial,
+            initial=initial,
             backend=self.backend,
             certificate=self.certificate,
             max_iterations=self.max_iterations,

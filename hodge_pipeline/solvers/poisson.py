@@ -13,8 +13,6 @@ from hodge_pipeline.complex.checks import NO_EDGES, check_graph, orthonormal, re
 from hodge_pipeline.complex.coboundary import coboundary_0
 from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.complex.cycles import loop_deviation
-from hodge_pipeline.complex.edge_weights import EdgeWeighting, edge_weights
-from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.one_form import Logarithm, centroids, shifted
 from hodge_pipeline.solvers.potential import (
     AroundLoops,
@@ -29,9 +27,8 @@ from hodge_pipeline.types import Bools, Floats, Solution, SolverIteration, ViewG
 
 @plain_dataclass(frozen=True)
 class _Problem(CentredProblem):
-    """With the weight of each edge."""
+    """With the coboundary of its graph."""
 
-    weights: Floats
     d0: csr_matrix
 
 
@@ -44,24 +41,13 @@ class PoissonSolver:
     would depend on where the origin is. f is taken with mean zero, then the component is moved back as one body, so
     that its first vertex keeps its pose exactly. Fixed vertices have f = 0, and a component with one is not moved back.
 
-    Every edge counts: a run leaves out what its diagnosis calls wrong before the solve (`solve_with`). The deviation
-    D in the history measures the *adjusted* edges `T_i⁻¹ exp(f_j − f_i) T_j` of that one step, that is how far the
-    exponential of the sum is from the product of exponentials. It is never taken from the absolute poses, where it is
-    0 by construction, and says nothing about the measured edges' own inconsistency, which no solver can change
-    (`measured_loop_deviation_*` in the metrics).
+    Every edge weighs 1, as in the paper up to a factor, whatever its information: a run leaves out what its diagnosis
+    calls wrong before the solve (`solve_with`). The deviation D in the history measures the *adjusted* edges
+    `T_i⁻¹ exp(f_j − f_i) T_j` of that one step, that is how far the exponential of the sum is from the product of
+    exponentials. It is never taken from the absolute poses, where it is 0 by construction, and says nothing about the
+    measured edges' own inconsistency, which no solver can change (`measured_loop_deviation_*` in the metrics).
     """
 
-    weights: EdgeWeighting = Field(
-        default="unit",
-        description="weight of each edge: unit as in the paper up to a factor; "
-        "information, 6 / tr(S Ω⁻¹ S) with S = diag(lever_arm_m × 3, 1 × 3), for measured pose graphs",
-    )
-    lever_arm_m: float = Field(
-        default=1.0,
-        gt=0,
-        description="metres: a rotation counts as the displacement it causes at this distance, about that of the "
-        "scene from the camera (1 m suits rooms)",
-    )
     inner_iterations: int = Field(
         default=3,
         ge=1,
@@ -84,10 +70,8 @@ class PoissonSolver:
         world_from_cam = np.asarray(world_from_cam, float)
         check_graph(graph, world_from_cam)
         refuse_priors(graph, "poisson")
-        base_weights, notes = edge_weights(graph, self.weights, self.lever_arm_m)
-        proper = graph.edges[:, 0] != graph.edges[:, 1]
-        used = proper & (base_weights > 0)
-        problem = _problem(graph, used, base_weights, world_from_cam)
+        used = graph.edges[:, 0] != graph.edges[:, 1]
+        problem = _problem(graph, used, world_from_cam)
         around_loops = tree_loops(problem.edges, len(problem.component))
         history = self._iterate(problem, around_loops)
         measured = loop_deviation(around_loops(problem.i_from_j))
@@ -104,9 +88,7 @@ class PoissonSolver:
             history=history,
             metrics=metrics,
             notes=(
-                *notes,
-                *_edge_notes(proper, base_weights),
-                *free_direction_notes(graph),
+                *_edge_notes(used),
                 *describe_components(problem.component, graph.vertex_ids),
                 *self._convergence_notes(problem, history),
             ),
@@ -115,10 +97,9 @@ class PoissonSolver:
     def _iterate(self, problem: _Problem, around_loops: AroundLoops) -> tuple[SolverIteration, ...]:
         if len(problem.edges) == 0:
             return ()
-        potential = problem.poisson(problem.d0, problem.weights)
-        return iterate(
-            problem, self.log, potential, problem.weights, around_loops, self.inner_iterations, self.tolerance
-        )
+        ones = np.ones(len(problem.edges))
+        potential = problem.poisson(problem.d0, ones)
+        return iterate(problem, self.log, potential, ones, around_loops, self.inner_iterations, self.tolerance)
 
     def _convergence_notes(self, problem: _Problem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
         if not history:
@@ -126,14 +107,13 @@ class PoissonSolver:
         return (*problem.half_turn_notes(self.log), *unconverged_notes(history))
 
 
-def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam: Floats) -> _Problem:
+def _problem(graph: ViewGraph, used: Bools, world_from_cam: Floats) -> _Problem:
     edges = graph.edges[used]
     component = connected_components(edges, graph.vertex_count)
     offset = centroids(world_from_cam, component)
     return _Problem(
         edges=edges,
         i_from_j=orthonormal(graph.i_from_j[used]),
-        weights=base_weights[used],
         d0=coboundary_0(edges, graph.vertex_count),
         component=component,
         fixed=graph.fixed,
@@ -143,11 +123,7 @@ def _problem(graph: ViewGraph, used: Bools, base_weights: Floats, world_from_cam
     )
 
 
-def _edge_notes(proper: Bools, base_weights: Floats) -> tuple[str, ...]:
-    notes = []
-    if not proper.all():
-        notes.append(f"{int((~proper).sum())} edges join a vertex to itself and hold no information on poses: ignored")
-    weightless = int((proper & (base_weights <= 0)).sum())
-    if weightless:
-        notes.append(f"{weightless} edges of weight 0 are ignored")
-    return tuple(notes)
+def _edge_notes(used: Bools) -> tuple[str, ...]:
+    if used.all():
+        return ()
+    return (f"{int((~used).sum())} edges join a vertex to itself and hold no information on poses: ignored",)

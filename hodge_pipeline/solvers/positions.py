@@ -6,12 +6,14 @@ Neither how far edges drift nor how far positions scatter is as their informatio
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.components import by_size
+from hodge_pipeline.complex.components import by_size, connected_components
 from hodge_pipeline.complex.judging import chi2_by_information
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -34,6 +36,8 @@ MOST_ROUNDS, SETTLED = 30, 0.05
 """Of factors and rejections, until both factors change by less than 5 %."""
 LOOSE = 100.0
 """The factor on the edges' sigma to begin with: from the loose side, drift is not taken for scatter of positions."""
+TORN, CALM, MOST_STRETCHES = 25.0, 5.0, 6
+"""Times the median chi-squared of edges: 25, five sigma, is beyond any noise; below 5 they hold a stretch together."""
 FEWEST_SPARE = 30
 """Numbers measured beyond those sought, below which nothing tells how far edges drift: then positions bend nothing."""
 INERTIA, MOST_FACTOR = 6.0, 1e3
@@ -121,7 +125,8 @@ def place(
     joined = placed[graph.edges[:, 0]] & (weights > 0)
     if 6 * int(joined.sum()) + 3 * int(used.sum()) > 6 * int(placed.sum()) + FEWEST_SPARE:
         gauges = 6 * len(np.unique(component[placed]))
-        settled = _settled(graph, poses, weights, fixes, used, reached, gauges)
+        settle = partial(_settled, graph, poses, weights, fixes, reached=reached, gauges=gauges)
+        settled = _untorn(graph, weights, fixes, settle(used), settle)
     solved = np.where(placed[:, None, None], settled.world_from_cam, world_from_cam)
     fit = PositionFit(
         fixes.labels,
@@ -198,8 +203,38 @@ class _Settled:
     fix_factor: float
 
 
+def _untorn(
+    graph: ViewGraph, weights: Floats, fixes: Fixes, settled: _Settled, settle: Callable[[Bools], _Settled]
+) -> _Settled:
+    """The same without the positions of a stretch whose two ends tear edges, where those before and after it then
+    agree along the edges: a receiver that is off by the same for a while agrees with itself. Edges torn in one place
+    alone may be at fault themselves: then all positions stay.
+    """
+    for _ in range(MOST_STRETCHES):
+        torn = _torn(graph, weights, settled.world_from_cam)
+        if torn.max(initial=0.0) <= TORN:
+            break
+        part = connected_components(graph.edges[torn <= CALM], len(settled.world_from_cam))[fixes.vertices]
+        labels, counts = np.unique(part[settled.used], return_counts=True)
+        labels = labels[counts >= FEWEST]
+        if len(labels) < FEWEST:
+            break
+        tried = [settle(settled.used & (part != label)) for label in labels[np.argsort(counts[counts >= FEWEST])]]
+        left = [float(_torn(graph, weights, each.world_from_cam).max()) for each in tried[:MOST_STRETCHES]]
+        if min(left) > torn.max() / 2:
+            break
+        settled = tried[int(np.argmin(left))]
+    return settled
+
+
+def _torn(graph: ViewGraph, weights: Floats, poses: Floats) -> Floats:
+    """Chi-squared (E,) of each edge over the median; 0 of an edge without weight."""
+    chi2 = chi2_by_information(graph, poses) * (weights > 0)
+    return np.asarray(chi2 / max(float(np.median(chi2[weights > 0])), 1e-12))
+
+
 def _settled(
-    graph: ViewGraph, poses: Floats, weights: Floats, fixes: Fixes, used: Bools, reached: Bools, gauges: int
+    graph: ViewGraph, poses: Floats, weights: Floats, fixes: Fixes, used: Bools, *, reached: Bools, gauges: int
 ) -> _Settled:
     """The poses once neither the factors nor the rejections change any more.
 

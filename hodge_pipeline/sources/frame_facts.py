@@ -18,6 +18,10 @@ LISTED = 5
 GAP, JUMP = 5.0, 10.0
 """Times the median step: what counts as a gap in time, and as a jump of the pose."""
 LEAST_JUMP_M, LEAST_JUMP_DEG = 0.1, 20.0
+FEWEST_SWEEPS, SWEEP_POINTS = 10, 300_000
+"""Scans in sequence are more, and one has fewer points (128 beams, 2048 columns): a station's has millions."""
+SECTORS, ALL_ROUND = 36, 0.9
+"""Of ten degrees each; the share of them that holds points of a scanner that sees all round it."""
 MOSTLY_EMPTY = 0.9
 PLAUSIBLE_DEPTH_M = (0.1, 30.0)
 """The median depth of a scene; outside, the scale is probably wrong."""
@@ -50,8 +54,25 @@ def frame_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
     without = len(frames) - facts["frames with depth"]
     if 0 < without < len(frames) and not facts["frames with points"]:
         bare = [str(frame.frame_id) for frame in frames if frame.read_depth is None]
-        oddities.append(f"{without} of {len(frames)} frames have no depth: {_listed(bare)}")
-    return {**facts, **_depth_facts(frames, oddities)}
+        oddities.append(f"{without} of {len(frames)} frames have no depth: {listed(bare)}")
+    return {**facts, **_depth_facts(frames, oddities), **_scanner_facts(frames)}
+
+
+def _scanner_facts(frames: Sequence[Frame]) -> dict[str, Any]:
+    """Whether the points look like those of a scanner that turns while it moves, by one frame in the middle."""
+    middle = frames[len(frames) // 2]
+    try:
+        cloud = middle.read_points() if middle.read_points else None
+    except (SourceError, OSError):
+        cloud = None
+    if cloud is None or not len(cloud) or len(frames) < FEWEST_SWEEPS:
+        return {}
+    if cloud.times_s is not None:
+        return {"scanner": "turns while it moves: its points have times"}
+    turns = np.arctan2(cloud.points_in_cam[:, 1], cloud.points_in_cam[:, 0])
+    seen = np.count_nonzero(np.bincount(((turns + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS))
+    sees_round = seen >= ALL_ROUND * SECTORS and len(cloud) <= SWEEP_POINTS
+    return {"scanner": "sees all round"} if sees_round else {}
 
 
 def trajectory_facts(trajectory: Trajectory, oddities: list[str]) -> dict[str, Any]:
@@ -70,7 +91,7 @@ def stamp_facts(stamps_s: Floats, together: Bools, names: Sequence[str], odditie
     after = np.flatnonzero(together)
     if (steps == 0).any():
         same = [names[row] for row in after[steps == 0]]
-        oddities.append(f"{len(same)} stamps are that of the one before: after {_listed(same)}")
+        oddities.append(f"{len(same)} stamps are that of the one before: after {listed(same)}")
     if (steps < 0).any():
         oddities.append(f"{int((steps < 0).sum())} stamps are before the one before them: not in order of time")
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -116,7 +137,7 @@ def _note_ids(frames: Sequence[Frame], oddities: list[str]) -> None:
     counts = Counter((frame.sequence, frame.frame_id) for frame in frames)
     twice = [str(name) for (_, name), count in counts.items() if count > 1]
     if twice:
-        oddities.append(f"{len(twice)} frame ids are given more than once: {_listed(twice)}")
+        oddities.append(f"{len(twice)} frame ids are given more than once: {listed(twice)}")
 
 
 def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
@@ -165,5 +186,6 @@ def _colour_fault(frame: Frame) -> list[str]:
     return []
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:LISTED]) + (" …" if len(names) > LISTED else "")
+def listed(names: Sequence[object]) -> str:
+    """The first few, and a sign that there are more."""
+    return ", ".join(map(str, names[:LISTED])) + (" …" if len(names) > LISTED else "")

@@ -6,17 +6,16 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import clique_counts
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.holes import unfilled_loops
+from hodge_pipeline.sources.frame_facts import LISTED, listed
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 MOST_TRIANGLES = 20_000
 """Elimination takes seconds beyond."""
-LISTED = 5
 INDEFINITE = 1e-9
 """Of the largest eigenvalue: a more negative one is not rounding."""
 
@@ -85,16 +84,11 @@ def _information_facts(graph: ViewGraph, oddities: list[str]) -> dict[str, Any]:
         return {"information": "the identity for every edge"}
     in_plane = np.array([2, 3, 4]) if graph.dimension == 2 else np.arange(6)
     diagonal = np.diagonal(information, axis1=1, axis2=2)[finite][:, in_plane]
-    rotation, translation = _halves(diagonal, graph.dimension)
+    cut = 1 if graph.dimension == 2 else 3
     return {
-        "information of rotation, least median most": _spread(rotation),
-        "information of translation, least median most": _spread(translation),
+        "information of rotation, least median most": _spread(diagonal[:, :cut]),
+        "information of translation, least median most": _spread(diagonal[:, cut:]),
     }
-
-
-def _halves(diagonal: Floats, dimension: int) -> tuple[Floats, Floats]:
-    cut = 1 if dimension == 2 else 3
-    return diagonal[:, :cut], diagonal[:, cut:]
 
 
 def _spread(values: Floats) -> list[float] | None:
@@ -111,7 +105,7 @@ def _note_shape(graph: ViewGraph, parallel: int, sizes: Ints, degree: Ints, oddi
     _note_edges(graph, loops, "both ends at one vertex", oddities)
     alone = graph.vertex_ids[degree == 0]
     if len(alone):
-        oddities.append(f"{len(alone)} of {graph.vertex_count} vertices have no edge: {_names(alone)}")
+        oddities.append(f"{len(alone)} of {graph.vertex_count} vertices have no edge: {listed(alone.tolist())}")
     pieces = int((sizes > 1).sum())
     if pieces > 1:
         oddities.append(f"the graph falls into {pieces} pieces with edges: each has a gauge of its own")
@@ -121,10 +115,5 @@ def _note_shape(graph: ViewGraph, parallel: int, sizes: Ints, degree: Ints, oddi
 
 def _note_edges(graph: ViewGraph, wrong: Bools, what: str, oddities: list[str]) -> None:
     if wrong.any():
-        pairs = [f"{graph.vertex_ids[i]}-{graph.vertex_ids[j]}" for i, j in graph.edges[wrong][:LISTED]]
-        more = " …" if wrong.sum() > LISTED else ""
-        oddities.append(f"{int(wrong.sum())} of {graph.edge_count} edges have {what}: {', '.join(pairs)}{more}")
-
-
-def _names(names: NDArray[np.generic]) -> str:
-    return ", ".join(map(str, names[:LISTED])) + (" …" if len(names) > LISTED else "")
+        pairs = [f"{graph.vertex_ids[i]}-{graph.vertex_ids[j]}" for i, j in graph.edges[wrong]]
+        oddities.append(f"{len(pairs)} of {graph.edge_count} edges have {what}: {listed(pairs)}")

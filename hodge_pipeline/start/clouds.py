@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
-from hodge_pipeline.registration.clouds import CloudOptions, prepare_clouds
+from hodge_pipeline.registration.clouds import FRAMES_IN_BLOCK, CloudOptions, landmarks_of, prepare_clouds
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.types import CloudSet, Source
+from hodge_pipeline.types import CloudSet, Landmarks, Source
 from hodge_pipeline.types.notes import notes_of
 
 
@@ -21,6 +22,29 @@ def clouds(source: Source, options: CloudOptions, *, workers: Workers, step: Ste
     made, notes = prepare_clouds(source.frames, options, workers, step.advance)
     step.note(*notes_of("clouds", notes))
     return made
+
+
+def with_landmarks(
+    source: Source, made: CloudSet, options: CloudOptions, matching: GlobalStart, steps: Steps, workers: Workers
+) -> CloudSet:
+    """The clouds, made by these options, with landmarks of frames that are matched without a guess.
+
+    Only then: SIFT costs more than all else of a key frame.
+    """
+    wanted = landmarks_for(options, matching)
+    if wanted.landmarks == options.landmarks or not any(frame.read_colour for frame in source.frames):
+        return made
+    return steps.step(add_landmarks, source, made, wanted, title="landmarks", total=len(made), workers=workers)
+
+
+def add_landmarks(source: Source, made: CloudSet, options: CloudOptions, *, workers: Workers, step: Step) -> CloudSet:
+    """Step: the clouds with landmarks of the frames (N) that they are of."""
+    frames, found = source.frames, dict[int, list[Landmarks]]()
+    blocks = [frames[start : start + FRAMES_IN_BLOCK] for start in range(0, len(frames), FRAMES_IN_BLOCK)]
+    for index, landmarks in workers.map(partial(landmarks_of, options), blocks):
+        found[index] = landmarks
+        step.advance(len(landmarks))
+    return made.with_landmarks([one for index in range(len(blocks)) for one in found[index]])
 
 
 def landmarks_for(clouds: CloudOptions, matching: GlobalStart) -> CloudOptions:

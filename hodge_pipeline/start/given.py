@@ -41,6 +41,8 @@ from hodge_pipeline.start.odometry import OPTIONS, chain
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, Source, Trajectory
 from hodge_pipeline.types.notes import Note, notes_of
 
+JUMP_SHARE = 0.25
+"""Of what makes a key frame: smaller jumps move the frames between two key frames by little."""
 SAME_M = 1e-6
 """Metres: given poses that are this near the true ones are the true ones."""
 
@@ -91,6 +93,7 @@ class GivenStart:
         rows = choose_key_frames(
             poses, list(sequences_of(source).values()), self.distance_m, self.angle_deg, self.every
         )
+        rows = np.union1d(rows, self._at_jumps(poses, list(sequences_of(source).values())))
         steps.note(Note("key frames", len(rows), str(len(source.frames))))
         whole = given_away(source, poses, rows)
         count = len(poses)
@@ -112,6 +115,21 @@ class GivenStart:
         made = make_clouds(keys, clouds, steps, workers)
         first = Round(Edges.of([]), vertex_ids(keys), poses[rows], name=START)
         return Scene(whole, keys, key_frames, made, first, is_given=True, given=file)
+
+    def _at_jumps(self, poses: Floats, sequences: Sequence[Ints]) -> Ints:
+        """The rows at both ends of a step that is unlike the one before and the one after it: what mends a jump is not
+        to be spread over the frames around it.
+        """
+        found = [np.zeros(0, np.int64)]
+        for rows in sequences:
+            steps = se3.inverse(poses[rows[:-1]]) @ poses[rows[1:]]
+            change = se3.inverse(steps[:-1]) @ steps[1:]
+            turned_deg = np.rad2deg(se3.rotation_angle(change))
+            moved_m = np.linalg.norm(change[:, :3, 3], axis=1)
+            unlike = (moved_m >= JUMP_SHARE * self.distance_m) | (turned_deg >= JUMP_SHARE * self.angle_deg)
+            jumps = unlike[:-1] & unlike[1:]
+            found += [rows[1:-2][jumps], rows[2:-1][jumps]]
+        return np.concatenate(found)
 
     def _matched(self, source: Source, steps: Steps) -> tuple[Matched, GivenFile | None]:
         if self.poses == "frames":

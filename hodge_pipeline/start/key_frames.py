@@ -37,6 +37,10 @@ from hodge_pipeline.types.notes import Note, notes_of
 NOTES_SHOWN = 5
 WHOLE_VIDEO, WHOLE_STILLS = 50, 300
 """Frames that are registered whole: tracking by optical flow is more exact at the rate of a video, and glues stills."""
+DOUBTED = 0.1
+"""Share of the frames whose motion may be an object's, from which the whole path is in doubt: of fr1/rpy's every third
+frame, where nothing moves but much is blurred, 0.07 are.
+"""
 VIDEO_STEP_S = 0.2
 """Between two frames: fr1/rpy's every third frame, 0.1 s, is tracked well; key frames 0.7 s apart are not."""
 
@@ -93,7 +97,7 @@ class KeyFrameStart(OdometryStart):
         found = steps.step(track, source, options, title="tracking", total=len(source.frames), workers=workers)
         steps.remember(found.clouds, steps.key(found) + "clouds")
         odometry = Odometry(found.world_from_key, found.steps, ())
-        scene = self.joined(source, found.clouds, odometry, followers(source, found), steps, workers)
+        scene = self.joined(source, found.clouds, clouds, odometry, followers(source, found), steps, workers)
         steps.remember(found.sightings, steps.key(found) + "sightings")
         return replace(scene, sightings=found.sightings if self.repose else None)
 
@@ -105,7 +109,7 @@ class KeyFrameStart(OdometryStart):
     def _tracking(self, clouds: CloudOptions) -> TrackingOptions:
         """How frames are followed."""
         return TrackingOptions(
-            clouds=self.cloud_options(clouds, apart=True),
+            clouds=clouds,
             odometry=self.odometry,
             distance_m=self.distance_m,
             angle_rad=float(np.deg2rad(self.angle_deg)),
@@ -239,6 +243,11 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
     moving = np.unique(np.concatenate([part.moving for part in parts]))
     if len(moving):
         notes.append(Note("moving objects", len(moving), in_runs(moving, ids)))
+    doubtful = np.unique(np.concatenate([part.doubtful for part in parts]))
+    if len(doubtful) > DOUBTED * len(tracked.anchors):
+        notes.append(
+            Note("camera or object", len(doubtful), f"{len(tracked.anchors)} frames, {in_runs(doubtful, ids)}")
+        )
     sizes = np.bincount(tracked.piece)
     pieces = int((sizes > 1).sum())
     if pieces > len(sequences_of(source)):

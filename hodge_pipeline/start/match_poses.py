@@ -11,7 +11,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.sources.inspect import guesses
+from hodge_pipeline.sources.inspect import guess_reader, guesses
 from hodge_pipeline.types import Floats, Frame, Trajectory, number_of
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
@@ -19,15 +19,25 @@ SAME_STAMP_S = 1e-6
 LIKELY_SHARE = 0.5
 """Of the frames: fewer numbers in common may be a coincidence, since small numbers occur in every sequence."""
 
-RECIPE = "slam_refine"
+RECIPE, SCANS = "slam_refine", "slam_refine_scans"
 CALIBRATED = {"tum": "slam_refine_tum"}
 """Recipes for the readers of formats whose depth and colour are calibrated to each other, where landmarks measure."""
 
 
 def recipe_for(frames: Path) -> str:
-    """The recipe that refines poses of these frames, by their format."""
+    """The recipe that refines poses of these frames, by their format; that for scans where no frame has a camera."""
     found = guesses(frames) if frames.exists() else []
-    return CALIBRATED.get(found[0].name, RECIPE) if found else RECIPE
+    if not found:
+        return RECIPE
+    if found[0].name in CALIBRATED:
+        return CALIBRATED[found[0].name]
+    return recipe_of(guess_reader(frames, found).open(frames).frames)
+
+
+def recipe_of(frames: Sequence[Frame]) -> str:
+    """The recipe that refines poses of these frames in memory."""
+    has_scans = any(frame.read_points is not None for frame in frames)
+    return SCANS if has_scans and all(frame.camera is None for frame in frames) else RECIPE
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,14 @@ from hodge_pipeline import se3
 from hodge_pipeline.pairs.revisits import Revisits, find_revisits
 from hodge_pipeline.registration import odometry as tracking
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.registration.odometry import Odometry, OdometryOptions
 from hodge_pipeline.registration.odometry_path import drift_of
 from hodge_pipeline.scene import START, Closed, KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import Step, Steps, Workers
-from hodge_pipeline.start.clouds import landmarks_for, make_clouds
+from hodge_pipeline.start.clouds import make_clouds, with_landmarks
 from hodge_pipeline.start.unordered.join import join_parts
-from hodge_pipeline.start.unordered.loops import find_loops, is_worth_it
+from hodge_pipeline.start.unordered.loops import find_loops, is_long, is_worth_it
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of
@@ -51,35 +50,42 @@ class OdometryStart(OdometryOptions):
         """The options of the odometry alone: others do not change what it finds."""
         return OdometryOptions(**{field.name: getattr(self, field.name) for field in fields(OdometryOptions)})
 
-    def cloud_options(self, clouds: CloudOptions, apart: bool) -> CloudOptions:
-        """The clouds, with landmarks where parts are joined by them; `apart`: several parts are likely."""
-        relocalises = apart if self.relocalise == "auto" else self.relocalise
-        return landmarks_for(clouds, self.unordered) if relocalises else clouds
-
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """Every frame of the source with its cloud and its pose by odometry."""
         sequences, stamps = tuple(sequences_of(source).values()), _stamps(source)
-        options = self.cloud_options(clouds, len(sequences) > 1 or len(gaps(sequences, stamps)) > 0)
-        made = make_clouds(source, options, steps, workers)
+        made = make_clouds(source, clouds, steps, workers)
         found = steps.step(
             chain, made, sequences, stamps, self.odometry, title="odometry", total=len(stamps), workers=workers
         )
-        return self.joined(source, made, found, KeyFrames.all_of(source, found.world_from_cam), steps, workers)
+        key_frames = KeyFrames.all_of(source, found.world_from_cam)
+        return self.joined(source, made, clouds, found, key_frames, steps, workers)
 
     def joined(
-        self, source: Source, clouds: CloudSet, found: Odometry, key_frames: KeyFrames, steps: Steps, workers: Workers
+        self,
+        source: Source,
+        clouds: CloudSet,
+        options: CloudOptions,
+        found: Odometry,
+        key_frames: KeyFrames,
+        steps: Steps,
+        workers: Workers,
     ) -> Scene:
-        """The scene of the key frames of `source`, its parts joined as `relocalise` says."""
+        """The scene of the key frames of `source`, their clouds made by `options`, its parts joined as `relocalise`
+        says.
+        """
         keys = key_source(source, key_frames.rows)
         steps.remember(keys, steps.key([source, key_frames.rows]))
         drift = drift_of(found.world_from_cam, found.steps, self.tail)
         first = Round(found.steps, vertex_ids(keys), found.world_from_cam)
         several = int((np.bincount(drift.part) > 1).sum()) > 1
         if self.relocalise is True or (self.relocalise == "auto" and several):
+            clouds = with_landmarks(keys, clouds, options, self.unordered, steps, workers)
             first = join_parts(keys, clouds, first, drift, self.unordered, steps, workers)
         closed = None
         if self.revisits is not None and first.name != START:
             known, count = None, len(found.world_from_cam)
+            if self.relocalise == "auto" and is_long(clouds, found.steps, drift, self.revisits):
+                clouds = with_landmarks(keys, clouds, options, self.unordered, steps, workers)
             if self.relocalise == "auto" and is_worth_it(clouds, found.steps, drift, self.revisits, self.unordered):
                 known = steps.step(
                     find_loops, keys, clouds, found.steps, drift, self.revisits, self.unordered,

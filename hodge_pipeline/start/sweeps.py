@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import small_gicp
@@ -15,14 +16,21 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.assessment import MIN_POINTS
-from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
+from hodge_pipeline.registration.clouds import (
+    CloudOptions,
+    Oddity,
+    in_range,
+    make_cloud,
+    out_of_range,
+    shortened,
+)
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame, velocities
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,
-    has_real_stamps,
+    is_clock,
     key_source,
     sequence_numbers,
     sequences_of,
@@ -32,7 +40,8 @@ from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
-from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, PointCloud, Source
+from hodge_pipeline.start.unordered.scan_checks import FACTOR_OF_UNITS
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Floats32, Frame, Ints, PointCloud, Source
 from hodge_pipeline.types.notes import Note, notes_of
 
 VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
@@ -45,11 +54,18 @@ LOOK_M, SAMPLE_M = 3.0, 0.7
 """Times a voxel: how far correspondences may be at its level; and the finest voxel thins a sweep."""
 NEIGHBOURS, MOST_ITERATIONS, SWEEPS_KEPT = 10, 30, 100
 """As small_gicp has them: points in a covariance; steps at a level; sweeps until a voxel that no sweep touches goes."""
+UNMATCHED = 9.0
+"""Times the usual squared error: what a point costs that has no voxel near, as one three times as far off."""
 REACH_QUANTILE = 0.99
 WARM_UP, MOST_PASSES = 20, 4
 """Sweeps that the first velocity is found on, and how often at most they are followed forth and back for it."""
 MOST_DESKEWS, FARTHER = 3, 0.9
 """A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
+LEFT_OUT = "the sweep is left out"
+LOOKS = 9
+"""Sweeps, spread over a sequence, that tell how far its scanner sees: any one may face a wall."""
+MOST_SKIPPED = 20
+"""Revolutions, 2 s of most scanners: numbers of files that are farther apart as a rule count something else."""
 NO_CLOCK_S = 1.0
 """Between two sweeps that neither stamps nor times of points tell apart: velocities are then a sweep's."""
 
@@ -58,7 +74,7 @@ NO_CLOCK_S = 1.0
 class Sweeps:
     """Poses (N, 4, 4) of all sweeps at their first points, their velocities (N, 6), and which (N,) were read.
 
-    `reach_m` is how far the scanner sees: 99 % of the first sweep's points are nearer.
+    `reach_m` is how far the scanner sees: 99 % of a usual sweep's points are nearer.
     """
 
     world_from_scan: Floats
@@ -95,65 +111,111 @@ class SweepsStart(OdometryStart):
         steps.remember(keys, steps.key([whole, rows]))
         steps.note(Note("key frames", len(rows), str(len(frames))))
         made = make_clouds(keys, clouds, steps, workers)
-        steps_of = tuple(np.flatnonzero(np.isin(rows, part)) for part in sequences)
+        steps_of = tuple(own for part in sequences if len(own := np.flatnonzero(np.isin(rows, part))))
         joined = steps.step(
             register_steps, made, steps_of, found.world_from_scan[rows], self.odometry,
             title="odometry", total=max(1, len(rows) - len(sequences)), workers=workers,
         )  # fmt: skip
         key_frames = _followers(whole, rows, found, joined, sequences)
-        return self.joined(whole, made, joined, key_frames, steps, workers)
+        return self.joined(whole, made, clouds, joined, key_frames, steps, workers)
 
 
 def follow(
     source: Source, sequences: tuple[Ints, ...], clouds: CloudOptions, voxel_m: float | None, *, step: Step
 ) -> Sweeps:
-    """Step: the poses of all sweeps, each sequence by itself."""
+    """Step: the poses of all sweeps, each sequence by itself. Raises `SourceError` where none has points in range."""
     count = len(source.frames)
-    poses, velocity = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6))
-    found, turn_s = np.zeros(count, bool), np.zeros(count)
-    stamps, is_clock = stamps_of(source), has_real_stamps(source.frames)
-    reach_m = _reach_m(source, clouds)
-    notes: list[str] = []
-    voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
+    poses, velocity, stamps = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), stamps_of(source)
+    found, turn_s, reaches_m = np.zeros(count, bool), np.zeros(count), []
+    odd: list[Oddity] = []
     for rows in sequences:
-        since = np.diff(stamps[rows], prepend=stamps[rows[0]]) if is_clock else np.zeros(len(rows))
-        first = [source.frames[row] for row in rows[:WARM_UP]]
-        tracker = _Tracker(clouds, voxel, LEVELS, _first_velocity(clouds, voxel, first, since))
-        times = np.zeros(len(rows))
-        for place, row in enumerate(rows.tolist()):
-            duration, problem = tracker.follow(source.frames[row], since[place])
-            times[place] = times[place - 1] + duration if place else 0.0
-            poses[row], found[row], turn_s[row] = tracker.pose, not problem, tracker.turn_s
-            notes += [f"frame {source.frames[row].frame_id}: {problem}"] if problem else []
+        frames = [source.frames[row] for row in rows]
+        reach_m, usual_turn_s = _first_look(frames, clouds)
+        reaches_m.append(reach_m)
+        times = _times(stamps[rows], usual_turn_s)
+        voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
+        first = list(zip(times, _sweeps(frames[:WARM_UP], clouds, reach_m), strict=False))
+        tracker = _Tracker(voxel, LEVELS, _first_velocity(voxel, first))
+        followed = []
+        for place, (row, sweep) in enumerate(zip(rows, _sweeps(frames, clouds, reach_m), strict=True)):
+            if sweep.cloud is not None:
+                tracker.follow(sweep.cloud, times[place])
+                followed.append(place)
+            poses[row], turn_s[row] = tracker.pose, tracker.turn_s
+            found[row] = sweep.cloud is not None or sweep.is_copy
+            odd += [] if sweep.odd is None else [sweep.odd]
             step.advance(1)
-        velocity[rows] = velocities(poses[rows], times)
-        from_middle = se3.exp(-turn_s[rows, None] / 2 * velocity[rows])
-        poses[rows] = poses[rows] @ from_middle  # to the first point
-    step.note(*notes_of("clouds", notes))
+        if followed:
+            last = np.searchsorted(followed, np.arange(len(rows)), side="right") - 1
+            velocity[rows] = velocities(poses[rows[followed]], times[followed])[np.maximum(last, 0)]
+            poses[rows] = poses[rows] @ se3.exp(-turn_s[rows, None] / 2 * velocity[rows])  # to the first point
+    if not found.any():
+        raise SourceError(f"{source.path}: none of the {count} sweeps gave points in range; the first: {odd[0]}")
+    step.note(*notes_of("clouds", shortened(odd)))
+    if not found.all():
+        step.note(Note("sweeps left out", int((~found).sum()), next(one.why for one in odd if one.what == LEFT_OUT)))
     if not turn_s.any():
         step.note(Note("sweeps untimed"))
-    return Sweeps(poses, velocity, found, reach_m)
+    return Sweeps(poses, velocity, found, min(reaches_m))
 
 
-def _reach_m(source: Source, clouds: CloudOptions) -> float:
-    """How far the scanner sees in the first sweep that can be read. Raises `SourceError` where none can."""
-    problem: object = "the source has no points"
-    for frame in source.frames:
+class _Sweep(NamedTuple):
+    """The points in range of a sweep, None where it cannot be read or repeats the one before it, and what is odd."""
+
+    cloud: PointCloud | None
+    odd: Oddity | None = None
+    is_copy: bool = False
+
+
+def _sweeps(frames: Iterable[Frame], clouds: CloudOptions, usual_m: float | None = None) -> Iterator[_Sweep]:
+    """Each sweep; one whose reach is far from the `usual_m` is left out too, since it has other units."""
+    before: Frame | None = None
+    points: Floats32 = np.zeros((0, 3), np.float32)
+    for frame in frames:
         try:
-            points = _sweep(frame, clouds).points_in_cam
+            # The points as measured; the cloud of a frame that has a depth image in their place.
+            cloud = make_cloud(frame, clouds)[0] if frame.read_points is None else frame.read_points()
+            near = in_range(cloud, clouds)
         except (SourceError, OSError) as error:
-            problem = error
+            yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, str(error)))
             continue
-        ranges = np.linalg.norm(points, axis=1)
-        ranges = ranges[(ranges >= clouds.min_range_m) & (ranges <= clouds.max_range_m)]
-        if len(ranges):
-            return float(np.quantile(ranges, REACH_QUANTILE))
-    raise SourceError(f"{source.path}: none of the {len(source.frames)} sweeps gave points in range: {problem}")
+        if not len(near):
+            yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, out_of_range(cloud, clouds)))
+        elif usual_m is not None and not 1 / FACTOR_OF_UNITS < (reach_m := _reach_m(cloud)) / usual_m < FACTOR_OF_UNITS:
+            why = f"it reaches {reach_m:.3g} m, the others {usual_m:.3g} m: has it other units (millimetres)?"
+            yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, why))
+        elif before is not None and np.array_equal(near.points_in_cam, points):
+            why = f"it is given the pose of {before.frame_id}"
+            yield _Sweep(None, Oddity(frame.frame_id, "holds the same points as the sweep before it", why), True)
+        else:
+            before, points = frame, near.points_in_cam
+            yield _Sweep(near)
 
 
-def _sweep(frame: Frame, clouds: CloudOptions) -> PointCloud:
-    """The points of a sweep as measured; the cloud of a frame that has a depth image in their place."""
-    return make_cloud(frame, clouds)[0] if frame.read_points is None else frame.read_points()
+def _first_look(frames: list[Frame], clouds: CloudOptions) -> tuple[float, float]:
+    """How far the scanner sees and how long it turns, as a rule; all the range that is asked for where no sweep of
+    those looked at can be read.
+    """
+    looks = [s.cloud for s in _sweeps(frames[:: max(1, len(frames) // LOOKS)], clouds) if s.cloud is not None]
+    looks = looks or [s.cloud for s in _sweeps(frames, clouds) if s.cloud is not None][:1]
+    if not looks:
+        return clouds.max_range_m, 0.0
+    reach_m = np.median([_reach_m(look) for look in looks])
+    return float(reach_m), float(np.median([0.0 if look.times_s is None else look.times_s.max() for look in looks]))
+
+
+def _reach_m(cloud: PointCloud) -> float:
+    ranges = np.linalg.norm(cloud.points_in_cam, axis=1)
+    return float(np.quantile(ranges[np.isfinite(ranges) & (ranges > 0)], REACH_QUANTILE))
+
+
+def _times(stamps_s: Floats, turn_s: float) -> Floats:
+    """When sweeps (N,) began, in seconds after the first: by their stamps, or by their numbers, a revolution each."""
+    after: Floats = stamps_s - stamps_s[0]
+    if len(after) < 2 or is_clock(stamps_s):
+        return after
+    step = float(np.median(np.diff(after)))
+    return np.asarray((after if step <= MOST_SKIPPED else after / step) * (turn_s or NO_CLOCK_S))
 
 
 class _Tracker:
@@ -163,65 +225,53 @@ class _Tracker:
     points it would move the next pose the other way by half, which swings for ever.
     """
 
-    def __init__(self, clouds: CloudOptions, voxel_m: float, levels: tuple[int, ...], velocity: Floats) -> None:
-        self._clouds, self._voxel_m, self._map = clouds, voxel_m, _Map(voxel_m, levels)
+    def __init__(self, voxel_m: float, levels: tuple[int, ...], velocity: Floats) -> None:
+        self._voxel_m, self._map, self._coarsest_m = voxel_m, _Map(voxel_m, levels), LOOK_M * voxel_m * levels[0]
         self.velocity, self.pose, self.turn_s = velocity, np.eye(4), 0.0
+        self._time_s: float | None = None
 
-    def follow(self, frame: Frame, since_s: float, *, backwards: bool = False) -> tuple[float, str]:
-        """The seconds since the last sweep, a revolution where no clock says (`since_s` 0), and what kept this one from
-        being read.
-        """
-        try:
-            cloud = _in_range(_sweep(frame, self._clouds), self._clouds)
-        except (SourceError, OSError) as error:
-            return since_s or self.turn_s or NO_CLOCK_S, str(error)
-        if not len(cloud):
-            return since_s or self.turn_s or NO_CLOCK_S, "it has no points in range"
+    def follow(self, cloud: PointCloud, time_s: float) -> None:
+        """Find the pose of a sweep that began at `time_s`, which is earlier than the last one's on the way back."""
         self.turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
-        duration, sense = since_s or self.turn_s or NO_CLOCK_S, -1.0 if backwards else 1.0
+        duration = 0.0 if self._time_s is None else time_s - self._time_s
         before, velocity, rates = self.pose, self.velocity, [self.velocity]
         for _ in range(MOST_DESKEWS):
-            points = deskewed(cloud, sense * rates[-1], self.turn_s / 2).points_in_cam.astype(np.float64)
-            self.pose, is_first = self._map.align(points, before @ se3.exp(velocity * duration))
+            points = deskewed(cloud, rates[-1], self.turn_s / 2).points_in_cam.astype(np.float64)
+            guesses = [before @ se3.exp(velocity * duration)]
+            if self._shift_m(velocity, points, abs(duration)) > self._coarsest_m:
+                guesses.append(before)  # after a gap the scanner may be where it was
+            self.pose, is_first = self._map.align(points, guesses)
             if is_first:
                 break
             velocity = se3.log(se3.inverse(before) @ self.pose) / duration
             rates.append(velocity)
-            if not self.turn_s or self._shift_m(rates[-1] - rates[-2], points) < self._voxel_m / 2:
+            if not self.turn_s or self._shift_m(rates[-1] - rates[-2], points, self.turn_s / 2) < self._voxel_m / 2:
                 break
         self._map.insert(self.pose)
-        self.velocity = velocity
-        return duration, ""
+        self.velocity, self._time_s = velocity, time_s
 
-    def _shift_m(self, rates: Floats, points: Floats) -> float:
-        """How far such an error of the velocity moves the farther points at the ends of a sweep."""
+    def _shift_m(self, rates: Floats, points: Floats, seconds: float) -> float:
+        """How far such a velocity moves the farther points in this time."""
         range_m = np.quantile(np.linalg.norm(points, axis=1), FARTHER)
-        return float((np.linalg.norm(rates[:3]) * range_m + np.linalg.norm(rates[3:])) * self.turn_s / 2)
+        return float((np.linalg.norm(rates[:3]) * range_m + np.linalg.norm(rates[3:])) * seconds)
 
 
-def _in_range(cloud: PointCloud, options: CloudOptions) -> PointCloud:
-    ranges = np.linalg.norm(cloud.points_in_cam, axis=1)  # NaN compares false
-    kept = (ranges > 0) & (ranges >= options.min_range_m) & (ranges <= options.max_range_m)
-    times_s = None if cloud.times_s is None else cloud.times_s[kept]
-    return PointCloud(cloud.points_in_cam[kept], times_s=times_s)
-
-
-def _first_velocity(clouds: CloudOptions, voxel_m: float, frames: list[Frame], since_s: Floats) -> Floats:
-    """The twist a second (6,) at the first of these frames, which are followed forth and back until it stays.
+def _first_velocity(voxel_m: float, sweeps: list[tuple[float, _Sweep]]) -> Floats:
+    """The twist a second (6,) at the first of these sweeps, each with its time; they are followed forth and back until
+    it stays.
 
     At first from rest: rings on the ground look the same ahead, and give a velocity that is too small.
     """
+    read = [(time_s, sweep.cloud) for time_s, sweep in sweeps if sweep.cloud is not None]
     velocity = np.zeros(6)
-    for _ in range(MOST_PASSES):
+    for _ in range(MOST_PASSES if len(read) > 1 else 0):
         before = velocity
-        for is_back in (False, True):
-            tracker = _Tracker(clouds, voxel_m, START_LEVELS, velocity)
-            places = range(len(frames))
-            for place in reversed(places) if is_back else places:
-                since = since_s[place + is_back] if place + is_back < len(since_s) else 0.0
-                duration, _ = tracker.follow(frames[place], since, backwards=is_back)
-            velocity = -tracker.velocity
-        if np.linalg.norm((velocity - before)[3:]) * duration < voxel_m / 2:
+        for way in (read, read[::-1]):
+            tracker = _Tracker(voxel_m, START_LEVELS, velocity)
+            for time_s, cloud in way:
+                tracker.follow(cloud, time_s)
+            velocity = tracker.velocity
+        if np.linalg.norm((velocity - before)[3:]) * (read[1][0] - read[0][0]) < voxel_m / 2:
             break
     return velocity
 
@@ -235,18 +285,28 @@ class _Map:
         for _, voxels in self._levels:
             voxels.set_lru(horizon=SWEEPS_KEPT)
 
-    def align(self, points: Floats, guess: Floats) -> tuple[Floats, bool]:
-        """The pose of a sweep by points (N, 3), and whether there was nothing to align, so that it is the guess."""
+    def align(self, points: Floats, guesses: list[Floats]) -> tuple[Floats, bool]:
+        """The pose of a sweep by points (N, 3), and whether there was nothing to align, so that it is the first
+        guess.
+        """
         self._sweep = self._thinned(points) if len(points) >= MIN_POINTS else None
         if self._sweep is None or self._is_empty:
-            return guess, True
-        coarse = guess
+            return guesses[0], True
+        starts = [start for guess in guesses for start in (guess, self._coarse(guess))]
+        found = [self._aligned(self._levels[-1], start) for start in starts]
+        held = [one for one in found if one.num_inliers >= MIN_POINTS and se3.is_motion(one.T_target_source)]
+        if not held:
+            return guesses[0], False
+        alone = UNMATCHED * min(one.error / one.num_inliers for one in held)
+        count = self._sweep.size()
+        best = min(held, key=lambda one: one.error + (count - one.num_inliers) * alone)
+        return np.asarray(best.T_target_source), False
+
+    def _coarse(self, guess: Floats) -> Floats:
         for level in self._levels[:-1]:
-            found = np.asarray(self._aligned(level, coarse).T_target_source)
-            coarse = found if se3.is_motion(found) else coarse
-        both = [self._aligned(self._levels[-1], start) for start in (guess, coarse)]
-        best = min(both, key=lambda found: found.error / max(found.num_inliers, 1) ** 2)  # near, and many
-        return (np.asarray(best.T_target_source) if best.num_inliers >= MIN_POINTS else guess), False
+            found = np.asarray(self._aligned(level, guess).T_target_source)
+            guess = found if se3.is_motion(found) else guess
+        return guess
 
     def _aligned(self, level: tuple[float, Any], guess: Floats) -> Any:
         size_m, voxels = level

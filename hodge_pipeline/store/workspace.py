@@ -73,8 +73,8 @@ class Workspace:
             lock = _open_lock(folder)
         except OSError as error:
             raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
-        _hold(lock, folder)
         try:
+            hold(lock, _in_use(folder))
             with disk_errors(folder):
                 _remove_drafts(folder)
                 _check_kind(folder, kind)
@@ -130,7 +130,7 @@ def holding(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise WorkspaceError(f"{folder}: cannot be written ({error.strerror})") from error
     with lock:
-        _hold(lock, folder)
+        hold(lock, _in_use(folder))
         yield
 
 
@@ -167,17 +167,20 @@ def _open_lock(folder: Path) -> IO[str]:
     return os.fdopen(os.open(folder / LOCK_FILE, flags, 0o644), "r+")
 
 
-def _hold(lock: IO[str], folder: Path) -> None:
-    """Take the folder's lock, which ends with the process."""
+def _in_use(folder: Path) -> str:
+    return f"{folder}: another run uses this folder: wait for it, or name another folder"
+
+
+def hold(file: IO[str] | int, refusal: str) -> None:
+    """Take the lock of an open file, which ends with it. Raises `WorkspaceError` where another process has it."""
     try:
         import fcntl
-    except ImportError:  # Windows has no flock: there two runs in one folder are the user's care
+    except ImportError:  # Windows has no flock: there two runs, or reviews, of one folder are the user's care
         return
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        lock.close()
-        raise WorkspaceError(f"{folder}: another run uses this folder: wait for it, or name another folder") from error
+        raise WorkspaceError(refusal) from error
 
 
 def _check_kind(folder: Path, kind: str) -> None:

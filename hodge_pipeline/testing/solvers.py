@@ -151,8 +151,7 @@ def _does_not_mind_the_directions(solver: ConsistencySolver) -> None:
     turned = np.arange(graph.edge_count) % 2 == 0
     edges, motions, information = graph.edges.copy(), graph.i_from_j.copy(), graph.information.copy()
     edges[turned], motions[turned] = edges[turned, ::-1], se3.inverse(motions[turned])
-    moved = se3.adjoint(motions[turned])
-    information[turned] = np.swapaxes(moved, 1, 2) @ information[turned] @ moved
+    information[turned] = se3.pull_back(motions[turned], information[turned])
     other = replace(graph, edges=edges, i_from_j=motions, information=information)
     one, two = (_solved(solver, given, start).world_from_cam for given in (graph, other))
     _assert_near(one, two, NO_CHANGE, "half of the edges measured the other way give other poses")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -310,6 +310,13 @@ class CloudSet(Sequence[PointCloud]):
     def open(cls, folder: Path) -> CloudSet:
         """The clouds that `save` wrote to this folder, mapped read-only."""
         return cls(**{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in cls.FILES}, folder=folder)
+
+    def with_landmarks(self, landmarks: Sequence[Landmarks]) -> CloudSet:
+        """The same clouds with these landmarks (N)."""
+        of_none = PointCloud(np.zeros((0, 3), np.float32))
+        marks = CloudSet.from_clouds([replace(of_none, landmarks=one) for one in landmarks])
+        of_marks = (marks.marks, marks.mark_points, marks.mark_descriptors, marks.mark_pixel_rad)
+        return CloudSet(self.offsets, self.points, self.normals, self.colours, *of_marks)
 
     @classmethod
     def from_clouds(cls, clouds: Sequence[PointCloud]) -> CloudSet:

@@ -52,6 +52,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
         "much of {count} frames moved otherwise than the camera ({detail}): people or objects that move? The camera's "
         "motion is the one that fits more of the image; key frames leave out what moves",
     ),
+    "camera or object": (
+        Rank.DOUBT,
+        "The path may in part be that of objects: in {count} of {detail}, more than a quarter of the image "
+        "moves otherwise than the camera is said to. Compare the model with the scene, or leave these frames out.",
+    ),
     "clock": (
         Rank.LOOK,
         "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
@@ -68,6 +73,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "odometry slid unnoticed at {count} frames ({detail}): the pairs over these steps agree on where they lead, "
         "and count in its place",
+    ),
+    "sweeps left out": (
+        Rank.LOOK,
+        "{count} sweeps are left out, and posed by their neighbours where these are known; the first: {detail}",
     ),
     "sweeps untimed": (
         Rank.FACT,

@@ -17,7 +17,7 @@ from hodge_pipeline.refine.guard import Decision
 from hodge_pipeline.refine.open3d_objects import poses_of, with_poses
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.sources.inspect import guess_reader
-from hodge_pipeline.start.match_poses import RECIPE, recipe_for
+from hodge_pipeline.start.match_poses import recipe_for, recipe_of
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source
 from hodge_pipeline.uses.image_checks import camera_of, check_colours, check_depths
@@ -83,14 +83,14 @@ def refine_trajectory(
     """Poses made better by the frames they belong to, one pose for each frame.
 
     `poses`: world_from_cam (N, 4, 4), or an `open3d.camera.PinholeCameraTrajectory`. `frames`: a path that a reader
-    opens, or frames (see `frames_from_images`). `recipe`: slam_refine, or slam_refine_tum for TUM's folders. `out`
-    keeps the run folder with report and recording; `dask` is as of `run`. Files of poses go to `hodge refine
-    trajectory`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
+    opens, or frames (see `frames_from_images`). `recipe`: slam_refine, slam_refine_tum for TUM's folders,
+    slam_refine_scans for scans. `out` keeps the run folder with report and recording; `dask` is as of `run`. Files of
+    poses go to `hodge refine trajectory`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     open3d = not isinstance(poses, (np.ndarray, list, tuple))
     given = poses_of(poses) if open3d else np.asarray(poses, float)
     source = _source(frames, given)
-    chosen = recipe or (recipe_for(Path(frames)) if isinstance(frames, (str, Path)) else RECIPE)
+    chosen = recipe or (recipe_for(Path(frames)) if isinstance(frames, (str, Path)) else recipe_of(frames))
     ours = ["start.stage=given", "start.poses=frames", f"guard.force={str(force).lower()}"]
     loaded = load_recipe(chosen, [*ours, *overrides])
     with tempfile.TemporaryDirectory(prefix="hodge-refine-") as scratch:

@@ -81,7 +81,9 @@ def _median_step(points: Floats32) -> float:
     return float(np.median(np.linalg.norm(np.diff(points.astype(float), axis=0), axis=1))) if len(points) > 1 else 0.0
 
 
-def scan_poses(folder: Path, numbers: Sequence[int], notes: list[str]) -> tuple[dict[int, Floats], tuple[Path, ...]]:
+def scan_poses(
+    folder: Path, numbers: Sequence[float], notes: list[str]
+) -> tuple[dict[float, Floats], tuple[Path, ...]]:
     """The poses world_from_scan of the scans by their numbers, which are rows of `poses.txt` in their folder or the one
     above, and the files read: where `calib.txt` lies beside it these are poses of the camera that it places.
     """
@@ -95,7 +97,7 @@ def scan_poses(folder: Path, numbers: Sequence[int], notes: list[str]) -> tuple[
         poses, files = poses @ _camera_from_scan(calibration), (*files, calibration)
     else:
         notes.append(f"no {CALIBRATION} beside {POSES}: its poses are taken as the scanner's own, not a camera's")
-    return {number: poses[number] for number in numbers if number < len(poses)}, files
+    return {number: poses[int(number)] for number in numbers if number < len(poses)}, files
 
 
 def _camera_from_scan(path: Path) -> Floats:

@@ -9,7 +9,7 @@ from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -28,7 +28,11 @@ from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, PointCloud, Source, ViewGraph
 
 OTHER_SCANS = frozenset((".xyz", ".pts", ".ptx", ".asc", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
-_NUMBER = re.compile(r"(\d{1,15})\D*$")
+_NUMBER = re.compile(r"(\d{1,19})\D*$")
+_CLOCK = re.compile(r"(?<!\d)(\d{9,10})([._])(\d{1,9})$")
+"""Seconds since 1970 with a fraction, as bag_to_pcd names its files, or with nanoseconds of their own."""
+A_SECOND = ((10**17, 10**9), (10**14, 10**6), (10**11, 10**3))
+"""From the first number on, a whole number is a time since 1973, counted in so many a second."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -71,12 +75,13 @@ class CloudFolderReader:
             counts = ", ".join(f"{name} {scanners.count(name)}" for name in dict.fromkeys(scanners))
             notes.append(f"several scanners, by the names of the files ({counts}): each is a sequence of its own")
         stems = [f"{f.path.stem}" if f.row is None else f"{f.path.stem} {f.row}" for f in fragments]
-        numbers = list(range(len(stems))) if scanners else _numbers(stems, notes)
+        numbers = [float(row) for row in range(len(stems))] if scanners else _numbers(stems, notes)
         order = np.argsort(numbers, kind="stable")
         fragments, numbers = [fragments[row] for row in order], [numbers[row] for row in order]
         log = self._log(path if path.is_dir() else path.parent) if path.is_dir() or self.log != "auto" else None
         parsed = read_log_file(log) if log else None
-        poses, beside = parsed.poses if parsed else {}, tuple(filter(None, [log]))
+        poses: Mapping[float, Floats] = dict(parsed.poses.items()) if parsed else {}
+        beside = tuple(filter(None, [log]))
         if not poses and is_scan(fragments[0].path.name):
             poses, beside = scan_poses(fragments[0].path.parent, numbers, notes)
         names = {number: fragment.name for number, fragment in zip(numbers, fragments, strict=True)}
@@ -86,7 +91,7 @@ class CloudFolderReader:
         frames = tuple(
             Frame(
                 frame_id=fragment.name,
-                stamp_s=float(number),
+                stamp_s=number,
                 read_points=partial(read_fragment, fragment, units_per_metre=self.units_per_metre),
                 world_from_cam=poses.get(number, fragment.in_metres(self.units_per_metre)),
                 sequence=scanner,
@@ -230,29 +235,43 @@ def _scanners(paths: list[Path]) -> list[str]:
     """The names of the files with a * in place of the last number, where the same numbers come with several names; else
     nothing.
     """
-    found = [_NUMBER.search(path.stem) for path in paths]
-    numbers = [int(match[1]) for match in found if match]
-    names = [
-        f"{path.stem[: match.start(1)]}*{path.stem[match.end(1) :]}{path.suffix}"
-        for path, match in zip(paths, found, strict=True)
-        if match
-    ]
+    found = [(path, number) for path in paths if (number := _number(path.stem))]
+    names = [f"{path.stem[: n.begin]}*{path.stem[n.end :]}{path.suffix}" for path, n in found]
+    numbers = [number.value for _, number in found]
     each = set(zip(names, numbers, strict=True))
     return names if len(set(numbers)) < len(numbers) == len(each) == len(paths) else []
 
 
-def _numbers(stems: list[str], notes: list[str]) -> list[int]:
+def _numbers(stems: list[str], notes: list[str]) -> list[float]:
     """The last number in each name, or the rows where one has none or two have the same."""
-    found = [_NUMBER.search(stem) for stem in stems]
-    numbers = [int(match[1]) for match in found if match]
+    numbers = [number.value for stem in stems if (number := _number(stem))]
     if len(numbers) == len(stems) == len(set(numbers)):
         return numbers
     if len(stems) > 1:
         notes.append("names without a number of their own: fragments are numbered in the order of their names")
-    return list(range(len(stems)))
+    return [float(row) for row in range(len(stems))]
 
 
-def _graph(names: Mapping[int, str], pairs: Any, i_from_j: Any, notes: list[str]) -> ViewGraph:
+class _Number(NamedTuple):
+    value: float
+    begin: int
+    end: int
+
+
+def _number(stem: str) -> _Number | None:
+    """The last number in a name and where it stands: in seconds, where it is a time since 1973."""
+    clock, number = _CLOCK.search(stem), _NUMBER.search(stem)
+    if clock:
+        fraction = clock[3] if clock[2] == "." else f"{clock[3]:0>9}"
+        return _Number(float(f"{clock[1]}.{fraction}"), clock.start(1), clock.end(3))
+    if not number:
+        return None
+    count = int(number[1])
+    a_second = next((per for least, per in A_SECOND if count >= least), 1)
+    return _Number(count / a_second, number.start(1), number.end(1))
+
+
+def _graph(names: Mapping[float, str], pairs: Any, i_from_j: Any, notes: list[str]) -> ViewGraph:
     row_of = {number: row for row, number in enumerate(names)}
     known = np.array([int(i) in row_of and int(j) in row_of for i, j in pairs], bool)
     if not known.all():

@@ -51,11 +51,10 @@ def body_graph(graph: ViewGraph, bodies: Bodies) -> ViewGraph:
     chosen = graph.select(between)
     i, j = chosen.edges.T
     cam_from_body = se3.inverse(bodies.body_from_cam[j])
-    adjoint = se3.adjoint(cam_from_body)
     return replace(
         chosen,
         vertex_ids=np.array(bodies.names),
         edges=bodies.body_of_image[chosen.edges].reshape(-1, 2),
         i_from_j=bodies.body_from_cam[i] @ chosen.i_from_j @ cam_from_body,
-        information=np.swapaxes(adjoint, 1, 2) @ chosen.information @ adjoint,
+        information=se3.pull_back(cam_from_body, chosen.information),
     )

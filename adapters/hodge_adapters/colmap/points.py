@@ -68,8 +68,7 @@ def _rays(model: Model, world_from_cam: Floats) -> tuple[Ints, Floats, Floats, I
     points = model.points
     row, owner = model.image_rows, points.owners
     rays = np.zeros((len(row), 3))
-    for number, image in enumerate(model.images):
-        here = np.flatnonzero(row == number)
+    for image, here in zip(model.images, model.entries, strict=True):
         if len(here):
             camera = colmap_camera(model.cameras[image.camera_id])
             plane = np.asarray(camera.cam_from_img(image.pixels[points.columns[here]]))

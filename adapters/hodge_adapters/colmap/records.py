@@ -75,3 +75,9 @@ class Model:
         ids = np.array([image.image_id for image in self.images], np.int64)
         order = np.argsort(ids)
         return np.asarray(order[np.searchsorted(ids[order], self.points.image_ids)], np.int64)
+
+    @cached_property
+    def entries(self) -> list[Ints]:
+        """The rows of the entries of tracks that name each image, ascending."""
+        order = np.argsort(self.image_rows, kind="stable")
+        return np.split(order, np.searchsorted(self.image_rows[order], np.arange(1, len(self.images))))

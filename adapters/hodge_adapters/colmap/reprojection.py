@@ -35,8 +35,7 @@ def reprojection_errors(model: Model) -> tuple[Ints, Floats]:
     points = model.points
     row, owner = model.image_rows, points.owners
     errors_px = np.full(len(row), np.inf)
-    for number, image in enumerate(model.images):
-        here = np.flatnonzero(row == number)
+    for image, here in zip(model.images, model.entries, strict=True):
         if not len(here):
             continue
         in_cam = se3.transform(se3.inverse(image.world_from_cam), points.xyz[owner[here]])

@@ -87,10 +87,9 @@ def _inverse_without_gauge(matrix: Floats) -> Floats:
 
 def _rows(model: Model, bodies: Bodies) -> _Rows:
     points = model.points
-    image_row, owner = model.image_rows, points.owners
+    owner = points.owners
     parts = []
-    for number, image in enumerate(model.images):
-        here = np.flatnonzero(image_row == number)
+    for number, (image, here) in enumerate(zip(model.images, model.entries, strict=True)):
         camera = colmap_camera(model.cameras[image.camera_id])
         body = bodies.body_of_image[number]
         body_from_world, cam_from_body = (

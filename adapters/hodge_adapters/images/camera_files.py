@@ -14,6 +14,8 @@ from hodge_pipeline.types import Camera
 
 _ENTRY = re.compile(r"^\s*\"?(?:Camera\d?\.)?(\w+)\"?\s*[:=]\s*([-+0-9.eE]+)\s*[,;]?\s*(?:#.*)?$", re.MULTILINE)
 _DISTORTION = ("k1", "k2", "k3", "p1", "p2")
+LONGEST_READOUT_S = 1.0
+"""Of a rolling shutter: slower cameras give no video."""
 _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"
 
 
@@ -43,7 +45,7 @@ class Intrinsics:
 
 def read_intrinsics(path: Path) -> Intrinsics:
     """The intrinsics in a file: one line `fx fy cx cy [width height]`, a 3x3 or 4x4 matrix K, `fx: …` lines as in
-    ORB-SLAM's YAML, or Open3D's JSON.
+    ORB-SLAM's YAML (with `readout_s: …` for a rolling shutter), or Open3D's JSON.
 
     Raises `SourceError` for anything else, and for numbers that are no camera.
     """
@@ -59,6 +61,8 @@ def checked(found: Intrinsics, where: str) -> Intrinsics:
     numbers = (found.fx, found.fy, found.cx, found.cy)
     scale = found.units_per_metre
     bad_size = found.size is not None and min(found.size) <= 0
+    if not abs(found.readout_s) < LONGEST_READOUT_S:
+        raise SourceError(f"{where}: readout_s {found.readout_s:g} is no time in seconds in which an image is read")
     if not all(map(math.isfinite, numbers)) or found.fx <= 0 or found.fy == 0 or bad_size or (scale and scale <= 0):
         raise SourceError(f"{where}: fx fy cx cy = {numbers} is no pinhole camera: write {_SUPPORTED}")
     return found
@@ -100,6 +104,7 @@ def _from_entries(text: str) -> Intrinsics | None:
         units_per_metre=values.get("DepthMapFactor"),
         distorted=any(values.get(name) for name in _DISTORTION),
         distortion=_distortion(values),
+        readout_s=values.get("readout_s", 0.0),
     )
     if {"width", "height"} <= values.keys():
         return replace(found, size=(int(values["width"]), int(values["height"])))

@@ -29,8 +29,7 @@ def offsets_of(priors: Records, parameters: Records, offsets: Floats) -> Floats:
 def moved_to_body(world_from_sensor: Floats, information: Floats, body_from_sensor: Floats) -> tuple[Floats, Floats]:
     """Poses (P, 4, 4) of the body, and the information (P, 6, 6) on them, of what is known of its sensor."""
     sensor_from_body = se3.inverse(body_from_sensor)
-    adjoint = se3.adjoint(sensor_from_body)
-    return world_from_sensor @ sensor_from_body, np.swapaxes(adjoint, 1, 2) @ information @ adjoint
+    return world_from_sensor @ sensor_from_body, se3.pull_back(sensor_from_body, information)
 
 
 def as_priors(keys: Ints, poses: Floats, information: Floats, ids: Ints, where: str) -> Priors | None:

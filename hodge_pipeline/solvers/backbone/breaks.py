@@ -11,16 +11,11 @@ from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, shifted, without_run
+from hodge_pipeline.solvers.backbone.places import places_along
 from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS, SEEDS = 8, 16
 """Loops that each is compared with first, and those that are then compared with all: a limit on cost."""
-PLACE = 4.0
-"""Loops of which the steps between their ends vary less than so many loops do are of one place, and one testimony: a
-place that is mistaken for another has many loops that agree.
-"""
-STEPS_OF_PLACE, FEWEST_PLACES = 20, 50
-"""Steps that a place has at the least, however large the errors of steps are; places that a path has, however small."""
 PLATEAU = 12.0
 """Nats: a step at which the loops' evidence is lower by more is not where the chain is broken."""
 CARRIED = 40.0
@@ -65,11 +60,7 @@ class Testimony:
     @classmethod
     def of(cls, chain: Chain, linear: Linear, explained: Floats, away: Floats, used: Bools) -> Testimony:
         """At the poses of the bare chain."""
-        own = np.median(np.einsum("mii->mi", chain.covariance), axis=0)
-        steps = np.where(chain.bridged[:, None], 0.0, np.einsum("nii->ni", chain.step_covariance))
-        longest = max(STEPS_OF_PLACE, chain.size / FEWEST_PLACES)
-        along = np.clip((steps / own).mean(axis=1) / PLACE, 1 / longest, 1 / STEPS_OF_PLACE)
-        return cls(chain, linear, explained, away, used, np.cumsum(along)[chain.ends])
+        return cls(chain, linear, explained, away, used, places_along(chain))
 
     def places(self, rows: Ints) -> Floats:
         """How many of these loops (K,), each itself included, are of one place."""

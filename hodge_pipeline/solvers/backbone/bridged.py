@@ -42,7 +42,7 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     A step is tried where loops of several places agree that it is broken, or where it is unlike all others. It is
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
     """
-    chain = joined(chain)
+    chain = unbroken = joined(chain)
     wrong = Wrong.of(chain, chain.poses())  # one for all trials: evidence is against all loops being wrong
     judge = partial(infer, wrong=wrong, always=always, thin=thin)
     found = judge(chain)
@@ -51,6 +51,8 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
         if better is None:
             break
         chain, found = better
+    if found is not None and not found.confirmed:  # nor is a break that they speak of
+        chain, found = unbroken, judge(unbroken)
     return None if found is None else (chain, found)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import Wrong, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, inverse, linearise, scaled, settled, without
+from hodge_pipeline.solvers.backbone.places import one_of_each_place, places_along
 from hodge_pipeline.solvers.backbone.polish import LOCAL, polished
 from hodge_pipeline.solvers.backbone.scales import EVEN, Scales, learn_scales, mixture
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -85,8 +86,8 @@ def infer(
             break
         seen = np.packbits(used).tobytes()
     judged, linear = best
-    used = (judged.factor > np.log(max(len(always), 1))) & (judged.log_odds > 0)
-    confirmed = _confirmed(judged.factor[used], len(used))
+    used = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
+    confirmed = _confirmed(linear, np.flatnonzero(used), wrong)
     used = (used & confirmed) | always
     rows = thinned(chain, np.flatnonzero(used)).active
     linear, width = polished(rows, linear if used.any() else start)
@@ -121,13 +122,29 @@ THINNING = 0.8
 """Of as many loops as would leave `MOST_UNKNOWNS` if these grew in proportion to the loops."""
 
 
-def _confirmed(factor: Floats, count: int) -> bool:
-    """Whether used loops with these log Bayes factors, of so many loops, are more than chance finds."""
-    return float((factor - np.log(max(count, 1))).sum()) > by_chance(count)
+def _limit(judged: Judged) -> float:
+    """The log Bayes factor that one wrong loop is expected to reach by chance, of as many as are likely to be wrong."""
+    return float(np.log(max((1 / (1 + np.exp(np.clip(judged.log_odds, -500, 500)))).sum(), 1)))
+
+
+def _confirmed(linear: Linear, rows: Ints, wrong: Wrong) -> bool:
+    """Whether these loops say more than chance finds: one of each place, judged at the poses that those of the other
+    places lead to.
+
+    Loops of one place agree also where it is mistaken for another: only the backbone and other places confirm them.
+    """
+    if not len(rows):
+        return False
+    chain, ends = linear.chain, places_along(linear.chain)
+    count, chosen = len(one_of_each_place(ends)), rows[one_of_each_place(ends[rows])]
+    reduced = thinned(chain, chosen)
+    fit = settled_globally(Fit(reduced, linear))
+    factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[reduced.active]
+    return float(np.maximum(factor - np.log(count), 0.0).sum()) > by_chance(count)
 
 
 def by_chance(count: int) -> float:
-    """The log-evidence that chance may reach among so many loops."""
+    """The log-evidence that chance may reach among so many loops or places."""
     return BY_CHANCE + BY_CHANCE_EACH_FOLD * float(np.log(max(count, 1)))
 
 
@@ -158,12 +175,16 @@ TOO_HIGH = 2.0
 CHORDAL_STEPS = 10
 
 
-def _judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong) -> Judged:
+def _judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong, tense: bool = False) -> Judged:
+    """The loops at a fit, or at the bare chain; `tense`: with errors by which half of those in the fit are usual."""
     covariance = uncertainty(linear, fit)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
     residual = linear.loops[0].copy()
     if fit is not None:
         residual[fit.reduced.active] = left_out(fit, covariance)
+    if tense and fit is not None:
+        usual = student(residual[fit.reduced.active], covariance[fit.reduced.active])[1]
+        covariance = covariance * max(1.0, float(np.median(usual)) / len(linear.chain.axes))
     log_density = np.zeros((2, len(covariance)))
     chi2 = np.full(len(covariance), np.nan)
     log_density[0, known], chi2[known] = student(residual[known], covariance[known])

@@ -24,13 +24,16 @@ SIMILAR_PER_FRAME = 3
 
 
 def is_worth_it(clouds: CloudSet, odometry: Edges, drift: Drift, revisits: Revisits, options: GlobalStart) -> bool:
-    """Whether the path is so long that a place may be farther off than `revisits` looks, and frames have landmarks:
-    surfaces alone look alike too often.
-    """
+    """Whether the path is long, and frames have landmarks: surfaces alone look alike too often."""
+    return is_long(clouds, odometry, drift, revisits) and uses_images(clouds, options)
+
+
+def is_long(clouds: CloudSet, odometry: Edges, drift: Drift, revisits: Revisits) -> bool:
+    """Whether the path is so long that a place may be farther off than `revisits` looks."""
     range_m = median_range_m(clouds, np.flatnonzero(clouds.sizes > 0))
     i, j = odometry.pairs.T
     way_m = displacement_m(se3.inverse(drift.world_from_cam[i]) @ drift.world_from_cam[j], range_m).sum()
-    return bool(way_m > revisits.longest_way_m) and uses_images(clouds, options)
+    return bool(way_m > revisits.longest_way_m)
 
 
 def find_loops(

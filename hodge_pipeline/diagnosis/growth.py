@@ -1,0 +1,196 @@
+"""Align a scene from its edges: pieces are merged greedily, those with the largest log-evidence first.
+
+Each round every piece picks the neighbour with the largest log-evidence and is merged with it, unless that neighbour
+has much better merges of its own to come (Borůvka's scheme for trees, with patience). Edges between two
+pieces are votes on where one lies in the other. Once joined, all edges of both vote together, so that long cycles are
+tested without ever being listed. No edge is trusted: one that agrees with no other is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.types import Bools, Floats, Ints
+
+SINGLE_VOTE_FROM = 0.3
+"""The weight from which one edge, which no other confirms, may join two pieces."""
+PATIENCE = 0.7
+"""Of the best score that a piece has: weaker merges wait, since more edges may then vote on their placement."""
+VOTES_AGREE = 30.0
+"""χ² over six dimensions of two votes: beyond it they do not agree. Generous, since tails are heavy."""
+HYPOTHESES = 24
+"""Votes of a pair of pieces, the weightiest, that are tried as the answer."""
+MOST_PAIRS_TO_A_VOTE = 400
+DRIFT = 0.25
+"""Of an edge's variance, for each usual edge length between two votes: pieces are not solved while they grow."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The piece (V,) of each vertex, and its pose in the piece's frame (V, 4, 4)."""
+
+    piece: Ints
+    poses: Floats
+
+
+def align(evidence: Evidence, start: Alignment | None = None) -> Alignment:
+    """The alignment that the edges' weights lead to, from vertices on their own or from the pieces of a start."""
+    count, weight = evidence.graph.vertex_count, evidence.weight
+    piece, poses = np.arange(count), np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+    if start is not None:
+        piece, poses = start.piece.copy(), start.poses.copy()
+    while (votes := collect_votes(evidence, piece, poses)) is not None:
+        joined, moves_low = _joins(votes, _gains(evidence, votes), count)
+        if not len(joined):
+            break
+        motions = agreed_motions(votes, joined, weight)
+        motions[moves_low] = se3.inverse(motions[moves_low])
+        pair = votes.pair[joined]
+        low, high = votes.low[pair], votes.high[pair]
+        into = np.full(count, -1, np.int64)
+        into[np.where(moves_low, low, high)] = np.arange(len(pair))
+        moving = np.flatnonzero(into[piece] >= 0)
+        step = into[piece[moving]]
+        poses[moving] = motions[step] @ poses[moving]
+        piece[moving] = np.where(moves_low, high, low)[step]
+    return Alignment(piece, poses)
+
+
+def _gains(evidence: Evidence, votes: Votes) -> Floats:
+    """Log-evidence (nats) for each hypothesis (N,): the weights of the edges that agree, and a term that grows with
+    the logarithm of their number. 0 for a vote that is no hypothesis, or may not join two pieces on its own.
+    """
+    size, weight = len(votes.edge), evidence.weight
+    strength = votes.agreement * weight[votes.edge[votes.vote]]
+    counted = votes.agreement * np.minimum(1.0, 0.5 + weight[votes.edge[votes.vote]])
+    gain: Floats = np.bincount(votes.hypothesis, strength, size).astype(np.float64)
+    gain += evidence.cluster_gain * np.log1p(np.bincount(votes.hypothesis, counted, size))
+    agreeing = np.bincount(votes.hypothesis, votes.agreement > 0, size)
+    suffices: Bools = evidence.in_no_listed_cycle[votes.edge] | (weight[votes.edge] > SINGLE_VOTE_FROM)
+    return np.where((agreeing >= 2) | ((agreeing == 1) & suffices), gain, 0.0)
+
+
+def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
+    """The hypotheses to join by, and whether it is the lower of the two pieces that moves.
+
+    A piece moves to the one with the largest log-evidence, if that one stays where it is in this round and has no much
+    better join of its own to wait for.
+    """
+    order = np.lexsort((-gain, votes.pair))
+    best = order[votes.start]
+    real = np.flatnonzero(gain[best] > 0)
+    real = real[np.lexsort((real, -gain[best][real]))]
+    low, high, score = votes.low[real], votes.high[real], gain[best][real]
+    first = np.full(count, len(real))
+    np.minimum.at(first, low, np.arange(len(real)))
+    np.minimum.at(first, high, np.arange(len(real)))
+    chosen, moves_low = [], []
+    has_moved, base = np.zeros(count, bool), np.zeros(count, bool)
+    for row in np.unique(first[first < len(real)]).tolist():
+        for mover, other, lower in ((high[row], low[row], False), (low[row], high[row], True)):
+            wanted = first[mover] == row and score[row] >= PATIENCE * score[first[other]]
+            if wanted and not (has_moved[mover] or base[mover] or has_moved[other]):
+                has_moved[mover] = base[other] = True
+                chosen.append(real[row])
+                moves_low.append(lower)
+    return best[np.array(chosen, np.int64)], np.array(moves_low, bool)
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Votes sorted by the pair of pieces that they join, weightiest first; hypotheses are some of them.
+
+    - `edge (N,)`, `low_from_high (N, 4, 4)`: where the edge puts the piece of higher number; `point (N, 3)`: the end
+      of the edge in that piece.
+    - `pair (N,)`: row of the pair of pieces; `low`, `high (P,)`: their numbers; `start`, `count (P,)`: its votes.
+    - `hypothesis`, `vote (M,)`: rows that were compared; `agreement (M,)` from 1 down to 0 at the gate.
+    """
+
+    edge: Ints
+    low_from_high: Floats
+    point: Floats
+    pair: Ints
+    low: Ints
+    high: Ints
+    start: Ints
+    count: Ints
+    hypothesis: Ints
+    vote: Ints
+    agreement: Floats
+
+
+def collect_votes(evidence: Evidence, piece: Ints, piece_from: Floats) -> Votes | None:
+    """The votes of all edges between two pieces; None where there is none."""
+    edge = np.flatnonzero(piece[evidence.graph.edges[:, 0]] != piece[evidence.graph.edges[:, 1]])
+    if not len(edge):
+        return None
+    tail, head = evidence.graph.edges[edge].T
+    swapped = piece[tail] > piece[head]
+    motion = piece_from[tail] @ evidence.graph.i_from_j[edge] @ se3.inverse(piece_from[head])
+    motion[swapped] = se3.inverse(motion[swapped])
+    point = piece_from[np.where(swapped, tail, head), :3, 3]
+    low, high = np.minimum(piece[tail], piece[head]), np.maximum(piece[tail], piece[head])
+    key = low * evidence.graph.vertex_count + high
+    order = np.lexsort((-evidence.weight[edge], key))
+    edge, motion, point, key = edge[order], motion[order], point[order], key[order]
+    names, start, pair, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    hypothesis, vote = _compared(pair.reshape(-1), start, count)
+    agreement = agreement_of(evidence, edge, motion, point, hypothesis, vote)
+    low, high = names // evidence.graph.vertex_count, names % evidence.graph.vertex_count
+    return Votes(edge, motion, point, pair.reshape(-1), low, high, start, count, hypothesis, vote, agreement)
+
+
+def _compared(pair: Ints, start: Ints, count: Ints) -> tuple[Ints, Ints]:
+    """Each of a pair's first votes with all of its votes, or with evenly spread ones where they are very many."""
+    rank = np.arange(len(pair)) - start[pair]
+    hypothesis = np.flatnonzero(rank < HYPOTHESES)
+    total = count[pair[hypothesis]]
+    taken = np.minimum(total, MOST_PAIRS_TO_A_VOTE)
+    row = np.repeat(np.arange(len(hypothesis)), taken)
+    number = np.arange(len(row)) - np.repeat(np.cumsum(taken) - taken, taken)
+    return hypothesis[row], start[pair[hypothesis]][row] + number * total[row] // taken[row]
+
+
+def agreement_of(evidence: Evidence, edge: Ints, motion: Floats, point: Floats, first: Ints, second: Ints) -> Floats:
+    """How well pairs (M,) of votes (N,) agree, from 1 down to 0 at the gate: rows `first` and `second` of the edges,
+    their motions (N, 4, 4) and the points (N, 3) that these move.
+    """
+    quat = se3.to_quat_xyzw(motion)
+    angle = 2 * np.arccos(np.minimum(1.0, np.abs(np.einsum("ni,ni->n", quat[first], quat[second]))))
+    at = point[second]
+    difference = motion[first, :3, :3] - motion[second, :3, :3]
+    moved = np.einsum("nij,nj->ni", difference, at) + motion[first, :3, 3] - motion[second, :3, 3]
+    apart = np.einsum("ni,ni->n", at - point[first], at - point[first])
+    turn = evidence.noise.rotation_rad[edge] ** 2
+    shift = evidence.noise.translation_m[edge] ** 2
+    slack = 1 + DRIFT * np.sqrt(apart) / evidence.reach_m
+    turn_both = (turn[first] + turn[second]) * slack
+    shift_both = (shift[first] + shift[second]) * slack + turn[first] * apart
+    chi2 = angle**2 / turn_both + np.einsum("ni,ni->n", moved, moved) / shift_both
+    return np.asarray(np.maximum(0.0, 1 - chi2 / VOTES_AGREE))
+
+
+def agreed_motions(votes: Votes, chosen: Ints, weight: Floats) -> Floats:
+    """The mean (K, 4, 4) of the votes that agree with each chosen hypothesis, one to a pair of pieces."""
+    place = np.full(len(votes.edge), -1, np.int64)
+    place[chosen] = np.arange(len(chosen))
+    used: Bools = (place[votes.hypothesis] >= 0) & (votes.agreement > 0)
+    row, vote = place[votes.hypothesis[used]], votes.vote[used]
+    share = votes.agreement[used] * weight[votes.edge[vote]]
+    return mean_motions(row, votes.low_from_high[vote], votes.point[vote], share, len(chosen))
+
+
+def mean_motions(group: Ints, motion: Floats, point: Floats, share: Floats, count: int) -> Floats:
+    """The mean (count, 4, 4) of the motions (n, 4, 4) of each group (n,) by where they bring their points (n, 3), each
+    counting its share (n,).
+    """
+    share = share / np.bincount(group, share, count)[group]
+    to_group = csr_matrix((share, (group, np.arange(len(group)))), shape=(count, len(group)))
+    rotation = se3.project_to_so3((to_group @ motion[:, :3, :3].reshape(-1, 9)).reshape(-1, 3, 3))
+    landed = to_group @ (np.einsum("nij,nj->ni", motion[:, :3, :3], point) + motion[:, :3, 3])
+    return se3.from_parts(rotation, landed - np.einsum("nij,nj->ni", rotation, to_group @ point))

@@ -1,0 +1,35 @@
+"""Maximum-likelihood poses with heavy-tailed errors: each edge weighs by Student's t what it leaves over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hodge_pipeline.complex.judging import chi2_by_information, student_weight
+from hodge_pipeline.solvers.weights import is_planar
+from hodge_pipeline.types import Floats, Solution, ViewGraph
+
+ROUNDS, SETTLED = 4, 1e-2
+"""Rounds of weights at most, and the change of them that ends the rounds: beyond, no edge goes or comes."""
+
+
+def reweighted(
+    graph: ViewGraph,
+    weights: Floats,
+    solution: Solution,
+    solved: Callable[[Floats, Floats], Solution],
+    registered: bool = False,
+) -> tuple[Floats, Solution]:
+    """The weights (E,), at most those given, and the solution that they lead to; `solution` is that of the given ones.
+
+    `solved` gives the solution of weights (E,) from poses (V, 4, 4); `registered`: see `student_weight`.
+    """
+    used, size = weights > 0, 3 if graph.dimension == 2 or is_planar(graph) else 6
+    for _ in range(ROUNDS):
+        chi2 = np.maximum(chi2_by_information(graph, solution.world_from_cam), 0.0)
+        new = np.where(used, student_weight(chi2, size, usual=chi2[used], registered=registered), 0.0)
+        if np.abs(new - weights).max(initial=0.0) < SETTLED:
+            break
+        weights, solution = new, solved(new, solution.world_from_cam)
+    return weights, solution
