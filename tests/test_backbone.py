@@ -20,6 +20,7 @@ from hodge_pipeline.solvers.backbone.inference import left_out, uncertainty
 from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.types import ViewGraph
 from tests.backbone_graphs import WORLDS, broken, drive, spanned
 
 NEVER_WORSE = 1.02
@@ -141,6 +142,22 @@ def test_small_random_motions_confirm_nothing(data_dir: Path) -> None:
     motion[loops] = se3.exp(np.random.default_rng(0).normal(size=(len(loops), 6)) * size)
     backbone = find_backbone(replace(graph, i_from_j=motion))
     assert backbone is not None and not backbone.used[loops].any()
+
+
+def test_a_path_that_closes_once_is_closed() -> None:
+    count, sigma = 520, np.array([[0.003, 0.03], [0.01, 0.05]])
+    turns = np.zeros((count, 6))
+    turns[:, 2] = 2 * np.pi * np.arange(count) / 500
+    truth = se3.exp(turns)
+    truth[:, :2, 3] = 500 / (2 * np.pi) * np.stack([np.sin(turns[:, 2]), -np.cos(turns[:, 2])], axis=1)
+    steps = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+    edges = np.concatenate([steps, np.stack([np.arange(20), np.arange(500, 520)], axis=1)])
+    size = np.repeat(sigma[(np.arange(len(edges)) >= len(steps)).astype(int)], 3, axis=1)
+    for seed in range(2):
+        noise = se3.exp(size * np.random.default_rng(seed).standard_normal(size.shape))
+        motion = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ noise
+        information = np.eye(6) / size[:, None, :] ** 2
+        assert diagnose(ViewGraph.from_edges(np.arange(count), edges, motion, information)).kept.all()
 
 
 @pytest.mark.parametrize("name", ["manhattan", "MIT"])
