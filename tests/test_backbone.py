@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
@@ -19,6 +20,7 @@ from hodge_pipeline.solvers.backbone.inference import left_out, uncertainty
 from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.types import ViewGraph
 from tests.backbone_graphs import WORLDS, broken, drive, spanned
 
 NEVER_WORSE = 1.02
@@ -121,6 +123,41 @@ def test_wrong_loops_that_agree_at_one_place_alone_confirm_nothing(kind: dict[st
     found = diagnose(made.graph)
     assert not (found.kept & ~made.right).any() and found.kept[made.right].all()
     assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+
+
+def test_places_that_tell_little_of_a_broken_backbone_still_name_its_break() -> None:
+    kind: dict[str, Any] = {"count": 200, "dimension": 3, "world": "town", "loops": 100, "wrong": 0.6}
+    made, step = drive(seed=323, in_groups=True, **kind), 82
+    backbone = find_backbone(broken(made, step, seed=323))
+    assert backbone is not None
+    assert np.flatnonzero(backbone.steps & ~backbone.used).tolist() == [step]
+
+
+def test_small_random_motions_confirm_nothing(data_dir: Path) -> None:
+    graph = read_graph(data_dir / "pose_graphs/sesync/intel.g2o").graph
+    assert graph is not None
+    loops = np.flatnonzero(np.diff(graph.edges, axis=1)[:, 0] != 1)
+    size = [0.0, 0.0, 0.7, 0.7, 0.7, 0.0]  # of an error: rad, m
+    motion = graph.i_from_j.copy()
+    motion[loops] = se3.exp(np.random.default_rng(0).normal(size=(len(loops), 6)) * size)
+    backbone = find_backbone(replace(graph, i_from_j=motion))
+    assert backbone is not None and not backbone.used[loops].any()
+
+
+def test_a_path_that_closes_once_is_closed() -> None:
+    count, sigma = 520, np.array([[0.003, 0.03], [0.01, 0.05]])
+    turns = np.zeros((count, 6))
+    turns[:, 2] = 2 * np.pi * np.arange(count) / 500
+    truth = se3.exp(turns)
+    truth[:, :2, 3] = 500 / (2 * np.pi) * np.stack([np.sin(turns[:, 2]), -np.cos(turns[:, 2])], axis=1)
+    steps = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+    edges = np.concatenate([steps, np.stack([np.arange(20), np.arange(500, 520)], axis=1)])
+    size = np.repeat(sigma[(np.arange(len(edges)) >= len(steps)).astype(int)], 3, axis=1)
+    for seed in range(2):
+        noise = se3.exp(size * np.random.default_rng(seed).standard_normal(size.shape))
+        motion = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ noise
+        information = np.eye(6) / size[:, None, :] ** 2
+        assert diagnose(ViewGraph.from_edges(np.arange(count), edges, motion, information)).kept.all()
 
 
 @pytest.mark.parametrize("name", ["manhattan", "MIT"])

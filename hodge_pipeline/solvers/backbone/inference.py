@@ -54,12 +54,12 @@ class Inferred:
 
 
 def infer(
-    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None
+    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None, sure: bool = True
 ) -> Inferred | None:
     """Judge the loops of a chain; those of `always (M,)` count whatever they say. Where they would leave more than
     `MOST_UNKNOWNS`, all are judged at the poses of some of the right ones, or None comes back without `thin`.
 
-    `scales`: of the errors; learned from the loops where none are given.
+    `scales`: of the errors; learned from the loops where none are given. `sure`: use none that are not confirmed.
     """
     poses = chain.poses()
     scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
@@ -87,8 +87,8 @@ def infer(
         seen = np.packbits(used).tobytes()
     judged, linear = best
     used = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
-    confirmed = _confirmed(linear, np.flatnonzero(used), wrong)
-    used = (used & confirmed) | always
+    confirmed = _confirmed(linear, judged, used, wrong)
+    used = (used & (confirmed or not sure)) | always
     rows = thinned(chain, np.flatnonzero(used)).active
     linear, width = polished(rows, linear if used.any() else start)
     return Inferred(used, judged, linear.poses, scales, LOCAL, width, top, confirmed)
@@ -127,24 +127,30 @@ def _limit(judged: Judged) -> float:
     return float(np.log(max((1 / (1 + np.exp(np.clip(judged.log_odds, -500, 500)))).sum(), 1)))
 
 
-def _confirmed(linear: Linear, rows: Ints, wrong: Wrong) -> bool:
-    """Whether these loops say more than chance finds: one of each place, judged at the poses that those of the other
-    places lead to.
+def _confirmed(linear: Linear, judged: Judged, used: Bools, wrong: Wrong) -> bool:
+    """Whether the used loops say more together than chance finds, and so do the places that they join.
 
-    Loops of one place agree also where it is mistaken for another: only the backbone and other places confirm them.
+    Loops of one place agree also where it is mistaken for another: of each, one is judged at the poses that those of
+    the other places lead to.
     """
-    if not len(rows):
+    if not used.any() or (judged.factor[used] - np.log(len(used))).sum() <= by_chance(len(used)):
         return False
-    chain, ends = linear.chain, places_along(linear.chain)
+    chain, ends, rows = linear.chain, places_along(linear.chain), np.flatnonzero(used)
     count, chosen = len(one_of_each_place(ends)), rows[one_of_each_place(ends[rows])]
     reduced = thinned(chain, chosen)
     fit = settled_globally(Fit(reduced, linear))
     factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[reduced.active]
-    return float(np.maximum(factor - np.log(count), 0.0).sum()) > by_chance(count)
+    return float(np.maximum(factor - np.log(count), 0.0).sum()) > MISTAKEN
+
+
+MISTAKEN = float(np.log(20.0))
+"""Log-evidence that places may reach by chance, all of which are mistaken for others by loops that agree: one graph in
+twenty. More would refuse the loops of a path that closes once: these can say no more than the drift is small.
+"""
 
 
 def by_chance(count: int) -> float:
-    """The log-evidence that chance may reach among so many loops or places."""
+    """The log-evidence that chance may reach among so many loops."""
     return BY_CHANCE + BY_CHANCE_EACH_FOLD * float(np.log(max(count, 1)))
 
 
