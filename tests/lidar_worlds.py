@@ -17,6 +17,10 @@ from hodge_pipeline.demo.street import Road, joined
 from hodge_pipeline.demo.sweeps import SpinningScanner
 from hodge_pipeline.types import Floats
 
+TURN_RAD_S = np.pi / 2
+OFFICE_STARTS_M = (28.0, 10.0, 20.0)
+"""In the middle of a long corridor, before a corner, after one."""
+
 
 @dataclass(frozen=True)
 class Ground:
@@ -71,17 +75,42 @@ class Walk:
     def world_from_car(self, times_s: Floats) -> Floats:
         """Poses (N, 4, 4): x ahead, y left, z up from the slope."""
         times_s = np.asarray(times_s, float)
+        waves = np.sin(2 * np.pi * times_s[:, None] * np.array([0.9, 1.3, 0.7, 1.1]) + self._phase)
+        twist = np.zeros((len(times_s), 6))
+        twist[:, :2] = np.radians(1.0) * waves[:, :2]
+        twist[:, 4:] = 0.02 * waves[:, 2:]
+        return np.asarray(self._level(times_s) @ se3.exp(twist))
+
+    def _level(self, times_s: Floats) -> Floats:
         way = np.mod(times_s * self.speed_m_s, self.length_m)
         ahead = self._path(way, 1)
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
         left = np.cross([0, 0, 1.0], ahead)
         left /= np.linalg.norm(left, axis=1, keepdims=True)
         turned = np.stack([ahead, left, np.cross(ahead, left)], axis=2)
-        waves = np.sin(2 * np.pi * times_s[:, None] * np.array([0.9, 1.3, 0.7, 1.1]) + self._phase)
-        twist = np.zeros((len(times_s), 6))
-        twist[:, :2] = np.radians(1.0) * waves[:, :2]
-        twist[:, 4:] = 0.02 * waves[:, 2:]
-        return np.asarray(se3.from_parts(turned, self._path(way)) @ se3.exp(twist))
+        return se3.from_parts(turned, self._path(way))
+
+
+class Rounds(Walk):
+    """A closed way along straight lines on flat ground from `start_m` on; at its `corners (K, 2)` it turns in place."""
+
+    def __init__(self, corners: Floats, speed_m_s: float, height_m: float, start_m: float, seed: int) -> None:
+        legs = np.roll(corners, -1, axis=0) - corners
+        heading = np.unwrap(np.arctan2(*legs.T[::-1]))
+        heading = np.append(heading, heading[0] + 2 * np.pi)
+        turns_s = np.abs(np.diff(heading)) / TURN_RAD_S
+        self._times_s = np.append(0, np.cumsum(np.stack([np.linalg.norm(legs, axis=1) / speed_m_s, turns_s], axis=1)))
+        xy = np.append(np.repeat(np.roll(corners, -1, axis=0), 2, axis=0), corners[:1], axis=0)
+        xy = np.concatenate([corners[:1], xy[:-1]])
+        yaw = np.append(np.repeat(heading[:-1], 2), heading[-1])
+        self._stops = np.column_stack([xy, np.full(len(xy), height_m), yaw])
+        self.length_m, self.speed_m_s, self._start_s = 1e9, speed_m_s, start_m / speed_m_s
+        self._phase = np.random.default_rng([seed, 4]).uniform(0, 2 * np.pi, 4)
+
+    def _level(self, times_s: Floats) -> Floats:
+        now = np.mod(times_s + self._start_s, self._times_s[-1])
+        x, y, z, yaw = (np.interp(now, self._times_s, column) for column in self._stops.T)
+        return se3.from_parts(se3.so3_exp(np.stack([0 * yaw, 0 * yaw, yaw], axis=1)), np.stack([x, y, z], axis=1))
 
 
 def _smooth(z: Floats, way: Floats, sigma_m: float) -> Floats:
@@ -135,14 +164,11 @@ def hill(seed: int) -> tuple[Walk, list[Mesh]]:
 
 
 def office(seed: int) -> tuple[Walk, list[Mesh]]:
-    """Corridors of 2 m round a block of 30 x 14 m, door recesses, the outer wall half of glass (no return)."""
+    """Corridors of 2 m round a block of 30 x 14 m, door frames, the outer wall half of glass (no return)."""
     rng = np.random.default_rng([seed, 13])
-    flat = Ground(0.0, 0.0, seed)
     x, y = 16.0, 8.0
-    quarter = np.array([(1, 0.8), (0.9, 1), (0.3, 1)]) * [x, y]
-    left = np.concatenate([quarter, quarter[::-1] * [-1, 1]])
-    corners = np.concatenate([left, -left])
-    walk = Walk(corners, flat, 1.4, 0.6, seed)
+    corners = np.array([(x, -y), (x, y), (-x, y), (-x, -y)])
+    walk = Rounds(corners, 1.4, 0.6, OFFICE_STARTS_M[seed % len(OFFICE_STARTS_M)], seed)
     meshes = [box(60, 60, 0.2).moved(motion(0, 0, -0.2)), box(60, 60, 0.2).moved(motion(0, 0, 2.7))]
     meshes.append(box(2 * x - 2, 2 * y - 2, 2.7))  # the block
     for half, away, turn in ((x, y, 0), (y, x, 90), (x, y, 180), (y, x, 270)):

@@ -125,6 +125,25 @@ def test_wrong_loops_that_agree_at_one_place_alone_confirm_nothing(kind: dict[st
     assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
 
 
+def test_places_that_tell_little_of_a_broken_backbone_still_name_its_break() -> None:
+    kind: dict[str, Any] = {"count": 200, "dimension": 3, "world": "town", "loops": 100, "wrong": 0.6}
+    made, step = drive(seed=323, in_groups=True, **kind), 82
+    backbone = find_backbone(broken(made, step, seed=323))
+    assert backbone is not None
+    assert np.flatnonzero(backbone.steps & ~backbone.used).tolist() == [step]
+
+
+def test_small_random_motions_confirm_nothing(data_dir: Path) -> None:
+    graph = read_graph(data_dir / "pose_graphs/sesync/intel.g2o").graph
+    assert graph is not None
+    loops = np.flatnonzero(np.diff(graph.edges, axis=1)[:, 0] != 1)
+    size = [0.0, 0.0, 0.7, 0.7, 0.7, 0.0]  # of an error: rad, m
+    motion = graph.i_from_j.copy()
+    motion[loops] = se3.exp(np.random.default_rng(0).normal(size=(len(loops), 6)) * size)
+    backbone = find_backbone(replace(graph, i_from_j=motion))
+    assert backbone is not None and not backbone.used[loops].any()
+
+
 def test_a_path_that_closes_once_is_closed() -> None:
     count, sigma = 520, np.array([[0.003, 0.03], [0.01, 0.05]])
     turns = np.zeros((count, 6))

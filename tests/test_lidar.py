@@ -316,9 +316,12 @@ def test_poses_of_sweeps_are_never_worse_than_they_came(kind: str, tmp_path: Pat
     assert absolute_error(refined.poses, exact).max_m < 0.05
 
 
-@pytest.mark.parametrize("name", ["forest", "hill", "office", "field"])
-def test_other_worlds_are_followed(name: str, tmp_path: Path) -> None:
-    own, count = scanner_in(name, seed=0), 30
+@pytest.mark.parametrize(
+    ("name", "seed", "count"),
+    [("forest", 0, 30), ("hill", 0, 30), ("field", 0, 30), ("office", 0, 30), ("office", 1, 60), ("office", 2, 60)],
+)
+def test_other_worlds_are_followed(name: str, seed: int, count: int, tmp_path: Path) -> None:
+    own = scanner_in(name, seed)
     frames = tuple(
         Frame(row, row * REVOLUTION_S, read_points=partial(cloud_of, own.sweep(row))) for row in range(count)
     )
@@ -326,4 +329,4 @@ def test_other_worlds_are_followed(name: str, tmp_path: Path) -> None:
     found = follow(Source(name, tmp_path, frames), (np.arange(count),), CloudOptions(max_range_m=80.0), None, step=step)
     exact = own.road.world_from_car(np.arange(count) * REVOLUTION_S)
     path_m = np.linalg.norm(np.diff(exact[:, :3, 3], axis=0), axis=1).sum()
-    assert absolute_error(found.world_from_scan, exact).rmse_m < 0.02 * path_m  # of the field: 1.3 %
+    assert absolute_error(found.world_from_scan, exact).rmse_m < 0.02 * path_m  # of the field: 1.2 %

@@ -30,7 +30,7 @@ from hodge_pipeline.types.notes import Note, notes_of
 
 HEADLINES = {
     "refined": "Better than the poses given",
-    "optimal": "The poses given were as good already: they are given back",
+    "optimal": "No significant improvement: the poses given are given back",
     "worse": "Worse than the poses given: those are given back",
     "forced": "Worse than the poses given, written all the same",
     "nothing": "Nothing could be refined: no poses are written",

@@ -56,6 +56,12 @@ NEIGHBOURS, MOST_ITERATIONS, SWEEPS_KEPT = 10, 30, 100
 """As small_gicp has them: points in a covariance; steps at a level; sweeps until a voxel that no sweep touches goes."""
 UNMATCHED = 9.0
 """Times the usual squared error: what a point costs that has no voxel near, as one three times as far off."""
+ACCELERATION_M_S2, FASTEST_M_S = 5.0, 30.0
+"""Sigmas: of the change of velocity in a second, as of a car that brakes hard; and of a velocity that nobody knows."""
+SHARED_ERRORS = 30.0
+"""The sigma of a pose, times the one that independent points would give: those of a ring or wall share their errors.
+In a simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
+"""
 REACH_QUANTILE = 0.99
 WARM_UP, MOST_PASSES = 20, 4
 """Sweeps that the first velocity is found on, and how often at most they are followed forth and back for it."""
@@ -223,11 +229,15 @@ class _Tracker:
 
     Sweeps are deskewed to their middle, where a wrong velocity moves them as little forwards as back. To their first
     points it would move the next pose the other way by half, which swings for ever.
+
+    What a sweep says of its pose is weighed against the motion so far (a Kalman filter of the velocity): along a
+    corridor the alignment knows little, and a scanner does not leap.
     """
 
     def __init__(self, voxel_m: float, levels: tuple[int, ...], velocity: Floats) -> None:
         self._voxel_m, self._map, self._coarsest_m = voxel_m, _Map(voxel_m, levels), LOOK_M * voxel_m * levels[0]
         self.velocity, self.pose, self.turn_s = velocity, np.eye(4), 0.0
+        self._spread: Floats = FASTEST_M_S**2 * np.eye(3)  # covariance of the velocity, (m/s)^2
         self._time_s: float | None = None
 
     def follow(self, cloud: PointCloud, time_s: float) -> None:
@@ -235,14 +245,18 @@ class _Tracker:
         self.turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
         duration = 0.0 if self._time_s is None else time_s - self._time_s
         before, velocity, rates = self.pose, self.velocity, [self.velocity]
+        predicted, spread = before @ se3.exp(velocity * duration), self._spread
+        self._spread = spread = spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3)
         for _ in range(MOST_DESKEWS):
             points = deskewed(cloud, rates[-1], self.turn_s / 2).points_in_cam.astype(np.float64)
             guesses = [before @ se3.exp(velocity * duration)]
             if self._shift_m(velocity, points, abs(duration)) > self._coarsest_m:
                 guesses.append(before)  # after a gap the scanner may be where it was
-            self.pose, is_first = self._map.align(points, guesses)
-            if is_first:
+            self.pose, information = self._map.align(points, guesses)
+            if information is None or not duration:  # no velocity from two sweeps of one stamp
                 break
+            self.pose, moved = _weighed(predicted, spread * duration**2, self.pose, information)
+            self._spread = moved / duration**2
             velocity = se3.log(se3.inverse(before) @ self.pose) / duration
             rates.append(velocity)
             if not self.turn_s or self._shift_m(rates[-1] - rates[-2], points, self.turn_s / 2) < self._voxel_m / 2:
@@ -254,6 +268,15 @@ class _Tracker:
         """How far such a velocity moves the farther points in this time."""
         range_m = np.quantile(np.linalg.norm(points, axis=1), FARTHER)
         return float((np.linalg.norm(rates[:3]) * range_m + np.linalg.norm(rates[3:])) * seconds)
+
+
+def _weighed(predicted: Floats, spread_m2: Floats, aligned: Floats, information: Floats) -> tuple[Floats, Floats]:
+    """The pose between the predicted and the aligned one, and the covariance (3, 3) of its translation."""
+    known = np.eye(6)  # of the prediction: of turns no more is known than their size in radians
+    known[3:, 3:] = np.linalg.inv(spread_m2)
+    both = information + known
+    moved = np.asarray(np.linalg.solve(both, information @ se3.log(se3.inverse(predicted) @ aligned)))
+    return predicted @ se3.exp(moved), np.asarray(np.linalg.inv(both)[3:, 3:])
 
 
 def _first_velocity(voxel_m: float, sweeps: list[tuple[float, _Sweep]]) -> Floats:
@@ -285,22 +308,22 @@ class _Map:
         for _, voxels in self._levels:
             voxels.set_lru(horizon=SWEEPS_KEPT)
 
-    def align(self, points: Floats, guesses: list[Floats]) -> tuple[Floats, bool]:
-        """The pose of a sweep by points (N, 3), and whether there was nothing to align, so that it is the first
-        guess.
+    def align(self, points: Floats, guesses: list[Floats]) -> tuple[Floats, Floats | None]:
+        """The pose of a sweep by points (N, 3) and its information (6, 6), rotation first in its own axes; the first
+        guess and none where nothing could be aligned.
         """
         self._sweep = self._thinned(points) if len(points) >= MIN_POINTS else None
         if self._sweep is None or self._is_empty:
-            return guesses[0], True
+            return guesses[0], None
         starts = [start for guess in guesses for start in (guess, self._coarse(guess))]
         found = [self._aligned(self._levels[-1], start) for start in starts]
         held = [one for one in found if one.num_inliers >= MIN_POINTS and se3.is_motion(one.T_target_source)]
         if not held:
-            return guesses[0], False
-        alone = UNMATCHED * min(one.error / one.num_inliers for one in held)
+            return guesses[0], None
+        usual = min(one.error / one.num_inliers for one in held)
         count = self._sweep.size()
-        best = min(held, key=lambda one: one.error + (count - one.num_inliers) * alone)
-        return np.asarray(best.T_target_source), False
+        best = min(held, key=lambda one: one.error + (count - one.num_inliers) * UNMATCHED * usual)
+        return np.asarray(best.T_target_source), np.asarray(best.H) / (SHARED_ERRORS**2 * max(usual, 1e-12))
 
     def _coarse(self, guess: Floats) -> Floats:
         for level in self._levels[:-1]:

@@ -44,7 +44,7 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     """
     chain = unbroken = joined(chain)
     wrong = Wrong.of(chain, chain.poses())  # one for all trials: evidence is against all loops being wrong
-    judge = partial(infer, wrong=wrong, always=always, thin=thin)
+    judge = partial(infer, wrong=wrong, always=always, thin=thin, sure=False)
     found = judge(chain)
     for _ in range(MOST_BREAKS):
         better = None if found is None else _better(chain, found, judge)
@@ -52,7 +52,7 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
             break
         chain, found = better
     if found is not None and not found.confirmed:  # nor is a break that they speak of
-        chain, found = unbroken, judge(unbroken)
+        chain, found = unbroken, judge(unbroken, sure=True)
     return None if found is None else (chain, found)
 
 

@@ -54,12 +54,12 @@ class Inferred:
 
 
 def infer(
-    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None
+    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None, sure: bool = True
 ) -> Inferred | None:
     """Judge the loops of a chain; those of `always (M,)` count whatever they say. Where they would leave more than
     `MOST_UNKNOWNS`, all are judged at the poses of some of the right ones, or None comes back without `thin`.
 
-    `scales`: of the errors; learned from the loops where none are given.
+    `scales`: of the errors; learned from the loops where none are given. `sure`: use none that are not confirmed.
     """
     poses = chain.poses()
     scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
@@ -88,7 +88,7 @@ def infer(
     judged, linear = best
     used = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
     confirmed = _confirmed(linear, judged, used, wrong)
-    used = (used & confirmed) | always
+    used = (used & (confirmed or not sure)) | always
     rows = thinned(chain, np.flatnonzero(used)).active
     linear, width = polished(rows, linear if used.any() else start)
     return Inferred(used, judged, linear.poses, scales, LOCAL, width, top, confirmed)
