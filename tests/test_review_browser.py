@@ -140,6 +140,9 @@ def test_an_edge_added_by_three_clicked_points(browser: Any, review: Review, run
     motion = se3.inverse(truth[i]) @ truth[j]
     clouds = session.subject.clouds
     assert clouds is not None and not session.rows_of(f"{i}-{j}")
+    for name in sorted(PLANTED):
+        page.choose(name)
+        page.decided(lambda: page.click("#disable"))
     page.browser.execute_script("document.getElementById('adding').open = true")
     page.find("#first").send_keys(str(i))
     page.find("#second").send_keys(str(j))
@@ -147,7 +150,7 @@ def test_an_edge_added_by_three_clicked_points(browser: Any, review: Review, run
     page.until(lambda: page.find("#candidate").is_displayed())
     page.click("#apart")
     page.until(lambda: session.look.mode == "apart")
-    page.until(lambda: page.place(shown_pair(session, False).middle))  # type: ignore[union-attr]
+    arrived(page)
     for count, (here, there) in enumerate(matching(page, i, j, motion), start=1):
         for point, done in ((here, (count, count - 1)), (there, (count, count))):
             page.click_scene(point)
@@ -175,13 +178,12 @@ def test_a_first_guess_by_the_handles_of_the_second_cloud(browser: Any, review: 
     before = session.candidate.guess  # type: ignore[union-attr]
     page.click("#put")
     page.until(lambda: session.look.mode == "place")
-    page.until(lambda: page.place(shown_pair(session, False).middle))  # type: ignore[union-attr]
+    arrived(page)
     handle = page.until(lambda: page.handle("/pair/second"))
     ways = np.outer([0.5, 0.6, 0.7, 0.9], [handle.scale, 0, 0])  # along the arrow of x
     pose = se3.from_quat_xyzw(np.array(handle.position), np.array(handle.wxyz)[[1, 2, 3, 0]])
     time.sleep(2)  # the handles are drawn a few frames after the server has made them
     arrow = se3.transform(pose, ways)
-    page.until(lambda: all(page.place(point) is not None for point in arrow))  # the camera has arrived
     page.click_scene(*arrow)
     page.until(lambda: "the place it was put at" in page.text("found"))
     moved = se3.log(se3.inverse(before) @ session.candidate.guess)  # type: ignore[union-attr]
@@ -194,8 +196,7 @@ def test_a_page_that_comes_later_looks_at_the_same_pair(browser: Any, review: Re
     session.show(mode="edge")
     browser.get("about:blank")
     later = Page(browser, review)
-    middle = shown_pair(session, False).middle  # type: ignore[union-attr]
-    later.until(lambda: np.allclose(later.scene.camera.look_at, middle, atol=1e-3))
+    arrived(later)
 
 
 def test_the_second_cloud_fades_from_the_edges_place_to_the_solutions(browser: Any, review: Review) -> None:
@@ -218,6 +219,13 @@ def seen(page: Page, name: str) -> list[Any]:
 def clicks(session: Any) -> tuple[int, int]:
     candidate = session.candidate
     return len(candidate.points_i), len(candidate.points_j)
+
+
+def arrived(page: Page) -> None:
+    """Return when the page looks at the pair that is shown."""
+    middle = shown_pair(page.review.session, False).middle  # type: ignore[union-attr]
+    page.until(lambda: np.allclose(page.scene.camera.look_at, middle, atol=1e-3))
+    time.sleep(0.5)  # the position follows in a message of its own
 
 
 def matching(page: Page, i: int, j: int, i_from_j: Any) -> list[tuple[Any, Any]]:
