@@ -40,7 +40,7 @@ class Inferred:
     were found to be: scales, and `step_width`, `loop_width (M,)`, factors on standard deviations for the last solve.
 
     `log_evidence`: of the loops as judged, against all being wrong. `confirmed`: whether they say more than chance; if
-    not, none is used, and the poses are those of the chain.
+    not, none is used where only confirmed ones were wanted, and the poses are those of the chain.
     """
 
     used: Bools
