@@ -16,6 +16,7 @@ from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.fusion.cloud import CloudFuser
 from hodge_pipeline.fusion.fuse import fuse_all
@@ -189,6 +190,12 @@ def test_blocks_share_their_border_and_nothing_else() -> None:
     assert [int(part[0]) for part in own[1:]] == [int(part[-1]) for part in own[:-1]]
     np.testing.assert_array_equal(np.concatenate([own[0], *(part[1:] for part in own[1:])]), rows)
     assert [block.rows.tolist() for block in frame_blocks(np.array([3]), tuple(range(9)), np.arange(9.0))] == [[3]]  # type: ignore[arg-type]
+
+
+def test_a_sequence_without_any_depth_in_range_is_an_error(sequence: Path, tmp_path: Path) -> None:
+    source = with_dark(TumReader().open(sequence), range(FRAMES), images=False)
+    with pytest.raises(SourceError, match=f"none of {FRAMES} frames gave a point cloud: hodge inspect .* the first: "):
+        track(source, tmp_path / "dark")
 
 
 @pytest.mark.parametrize("images", [False, True])

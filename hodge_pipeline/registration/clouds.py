@@ -31,8 +31,8 @@ class CloudOptions:
     stride: int = Field(
         default=2,
         ge=1,
-        description="Pixels; every n-th row and column, or, of an image too coarse for that, as many as keep the voxels "
-        "filled up to the end of the range: 2 of 640 pixels, 3 cm and 6 m, 1 of 320.",
+        description="Pixels; every n-th row and column, or, of an image too coarse for that, as many as keep the "
+        "voxels filled up to the end of the range: with 3 cm and 6 m every 2nd of 640 pixels, all of 320.",
     )
     min_range_m: float = Field(
         default=0.2, ge=0, description="Metres along the optical axis; nearer is the sensor's blind zone."

@@ -30,7 +30,7 @@ from hodge_pipeline.report.contents import (
 )
 from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.report.refined import summary
-from hodge_pipeline.report.summary import graph_summary, trajectory_rows, weigh_wrong, worst_edges
+from hodge_pipeline.report.summary import graph_summary, trajectory_rows, unheld, weigh_wrong, worst_edges
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.scene import (
     START,
@@ -129,7 +129,7 @@ def make_report(
         graph=graph_summary(last.edges, last.vertex_ids, component),
         worst_edges=worst,
         stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in store.costs()),
-        notes=tuple(store.notes),
+        notes=(*store.notes, *unheld(last.edges, last.vertex_ids, recipe.acceptance.min_spread)),
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(recipe)),
         last_shift_m=_last_shift(rounds, component),

@@ -57,6 +57,16 @@ WORDING: dict[str, tuple[Rank, str]] = {
         "The path may in part be that of objects: in {count} of {detail}, more than a quarter of the image "
         "moves otherwise than the camera is said to. Compare the model with the scene, or leave these frames out.",
     ),
+    "unheld": (
+        Rank.DOUBT,
+        "The path may slide: at {count} of {detail} what both frames see, such as a bare wall, does not hold the "
+        "camera in every direction, and no other edge tests the step.",
+    ),
+    "other scale": (
+        Rank.DOUBT,
+        "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
+        "source.reader.depth_scale), or with another camera's focal length.",
+    ),
     "clock": (
         Rank.LOOK,
         "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
