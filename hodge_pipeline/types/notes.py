@@ -59,11 +59,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
     ),
     "clock": (
         Rank.LOOK,
-        "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
+        "the clock goes back at {detail}: the step there counts as long as the usual one",
     ),
     "holes": (
         Rank.LOOK,
-        "the recording stops at {count} places ({detail}): what the frames on both sides share tells the motion there",
+        "the recording stops for {detail}: what the frames on both sides share tells the motion there",
     ),
     "path broken": (
         Rank.LOOK,
