@@ -45,7 +45,7 @@ class Revisits:
         default=0.03, gt=0, lt=1, description="of that path, what odometry may be off by since the last place known"
     )
     most_m: float = Field(
-        default=1.5, gt=0, description="metres that a place may be off at most, since rooms that look alike may lie near"
+        default=1.5, gt=0, description="metres that a place may be off at most: rooms that look alike may lie near"
     )
     longest_way_m: float = Field(
         default=65.0,
