@@ -40,9 +40,12 @@ REFINEMENTS: dict[str, Outcome] = {
     "nothing": "not measured",
 }  # fmt: skip
 DOUBTS = {
-    "unsettled": "Not settled", "camera or object": "In doubt, since much of the image moves",
-    "unheld": "In doubt, since what frames share lets them slide", "other scale": "In another scale than the truth",
-}  # fmt: skip
+    "unsettled": "Not settled",
+    "camera or object": "In doubt, since much of the image moves",
+    "unheld": "In doubt, since what frames share lets them slide",
+    "path loose": "In doubt, since the scans tell little of how far the scanner went",
+    "other scale": "In another scale than the truth",
+}
 """How a headline begins where the run says that its result may be wrong, whatever was measured."""
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 
