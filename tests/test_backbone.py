@@ -125,7 +125,7 @@ def test_wrong_loops_that_agree_at_one_place_alone_confirm_nothing(kind: dict[st
     assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
 
 
-HIDDEN: dict[str, tuple[int, dict[str, Any]]] = {
+BROKEN_TOWNS: dict[str, tuple[int, dict[str, Any]]] = {
     "in places that tell little": (82, {"seed": 323, "count": 200, "dimension": 3, "wrong": 0.6, "in_groups": True}),
     "under every right loop": (143, {"seed": 626, "count": 200, "wrong": 0.2}),
     "at a corner": (259, {"seed": 658, "count": 400, "loops": 200, "wrong": 0.0, "in_groups": True}),
@@ -133,9 +133,9 @@ HIDDEN: dict[str, tuple[int, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("where", HIDDEN)
+@pytest.mark.parametrize("where", BROKEN_TOWNS)
 def test_a_broken_step_is_named(where: str) -> None:
-    step, kind = HIDDEN[where]
+    step, kind = BROKEN_TOWNS[where]
     made = drive(**{"world": "town", "loops": 100, **kind})
     backbone = find_backbone(broken(made, step, seed=kind["seed"]))
     assert backbone is not None
