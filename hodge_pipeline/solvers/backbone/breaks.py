@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, student
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, shifted, without_run
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, root, shifted, without_run
 from hodge_pipeline.solvers.backbone.places import places_along
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -190,24 +190,26 @@ class Usual:
 def _kinds(left: Floats, chi2: Floats, covariance: Floats) -> tuple[Floats, Floats, Bools]:
     """The centres (K, p) of kinds of steps, the share of the steps that are of each, and which steps are of one."""
     size = left.shape[1]
-    factor = np.linalg.inv(np.linalg.cholesky(covariance))
-    white, gate = left @ factor.T, ALIKE * size
+    white, gate = left @ np.linalg.inv(root(covariance[None])[0]).T, ALIKE * size
     other = chi2 > gate
-    centres, counts = [np.zeros(size)], [float((~other).sum())]
+    centres, counts = [np.zeros(size)], [max(float((~other).sum()), 1.0)]
     while other.sum() >= FEWEST_ALIKE and len(centres) < MOST_KINDS:
-        tree = cKDTree(white[other])
-        near = tree.query_ball_point(white[other], np.sqrt(gate), return_length=True)
-        if near.max() < FEWEST_ALIKE:
+        rows = np.flatnonzero(other)
+        some = white[rows[:: -(-len(rows) // MOST_COMPARED)]]
+        near = cKDTree(some).query_ball_point(some, np.sqrt(gate), return_length=True)
+        alike = rows[((white[rows] - some[np.argmax(near)]) ** 2).sum(axis=1) <= gate]
+        if len(alike) < FEWEST_ALIKE:
             break
-        rows = np.flatnonzero(other)[tree.query_ball_point(white[other][np.argmax(near)], np.sqrt(gate))]
-        centres.append(np.median(left[rows], axis=0))
-        counts.append(float(len(rows)))
-        other[rows] = False
+        centres.append(np.median(left[alike], axis=0))
+        counts.append(float(len(alike)))
+        other[alike] = False
     return np.stack(centres), np.array(counts) / len(left), ~other
 
 
-ALIKE, FEWEST_ALIKE, MOST_KINDS = 3.0, 3, 8
-"""χ² to an axis up to which steps are of one kind, steps that a kind has at the least, and a limit on cost."""
+ALIKE, FEWEST_ALIKE = 3.0, 3
+"""χ² to an axis up to which steps are of one kind, and steps that a kind has at the least."""
+MOST_KINDS, MOST_COMPARED = 8, 2000
+"""Limits on cost."""
 
 
 def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:

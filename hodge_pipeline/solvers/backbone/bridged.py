@@ -63,7 +63,8 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
 def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> tuple[Chain, Inferred] | None:
     """The chain with one more step bridged, and its loops judged; None where it has none that is broken."""
     founds = [found]
-    if not found.confirmed:  # a break that all loops see looks like larger errors of all steps: as stated, they agree
+    if not found.confirmed and found.scales != Scales():
+        # a break that all loops see looks like larger errors of all steps: with these as stated, the loops agree on it
         founds += [other for other in [judge(chain, scales=Scales())] if other is not None]
     for broken, least in [each for one in founds for each in _candidates(chain, one)]:
         tried = bridged(chain, broken)
