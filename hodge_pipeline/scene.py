@@ -196,10 +196,20 @@ def vertex_ids(source: Source) -> NDArray[np.generic]:
 
 
 def stamps_of(source: Source) -> Floats:
-    """Times (N,) of the frames; their numbers in a sequence whose stamps do not ascend: those are no clock."""
+    """Times (N,) of the frames, ascending in each sequence: where its clock goes back, by a step as long as the others.
+
+    In a sequence whose stamps are no clock's, or mostly do not ascend, the times are the numbers of the frames.
+    """
     stamps = np.array([frame.stamp_s for frame in source.frames], float)
     for rows in sequences_of(source).values():
-        if not (np.diff(stamps[rows]) > 0).all():
+        steps_s = np.diff(stamps[rows])
+        ahead = steps_s > 0
+        if ahead.all():
+            continue
+        if is_clock(stamps[rows]) and 2 * ahead.sum() > len(steps_s):
+            steps_s = np.where(ahead, steps_s, np.median(steps_s[ahead]))
+            stamps[rows[1:]] = stamps[rows[0]] + np.cumsum(steps_s)
+        else:
             stamps[rows] = np.arange(len(rows))
     return stamps
 

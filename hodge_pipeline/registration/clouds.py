@@ -47,7 +47,7 @@ class CloudOptions:
     landmarks: int = Field(
         default=0,
         ge=0,
-        description="SIFT landmarks of a frame, at most, the strongest; `rgbd` needs them, 800 serve it. About 60 ms a "
+        description="SIFT landmarks of a frame, at most, the strongest; `rgbd` needs them, 800 serve it. About 30 ms a "
         "frame; 0: none",
     )
     unit_m: float = Field(

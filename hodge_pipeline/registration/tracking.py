@@ -241,7 +241,8 @@ class _Tracker:
         self._velocity = se3.log(se3.inverse(self._key_from_last) @ found.i_from_j) / seconds
         self._rows[view.place] = (self._keys[-1].place, found.i_from_j, found.fitness)
         self._last, self._key_from_last, self._missed = view, found.i_from_j, None
-        if is_last or self._has_moved(found.i_from_j) or self._sees_little(view):
+        has_left = self._has_moved(found.i_from_j) or self._sees_little(view)
+        if is_last or (has_left and len(view.cloud)):  # a key frame without depth is joined to nothing
             self._promote(view, found)
 
     def _flowed(self, key: _View, view: _View, guess: Floats) -> Registration | None:

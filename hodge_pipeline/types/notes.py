@@ -59,11 +59,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
     ),
     "clock": (
         Rank.LOOK,
-        "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
+        "the clock goes back at {detail}: the step there counts as long as the usual one",
     ),
     "holes": (
         Rank.LOOK,
-        "the recording stops at {count} places ({detail}): what the frames on both sides share tells the motion there",
+        "the recording stops for {detail}: what the frames on both sides share tells the motion there",
     ),
     "path broken": (
         Rank.LOOK,
@@ -77,6 +77,15 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "sweeps left out": (
         Rank.LOOK,
         "{count} sweeps are left out, and posed by their neighbours where these are known; the first: {detail}",
+    ),
+    "sweeps loose": (
+        Rank.LOOK,
+        "{count} of {detail} sweeps tell little of how far the scanner went, as in a tunnel, and it goes on as before",
+    ),
+    "path loose": (
+        Rank.DOUBT,
+        "The length of the path is in doubt: {count} of {detail} sweeps tell little of how far the scanner went, as on "
+        "a bare field, and it goes on as before there. Known positions (positions.path) would hold it.",
     ),
     "sweeps untimed": (
         Rank.FACT,
