@@ -13,6 +13,7 @@ from scipy.ndimage import uniform_filter
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import length
+from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow
 from hodge_pipeline.report.document import Picture
@@ -28,6 +29,9 @@ FILL_PX = 5
 """In a picture that shows the points from near."""
 CLOSER = 2
 """How many times the place that changed most is enlarged."""
+SEEN_BEHIND = 0.01
+"""Share of points behind the image plane, which no camera has: of those of a scanner, whose z is up, it is the ground.
+"""
 VIEWED_PERCENT = 3.0
 """Of a frame's points, which may lie outside its own picture."""
 
@@ -102,7 +106,8 @@ def _some(rows: Ints) -> Ints:
 
 
 def four_sides(clouds: CloudSet, before: Floats, after: Floats, component: Ints) -> tuple[Picture, ...]:
-    """One picture for each side: the clouds laid together by the poses before on the left, after on the right.
+    """One picture for each side: the clouds laid together by the poses before, aligned to those after, on the left, and
+    by these on the right.
 
     Only frames of the largest component, which both sets of poses (N, 4, 4) know; none where there is nothing to see.
     """
@@ -110,8 +115,11 @@ def four_sides(clouds: CloudSet, before: Floats, after: Floats, component: Ints)
     rows = _some(np.flatnonzero(finite & (component == 0) & (clouds.sizes > 0)))
     if len(rows) < 2:
         return ()
-    scenes = [raster.merged(clouds, poses, rows) for poses in (before, after)]
-    return sides(scenes, raster.around(scenes[1], after[rows]), "Before | after")
+    aligned = align(before[rows], after[rows]).apply(before)  # known positions have a world of their own
+    scenes = [raster.merged(clouds, poses, rows) for poses in (aligned, after)]
+    behind = np.mean([np.mean(clouds[int(row)].points_in_cam[:, 2] < 0) for row in rows])
+    views = raster.around(scenes[1], after[rows], is_scanner=bool(behind > SEEN_BEHIND))
+    return sides(scenes, views, "Before | after")
 
 
 def sides(scenes: Sequence[raster.Points], views: Mapping[str, raster.View], caption: str) -> tuple[Picture, ...]:

@@ -35,7 +35,11 @@ REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",
 }  # fmt: skip
-DOUBTS = {"unsettled": "Not settled", "camera or object": "In doubt, since much of the image moves"}
+DOUBTS = {
+    "unsettled": "Not settled",
+    "camera or object": "In doubt, since much of the image moves",
+    "path loose": "In doubt, since the scans tell little of how far the scanner went",
+}
 """How a headline begins where the run says that its result may be wrong, whatever was measured."""
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 

@@ -78,6 +78,15 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "{count} sweeps are left out, and posed by their neighbours where these are known; the first: {detail}",
     ),
+    "sweeps loose": (
+        Rank.LOOK,
+        "{count} of {detail} sweeps tell little of how far the scanner went, as in a tunnel, and it goes on as before",
+    ),
+    "path loose": (
+        Rank.DOUBT,
+        "The length of the path is in doubt: {count} of {detail} sweeps tell little of how far the scanner went, as on "
+        "a bare field, and it goes on as before there. Known positions (positions.path) would hold it.",
+    ),
     "sweeps untimed": (
         Rank.FACT,
         "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an instant",
