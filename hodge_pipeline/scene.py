@@ -169,7 +169,8 @@ class Scene:
     `drift`: None where the first poses are not odometry's; `given`: the file that they come from, where there is one;
     `in_order`: whether frames that follow each other in the source do so in time; `sightings`: the folder of what
     frames that are no key frames saw of these, where they were tracked; `closed`: the first poses with
-    the loops along the path closed, None where nobody looked for any.
+    the loops along the path closed, None where nobody looked for any; `steps_stand`: whether the first steps are more
+    exact than a registration of their two clouds.
     """
 
     whole: Source
@@ -183,6 +184,7 @@ class Scene:
     in_order: bool = True
     sightings: Path | None = None
     closed: Closed | None = None
+    steps_stand: bool = False
 
 
 def key_source(whole: Source, rows: Ints) -> Source:

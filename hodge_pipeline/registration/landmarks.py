@@ -13,7 +13,7 @@ EDGE_STEP = 0.03
 WIDE_PX, SHRUNK = 640, 0.7
 """An image at least so wide is shrunk first: SIFT begins with it doubled, and finds the finest features where a pixel's
 noise is largest. Less than half the time, and smaller errors in four of six videos (fr1/xyz and one of the rendered
-ones have 4 and 10 % more); at 0.5 too few features are left of a bare room, whose error doubles.
+ones have 4 and 11 % more); at 0.5 too few features are left of a bare room, whose error doubles.
 """
 FEW = 150
 """Landmarks of a frame below which its image is looked at again for faint ones."""

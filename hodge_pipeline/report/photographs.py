@@ -13,7 +13,6 @@ from scipy.ndimage import uniform_filter
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import length
-from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow
 from hodge_pipeline.report.document import Picture
@@ -29,6 +28,8 @@ FILL_PX = 5
 """In a picture that shows the points from near."""
 CLOSER = 2
 """How many times the place that changed most is enlarged."""
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""Right, down and look of a view from above, in the axes of a scanner."""
 SEEN_BEHIND = 0.01
 """Share of points behind the image plane, which no camera has: of those of a scanner, whose z is up, it is the ground.
 """
@@ -77,13 +78,15 @@ def _moved_m(clouds: CloudSet, before: Floats, after: Floats, pairs: Ints) -> Fl
 
 
 def _as_seen_by(clouds: CloudSet, world_from_cam: Floats, row: int) -> raster.View:
-    """The view of one camera, orthographic, which its own points fill."""
+    """The view of one camera, orthographic, which its own points fill; of a scanner, from above."""
     pose = world_from_cam[row]
     points = np.asarray(clouds[row].points_in_cam, float)
-    held = raster.holding(np.eye(3), points, LARGE, VIEWED_PERCENT)
-    near_m = float(held.centre[2] - max(np.percentile(points[:, 2], 1) / 2, 0.0))
+    axes = DOWN if _is_scanner(clouds, np.array([row])) else np.eye(3)
+    held = raster.holding(axes, points, LARGE, VIEWED_PERCENT)
+    depth_m = points @ axes[2]
+    near_m = float(axes[2] @ held.centre - max(np.percentile(depth_m, 1) / 2, 0.0))
     centre = se3.transform(pose, held.centre[None])[0]
-    return raster.View(pose[:3, :3].T, centre, held.metres_per_pixel, LARGE, near_m=near_m)
+    return raster.View(axes @ pose[:3, :3].T, centre, held.metres_per_pixel, LARGE, near_m=near_m)
 
 
 def _closer(scenes: Sequence[raster.Points], view: raster.View) -> raster.View:
@@ -115,11 +118,21 @@ def four_sides(clouds: CloudSet, before: Floats, after: Floats, component: Ints)
     rows = _some(np.flatnonzero(finite & (component == 0) & (clouds.sizes > 0)))
     if len(rows) < 2:
         return ()
-    aligned = align(before[rows], after[rows]).apply(before)  # known positions have a world of their own
+    aligned = _laid_on(before, after, rows)
     scenes = [raster.merged(clouds, poses, rows) for poses in (aligned, after)]
-    behind = np.mean([np.mean(clouds[int(row)].points_in_cam[:, 2] < 0) for row in rows])
-    views = raster.around(scenes[1], after[rows], is_scanner=bool(behind > SEEN_BEHIND))
-    return sides(scenes, views, "Before | after")
+    return sides(scenes, raster.around(scenes[1], after[rows], _is_scanner(clouds, rows)), "Before | after")
+
+
+def _laid_on(before: Floats, after: Floats, rows: Ints) -> Floats:
+    """The poses before, turned and moved as these rows are on average: known positions have a world of their own."""
+    turn = se3.project_to_so3((after[rows, :3, :3] @ np.swapaxes(before[rows, :3, :3], 1, 2)).mean(axis=0))
+    shift = (after[rows, :3, 3] - before[rows, :3, 3] @ turn.T).mean(axis=0)
+    return np.asarray(se3.from_parts(turn, shift) @ before)
+
+
+def _is_scanner(clouds: CloudSet, rows: Ints) -> bool:
+    """Whether these rows hold points behind an image plane."""
+    return bool(np.mean([np.mean(clouds[int(row)].points_in_cam[:, 2] < 0) for row in rows]) > SEEN_BEHIND)
 
 
 def sides(scenes: Sequence[raster.Points], views: Mapping[str, raster.View], caption: str) -> tuple[Picture, ...]:

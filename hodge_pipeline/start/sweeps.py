@@ -108,7 +108,7 @@ class SweepsStart(OdometryStart):
             title="odometry", total=max(1, len(rows) - len(sequences)), workers=workers,
         )  # fmt: skip
         key_frames = _followers(whole, rows, found, joined, sequences)
-        return self.joined(whole, made, clouds, joined, key_frames, steps, workers)
+        return replace(self.joined(whole, made, clouds, joined, key_frames, steps, workers), steps_stand=True)
 
 
 def follow(
