@@ -51,7 +51,16 @@ class Ground:
         return Mesh(vertices, np.tile([0, 0, 1.0], (len(vertices), 1)), np.concatenate([a, b]).astype(np.int64))
 
 
-class Walk:
+class CarFree:
+    """A way on which no cars drive."""
+
+    def place(self, way_m: Floats) -> tuple[Floats, Floats, Floats]:
+        """Where the next car is: far away."""
+        far = np.full(np.shape(way_m), 1e6)
+        return far, far, 0 * far
+
+
+class Walk(CarFree):
     """A closed way through `corners (K, 2)` over the ground, the scanner `height_m` above it, pitched as the slope."""
 
     def __init__(self, corners: Floats, ground: Ground, speed_m_s: float, height_m: float, seed: int) -> None:
@@ -66,11 +75,6 @@ class Walk:
         self.length_m, self.speed_m_s = float(way[-1]), speed_m_s
         self._path = CubicSpline(way, np.column_stack([xy, z]))
         self._phase = np.random.default_rng([seed, 4]).uniform(0, 2 * np.pi, 4)
-
-    def place(self, way_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Far away: no cars drive."""
-        far = np.full(np.shape(way_m), 1e6)
-        return far, far, 0 * far
 
     def world_from_car(self, times_s: Floats) -> Floats:
         """Poses (N, 4, 4): x ahead, y left, z up from the slope."""
@@ -128,10 +132,13 @@ def _away(walk: Walk) -> Floats:
     return walk.world_from_car(np.linspace(0, walk.length_m / walk.speed_m_s, 600))[:, :2, 3]
 
 
-def _scattered(rng: np.random.Generator, count: int, half_m: float, way: Floats, apart_m: float) -> Iterator[Floats]:
+def _scattered(
+    rng: np.random.Generator, ground: Ground, count: int, half_m: float, way: Floats, apart_m: float, depth_m: float
+) -> Iterator[tuple[float, float, float]]:
+    """Spots at random, but for those near the way, `depth_m` in the ground."""
     for at in rng.uniform(-half_m, half_m, (count, 2)):
         if np.linalg.norm(way - at, axis=1).min() > apart_m:
-            yield at
+            yield at[0], at[1], float(ground(*at)) - depth_m
 
 
 def forest(seed: int) -> tuple[Walk, list[Mesh]]:
@@ -139,11 +146,9 @@ def forest(seed: int) -> tuple[Walk, list[Mesh]]:
     rng, ground = np.random.default_rng([seed, 11]), Ground(4.0, 0.12, seed)
     walk = Walk(_ring(24, 16, 0.15, rng), ground, 3.0, 1.4, seed)
     way, meshes = _away(walk), [ground.mesh(70, 0.7)]
-    for x, y in _scattered(rng, 1100, 65, way, 1.0):
-        z = float(ground(np.array(x), np.array(y))) - 0.3
+    for x, y, z in _scattered(rng, ground, 1100, 65, way, 1.0, 0.3):
         meshes.append(cylinder(rng.uniform(0.08, 0.35), rng.uniform(6, 14), 8).moved(motion(x, y, z)))
-    for x, y in _scattered(rng, 300, 65, way, 2.2):
-        z = float(ground(np.array(x), np.array(y))) - 0.3
+    for x, y, z in _scattered(rng, ground, 300, 65, way, 2.2, 0.3):
         meshes.append(ball(rng.uniform(0.4, 1.3), 8).moved(motion(x, y, z)))
     return walk, meshes
 
@@ -153,12 +158,10 @@ def hill(seed: int) -> tuple[Walk, list[Mesh]]:
     rng, ground = np.random.default_rng([seed, 12]), Ground(18.0, 0.04, seed)
     walk = Walk(_ring(45, 30, 0.12, rng), ground, 6.0, 1.9, seed)
     way, meshes = _away(walk), [ground.mesh(120, 1.0)]
-    for x, y in _scattered(rng, 90, 100, way, 3.0):
-        z = float(ground(np.array(x), np.array(y))) - 0.5
+    for x, y, z in _scattered(rng, ground, 90, 100, way, 3.0, 0.5):
         meshes.append(cylinder(rng.uniform(0.15, 0.3), 4, 8).moved(motion(x, y, z)))
         meshes.append(ball(rng.uniform(1, 1.8), 10).moved(motion(x, y, z + 3)))
-    for x, y in _scattered(rng, 14, 90, way, 9.0):
-        z = float(ground(np.array(x), np.array(y))) - 2
+    for x, y, z in _scattered(rng, ground, 14, 90, way, 9.0, 2):
         meshes.append(box(*rng.uniform(5, 11, 2), 8).moved(motion(x, y, z, rng.uniform(0, 90))))
     return walk, meshes
 

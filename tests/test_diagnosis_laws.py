@@ -19,6 +19,7 @@ from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.diagnosis.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.wording import name_cycle
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.solvers.backbone.trust import NONE
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 QUICK = DiagnosisOptions()
@@ -222,6 +223,18 @@ def test_a_reason_names_what_spoke_against_an_edge_whose_cycles_all_close() -> N
     for row in (48, 49):
         assert found.verdict[row] == WRONG
         assert found.reason[row].startswith("1 of 1 cycles close, each over another edge that is left out; against it")
+
+
+def test_pieces_of_a_lattice_that_wrong_edges_cut_grow_again() -> None:
+    rng = np.random.default_rng(0)
+    at = np.stack([*np.divmod(np.arange(24 * 24), 24), np.zeros(24 * 24)], axis=1)
+    poses = se3.from_parts(se3.so3_exp(rng.normal(size=at.shape)), at)
+    pairs = np.argwhere(np.triu(np.linalg.norm(at[:, None] - at, axis=2) < 1.01, 1))
+    pairs = pairs[rng.random(len(pairs)) < 0.75]
+    wrong = rng.choice(len(pairs), int(0.15 * len(pairs)), replace=False)
+    graph, right = spoiled(measured(poses, pairs, noise=3.0), wrong)
+    found = diagnose(graph, DiagnosisOptions(trust=NONE))
+    assert found.kept[right].mean() > 0.9 and found.kept[~right].mean() < 0.45
 
 
 def test_a_long_loop_that_drifted_is_closed_and_nobody_blamed() -> None:

@@ -31,7 +31,7 @@ from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.recipe_run import run
 from hodge_pipeline.uses.trajectory import refine_trajectory
-from lidar_worlds import scanner_in
+from lidar_worlds import CarFree, scanner_in
 from mcap_data import SECOND, Log, point_cloud, ros_header
 from mcap_encoding import CDR
 
@@ -179,16 +179,11 @@ def test_a_street_is_followed_and_deskewed(tmp_path: Path) -> None:
 
 
 @dataclass(frozen=True)
-class Flight:
+class Flight(CarFree):
     """A scanner that climbs, rolls and swings its yaw by up to 60 degrees a second while it flies down the street."""
 
     speed_m_s: float
     length_m: float = 1e9
-
-    def place(self, way_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Far away: no cars drive."""
-        far = np.full(np.shape(way_m), 1e6)
-        return far, far, 0 * far
 
     def world_from_car(self, times_s: Floats) -> Floats:
         """Poses (N, 4, 4)."""

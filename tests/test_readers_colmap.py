@@ -214,6 +214,16 @@ def test_damaged_binary_models_name_file_and_byte(tmp_path: Path, name: str, edi
     assert path.name in str(error.value) and "at byte" in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_text_models_with_a_byte_order_mark_are_refused_by_name(tmp_path: Path, name: str, encoding: str) -> None:
+    synthetic(tmp_path)
+    path = tmp_path / "text" / f"{name}.txt"
+    path.write_text(path.read_text("utf-8"), encoding)
+    with pytest.raises(SourceError, match=rf"{name}.txt:1: begins with a byte-order mark.*save it as UTF-8"):
+        ColmapReader().open(tmp_path / "text")
+
+
 def test_a_database_that_is_none_is_named(tmp_path: Path) -> None:
     synthetic(tmp_path)
     with pytest.raises(SourceError, match="no database.db"):

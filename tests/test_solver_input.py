@@ -26,6 +26,15 @@ def test_repeated_edges_count_each_time():
     assert one.metrics["objective"] == pytest.approx(two.metrics["objective"], rel=1e-9)
 
 
+@pytest.mark.parametrize("solver", [solve, solve_robust])
+def test_weights_that_rounding_cannot_resolve_give_a_warning(solver):
+    graph, _ = ladder(0.1)
+    for precision, warned in ((1e12, False), (1e30, True)):
+        information = np.tile(np.diag([1e2] * 3 + [precision] * 3), (graph.edge_count, 1, 1))
+        notes = solver(dataclasses.replace(graph, information=information)).notes
+        assert sum("rounding hides the smaller" in note for note in notes) == warned
+
+
 @pytest.mark.parametrize("objective", ["isotropic", "full"])
 @pytest.mark.parametrize("length", [2e7, 1e9, 1e12])
 def test_an_edge_longer_than_the_earth_gives_a_result_and_a_warning(objective, length):

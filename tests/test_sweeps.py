@@ -24,6 +24,7 @@ from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.sweeps import Sweeps, follow
 from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
+from lidar_worlds import CarFree
 
 COUNT, SPEED_M_S, UNIX_S = 30, 10.0, 1.7e9
 NEAR_M = 0.1
@@ -137,15 +138,10 @@ def test_a_scanner_whose_sweeps_cannot_be_read_leaves_the_other_be() -> None:
 
 
 @dataclass(frozen=True)
-class Turning:
+class Turning(CarFree):
     """A walk that begins in a turn of 90 degrees a second."""
 
     length_m: float = 1e9
-
-    def place(self, way_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Far away: no cars drive."""
-        far = np.full(np.shape(way_m), 1e6)
-        return far, far, 0 * far
 
     def world_from_car(self, times_s: Floats) -> Floats:
         """Poses (N, 4, 4)."""

@@ -12,7 +12,6 @@ from hodge_pipeline.diagnosis.growth import Alignment, align
 from hodge_pipeline.diagnosis.mending import mend
 from hodge_pipeline.diagnosis.rearrange import best_arrangement
 from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, LARGE, TWICE, Fit, fit
-from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Floats
 
 PRIOR_SHARE = 0.25
@@ -21,12 +20,8 @@ edges of 90 simulated rings, corridors and streets and 16 rooms, and of nine gra
 """
 EXTREME = 0.01
 UNVOUCHED = 0.9
-STEPS = 3
-"""Of Newton's, where the robust solution goes on from there."""
 MOST_GROWTHS, WORTH = 3, 1e-3
 """Times that pieces grow again, while more than this share of the edges is to be won by it."""
-FEW = 0.01
-"""With no more than this share of its edges left out, a graph may be right as it is."""
 SMALL = 3000
 """Vertices, up to which another solve costs little."""
 
@@ -56,11 +51,6 @@ def _one_of_each_series(best: Fit, evidence: Evidence) -> Fit:
 def _mended(evidence: Evidence, grown: Alignment) -> Fit:
     """The solution that grown pieces lead to where the order tells nothing of pairs that were tried."""
     graph, best = evidence.graph, _regrown(evidence, fit(evidence, grown, ANNEALED, rough=True))
-    if 0 < (~best.used).sum() <= FEW * len(best.used):
-        # where nearly all edges are right, none of them is left behind by a piece that drifted while it grew
-        found = solve(graph, objective="isotropic", max_iterations=STEPS)
-        of_all = Alignment(found.component, found.world_from_cam)
-        best = max(best, fit(evidence, of_all, ANNEALED, rough=True), key=_used)
     best = fit(evidence, best, (GATE,))
     if graph.edge_count > LARGE:  # one exact solve is all that there is time for
         return best

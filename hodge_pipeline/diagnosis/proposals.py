@@ -12,7 +12,7 @@ from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import agreement_of, mean_motions
 from hodge_pipeline.types import Bools, Floats, Ints
 
-DRIFTED_RAD, ALIKE = 0.1, 12.0
+DRIFTED_RAD, SIGMAS_APART = 0.1, 12.0
 """Motions are compared where they turn alike but for this, and for so many standard deviations."""
 
 
@@ -64,6 +64,6 @@ def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints
     """Pairs of motions whose rotations may agree."""
     quat = se3.to_quat_xyzw(motion).astype(np.float32)
     likeness = np.abs(quat @ quat.T)
-    widest = min(DRIFTED_RAD + ALIKE * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
+    widest = min(DRIFTED_RAD + SIGMAS_APART * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
     first, second = np.nonzero(likeness >= np.cos(widest / 2))
     return first, second

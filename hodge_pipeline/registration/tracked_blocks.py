@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,27 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.registration.sightings import Sightings
-from hodge_pipeline.registration.tracking import TrackedBlock
+from hodge_pipeline.registration.tracking import BlockRows, TrackedBlock
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
+from hodge_pipeline.types import CloudSet, Edges, Ints
 
 STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
 COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful")
-
-
-@dataclass(frozen=True)
-class BlockRows:
-    """A `TrackedBlock` without its clouds and sightings."""
-
-    keys: Ints
-    steps: Edges
-    rows: Ints
-    anchors: Ints
-    key_from_row: Floats
-    fitness: Floats
-    moving: Ints
-    doubtful: Ints
-    notes: tuple[str, ...]
 
 
 class TrackedBlocks:

@@ -70,17 +70,16 @@ class FrameBlock:
 
 
 @dataclass(frozen=True)
-class TrackedBlock:
-    """What became of a block: its key frames (rows, clouds), the steps from each to the next, and for every row the row
-    of the key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess; and the
-    rows `moving` of frames much of which moved otherwise than the camera, and `doubtful` of those whose motion may be
-    that of an object.
+class BlockRows:
+    """What became of a block's rows: its key frames, the steps from each to the next, and for every row the row of the
+    key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess; and the rows
+    `moving` of frames much of which moved otherwise than the camera, and `doubtful` of those whose motion may be that
+    of an object.
 
     A step of fitness 0 is a guess too. The block's last row is the first of the next one.
     """
 
     keys: Ints
-    clouds: tuple[PointCloud, ...]
     steps: Edges
     rows: Ints
     anchors: Ints
@@ -89,6 +88,13 @@ class TrackedBlock:
     moving: Ints
     doubtful: Ints
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TrackedBlock(BlockRows):
+    """These, with the key frames' clouds, and what the frames saw of the key frames' corners."""
+
+    clouds: tuple[PointCloud, ...]
     sightings: Sightings
 
 

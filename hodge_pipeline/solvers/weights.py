@@ -16,6 +16,8 @@ INDEFINITE_TOLERANCE = 1e-9
 """Of the largest eigenvalue: a more negative one is not rounding."""
 EARTH_M = 1.2742e7
 """The earth's diameter: a longer edge is a unit or a measurement gone wrong."""
+RESOLVED = float(1 / np.finfo(float).eps)
+"""Ratio of weights up to which the rounding of a cost's larger terms leaves the smaller ones."""
 FLOOR = 1e-9
 """Of the median weight: for a used edge without information on rotation, or on translation."""
 
@@ -69,6 +71,13 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
     indefinite = _indefinite(information) & used
     if indefinite.any():
         notes.append(f"{int(indefinite.sum())} of {graph.edge_count} information matrices are indefinite")
+    stated = np.concatenate([kappa[used], tau[used]])
+    stated = stated[stated > 0]
+    if len(stated) and stated.max() > RESOLVED * stated.min():
+        notes.append(
+            f"the information of rotation and translation, or of edges, differs by a factor of more than "
+            f"{RESOLVED:.0e}: rounding hides the smaller, and the poses may not be the best: lower the largest"
+        )
     kappa, tau = _floor(kappa, used, "rotation", notes), _floor(tau, used, "translation", notes)
     return Weights(kappa, tau, information, used, not indefinite.any(), tuple(notes))
 

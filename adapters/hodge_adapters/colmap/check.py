@@ -5,6 +5,7 @@ Of a file whose records fill it to the last byte or word, whatever they hold, py
 
 from __future__ import annotations
 
+import codecs
 import mmap
 import os
 import struct
@@ -16,10 +17,11 @@ import numpy as np
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.text_rows import read_text, reading, to_floats
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types.input_files import open_input
+from hodge_pipeline.types.input_files import beginning, open_input
 
 REMEDY = "write the model again with `colmap model_converter`"
 MAX_NAME_BYTES = 4096
+MARKS = codecs.BOM_UTF8, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 _U32, _I32, _U64 = struct.Struct("<I"), struct.Struct("<i"), struct.Struct("<Q")
 
 
@@ -153,6 +155,10 @@ _SENSORS = ("CAMERA", "IMU")
 
 
 def _check_lines(path: Path) -> None:
+    if beginning(path, len(codecs.BOM_UTF8)).startswith(MARKS):
+        raise SourceError(
+            f"{path}:1: begins with a byte-order mark, which COLMAP does not read: save it as UTF-8 without one"
+        )
     if path.stem == "images":
         for line, text, observations in _image_lines(path):
             if not _is_pose(text):

@@ -16,7 +16,7 @@ LOCAL = 0.5
 """Of the scale of the steps' errors over long paths, that over short ones: these errors are alike from step to step.
 Fitted, with the next, on the graphs of Bicocca and RobotCar.
 """
-ALIKE = 0.5
+CROWDED_POWER = 0.5
 """The power of the number of loops at one place by which their variances are larger: 0 for errors that are independent,
 1 for the same error in all.
 """
@@ -34,7 +34,7 @@ def polished(rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
     reduced = Reduced.of(chain, rows)
     chain = replace(chain, step_covariance=LOCAL**2 * chain.step_covariance)
     wide = np.ones(count)
-    wide[rows] = crowding(chain, rows) ** ALIKE
+    wide[rows] = crowding(chain, rows) ** CROWDED_POWER
     chain = replace(chain, covariance=chain.covariance * wide[:, None, None])
     weights = np.ones(count)
     for _ in range(ROUNDS):
