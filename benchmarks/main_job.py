@@ -1,24 +1,34 @@
-"""What the main job costs: CPU and wall seconds and peak memory of each stage, and how they grow with the frames.
+"""What the main job costs and reaches: CPU seconds a frame by part, memory, errors and scores of one run or of several.
 
-    python benchmarks/main_job.py SEQUENCE [--recipe seven_scenes] [--frames 50 100 200 250] [--repeat 1]
-    python benchmarks/main_job.py SEQUENCE --frames 1000 5000 20000 --plot length.svg
-    OMP_NUM_THREADS=1 python benchmarks/main_job.py SEQUENCE --recipe tum --frames 60 --open3d
+    python benchmarks/main_job.py tum=fr1_xyz seven_scenes=redkitchen video --open3d
+    python benchmarks/main_job.py demo=SEQUENCE --frames 1000 5000 20000 --plot length.svg
 
-The first N frames of the sequence are run in a fresh process each; one that has fewer is played back and forth. The
-table is Markdown, the plot shows time and memory against frames.
+Each is RECIPE=PATH, or the word video: the sequence of `hodge demo --video`. All its frames are run in a fresh process,
+or the first N; one that has fewer is played back and forth. Beside consecutive frames Open3D's RGB-D odometry can be
+run. The tables are Markdown, the plot shows time and memory against frames.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
+import re
 import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
+
+HEADER = (
+    *("sequence", "frames", "CPU s", "CPU ms a frame", "wall s", "peak MB (in)", "page, recording MB"),
+    *("ATE cm", "largest cm", "RPE mm", "RPE °", "scores (truth's)"),
+)
+CONSECUTIVE_S = 0.05
+"""Seconds between the frames of a camera that delivers 20 a second, below which they count as consecutive."""
 
 SCRIPT = """
 import sys
@@ -30,17 +40,17 @@ from hodge_pipeline.sources.opening import open_with_reader
 name, path, out, count, *overrides = sys.argv[1:]
 recipe = load_recipe(name, overrides, Path(path))
 whole, _ = open_with_reader(Path(path), recipe.source.reader)
-hodge_pipeline.run(recipe, out, source=first_frames(whole, int(count)))
+hodge_pipeline.run(recipe, out, source=first_frames(whole, int(count) or len(whole.frames)))
 """
 
 
-def measure(recipe: str, source: Path, frames: int, overrides: list[str]) -> dict[str, Any]:
-    """The report of one run in a fresh process, with `total_cpu_s` and `total_wall_s` of the process tree."""
-    import os
-    import time
+def measure(recipe: str, source: Path, frames: int, overrides: list[str], keep: Path | None) -> dict[str, Any]:
+    """The report of one run in a fresh process, with `total_cpu_s` and `total_wall_s` of the process tree.
 
+    Of all frames where `frames` is 0; the run folder is kept in `keep`.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "run"
+        out = keep / f"{recipe}-{source.name}-{frames or 'all'}" if keep else Path(folder) / "run"
         paths = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
         environment = {**os.environ, "PYTHONPATH": paths}
         before, begin = os.times(), time.perf_counter()
@@ -62,16 +72,21 @@ def measure(recipe: str, source: Path, frames: int, overrides: list[str]) -> dic
     }
 
 
-def open3d_odometry(name: str, path: Path, frames: int, overrides: list[str]) -> str:
-    """The row of Open3D's odometry."""
-    sys.path.insert(0, str(Path(__file__).parents[1]))
+def open3d_odometry(recipe_name: str, path: Path, frames: int, overrides: list[str]) -> str:
+    """The row of Open3D's odometry; an empty one where the frames are not consecutive."""
+    import numpy as np
+
     from benchmarks.back_and_forth import first_frames
     from benchmarks.open3d_odometry import open3d_row
     from hodge_pipeline.recipe.schema import load_recipe
+    from hodge_pipeline.scene import has_real_stamps
     from hodge_pipeline.sources.opening import open_with_reader
 
-    whole, _ = open_with_reader(path, load_recipe(name, overrides, path).source.reader)
-    return open3d_row(first_frames(whole, frames))
+    whole, _ = open_with_reader(path, load_recipe(recipe_name, overrides, path).source.reader)
+    step = float(np.median(np.diff([frame.stamp_s for frame in whole.frames])))
+    if step > (CONSECUTIVE_S if has_real_stamps(whole.frames) else 1.0):
+        return ""
+    return open3d_row(first_frames(whole, frames or len(whole.frames)))
 
 
 def errors(report: dict[str, Any]) -> str:
@@ -100,7 +115,7 @@ def plot(points: list[tuple[int, float, float]], path: Path) -> None:
     """Draw CPU seconds and peak memory against frames."""
     from matplotlib.figure import Figure
 
-    frames, cpu_s, peak_mb = zip(*points, strict=True)
+    frames, cpu_s, peak_mb = zip(*sorted(points), strict=True)
     figure = Figure(figsize=(6, 3.2), layout="constrained")
     for axes, values, label in zip(figure.subplots(1, 2), (cpu_s, peak_mb), ("CPU s", "peak MB"), strict=True):
         axes.plot(frames, values, marker="o")
@@ -108,50 +123,74 @@ def plot(points: list[tuple[int, float, float]], path: Path) -> None:
     figure.savefig(path)
 
 
+def parts(runs: dict[str, dict[str, Any]]) -> str:
+    """CPU milliseconds a frame of each part, its rounds together; what lies outside of the stages is the last row."""
+    each: dict[str, dict[str, float]] = {}
+    for name, run in runs.items():
+        spent = run["total_cpu_s"] - sum(stage["cpu_s"] for stage in run["stages"])
+        for stage in (*run["stages"], {"name": "start of processes, libraries", "cpu_s": spent}):
+            row = each.setdefault(re.sub(r"(, round)? \d+$", "", stage["name"]), dict.fromkeys(runs, 0.0))
+            row[name] += 1e3 * stage["cpu_s"] / run["frames"]
+    each["start of processes, libraries"] = each.pop("start of processes, libraries")
+    lines = [f"| CPU ms a frame | {' | '.join(runs)} |", "|---" * (1 + len(runs)) + "|"]
+    lines += [f"| {part} | {' | '.join(f'{ms:.1f}' for ms in row.values())} |" for part, row in each.items()]
+    return "\n".join(lines)
+
+
+def row(name: str, run: dict[str, Any]) -> str:
+    """The table's row of one run."""
+    highest = max(run["stages"], key=lambda stage: stage["peak_mb"])
+    sizes, cpu_s = ", ".join(f"{size:.1f}" for size in run["sizes_mb"].values()), run["total_cpu_s"]
+    return (
+        f"| {name} | {run['frames']} | {cpu_s:.1f} | {1e3 * cpu_s / run['frames']:.0f} | {run['total_wall_s']:.1f} | "
+        f"{highest['peak_mb']:.0f} ({highest['name']}) | {sizes} | {errors(run)} |"
+    )
+
+
+def job(text: str) -> tuple[str, str, Path]:
+    """What an argument is called in the table, and the recipe and the path that it means."""
+    if text == "video":
+        from hodge_pipeline.demo.sequence import DemoOptions, demo_source
+
+        return "demo video", "tum", demo_source(DemoOptions.video())
+    recipe, equals, path = text.partition("=")
+    if not equals:
+        raise argparse.ArgumentTypeError(f"{text}: give RECIPE=PATH, such as tum=fr1_xyz, or the word video")
+    return Path(path).name, recipe, Path(path)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("source", type=Path)
-    parser.add_argument("--recipe", default="seven_scenes")
-    parser.add_argument("--frames", type=int, nargs="+", default=[50, 100, 200, 250])
-    parser.add_argument("--repeat", type=int, default=1, help="runs of each; the medians are printed")
-    parser.add_argument("--open3d", action="store_true", help="beside it Open3D's RGB-D odometry of the same frames")
+    parser.add_argument("sources", type=job, nargs="+", metavar="RECIPE=PATH")
+    parser.add_argument("--frames", type=int, nargs="+", default=[0], help="how many are run; 0: all")
+    parser.add_argument("--repeat", type=int, default=1, help="runs of each; that of the median CPU time is printed")
+    parser.add_argument("--open3d", action="store_true", help="Open3D's odometry beside those of consecutive frames")
     parser.add_argument("--plot", type=Path, help="an SVG file: CPU seconds and peak memory against frames")
+    parser.add_argument("--keep", type=Path, help="a folder that keeps the runs")
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     options = parser.parse_args()
     print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}\n")
-    header = (
-        *("frames", "CPU s", "CPU ms a frame", "wall s", "peak MB", "page, recording MB"),
-        *("ATE cm", "largest cm", "RPE mm", "RPE °", "scores (truth's)"),
-    )
-    print(f"| {' | '.join(header)} |\n{'|---' * len(header)}|")
-    last: dict[str, Any] = {}
-    points: list[tuple[int, float, float]] = []
-    for frames in options.frames:
-        runs = [measure(options.recipe, options.source, frames, options.overrides) for _ in range(options.repeat)]
-        cpu, wall = (statistics.median(run[key] for run in runs) for key in ("total_cpu_s", "total_wall_s"))
-        peak = statistics.median(max(stage["peak_mb"] for stage in run["stages"]) for run in runs)
-        posed = runs[0]["frames"]
-        sizes = ", ".join(f"{size:.1f}" for size in runs[0]["sizes_mb"].values())
-        print(
-            f"| {posed} | {cpu:.1f} | {1e3 * cpu / posed:.0f} | {wall:.1f} | {peak:.0f} | {sizes} | "
-            f"{errors(runs[0])} |",
-            flush=True,
-        )
-        last = runs[0]
-        if options.open3d:
-            print(open3d_odometry(options.recipe, options.source, frames, options.overrides), flush=True)
-        points.append((posed, cpu, peak))
-        if options.plot:
-            plot(points, options.plot)
-    posed = last["frames"]
-    print(f"\n| stage ({posed} frames) | CPU s | CPU ms a frame | wall s | peak MB |\n|---|---|---|---|---|")
-    for stage in last["stages"]:
-        each = 1e3 * stage["cpu_s"] / posed
-        print(
-            f"| {stage['name']} | {stage['cpu_s']:.1f} | {each:.1f} | {stage['wall_s']:.1f} | {stage['peak_mb']:.0f} |"
-        )
+    print(f"| {' | '.join(HEADER)} |\n{'|---' * len(HEADER)}|")
+    kept: dict[str, dict[str, Any]] = {}
+    for name, recipe, path in options.sources:
+        for frames in options.frames:
+            repeated = [measure(recipe, path, frames, options.overrides, options.keep) for _ in range(options.repeat)]
+            cpu_s = statistics.median_low([run["total_cpu_s"] for run in repeated])
+            run = next(run for run in repeated if run["total_cpu_s"] == cpu_s)
+            kept[f"{name}, {run['frames']}"] = run
+            print(row(name, run), flush=True)
+            peer = open3d_odometry(recipe, path, frames, options.overrides) if options.open3d else ""
+            print(peer + "\n" * bool(peer), end="", flush=True)
+            if options.plot:
+                points = [
+                    (one["frames"], one["total_cpu_s"], max(stage["peak_mb"] for stage in one["stages"]))
+                    for one in kept.values()
+                ]
+                plot(points, options.plot)
+    print(f"\n{parts(kept)}")
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
     main()

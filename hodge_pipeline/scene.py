@@ -169,7 +169,8 @@ class Scene:
     `drift`: None where the first poses are not odometry's; `given`: the file that they come from, where there is one;
     `in_order`: whether frames that follow each other in the source do so in time; `sightings`: the folder of what
     frames that are no key frames saw of these, where they were tracked; `closed`: the first poses with
-    the loops along the path closed, None where nobody looked for any.
+    the loops along the path closed, None where nobody looked for any; `steps_stand`: whether the first steps are more
+    exact than a registration of their two clouds.
     """
 
     whole: Source
@@ -183,6 +184,7 @@ class Scene:
     in_order: bool = True
     sightings: Path | None = None
     closed: Closed | None = None
+    steps_stand: bool = False
 
 
 def key_source(whole: Source, rows: Ints) -> Source:
@@ -196,10 +198,20 @@ def vertex_ids(source: Source) -> NDArray[np.generic]:
 
 
 def stamps_of(source: Source) -> Floats:
-    """Times (N,) of the frames; their numbers in a sequence whose stamps do not ascend: those are no clock."""
+    """Times (N,) of the frames, ascending in each sequence: where its clock goes back, by a step as long as the others.
+
+    In a sequence whose stamps are no clock's, or mostly do not ascend, the times are the numbers of the frames.
+    """
     stamps = np.array([frame.stamp_s for frame in source.frames], float)
     for rows in sequences_of(source).values():
-        if not (np.diff(stamps[rows]) > 0).all():
+        steps_s = np.diff(stamps[rows])
+        ahead = steps_s > 0
+        if ahead.all():
+            continue
+        if is_clock(stamps[rows]) and 2 * ahead.sum() > len(steps_s):
+            steps_s = np.where(ahead, steps_s, np.median(steps_s[ahead]))
+            stamps[rows[1:]] = stamps[rows[0]] + np.cumsum(steps_s)
+        else:
             stamps[rows] = np.arange(len(rows))
     return stamps
 

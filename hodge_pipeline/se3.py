@@ -174,6 +174,12 @@ def pull_back(b_from_a: Floats, information: Floats) -> Floats:
     return np.asarray(np.swapaxes(into, -1, -2) @ information @ into)
 
 
+def carried(b_from_a: Floats, covariance: Floats) -> Floats:
+    """The covariance (..., 6, 6) of twists in the axes of b, from that in the axes of a."""
+    into = adjoint(b_from_a)
+    return np.asarray(into @ covariance @ np.swapaxes(into, -1, -2))
+
+
 def transform(b_from_a: Floats, points_in_a: Floats) -> Floats:
     """Points (..., N, 3) in b; the batch shapes broadcast."""
     rotated = np.asarray(points_in_a) @ np.swapaxes(b_from_a[..., :3, :3], -1, -2)

@@ -1,4 +1,4 @@
-"""Worlds for a spinning scanner beside the demo's street: a forest, a hill, an office floor, a field with a house."""
+"""Worlds for a spinning scanner beside the demo's street: forest, hill, office floor, fields, tunnel."""
 
 from __future__ import annotations
 
@@ -192,11 +192,34 @@ def field(seed: int) -> tuple[Walk, list[Mesh]]:
     return walk, [ground.mesh(200, 1.3), *[part.moved(motion(1, 2, -0.5, 20)) for part in house]]
 
 
+def bare(seed: int) -> tuple[Walk, list[Mesh]]:
+    """That field without its house."""
+    walk, meshes = field(seed)
+    return walk, meshes[:1]
+
+
+def tunnel(seed: int) -> tuple[Walk, list[Mesh]]:
+    """From among houses at 15 m/s into a straight tunnel of 220 m that is bare but for a niche every 50 m."""
+    rng = np.random.default_rng([seed, 15])
+    corners = np.array([(-140.0, 0), (140, 0), (140, 60), (-140, 60)])
+    meshes = [box(1000, 1000, 0.2).moved(motion(0, 0, -0.2)), box(220, 11, 0.3).moved(motion(0, 0, 5))]
+    for side in (-1, 1):
+        meshes.append(box(220, 0.5, 5).moved(motion(0, side * 5.25)))
+        for _ in range(14):
+            at = side * (115 + rng.uniform(5, 70)), rng.choice([-1, 1]) * rng.uniform(9, 25)
+            meshes.append(box(*rng.uniform(3, 9, 2), rng.uniform(3, 9)).moved(motion(*at)))
+    for x in np.arange(-90, 110, 50.0):
+        meshes.append(box(2, 1, 2.2).moved(motion(x + rng.uniform(-8, 8), rng.choice([-4.9, 4.9]))))
+    return Rounds(corners, 15.0, 1.9, 0.0, seed), meshes
+
+
 WORLDS: dict[str, Callable[[int], tuple[Walk, list[Mesh]]]] = {
     "forest": forest,
     "hill": hill,
     "office": office,
     "field": field,
+    "bare": bare,
+    "tunnel": tunnel,
 }
 
 

@@ -15,7 +15,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone import inference
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
-from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, settled
+from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, root, settled
 from hodge_pipeline.solvers.backbone.inference import left_out, uncertainty
 from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
@@ -35,8 +35,8 @@ def test_selected_inversion_is_the_dense_inverse() -> None:
     count = 60
     edges = np.array([(k, k + 1) for k in range(count - 1)] + [(k, (7 * k + 13) % count) for k in range(0, count, 3)])
     edges = edges[edges[:, 0] != edges[:, 1]]
-    root = rng.normal(size=(len(edges), 3, 3))
-    precision = root @ np.swapaxes(root, 1, 2) + np.eye(3)
+    sides = rng.normal(size=(len(edges), 3, 3))
+    precision = sides @ np.swapaxes(sides, 1, 2) + np.eye(3)
     carry = np.eye(3) + 0.3 * np.tril(rng.normal(size=(len(edges), 3, 3)), -1)
     whole = np.zeros((count, 3, count, 3))
     for (i, j), weight, moved in zip(edges, precision, carry, strict=True):
@@ -125,12 +125,43 @@ def test_wrong_loops_that_agree_at_one_place_alone_confirm_nothing(kind: dict[st
     assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
 
 
-def test_places_that_tell_little_of_a_broken_backbone_still_name_its_break() -> None:
-    kind: dict[str, Any] = {"count": 200, "dimension": 3, "world": "town", "loops": 100, "wrong": 0.6}
-    made, step = drive(seed=323, in_groups=True, **kind), 82
-    backbone = find_backbone(broken(made, step, seed=323))
+BROKEN_TOWNS: dict[str, tuple[int, dict[str, Any]]] = {
+    "in places that tell little": (82, {"seed": 323, "count": 200, "dimension": 3, "wrong": 0.6, "in_groups": True}),
+    "under every right loop": (143, {"seed": 626, "count": 200, "wrong": 0.2}),
+    "at a corner": (259, {"seed": 658, "count": 400, "loops": 200, "wrong": 0.0, "in_groups": True}),
+    "under loops of one place": (214, {"seed": 659, "count": 400, "dimension": 3, "loops": 200, "wrong": 0.6}),
+}
+
+
+@pytest.mark.parametrize("where", BROKEN_TOWNS)
+def test_a_broken_step_is_named(where: str) -> None:
+    step, kind = BROKEN_TOWNS[where]
+    made = drive(**{"world": "town", "loops": 100, **kind})
+    backbone = find_backbone(broken(made, step, seed=kind["seed"]))
     assert backbone is not None
     assert np.flatnonzero(backbone.steps & ~backbone.used).tolist() == [step]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_information_that_is_unknown_hides_no_right_loop(dimension: int) -> None:
+    made = drive(dimension=dimension)
+    diagonal = (made.graph.information != 0) & np.eye(6, dtype=bool)
+    found = diagnose(replace(made.graph, information=diagonal.astype(float)))
+    assert not (found.kept & ~made.right).any()
+    assert (found.kept & made.right).sum() >= made.right.sum() - 3
+
+
+def test_a_graph_is_not_parted_at_two_steps_that_share_the_blame(data_dir: Path) -> None:
+    graph = read_graph(data_dir / "pose_graphs/sesync/parking-garage.g2o").graph
+    assert graph is not None
+    found = diagnose(graph)
+    assert not found.piece.any() and (~found.kept).sum() < 23
+
+
+def test_a_covariance_that_sums_left_indefinite_has_a_root() -> None:
+    covariance = np.array([np.diag([4.0, 1.0]), [[1.0, 1.001], [1.001, 1.0]]])
+    found = root(covariance)
+    np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), covariance, atol=2e-3)
 
 
 def test_small_random_motions_confirm_nothing(data_dir: Path) -> None:

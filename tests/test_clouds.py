@@ -45,10 +45,19 @@ def test_a_wall_gives_its_plane_and_normals_towards_the_camera() -> None:
     cloud, counts = make_cloud(frame(wall(WALL_M)), CloudOptions())
     assert np.allclose(cloud.points_in_cam[:, 2], WALL_M, atol=1e-6)
     assert np.allclose(cloud.normals_in_cam, [0, 0, -1], atol=1e-4)
-    assert counts.looked_at == counts.valid == 24 * 32
+    assert counts.looked_at == counts.valid == 48 * 64
     assert counts.points == len(cloud)
     corner = [-32 / 60 * WALL_M, -24 / 60 * WALL_M]
     assert np.allclose(cloud.points_in_cam[:, :2].min(axis=0), corner, atol=0.03)
+
+
+@pytest.mark.parametrize(("width", "stride"), [(640, 2), (320, 1), (160, 1)])
+def test_no_pixel_of_a_small_image_is_skipped(width: int, stride: int) -> None:
+    height, focal = width * 3 // 4, width * 525 / 640
+    camera = Camera(width, height, focal, focal, width / 2, height / 2)
+    depth = np.full((height, width), 4.0, np.float32)
+    _, counts = make_cloud(Frame(0, 0.0, camera, read_depth=lambda: depth), CloudOptions())
+    assert counts.looked_at == width * height / stride**2
 
 
 def test_one_pixel_is_back_projected_where_the_camera_equation_says() -> None:

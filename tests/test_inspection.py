@@ -55,6 +55,7 @@ def test_a_run_folder_is_no_source(tmp_path: Path) -> None:
 
 
 def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
+    assert next_command(Path("my data"), {"frames": 0}, None).split(" --")[0] == "hodge refine trajectory 'my data'"
     command = next_command(Path("in"), {"frames": 3, "frames with depth": 0, "formats": []}, "mine")
     assert command == "hodge run clouds --source in --set source.reader=mine --out runs/in"
 

@@ -125,12 +125,12 @@ def test_a_killed_registration_keeps_its_blocks(run: Run, tmp_path: Path) -> Non
         import os, signal, sys
         import hodge_pipeline
         from hodge_pipeline.recipe.schema import load_recipe
-        from hodge_pipeline.registration.block_store import BlockStore
-        keep = BlockStore.write
-        def write(self, block, result):
-            keep(self, block, result)
+        from hodge_pipeline.registration import register
+        keep = register.keep_block
+        def write(folder, block, result):
+            keep(folder, block, result)
             os.kill(os.getpid(), signal.SIGKILL)
-        BlockStore.write = write
+        register.keep_block = write
         recipe = load_recipe("demo", {[*SMALL, "executor.workers=0"]!r}, {str(run.source.path)!r})
         hodge_pipeline.run(recipe, {str(tmp_path / "run")!r})
     """)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hodge_adapters.trajectories.rewriting import TumRewriter
 from hodge_adapters.trajectories.text import KittiWriter, TumWriter, parse_tum, read_kitti, write_kitti, write_tum
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, WorkspaceError
@@ -34,6 +35,19 @@ def test_what_is_written_reads_back(tmp_path_factory: pytest.TempPathFactory, se
     write_kitti(folder / "poses.kitti", written)
     np.testing.assert_allclose(read_kitti(folder / "poses.kitti").world_from_cam, written.world_from_cam, atol=1e-14)
     assert [path.name for path in sorted(folder.iterdir())] == ["poses.kitti", "poses.tum"], "no temporary file is left"
+
+
+@pytest.mark.parametrize(("unit", "per_second"), [("nano", 10**9), ("micro", 10**6), ("milli", 10**3)])
+def test_stamps_too_large_for_seconds_are_read_in_their_unit(tmp_path: Path, unit: str, per_second: int) -> None:
+    path, stamps = tmp_path / "poses.txt", [1305031229, 1305031231]
+    path.write_text("".join(f"{stamp * per_second} {IDENTITY}\n" for stamp in stamps))
+    read = parse_tum(path)
+    assert read.trajectory.stamps_s.tolist() == stamps
+    assert read.notes == (f"poses.txt: stamps are read as {unit}seconds, too large for seconds",)
+    (tmp_path / "out").mkdir()
+    moved = Trajectory(read.trajectory.stamps_s, np.tile(se3.exp([0.0, 0, 0, 1, 2, 3]), (2, 1, 1)))
+    lines = TumRewriter().rewrite(tmp_path / "out", path, moved).read_text().splitlines()
+    assert [line.split()[:2] for line in lines] == [[str(stamp * per_second), "1.0"] for stamp in stamps]
 
 
 def test_a_quarter_turn_by_hand(tmp_path: Path) -> None:

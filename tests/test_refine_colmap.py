@@ -88,6 +88,24 @@ def test_disturbed_poses_come_back_with_every_rig_name_and_track(tmp_path: Path,
     assert (tmp_path / "out/sparse/0/images.txt").is_file(), "text stays text"
 
 
+def test_one_image_of_many_that_is_off_is_no_optimum(tmp_path: Path) -> None:
+    """It weighs little in the mean of all errors, which keypoints of a pixel's noise make large."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_frames_per_rig, options.num_points3D = 40, 150
+    options.camera_params = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1280.0, 1024, 768).params
+    pycolmap.set_random_seed(0)
+    model, rng = pycolmap.synthesize_dataset(options), np.random.default_rng(0)
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = point.xy + rng.normal(scale=1.0, size=2)
+    frame = model.frames[min(model.reg_frame_ids())]
+    off = se3.exp([0.05, 0, 0, 0.5, 0, 0]) @ np.vstack([frame.rig_from_world.matrix(), [0, 0, 0, 1]])
+    frame.rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(off[:3]))
+    (result,) = hodge_pipeline.refine_colmap(model, database="none", overrides=FREE).results
+    assert result.decision.outcome == "refined"
+    assert len(result.candidates[0][1].images_off) == 1 and not result.candidates[result.kept_row][1].images_off
+
+
 def test_an_optimal_model_is_given_back_byte_for_byte(tmp_path: Path) -> None:
     model = noisy(tmp_path)
     done = hodge_pipeline.refine_colmap(model, out=tmp_path / "out", overrides=FREE)

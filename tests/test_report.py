@@ -22,7 +22,7 @@ from hodge_pipeline.report.contents import (
     Residuals,
     SourceSummary,
 )
-from hodge_pipeline.report.run_page import document
+from hodge_pipeline.report.run_page import document, next_commands
 from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows
 from hodge_pipeline.report.tables import score_tables
 from hodge_pipeline.report.verdict import suspicions
@@ -103,6 +103,7 @@ def test_the_first_lines_say_where_it_is_worst_and_what_to_type(report: Report) 
     worst, now = page.first
     assert worst.lines[0] == "Frame 113 lies 30.2 cm off the truth, more than any other."
     assert worst.lines[1].startswith("Of the edges that count, 107–108 fits least: it is 5")
+    assert list(next_commands(report, "my run"))[1] == "hodge view 'my run' --web"
     assert "hodge view runs/a --web" in now.text and "hodge diagnose runs/a" in now.text
     assert "hodge edit" not in now.text, "nothing is known to be wrong"
     assert "hodge diagnose" not in document(report, "runs/a").first[1].text

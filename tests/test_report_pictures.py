@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.recording.shapes import up_and_ahead
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow, Path3D, Pictures, Report, SourceSummary
 from hodge_pipeline.report.painting import turns_deg
@@ -74,6 +76,22 @@ def test_four_sides_are_jpegs_of_both_sets_of_poses() -> None:
     left, right = image[:, : raster.WIDTH], image[:, -raster.WIDTH :]
     assert ((left.min(axis=2) < 200).sum(), (right.min(axis=2) < 200).sum()) > (0, 0)
     assert np.abs(left - right).max() > 100
+
+
+def test_poses_before_in_another_world_are_seen_beside_those_after() -> None:
+    clouds, poses = room()
+    world_from_room = se3.exp(np.array([0.0, 0.0, 1.0, 1000.0, 2000.0, 30.0]))
+    for before, after in ((poses, world_from_room @ poses), (world_from_room @ poses, poses)):
+        front = four_sides(clouds, before, after, np.zeros(6, int))[0]
+        image = np.asarray(Image.open(io.BytesIO(front.image)), int).min(axis=2)
+        seen = [(half < 200).sum() for half in (image[:, : raster.WIDTH], image[:, -raster.WIDTH :])]
+        assert seen[1] > 100 and seen[0] == pytest.approx(seen[1], rel=0.05)
+
+
+def test_scanners_are_seen_with_their_own_z_up() -> None:
+    tilted = se3.exp(np.array([[0.0, 0.1, 0.4, 1, 2, 3]]))
+    up, ahead = up_and_ahead(tilted, is_scanner=True)
+    assert up == pytest.approx(tilted[0, :3, 2]) and ahead == pytest.approx(tilted[0, :3, 0])
 
 
 def test_frames_that_show_nothing_are_no_error() -> None:

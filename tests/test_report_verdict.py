@@ -21,7 +21,7 @@ from hodge_pipeline.report.contents import (
     SourceSummary,
     WrongEdges,
 )
-from hodge_pipeline.report.summary import graph_summary, weigh_wrong
+from hodge_pipeline.report.summary import graph_summary, unheld, weigh_wrong
 from hodge_pipeline.report.verdict import judge, suspicions
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.scene import Round
@@ -132,6 +132,37 @@ def test_a_path_in_doubt_says_so_first(report: Report) -> None:
     verdict = judge(replace(report, notes=(Note("camera or object", 9, "20 frames, 1–9"),)))
     assert verdict.headline == "In doubt, since much of the image moves: improved against odometry"
     assert verdict.mark == "mixed"
+
+
+@pytest.mark.parametrize(
+    ("scale", "noise_m", "told"), [(5.0, 0.002, "5"), (0.2, 0.01, "0.2"), (1.05, 0.0, ""), (5.0, 1.0, "")]
+)
+def test_depth_in_another_unit_than_the_truth_comes_first(
+    report: Report, scale: float, noise_m: float, told: str
+) -> None:
+    """Where the size explains the error: a path of noise has no scale."""
+    true = circle()[:, :3, 3]
+    found = true / scale + np.random.default_rng(0).normal(0, noise_m, true.shape)
+    pictures = Pictures((Path3D("truth", true), Path3D("result", found)), np.zeros(20, np.int64))
+    shown = replace(report, pictures=pictures)
+    assert judge(shown).headline.startswith("In another scale than the truth: ") == bool(told)
+    notes = [str(note) for note in suspicions(shown) if note.kind == "other scale"]
+    assert [f"The true path is {told} times" in note for note in notes] == [True] * bool(told)
+
+
+@pytest.mark.parametrize(
+    ("held", "verdict", "doubted"),
+    [("wall", "untestable", True), ("wall", "consistent", False), ("corner", "untestable", False)],
+)
+def test_a_path_along_a_bare_wall_is_in_doubt(held: str, verdict: str, doubted: bool) -> None:
+    """The wall holds the distance to it alone; other edges over a step would hold it all the same."""
+    edges = Edges.measured(ring(circle())).put(slice(None), verdict=verdict)
+    information = np.diag([1e4, 1e4, 1e4, 1.0, 1.0, 1e6] if held == "wall" else [1e4] * 6)
+    edges = edges.put(slice(None), information=information)
+    notes = unheld(edges, np.arange(20), 0.02)
+    assert [note.kind for note in notes] == ["unheld"] * doubted
+    verdict_of = judge(Report("r", SourceSummary("tum", "x", 20), notes=notes))
+    assert verdict_of.headline.startswith("In doubt, since what frames share lets them slide: ") == doubted
 
 
 def test_a_refinement_whose_error_against_the_truth_rose_is_mixed() -> None:

@@ -65,6 +65,9 @@ def test_information_pulled_back_weighs_a_motion_as_on_the_other_side(xi: np.nda
     factor = np.random.default_rng(0).normal(size=(6, 6))
     of_left = np.einsum("...i,ij,...j->...", left, factor @ factor.T, left)
     of_right = np.einsum("i,...ij,j->...", small, se3.pull_back(motion, factor @ factor.T), small)
+    covariance = se3.carried(se3.inverse(motion), np.linalg.inv(factor @ factor.T))
+    product = covariance @ se3.pull_back(motion, factor @ factor.T)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(6), product.shape), atol=1e-6)
     np.testing.assert_allclose(of_right, of_left, rtol=1e-6)
 
 

@@ -191,3 +191,13 @@ def test_what_nothing_confirms_is_said_first_and_fails(tmp_path):
     tree = graph.select(np.array([0]))
     write_g2o(tmp_path / "tree.g2o", tree)
     assert json.loads(hodge(tmp_path / "tree.g2o", "--robust", "--json"))["confirmed"] is None
+
+
+@pytest.mark.parametrize("ring", ["", "EDGE_SE2 0 1 1 0 0 0 0 0 0 0 0\nEDGE_SE2 2 2 1 0 0 1 0 0 1 0 1\n"])
+@pytest.mark.parametrize("how", [(), ("--robust",)])
+def test_where_no_edge_says_anything_nothing_is_called_solved(tmp_path, ring, how):
+    vertices = "".join(f"VERTEX_SE2 {row} {row} 0 0\n" for row in range(3))
+    (tmp_path / "in.g2o").write_text(vertices + ring)
+    text = hodge(tmp_path / "in.g2o", *how, "--out", tmp_path / "out.g2o")
+    assert text.startswith("verdict  Nothing to solve: no edge joins two vertices")
+    np.testing.assert_array_equal(load_g2o(tmp_path / "out.g2o").trajectory.world_from_cam[:, 0, 3], [0, 1, 2])

@@ -247,6 +247,18 @@ def test_a_tree_is_tested_by_nothing_and_refuted_by_nothing():
     assert solve_robust(wrong, start=truth).confirmed is False
 
 
+def test_an_edge_of_a_vertex_to_itself_is_none_that_was_left_out():
+    """A ring and a chord that confirm too little on their own: with nothing left out, nothing is in doubt."""
+    graph, truth = band(5, 1, 3)
+    looped = ViewGraph.from_edges(
+        graph.vertex_ids,
+        np.concatenate([graph.edges, [(2, 2)]]),
+        np.concatenate([graph.i_from_j, graph.i_from_j[:1]]),
+        np.concatenate([graph.information, graph.information[:1]]),
+    )
+    assert solve_robust(looped, start=truth).confirmed is solve_robust(graph, start=truth).confirmed is None
+
+
 def test_edges_of_very_different_lengths_are_confirmed(data_dir: Path) -> None:
     graph = open_source(data_dir / "pose_graphs/sesync/cubicle.g2o").graph
     assert solve_robust(graph).confirmed is True

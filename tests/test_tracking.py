@@ -16,6 +16,7 @@ from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.fusion.cloud import CloudFuser
 from hodge_pipeline.fusion.fuse import fuse_all
@@ -191,6 +192,12 @@ def test_blocks_share_their_border_and_nothing_else() -> None:
     assert [block.rows.tolist() for block in frame_blocks(np.array([3]), tuple(range(9)), np.arange(9.0))] == [[3]]  # type: ignore[arg-type]
 
 
+def test_a_sequence_without_any_depth_in_range_is_an_error(sequence: Path, tmp_path: Path) -> None:
+    source = with_dark(TumReader().open(sequence), range(FRAMES), images=False)
+    with pytest.raises(SourceError, match=f"none of {FRAMES} frames gave a point cloud: hodge inspect .* the first: "):
+        track(source, tmp_path / "dark")
+
+
 @pytest.mark.parametrize("images", [False, True])
 @pytest.mark.parametrize("dark", [range(20, 26), range(46, 51), range(60, 64)])
 def test_frames_without_depth_are_bridged_and_said(sequence: Path, tmp_path: Path, dark: range, images: bool) -> None:
@@ -208,6 +215,8 @@ def test_frames_without_depth_are_bridged_and_said(sequence: Path, tmp_path: Pat
     apart = se3.inverse(se3.inverse(poses[first]) @ poses) @ (se3.inverse(expected[first]) @ expected)
     assert np.linalg.norm(apart[seen, :3, 3], axis=1).max() < 0.06
     assert np.isfinite(poses).all()
+    empty = set(found.key_rows[np.diff(found.clouds.offsets) == 0].tolist())
+    assert empty <= {0, BLOCK, FRAMES - 1}  # the ends of blocks are key frames whatever they saw
     inside = [row for row in dark if dark[0] > 0 and dark[-1] < FRAMES - 1]
     assert all(np.linalg.norm(apart[row, :3, 3]) < 0.09 for row in inside)
 
@@ -312,7 +321,7 @@ def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(sequ
     whole, _ = track(source, tmp_path / "whole")
     found, notes = track(replace(source, frames=tuple(frames)), tmp_path / "stopped")
     assert found.found.all()
-    assert any("the recording stops at 1 places (3600.0 s before 30)" in note for note in notes)
+    assert any("the recording stops for 3600.0 s before 30:" in note for note in notes)
     poses, expected = (all_poses(source, one, one.world_from_key) for one in (found, whole))
     assert np.abs(poses - expected).max() < 0.06
 
@@ -323,9 +332,22 @@ def test_a_clock_that_goes_back_is_said_and_costs_no_frame(sequence: Path, tmp_p
     whole, _ = track(source, tmp_path / "whole")
     found, notes = track(replace(source, frames=tuple(frames)), tmp_path / "back")
     assert found.found.all()
-    assert any("the clock goes back at 1 frames (30)" in note for note in notes)
+    assert any("the clock goes back at 30:" in note for note in notes)
     poses, expected = (all_poses(source, one, one.world_from_key) for one in (found, whole))
     assert np.abs(poses - expected).max() < 0.06
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 1e9])
+def test_only_the_step_over_which_a_clock_goes_back_is_made_up(begin_s: float) -> None:
+    stamps = begin_s + np.array([0.25, 0.5, 1.0, 1.25, -7.0, -6.5, -6.25])
+    source = Source("s", Path("s"), tuple(Frame(row, stamp) for row, stamp in enumerate(stamps.tolist())))
+    np.testing.assert_allclose(tracked.stamps_of(source) - begin_s, [0.25, 0.5, 1.0, 1.25, 1.5, 2.0, 2.25])
+
+
+@pytest.mark.parametrize("stamps", [[0.5] * 5, [1.5, 1.5, 1.5, 2.5, 2.5], [3.0, 4.0, 1.0, 2.0, 3.0]])
+def test_stamps_that_are_no_clock_are_the_numbers_of_the_frames(stamps: list[float]) -> None:
+    source = Source("s", Path("s"), tuple(Frame(row, stamp) for row, stamp in enumerate(stamps)))
+    np.testing.assert_array_equal(tracked.stamps_of(source), np.arange(5))
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,8 @@ def test_what_holds_nothing_or_something_packed_is_told_so(tmp_path: Path) -> No
     (tmp_path / "folder/bag.tar.xz").write_bytes(b"x")
     (tmp_path / "folder/README.md").write_text("a bag")
     assert complaint(tmp_path / "folder").endswith("unpack bag.tar.xz first")
+    (tmp_path / "graph.g2o.gz").write_bytes(b"\x1f\x8b")
+    assert complaint(tmp_path / "graph.g2o.gz").endswith(": packed: unpack it first")
 
 
 def test_a_folder_of_many_sources_names_a_few(tmp_path: Path) -> None:

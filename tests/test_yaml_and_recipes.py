@@ -107,6 +107,9 @@ def test_another_stage_drops_the_options_of_the_first(recipes: Path) -> None:
     path = recipes / "other.yaml"
     path.write_text("extends: base.yaml\nregistration: {stage: ndt}\n")
     assert recipe_file.load(str(path)).data["registration"] == {"stage": "ndt"}
+    path.write_text("extends: base.yaml\nregistration: ndt\n")
+    document = recipe_file.load(str(path))
+    assert document.where(("registration", "stage")).endswith("other.yaml:2")
 
 
 def test_extends_in_a_circle_is_refused(recipes: Path) -> None:

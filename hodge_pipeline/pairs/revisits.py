@@ -42,13 +42,16 @@ class Revisits:
         default=1.0, gt=0, description="metres of the path, a turn as the arc at the scene, between two attempts"
     )
     drift_share: float = Field(
-        default=0.02, gt=0, lt=1, description="of that path, what odometry may be off by since the last place known"
+        default=0.03, gt=0, lt=1, description="of that path, what odometry may be off by since the last place known"
     )
     most_m: float = Field(
-        default=1.5,
+        default=1.5, gt=0, description="metres that a place may be off at most: rooms that look alike may lie near"
+    )
+    longest_way_m: float = Field(
+        default=65.0,
         gt=0,
-        description="metres that a place may be off: beyond it none is looked for by the poses, since rooms that look "
-        "alike may lie so near; where a path is so long that more is possible, frames that look alike are matched",
+        description="metres of that path beyond which no place is looked for by the poses; where a path is longer, "
+        "frames that look alike are matched",
     )
     agree_m: float = Field(
         default=0.2,
@@ -63,11 +66,6 @@ class Revisits:
         default=Gicp(distances_m=(1.0, 0.5, 0.2, 0.1, 0.05), source_points=(1000, 1000, 1000, 2000, 4000)),
         description="how a view is registered to one of before, from a guess that may be half a metre off",
     )
-
-    @property
-    def longest_way_m(self) -> float:
-        """The path over which odometry may drift by `most_m`."""
-        return (self.most_m - self.agree_m) / self.drift_share
 
 
 def find_revisits(
@@ -131,10 +129,10 @@ class _Path:
         options = self._options
         before = int(np.searchsorted(self._at_m, self._at_m[row] - LOOP_RANGES * self._range_m))
         way_m = self._ways(row, options.longest_way_m)[:before]
-        allowed_m = options.agree_m + options.drift_share * way_m
+        allowed_m = np.minimum(options.agree_m + options.drift_share * way_m, options.most_m)
         shift_m = np.linalg.norm(self._poses[:before, :3, 3] - self._poses[row, :3, 3], axis=1)
         usable = np.flatnonzero(
-            (shift_m < REACH_RANGES * self._range_m) & np.isfinite(allowed_m) & self._has_points[:before]
+            (shift_m < REACH_RANGES * self._range_m) & np.isfinite(way_m) & self._has_points[:before]
         )
         apart = self._far(se3.inverse(self._poses[usable]) @ self._poses[row])
         near = _spaced(usable[np.argsort(apart, kind="stable")][: int((apart < REACH_RANGES * self._range_m).sum())])

@@ -77,7 +77,19 @@ def _extended(path: Path, depth: int) -> Document:
         base = _extended(find(parent, beside=path.parent), depth + 1)
     except RecipeError as error:
         raise error if ":" in str(error).split(" ")[0] else RecipeError(f"{where}: extends: {error}") from error
-    return Document(_merged(base.data, document.data), {**base.origins, **document.origins})
+    merged = _merged(base.data, document.data)
+    inherited = {keys: line for keys, line in base.origins.items() if _stands(merged, keys)}
+    return Document(merged, {**inherited, **document.origins})
+
+
+def _stands(data: Any, keys: Keys) -> bool:
+    """Whether the path leads somewhere: not into what another recipe replaced."""
+    try:
+        for key in keys:
+            data = data[key]
+    except (KeyError, IndexError, TypeError):
+        return False
+    return True
 
 
 def _merged(base: Any, over: Any) -> Any:

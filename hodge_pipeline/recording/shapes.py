@@ -59,10 +59,15 @@ def frustum_lines(world_from_cam: Floats) -> Floats32:
     return np.asarray(se3.transform(world_from_cam, _FRUSTUM), np.float32)
 
 
-def up_and_ahead(world_from_cam: Floats) -> tuple[Floats, Floats]:
-    """Unit vectors (3,): the cameras' mean up direction, and their mean view direction across it."""
-    up = unit(-world_from_cam[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
-    ahead = world_from_cam[:, :3, 2].mean(axis=0)
+def up_and_ahead(world_from_cam: Floats, is_scanner: bool = False) -> tuple[Floats, Floats]:
+    """Unit vectors (3,): the cameras' mean up direction, and their mean view direction across it; of scanners, whose z
+    is up and whose x is ahead, likewise.
+    """
+    right, down, forth = world_from_cam[:, :3, :3].mean(axis=0).T
+    if is_scanner:
+        up, ahead = unit(forth, np.array([0.0, 0.0, 1.0])), right
+    else:
+        up, ahead = unit(-down, np.array([0.0, -1.0, 0.0])), forth
     return up, unit(ahead - (ahead @ up) * up, unit(np.cross(up, [1.0, 0.3, 0.2]), up))
 
 

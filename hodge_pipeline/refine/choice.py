@@ -21,7 +21,8 @@ CLEAR_GAIN = 0.5
 """Of the cost: half of it is more than any way to weigh observations; below it observations held out decide as well."""
 LEAST_MOVE, GAIN_TO_MOVE = 1e-3, 0.2
 """Of the extent of the cameras: poses that move by more need a gain of a fifth, since a lens that does not quite fit
-moves them by as much and gains a few per cent."""
+moves them by as much and gains a few per cent. It puts no image off by most of its observations: a candidate that mends
+such images, and spoils none, needs no more than the least gain, since few of many weigh little in the mean."""
 MERGE_LOSS = 0.05
 """Of the cost: so much more of it is the price of points that a match makes one."""
 MERGED_MORE = 1.25
@@ -115,7 +116,8 @@ def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
     moved = absolute_error(model.world_from_body, start.world_from_body, with_scale=True).rmse_m
     extent = float(np.linalg.norm(np.ptp(start.world_from_body[:, :3, 3], axis=0)))
     share = moved / extent if extent > 0 else 0.0
-    if share > LEAST_MOVE and gain < GAIN_TO_MOVE and not start.moves_intrinsics:
+    mends = set(after.images_off) < set(before.images_off)
+    if share > LEAST_MOVE and gain < GAIN_TO_MOVE and not mends and not start.moves_intrinsics:
         return f"the best candidate gains {gain:.1%} of the mean error and moves cameras by {share:.2%} of their extent"
     errors = steps.step(held_out_errors, start, model, seed, title="observations held out").errors_px
     if not errors.size:

@@ -74,12 +74,10 @@ def triangle_chi2(graph: ViewGraph) -> Floats:
     edge, forward = loops.edge[at], (loops.sign[at] > 0)[..., None, None]
     motion = np.where(forward, graph.i_from_j[edge], se3.inverse(graph.i_from_j[edge]))
     covariance = np.linalg.pinv(graph.information, hermitian=True)[edge]
-    turned = se3.adjoint(graph.i_from_j[edge])
-    covariance = np.where(forward, covariance, turned @ covariance @ np.swapaxes(turned, -1, -2))
+    covariance = np.where(forward, covariance, se3.carried(graph.i_from_j[edge], covariance))
     total, rest = np.zeros((len(at), 6, 6)), np.broadcast_to(np.eye(4), (len(at), 4, 4))
     for number in (2, 1, 0):
-        moved = se3.adjoint(se3.inverse(rest))
-        total = total + moved @ covariance[:, number] @ np.swapaxes(moved, -1, -2)
+        total = total + se3.carried(se3.inverse(rest), covariance[:, number])
         rest = motion[:, number] @ rest
     xi = se3.log(rest)
     return np.asarray(np.einsum("ta,tab,tb->t", xi, np.linalg.pinv(total, hermitian=True), xi))

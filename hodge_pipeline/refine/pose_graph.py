@@ -76,6 +76,8 @@ class SolvedFile:
         summary = self.summary()
         before, after, name = summary["cost_before"], summary["cost_after"], OBJECTIVES[summary["objective"]]
         fell = f"{name} {after:.6g}" if before is None else f"{name} {before:.6g} → {after:.6g}"
+        if not self.doubt and summary["edges_ignored"] == summary["edges"]:
+            return "Nothing to solve: no edge joins two vertices with information, so every pose is as it was"
         proven = ", globally optimal" if summary["certified"] else ""
         return f"Solved, but {self.doubt}: {fell}" if self.doubt else f"Solved{proven}: {fell}"
 

@@ -29,7 +29,10 @@ class CloudOptions:
     """How a frame becomes a cloud."""
 
     stride: int = Field(
-        default=2, ge=1, description="Pixels; every n-th row and column. 2 keeps 3 cm voxels filled up to 6 m."
+        default=2,
+        ge=1,
+        description="Pixels; every n-th row and column, or, of an image too coarse for that, as many as keep the "
+        "voxels filled up to the end of the range: with 3 cm and 6 m every 2nd of 640 pixels, all of 320.",
     )
     min_range_m: float = Field(
         default=0.2, ge=0, description="Metres along the optical axis; nearer is the sensor's blind zone."
@@ -47,7 +50,7 @@ class CloudOptions:
     landmarks: int = Field(
         default=0,
         ge=0,
-        description="SIFT landmarks of a frame, at most, the strongest; `rgbd` needs them, 800 serve it. About 60 ms a "
+        description="SIFT landmarks of a frame, at most, the strongest; `rgbd` needs them, 800 serve it. About 30 ms a "
         "frame; 0: none",
     )
     unit_m: float = Field(
@@ -64,6 +67,10 @@ class CloudOptions:
         if 2 * self.max_range_m / self.voxel_m > MAX_VOXELS_ALONG_AXIS:
             raise ValueError(f"voxel_m {self.voxel_m} is too small for max_range_m {self.max_range_m}")
         return self
+
+    def stride_of(self, camera: Camera) -> int:
+        """The rows and columns of this camera's depth images from one that is taken to the next."""
+        return min(self.stride, max(1, round(abs(camera.fx) * self.voxel_m / self.max_range_m)))
 
 
 class Oddity(NamedTuple):
@@ -193,19 +200,19 @@ def _read_samples(frame: Frame, options: CloudOptions) -> _Samples:
 
 
 def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Camera, options: CloudOptions) -> _Samples:
-    depth = read_depth()
-    z = depth[:: options.stride, :: options.stride]
+    depth, stride = read_depth(), options.stride_of(camera)
+    z = depth[::stride, ::stride]
     rows, columns = np.nonzero((z >= options.min_range_m) & (z <= options.max_range_m))  # false for NaN
     z_kept = z[rows, columns].astype(np.float32)
-    x = ((columns * options.stride - camera.cx) / camera.fx).astype(np.float32) * z_kept
-    y = ((rows * options.stride - camera.cy) / camera.fy).astype(np.float32) * z_kept
+    x = ((columns * stride - camera.cx) / camera.fx).astype(np.float32) * z_kept
+    y = ((rows * stride - camera.cy) / camera.fy).astype(np.float32) * z_kept
     colours, odd = None, None
     if options.colours and frame.read_colour is not None and len(rows):
         try:
             image = frame.read_colour()
             # A colour image of another size covers the same view: take the pixel at the same share of it.
-            v = rows * options.stride * image.shape[0] // depth.shape[0]
-            u = columns * options.stride * image.shape[1] // depth.shape[1]
+            v = rows * stride * image.shape[0] // depth.shape[0]
+            u = columns * stride * image.shape[1] // depth.shape[1]
             colours = image[v, u]
         except (SourceError, OSError) as error:
             odd = Oddity(frame.frame_id, "its cloud has no colours", str(error))

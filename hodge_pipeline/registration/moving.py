@@ -27,6 +27,8 @@ of the 60 of fr1/rpy, where nothing moves.
 """
 GREY_LEVELS = 20.0
 """Grey values, of 256, of the mean of a few pixels: more than noise and interpolation change in a static scene."""
+OFF_M, OFF_SIGMAS = 0.05, 3.0
+"""By which a depth is off what a motion predicts: what clouds are matched within, and beyond the noise of a pixel."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +69,28 @@ def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floa
     return share, Rival(others, other, fits_better, moving, _contradicting(others_misfit))
 
 
-def fits_most(key: FlowImage, view: FlowImage, key_from_view: Floats, other: Floats) -> tuple[bool, float]:
-    """Whether another motion fits most tiles of the image better than the first one, and the share of the pixels that
-    contradict it.
+def contradicting(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
+    """The share of the tested pixels whose depth or grey value contradicts a motion."""
+    return _contradicting(_misfit(key, view, key_from_view))
+
+
+def misplaced(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
+    """The share of the tested pixels whose depth in the view is off what the motion predicts, by `OFF_M` and
+    `OFF_SIGMAS`: few where both see one rigid scene, most of a bare room where the motion is an object's.
     """
-    first, misfit = _misfit(key, view, key_from_view), _misfit(key, view, other)
-    won, _ = _votes(key, first - misfit)
-    return 2 * won > TILES**2, _contradicting(misfit)
+    expected, actual = _compared(key, view, key_from_view)
+    off = np.abs(actual - expected[:, 2])
+    off = off[np.isfinite(off)] / view.unit_m
+    sigma = depth_sigma(expected[np.isfinite(actual), 2] / view.unit_m)
+    return float((off > np.maximum(OFF_M, OFF_SIGMAS * sigma)).mean()) if len(off) else 0.0
+
+
+def _compared(key: FlowImage, view: FlowImage, key_from_view: Floats) -> tuple[Floats, Floats]:
+    """Columns u, v, z (n, 3) at which a motion puts the tested pixels of the key frame, and the depths (n,) there; NaN
+    where not both frames have one.
+    """
+    expected = project(se3.transform(se3.inverse(key_from_view), _points(key)), view.camera)
+    return expected, _depth(view, expected[:, :2])
 
 
 def _votes(key: FlowImage, gain: Floats) -> tuple[int, int]:
@@ -102,8 +119,7 @@ def _misfit(key: FlowImage, view: FlowImage, key_from_view: Floats) -> Floats:
     predicts, 1: by as much as may be or more; NaN where not both frames have a depth.
     """
     pixels = tested_pixels(key.depth.shape)
-    expected = project(se3.transform(se3.inverse(key_from_view), _points(key)), view.camera)
-    actual = _depth(view, expected[:, :2])
+    expected, actual = _compared(key, view, key_from_view)
     sigma = DEPTH_SIGMAS * view.unit_m * depth_sigma(expected[:, 2] / view.unit_m)
     off = (actual - expected[:, 2]) / (GATE_PX / PIXEL_SIGMA * sigma)
     change = _grey(view, expected[:, :2]) - _grey(key, pixels)

@@ -34,7 +34,7 @@ def drift_of(world_from_cam: Floats, steps: Edges, tail: float | None) -> Drift:
     """
     covariance = np.zeros((len(world_from_cam), 6, 6))
     ends = steps.pairs.max(axis=1, initial=0)
-    np.add.at(covariance, ends, _turned(world_from_cam[steps.pairs[:, 1]], se3.covariances(steps.information)))
+    np.add.at(covariance, ends, se3.carried(world_from_cam[steps.pairs[:, 1]], se3.covariances(steps.information)))
     part = connected_components(steps.pairs, len(world_from_cam))
     gate = np.inf if tail is None else 6 * float(fdtri(6, FREEDOM, 1 - tail))
     return Drift(world_from_cam, part, np.cumsum(covariance, axis=0), gate)
@@ -77,13 +77,13 @@ class _Pairs:
     def of(cls, registered: Edges) -> _Pairs:
         (i, j), motion, covariance = registered.pairs.T, registered.i_from_j, se3.covariances(registered.information)
         back = (i > j)[:, None, None]
-        covariance = np.where(back, _turned(motion, covariance), covariance)
+        covariance = np.where(back, se3.carried(motion, covariance), covariance)
         return cls(np.minimum(i, j), np.maximum(i, j), np.where(back, se3.inverse(motion), motion), covariance)
 
     def chi2(self, drift: Drift) -> Floats:
         """Squared Mahalanobis distance (P,) from odometry's motions; 0 across two parts."""
         poses, low, high = drift.world_from_cam, self.low, self.high
-        path = _turned(se3.inverse(poses[high]), drift.covariance[high] - drift.covariance[low])
+        path = se3.carried(se3.inverse(poses[high]), drift.covariance[high] - drift.covariance[low])
         off = se3.log(se3.inverse(poses[high]) @ poses[low] @ self.motion)
         chi2 = np.einsum("ni,ni->n", off, np.linalg.solve(path + self.covariance, off[..., None])[..., 0])
         return np.asarray(np.where(drift.part[low] == drift.part[high], chi2, 0.0))
@@ -124,11 +124,5 @@ def _mended(drift: Drift, row: int, seed: _Pairs) -> Drift:
     end = poses[seed.low[0]] @ seed.motion[0]
     behind = (np.arange(len(poses)) >= row) & (drift.part == drift.part[row])
     poses[behind] = end @ se3.inverse(poses[seed.high[0]]) @ poses[behind]
-    covariance[row:] += _turned(end, seed.covariance[0])
+    covariance[row:] += se3.carried(end, seed.covariance[0])
     return replace(drift, world_from_cam=poses, covariance=covariance)
-
-
-def _turned(b_from_a: Floats, covariances: Floats) -> Floats:
-    """Covariances (..., 6, 6) of twists in the axes of a, in those of b."""
-    into = se3.adjoint(b_from_a)
-    return np.asarray(into @ covariances @ np.swapaxes(into, -1, -2))

@@ -72,6 +72,12 @@ def _slides(registered: Edges, min_spread: float) -> Bools:
     return np.asarray(weak.any(axis=1) & ~_consecutive(registered))
 
 
+def unheld_steps(edges: Edges, min_spread: float) -> Bools:
+    """Where (P,) consecutive frames share too little to hold translation in every direction, as before a bare wall."""
+    weak, _ = _weak_directions(edges, HELD_SPREADS * min_spread)
+    return np.asarray(weak.any(axis=1) & _consecutive(edges))
+
+
 def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) -> Edges:
     """The table with pairs at their guesses `i_from_j (P, 4, 4)` in directions in which what they share may let them
     slide (solution remapping, Zhang et al., ICRA 2016).

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.block_store import BlockStore
 from hodge_pipeline.registration.pairs import held_where_sliding, register_pairs
 from hodge_pipeline.stages import Registrar, Step, Workers
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import HELD_OUT, MEASURED, USED
 
@@ -42,12 +44,13 @@ def register_edges(
     rows, known = _reusable(candidates, guesses, earlier, scale)
     missing = np.setdiff1d(np.arange(len(candidates)), rows)
     step.advance(len(rows))
-    blocks = BlockStore(step.folder / "blocks")
+    blocks = step.folder / "blocks"
     found = register_pairs(
         clouds.folder, registrar, candidates.select(missing), guesses[missing], workers, step.advance,
-        finished=blocks.read(), on_block=blocks.write,
+        finished={int(path.stem): artifacts.load(path, Edges) for path in sorted(blocks.glob("[0-9]*.npz"))},
+        on_block=lambda block, result: keep_block(blocks, block, result),
     )  # fmt: skip
-    blocks.remove()
+    shutil.rmtree(blocks, ignore_errors=True)
     found = held_where_sliding(found, guesses[missing], min_spread)
     kept = candidates.select(rows)
     if earlier is not None and len(rows):
@@ -55,6 +58,12 @@ def register_edges(
         kept = replace(kept, status=np.full(len(rows), USED), **columns)
     order = np.argsort(np.concatenate([missing, rows]))
     return Edges.joined([Edges.joined([found, kept]).select(order), edges.select(held_out)])
+
+
+def keep_block(folder: Path, block: int, result: Edges) -> None:
+    """Write one block of registered pairs, so that a killed registration goes on with the next one."""
+    folder.mkdir(exist_ok=True)
+    artifacts.save(folder / f"{block:06d}.npz", result)
 
 
 def _reusable(candidates: Edges, guesses: Floats, earlier: Edges | None, scale: float) -> tuple[Ints, Ints]:

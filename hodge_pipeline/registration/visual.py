@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.types import Bools, Floats
+from hodge_pipeline.types import Floats
 
 TRIPLES = 300
 FEWEST_MATCHES = 8
@@ -65,17 +65,20 @@ def visual_motion(
     gate_i, gate_j = (covariances(points, GATE_PIXEL_SIGMA * pixel, 1.0) for points, pixel in both)
     rows = np.random.default_rng(seed).integers(0, count, (TRIPLES, 3))
     guesses = se3.fit_rigid(points_i[rows], points_j[rows])
-    spread = np.sqrt((np.trace(gate_i, axis1=1, axis2=2) + np.trace(gate_j, axis1=1, axis2=2)) / 3)
-    apart = np.linalg.norm(se3.transform(guesses, points_j[None]) - points_i, axis=2) / spread
-    scores = np.maximum(1 - (apart / (2 * GATE)) ** 2, 0).sum(axis=1)
-    motion = guesses[int(np.argmax(scores))]
-    inlier = apart[int(np.argmax(scores))] < 2 * GATE
+    spread = (np.trace(gate_i, axis1=1, axis2=2) + np.trace(gate_j, axis1=1, axis2=2)) / 3
+    apart = _squares_apart(points_i, points_j, guesses) / ((2 * GATE) ** 2 * spread)
+    best = int(np.argmax(np.maximum(1 - apart, 0).sum(axis=1)))
+    motion, inlier = guesses[best], apart[best] < 1
+    turn = motion[:3, :3]  # the steps add a degree at most, which changes these errors by nothing
+    weight, gate = (
+        np.linalg.inv(of_i + turn @ of_j @ turn.T) for of_i, of_j in ((errors_i, errors_j), (gate_i, gate_j))
+    )
     for _ in range(STEPS):
         if inlier.sum() < FEWEST_MATCHES:
             return None
-        step, information = _step(points_i[inlier], points_j[inlier], errors_i[inlier], errors_j[inlier], motion)
+        step, information = _step(points_i[inlier], points_j[inlier], weight[inlier], motion)
         motion = motion @ se3.exp(step)
-        before, inlier = inlier, _agrees(points_i, points_j, gate_i, gate_j, motion)
+        before, inlier = inlier, _squares(gate, points_i - se3.transform(motion, points_j)) < 3 * GATE**2
         if np.linalg.norm(step) < 1e-5 and (before == inlier).all():
             break
     if inlier.sum() < FEWEST_MATCHES:
@@ -83,29 +86,32 @@ def visual_motion(
     return VisualMotion(motion, information, int(inlier.sum()), count)
 
 
-def _whitened(
-    points_i: Floats, points_j: Floats, errors_i: Floats, errors_j: Floats, i_from_j: Floats
-) -> tuple[Floats, Floats]:
-    """Inverse covariances (M, 3, 3) of the residuals, and the residuals (M, 3) in i's axes."""
-    turn = i_from_j[:3, :3]
-    weight = np.asarray(np.linalg.inv(errors_i + turn @ errors_j @ turn.T), np.float64)
-    return weight, points_i - se3.transform(i_from_j, points_j)
+def _squares_apart(points_i: Floats, points_j: Floats, guesses: Floats) -> Floats:
+    """Squared distances (G, M) of matched points under each motion (G, 4, 4), |p − R q − t|² multiplied out: one
+    product of matrices for all.
+    """
+    turns, shifts = guesses[:, :3, :3], guesses[:, :3, 3]
+    turned_back = (shifts[:, None] @ turns)[:, 0]
+    ones = np.ones((len(guesses), 1))
+    squared = (shifts**2).sum(axis=1, keepdims=True)
+    of_guess = np.hstack([-2 * turns.reshape(-1, 9), -2 * shifts, 2 * turned_back, squared, ones])
+    products = (points_i[:, :, None] * points_j[:, None]).reshape(-1, 9)
+    lengths = (points_i**2 + points_j**2).sum(axis=1, keepdims=True)
+    return np.asarray(of_guess @ np.hstack([products, points_i, points_j, np.ones_like(lengths), lengths]).T)
 
 
-def _agrees(points_i: Floats, points_j: Floats, errors_i: Floats, errors_j: Floats, i_from_j: Floats) -> Bools:
-    weight, residual = _whitened(points_i, points_j, errors_i, errors_j, i_from_j)
-    return np.asarray(np.einsum("mi,mij,mj->m", residual, weight, residual) < 3 * GATE**2)
+def _squares(weight: Floats, residual: Floats) -> Floats:
+    return np.asarray(((weight @ residual[:, :, None])[:, :, 0] * residual).sum(axis=1))
 
 
-def _step(
-    points_i: Floats, points_j: Floats, errors_i: Floats, errors_j: Floats, i_from_j: Floats
-) -> tuple[Floats, Floats]:
-    """The Gauss-Newton step ξ (6,) and the information (6, 6), Cauchy weights within the consensus."""
-    weight, residual = _whitened(points_i, points_j, errors_i, errors_j, i_from_j)
-    squares = np.einsum("mi,mij,mj->m", residual, weight, residual)
-    weight = weight / (1 + squares / 3)[:, None, None]
+def _step(points_i: Floats, points_j: Floats, weight: Floats, i_from_j: Floats) -> tuple[Floats, Floats]:
+    """The Gauss-Newton step ξ (6,) and the information (6, 6), Cauchy weights within the consensus; `weight (m, 3, 3)`
+    are the inverse covariances of the residuals, in i's axes.
+    """
+    residual = points_i - se3.transform(i_from_j, points_j)
+    weight = weight / (1 + _squares(weight, residual) / 3)[:, None, None]
     turn = i_from_j[:3, :3]
     jacobian = np.concatenate([-turn @ se3.hat(points_j), np.broadcast_to(turn, (len(points_j), 3, 3))], axis=2)
-    information = np.einsum("mia,mij,mjb->ab", jacobian, weight, jacobian)
-    gradient = np.einsum("mia,mij,mj->a", jacobian, weight, residual)
+    weighted = (weight @ jacobian).reshape(-1, 6)
+    information, gradient = jacobian.reshape(-1, 6).T @ weighted, weighted.T @ residual.ravel()
     return np.linalg.solve(information + 1e-9 * np.trace(information) * np.eye(6), gradient), information

@@ -28,6 +28,11 @@ FILL_PX = 5
 """In a picture that shows the points from near."""
 CLOSER = 2
 """How many times the place that changed most is enlarged."""
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""Right, down and look of a view from above, in the axes of a scanner."""
+SEEN_BEHIND = 0.01
+"""Share of points behind the image plane, which no camera has: of those of a scanner, whose z is up, it is the ground.
+"""
 VIEWED_PERCENT = 3.0
 """Of a frame's points, which may lie outside its own picture."""
 
@@ -73,13 +78,15 @@ def _moved_m(clouds: CloudSet, before: Floats, after: Floats, pairs: Ints) -> Fl
 
 
 def _as_seen_by(clouds: CloudSet, world_from_cam: Floats, row: int) -> raster.View:
-    """The view of one camera, orthographic, which its own points fill."""
+    """The view of one camera, orthographic, which its own points fill; of a scanner, from above."""
     pose = world_from_cam[row]
     points = np.asarray(clouds[row].points_in_cam, float)
-    held = raster.holding(np.eye(3), points, LARGE, VIEWED_PERCENT)
-    near_m = float(held.centre[2] - max(np.percentile(points[:, 2], 1) / 2, 0.0))
+    axes = DOWN if _is_scanner(clouds, np.array([row])) else np.eye(3)
+    held = raster.holding(axes, points, LARGE, VIEWED_PERCENT)
+    depth_m = points @ axes[2]
+    near_m = float(axes[2] @ held.centre - max(np.percentile(depth_m, 1) / 2, 0.0))
     centre = se3.transform(pose, held.centre[None])[0]
-    return raster.View(pose[:3, :3].T, centre, held.metres_per_pixel, LARGE, near_m=near_m)
+    return raster.View(axes @ pose[:3, :3].T, centre, held.metres_per_pixel, LARGE, near_m=near_m)
 
 
 def _closer(scenes: Sequence[raster.Points], view: raster.View) -> raster.View:
@@ -102,7 +109,8 @@ def _some(rows: Ints) -> Ints:
 
 
 def four_sides(clouds: CloudSet, before: Floats, after: Floats, component: Ints) -> tuple[Picture, ...]:
-    """One picture for each side: the clouds laid together by the poses before on the left, after on the right.
+    """One picture for each side: the clouds laid together by the poses before, aligned to those after, on the left, and
+    by these on the right.
 
     Only frames of the largest component, which both sets of poses (N, 4, 4) know; none where there is nothing to see.
     """
@@ -110,8 +118,21 @@ def four_sides(clouds: CloudSet, before: Floats, after: Floats, component: Ints)
     rows = _some(np.flatnonzero(finite & (component == 0) & (clouds.sizes > 0)))
     if len(rows) < 2:
         return ()
-    scenes = [raster.merged(clouds, poses, rows) for poses in (before, after)]
-    return sides(scenes, raster.around(scenes[1], after[rows]), "Before | after")
+    aligned = _laid_on(before, after, rows)
+    scenes = [raster.merged(clouds, poses, rows) for poses in (aligned, after)]
+    return sides(scenes, raster.around(scenes[1], after[rows], _is_scanner(clouds, rows)), "Before | after")
+
+
+def _laid_on(before: Floats, after: Floats, rows: Ints) -> Floats:
+    """The poses before, turned and moved as these rows are on average: known positions have a world of their own."""
+    turn = se3.project_to_so3((after[rows, :3, :3] @ np.swapaxes(before[rows, :3, :3], 1, 2)).mean(axis=0))
+    shift = (after[rows, :3, 3] - before[rows, :3, 3] @ turn.T).mean(axis=0)
+    return np.asarray(se3.from_parts(turn, shift) @ before)
+
+
+def _is_scanner(clouds: CloudSet, rows: Ints) -> bool:
+    """Whether these rows hold points behind an image plane."""
+    return bool(np.mean([np.mean(clouds[int(row)].points_in_cam[:, 2] < 0) for row in rows]) > SEEN_BEHIND)
 
 
 def sides(scenes: Sequence[raster.Points], views: Mapping[str, raster.View], caption: str) -> tuple[Picture, ...]:

@@ -111,11 +111,11 @@ def _tinted(count: int, tint: Sequence[float]) -> Bytes:
     return np.tile(np.asarray(tint, np.uint8), (count, 1))
 
 
-def around(scene: Points, world_from_cam: Floats) -> dict[str, View]:
-    """One view from each of four sides, above the scene; up is where the cameras have it, on average."""
+def around(scene: Points, world_from_cam: Floats, is_scanner: bool = False) -> dict[str, View]:
+    """One view from each of four sides, above the scene; up is where the cameras, or scanners, have it, on average."""
     sample = scene.points[:: max(1, len(scene.points) // FRAMING_POINTS)].astype(float)
     known = world_from_cam[np.isfinite(world_from_cam).all(axis=(1, 2))]
-    up, ahead = up_and_ahead(known)
+    up, ahead = up_and_ahead(known, is_scanner)
     found = {}
     for name, degrees in SIDES.items():
         turn = se3.exp(np.concatenate([np.deg2rad(degrees) * up, np.zeros(3)]))[:3, :3]

@@ -30,7 +30,7 @@ from hodge_pipeline.report.contents import (
 )
 from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.report.refined import summary
-from hodge_pipeline.report.summary import graph_summary, trajectory_rows, weigh_wrong, worst_edges
+from hodge_pipeline.report.summary import graph_summary, trajectory_rows, unheld, weigh_wrong, worst_edges
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.scene import (
     START,
@@ -107,6 +107,7 @@ def make_report(
     first = next(iter(sets))
     shown = sets[first], sets["result"]
     worst = worst_edges(last.edges, last.vertex_ids)
+    scans = all(frame.read_depth is None for frame in source.frames)  # where these slide, `start.sweeps` says it
     return Report(
         title=re.sub(KEY_OF_CACHE, "", source.name),
         before=first,
@@ -119,7 +120,7 @@ def make_report(
             sequences=tuple(name for name in sequences_of(source) if name),
             notes=source.notes,
             format="" if recipe.source.reader is None else registry.name_of(recipe.source.reader),
-            kind="scans" if all(frame.read_depth is None for frame in source.frames) else "frames",
+            kind="scans" if scans else "frames",
             unordered=not scene.in_order,
         ),
         scores=scores,
@@ -129,7 +130,7 @@ def make_report(
         graph=graph_summary(last.edges, last.vertex_ids, component),
         worst_edges=worst,
         stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in store.costs()),
-        notes=tuple(store.notes),
+        notes=(*store.notes, *(() if scans else unheld(last.edges, last.vertex_ids, recipe.acceptance.min_spread))),
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(recipe)),
         last_shift_m=_last_shift(rounds, component),

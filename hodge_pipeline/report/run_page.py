@@ -20,6 +20,7 @@ from hodge_pipeline.report.tables import (
 )
 from hodge_pipeline.report.verdict import Outcome, judge, suspicions
 from hodge_pipeline.types.notes import Rank
+from hodge_pipeline.types.text import command
 
 MARKS: dict[Outcome, Mark] = {
     "improved": "better", "unchanged": "same", "worse": "worse", "mixed": "mixed", "not measured": "not measured",
@@ -103,12 +104,15 @@ def worst_places(report: Report) -> Iterator[str]:
 
 def next_commands(report: Report, folder: str) -> Iterator[str]:
     """What to type next, each with why."""
-    yield from ("# see it in 3-D, in the browser", f"hodge view {folder} --web")
+    yield from ("# see it in 3-D, in the browser", command("hodge", "view", folder, "--web"))
     if report.verdicts_of_concern or len(report.pieces) > 1:
-        yield from ("# which edges are wrong, and what to do", f"hodge diagnose {folder} --out {folder}-why")
+        yield from (
+            "# which edges are wrong, and what to do",
+            command("hodge", "diagnose", folder, "--out", f"{folder}-why"),
+        )
     if report.wrong_edges is not None and report.wrong_edges.matters(report.scale):
         yield "# leave the wrong edges out; solve and fuse again"
-        yield from (f"hodge edit {folder} --disable wrong", f"hodge solve {folder}")
+        yield from (command("hodge", "edit", folder, "--disable", "wrong"), command("hodge", "solve", folder))
 
 
 def duration(seconds: float) -> str:

@@ -8,17 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import in_runs
+from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
+from hodge_pipeline.registration.pairs import unheld_steps
 from hodge_pipeline.report.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow, WrongEdges
 from hodge_pipeline.scene import Round
 from hodge_pipeline.stages import ConsistencySolver, Step
 from hodge_pipeline.types import Edges, Floats, Ints
+from hodge_pipeline.types.notes import Note
 
 CENTIMETRES_PER_DEGREE = 1.0
 """How a residual's angle counts beside its translation when edges are ranked: a scene lies about 0.6 m away."""
 
 MOST_FRAMES = 3
 """That a note names."""
+UNHELD = 0.02
+"""Share of the steps that nothing holds in some direction and no other edge tests, above which the path is in doubt:
+none of fr1, red kitchen, ICL-NUIM, fr3's cabinet; 6 % of a walk where steps slid by 20 cm; all before a bare wall.
+"""
 VERDICTS = ("consistent", "suspect", "wrong", "untestable")
 
 
@@ -90,6 +97,17 @@ def graph_summary(edges: Edges, vertex_ids: NDArray[np.generic], component: Ints
         verdicts=_verdicts(graph),
         verdicts_in_use=_verdicts(graph.select(graph.weight > 0)),
     )
+
+
+def unheld(edges: Edges, vertex_ids: NDArray[np.generic], min_spread: float) -> tuple[Note, ...]:
+    """A note where much of the path hangs on steps that what their frames share lets slide, and that nothing tests."""
+    graph = edges.select(edges.in_graph)
+    steps = np.abs(np.diff(graph.pairs, axis=1)[:, 0]) == 1
+    free = unheld_steps(graph, min_spread) & (graph.verdict == UNTESTABLE)
+    if free.sum() <= UNHELD * steps.sum():
+        return ()
+    frames = in_runs(np.unique(graph.pairs[free].max(axis=1)), vertex_ids)
+    return (Note("unheld", int(free.sum()), f"{int(steps.sum())} steps (to {frames})"),)
 
 
 def _verdicts(graph: Edges) -> dict[str, int]:

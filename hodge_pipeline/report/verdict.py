@@ -23,6 +23,10 @@ UNMATCHED_SHARE = 0.01
 UNSETTLED_M, UNSETTLED_SHARE = 0.05, 0.01
 """By how much (root mean square), and by which share of the path, the last of several rounds may move the positions.
 Runs that end near the truth move by less than 1 cm, one whose edges slide along a bare floor by 30."""
+OTHER_SCALE, EXPLAINED = 1.1, 0.25
+"""The factor between the true path and the result from which one is not in metres, where it leaves a quarter of the
+error: focal lengths are known to a few per cent, and units differ by 5 or 1000.
+"""
 NOTHING_MOVED_M = 0.0005
 """The least movement that is told in a room."""
 TRUTH = "truth"
@@ -35,7 +39,13 @@ REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",
 }  # fmt: skip
-DOUBTS = {"unsettled": "Not settled", "camera or object": "In doubt, since much of the image moves"}
+DOUBTS = {
+    "unsettled": "Not settled",
+    "camera or object": "In doubt, since much of the image moves",
+    "unheld": "In doubt, since what frames share lets them slide",
+    "path loose": "In doubt, since the scans tell little of how far the scanner went",
+    "other scale": "In another scale than the truth",
+}
 """How a headline begins where the run says that its result may be wrong, whatever was measured."""
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 
@@ -85,9 +95,9 @@ def judge(report: Report) -> Verdict:
     if pieces:
         all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
-    doubts = [DOUBTS[note.kind] for note in (*_unsettled(report), *report.notes) if note.kind in DOUBTS]
-    if doubts:
-        headline = ": ".join([*doubts, f"{headline[:1].lower()}{headline[1:]}"])
+    told = (*_unsettled(report), *_other_scale(report), *report.notes)
+    doubts = [DOUBTS[note.kind] for note in told if note.kind in DOUBTS]
+    headline = _capital(": ".join(f"{text[:1].lower()}{text[1:]}" for text in (*doubts, headline)))
     return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason, bool(doubts))
 
 
@@ -175,6 +185,7 @@ def suspicions(report: Report) -> tuple[Note, ...]:
     """What a reader should distrust and what else is to be known, by rank; the run's own notes come first in each."""
     found = (
         *_unsettled(report),
+        *_other_scale(report),
         *(() if report.position_fit is None else known_positions.notes(report.position_fit)),
         *report.notes,
         *(() if report.graph is None else _graph_suspicions(report.graph)),
@@ -193,6 +204,24 @@ def _unsettled(report: Report) -> Iterator[Note]:
         UNSETTLED_M * report.scale, UNSETTLED_SHARE * path_m
     ):
         yield Note("unsettled", detail=length(report.last_shift_m))
+
+
+def _other_scale(report: Report) -> Iterator[Note]:
+    """Where the true path is as the result's but for its size, in the largest piece."""
+    paths = {path.name: path.positions for path in report.pictures.paths}
+    if not report.has_metres or TRUTH not in paths or report.after not in paths:
+        return
+    x, y, component = paths[report.after], paths[TRUTH], report.pictures.component
+    if len(component) != len(x):
+        return
+    rows = (component == np.bincount(component).argmax()) & np.isfinite(x + y).all(axis=1)
+    if rows.sum() < 3:
+        return
+    x, y = x[rows] - x[rows].mean(axis=0), y[rows] - y[rows].mean(axis=0)
+    scale = float(np.sum(x * y) / max(np.sum(x * x), np.finfo(float).tiny))
+    explained = np.sum((scale * x - y) ** 2) < EXPLAINED**2 * np.sum((x - y) ** 2)
+    if explained and (scale > OTHER_SCALE or 0 < scale < 1 / OTHER_SCALE):
+        yield Note("other scale", detail=f"{scale:.2g}")
 
 
 def _path_m(positions: Floats) -> float:

@@ -107,6 +107,8 @@ class Work:
     def register(self, number: int, edges: Edges, before: Round) -> Registered:
         """The candidates registered from the poses of the round before, and accepted or rejected."""
         world_from_cam, earlier = before.world_from_cam, before.registered(self.measured) if number > 1 else None
+        if number == 1 and self.scene.steps_stand:
+            earlier = before.edges.select(np.abs(np.diff(before.edges.pairs, axis=1)[:, 0]) == 1)
         registered = self.steps.step(
             register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,
             self.recipe.acceptance.min_spread,

@@ -36,9 +36,11 @@ def unknown(path: Path) -> SourceError:
 
 
 def _nothing(path: Path) -> str:
-    """What to do about a path without contents; nothing of one that has some."""
+    """What to do about a path without contents, or packed ones; nothing of one that has some."""
     if path.is_file() and not path.stat().st_size:
         return "the file is empty: record or copy it again"
+    if path.is_file() and path.suffix.lower() in PACKED:
+        return "packed: unpack it first"
     if not path.is_dir():
         return ""
     children = _children(path)

@@ -36,7 +36,7 @@ class OdometryStart(OdometryOptions):
         default=False,
         description="join what odometry leaves apart, by `unordered`: after lost tracking, or several sequences; "
         "auto: only where it left something apart, true: always. auto also matches frames that look alike along a path "
-        "so long that it may have drifted by more than `revisits.most_m`; true matches more of them",
+        "longer than `revisits.longest_way_m`; true matches more of them",
     )
     unordered: GlobalStart = Field(default=GlobalStart(), description="how parts are joined without a guess")
     revisits: Revisits | None = Field(

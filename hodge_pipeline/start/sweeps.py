@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import small_gicp
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.registration.assessment import MIN_POINTS
 from hodge_pipeline.registration.clouds import (
     CloudOptions,
     Oddity,
@@ -26,7 +24,8 @@ from hodge_pipeline.registration.clouds import (
 )
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
-from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame, velocities
+from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity
+from hodge_pipeline.registration.sweeps import deskewed_frame, velocities
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,
@@ -48,26 +47,12 @@ VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
 """0.8 m, as KISS-ICP (Vizzo et al., RA-L 2023) has it, and 2 m for a scanner that sees 80 m."""
 SMALLEST_VOXEL_M = 0.08
 """Four times the usual noise of a range, 2 cm: smaller voxels, as in a room, would hold noise in place of surfaces."""
-START_LEVELS, LEVELS = (9, 3, 1), (3, 1)
-"""Voxels of the map, coarse to fine: the coarsest are for a velocity of 30 m a second that nobody knows yet."""
-LOOK_M, SAMPLE_M = 3.0, 0.7
-"""Times a voxel: how far correspondences may be at its level; and the finest voxel thins a sweep."""
-NEIGHBOURS, MOST_ITERATIONS, SWEEPS_KEPT = 10, 30, 100
-"""As small_gicp has them: points in a covariance; steps at a level; sweeps until a voxel that no sweep touches goes."""
-UNMATCHED = 9.0
-"""Times the usual squared error: what a point costs that has no voxel near, as one three times as far off."""
-ACCELERATION_M_S2, FASTEST_M_S = 5.0, 30.0
-"""Sigmas: of the change of velocity in a second, as of a car that brakes hard; and of a velocity that nobody knows."""
-SHARED_ERRORS = 30.0
-"""The sigma of a pose, times the one that independent points would give: those of a ring or wall share their errors.
-In a simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
-"""
 REACH_QUANTILE = 0.99
-WARM_UP, MOST_PASSES = 20, 4
-"""Sweeps that the first velocity is found on, and how often at most they are followed forth and back for it."""
-MOST_DESKEWS, FARTHER = 3, 0.9
-"""A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
+WARM_UP = 20
+"""Sweeps that the first velocity is found on."""
 LEFT_OUT = "the sweep is left out"
+MOST_LOOSE = 0.5
+"""Share of sweeps that tell little of how far the scanner went, above which the whole path is in doubt."""
 LOOKS = 9
 """Sweeps, spread over a sequence, that tell how far its scanner sees: any one may face a wall."""
 MOST_SKIPPED = 20
@@ -123,7 +108,7 @@ class SweepsStart(OdometryStart):
             title="odometry", total=max(1, len(rows) - len(sequences)), workers=workers,
         )  # fmt: skip
         key_frames = _followers(whole, rows, found, joined, sequences)
-        return self.joined(whole, made, clouds, joined, key_frames, steps, workers)
+        return replace(self.joined(whole, made, clouds, joined, key_frames, steps, workers), steps_stand=True)
 
 
 def follow(
@@ -133,6 +118,7 @@ def follow(
     count = len(source.frames)
     poses, velocity, stamps = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), stamps_of(source)
     found, turn_s, reaches_m = np.zeros(count, bool), np.zeros(count), []
+    loose = np.zeros(count, bool)
     odd: list[Oddity] = []
     for rows in sequences:
         frames = [source.frames[row] for row in rows]
@@ -140,12 +126,13 @@ def follow(
         reaches_m.append(reach_m)
         times = _times(stamps[rows], usual_turn_s)
         voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-        first = list(zip(times, _sweeps(frames[:WARM_UP], clouds, reach_m), strict=False))
-        tracker = _Tracker(voxel, LEVELS, _first_velocity(voxel, first))
+        first = zip(times, _sweeps(frames[:WARM_UP], clouds, reach_m), strict=False)
+        tracker = ScanToMap(voxel, first_velocity(voxel, [(at, one.cloud) for at, one in first if one.cloud]))
         followed = []
         for place, (row, sweep) in enumerate(zip(rows, _sweeps(frames, clouds, reach_m), strict=True)):
             if sweep.cloud is not None:
                 tracker.follow(sweep.cloud, times[place])
+                loose[row] = tracker.is_loose
                 followed.append(place)
             poses[row], turn_s[row] = tracker.pose, tracker.turn_s
             found[row] = sweep.cloud is not None or sweep.is_copy
@@ -160,6 +147,9 @@ def follow(
     step.note(*notes_of("clouds", shortened(odd)))
     if not found.all():
         step.note(Note("sweeps left out", int((~found).sum()), next(one.why for one in odd if one.what == LEFT_OUT)))
+    if loose.any():
+        kind = "path loose" if loose.sum() > MOST_LOOSE * found.sum() else "sweeps loose"
+        step.note(Note(kind, int(loose.sum()), str(count)))
     if not turn_s.any():
         step.note(Note("sweeps untimed"))
     return Sweeps(poses, velocity, found, min(reaches_m))
@@ -222,137 +212,6 @@ def _times(stamps_s: Floats, turn_s: float) -> Floats:
         return after
     step = float(np.median(np.diff(after)))
     return np.asarray((after if step <= MOST_SKIPPED else after / step) * (turn_s or NO_CLOCK_S))
-
-
-class _Tracker:
-    """Scan to map on one sequence: `pose` is that at the middle of the last sweep, which took `turn_s`, if known.
-
-    Sweeps are deskewed to their middle, where a wrong velocity moves them as little forwards as back. To their first
-    points it would move the next pose the other way by half, which swings for ever.
-
-    What a sweep says of its pose is weighed against the motion so far (a Kalman filter of the velocity): along a
-    corridor the alignment knows little, and a scanner does not leap.
-    """
-
-    def __init__(self, voxel_m: float, levels: tuple[int, ...], velocity: Floats) -> None:
-        self._voxel_m, self._map, self._coarsest_m = voxel_m, _Map(voxel_m, levels), LOOK_M * voxel_m * levels[0]
-        self.velocity, self.pose, self.turn_s = velocity, np.eye(4), 0.0
-        self._spread: Floats = FASTEST_M_S**2 * np.eye(3)  # covariance of the velocity, (m/s)^2
-        self._time_s: float | None = None
-
-    def follow(self, cloud: PointCloud, time_s: float) -> None:
-        """Find the pose of a sweep that began at `time_s`, which is earlier than the last one's on the way back."""
-        self.turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
-        duration = 0.0 if self._time_s is None else time_s - self._time_s
-        before, velocity, rates = self.pose, self.velocity, [self.velocity]
-        predicted, spread = before @ se3.exp(velocity * duration), self._spread
-        self._spread = spread = spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3)
-        for _ in range(MOST_DESKEWS):
-            points = deskewed(cloud, rates[-1], self.turn_s / 2).points_in_cam.astype(np.float64)
-            guesses = [before @ se3.exp(velocity * duration)]
-            if self._shift_m(velocity, points, abs(duration)) > self._coarsest_m:
-                guesses.append(before)  # after a gap the scanner may be where it was
-            self.pose, information = self._map.align(points, guesses)
-            if information is None or not duration:  # no velocity from two sweeps of one stamp
-                break
-            self.pose, moved = _weighed(predicted, spread * duration**2, self.pose, information)
-            self._spread = moved / duration**2
-            velocity = se3.log(se3.inverse(before) @ self.pose) / duration
-            rates.append(velocity)
-            if not self.turn_s or self._shift_m(rates[-1] - rates[-2], points, self.turn_s / 2) < self._voxel_m / 2:
-                break
-        self._map.insert(self.pose)
-        self.velocity, self._time_s = velocity, time_s
-
-    def _shift_m(self, rates: Floats, points: Floats, seconds: float) -> float:
-        """How far such a velocity moves the farther points in this time."""
-        range_m = np.quantile(np.linalg.norm(points, axis=1), FARTHER)
-        return float((np.linalg.norm(rates[:3]) * range_m + np.linalg.norm(rates[3:])) * seconds)
-
-
-def _weighed(predicted: Floats, spread_m2: Floats, aligned: Floats, information: Floats) -> tuple[Floats, Floats]:
-    """The pose between the predicted and the aligned one, and the covariance (3, 3) of its translation."""
-    known = np.eye(6)  # of the prediction: of turns no more is known than their size in radians
-    known[3:, 3:] = np.linalg.inv(spread_m2)
-    both = information + known
-    moved = np.asarray(np.linalg.solve(both, information @ se3.log(se3.inverse(predicted) @ aligned)))
-    return predicted @ se3.exp(moved), np.asarray(np.linalg.inv(both)[3:, 3:])
-
-
-def _first_velocity(voxel_m: float, sweeps: list[tuple[float, _Sweep]]) -> Floats:
-    """The twist a second (6,) at the first of these sweeps, each with its time; they are followed forth and back until
-    it stays.
-
-    At first from rest: rings on the ground look the same ahead, and give a velocity that is too small.
-    """
-    read = [(time_s, sweep.cloud) for time_s, sweep in sweeps if sweep.cloud is not None]
-    velocity = np.zeros(6)
-    for _ in range(MOST_PASSES if len(read) > 1 else 0):
-        before = velocity
-        for way in (read, read[::-1]):
-            tracker = _Tracker(voxel_m, START_LEVELS, velocity)
-            for time_s, cloud in way:
-                tracker.follow(cloud, time_s)
-            velocity = tracker.velocity
-        if np.linalg.norm((velocity - before)[3:]) * (read[1][0] - read[0][0]) < voxel_m / 2:
-            break
-    return velocity
-
-
-class _Map:
-    """Voxels of Gaussians (Koide et al., ICRA 2021) of the sweeps so far, at several sizes, coarse to fine."""
-
-    def __init__(self, voxel_m: float, levels: tuple[int, ...]) -> None:
-        self._voxel_m, self._is_empty, self._sweep = voxel_m, True, None
-        self._levels = [(size * voxel_m, small_gicp.GaussianVoxelMap(size * voxel_m)) for size in levels]
-        for _, voxels in self._levels:
-            voxels.set_lru(horizon=SWEEPS_KEPT)
-
-    def align(self, points: Floats, guesses: list[Floats]) -> tuple[Floats, Floats | None]:
-        """The pose of a sweep by points (N, 3) and its information (6, 6), rotation first in its own axes; the first
-        guess and none where nothing could be aligned.
-        """
-        self._sweep = self._thinned(points) if len(points) >= MIN_POINTS else None
-        if self._sweep is None or self._is_empty:
-            return guesses[0], None
-        starts = [start for guess in guesses for start in (guess, self._coarse(guess))]
-        found = [self._aligned(self._levels[-1], start) for start in starts]
-        held = [one for one in found if one.num_inliers >= MIN_POINTS and se3.is_motion(one.T_target_source)]
-        if not held:
-            return guesses[0], None
-        usual = min(one.error / one.num_inliers for one in held)
-        count = self._sweep.size()
-        best = min(held, key=lambda one: one.error + (count - one.num_inliers) * UNMATCHED * usual)
-        return np.asarray(best.T_target_source), np.asarray(best.H) / (SHARED_ERRORS**2 * max(usual, 1e-12))
-
-    def _coarse(self, guess: Floats) -> Floats:
-        for level in self._levels[:-1]:
-            found = np.asarray(self._aligned(level, guess).T_target_source)
-            guess = found if se3.is_motion(found) else guess
-        return guess
-
-    def _aligned(self, level: tuple[float, Any], guess: Floats) -> Any:
-        size_m, voxels = level
-        return small_gicp.align(
-            voxels,
-            self._sweep,
-            guess,
-            max_correspondence_distance=LOOK_M * size_m,
-            max_iterations=MOST_ITERATIONS,
-        )
-
-    def insert(self, pose: Floats) -> None:
-        """The sweep aligned last joins the map."""
-        if self._sweep is None:
-            return
-        for _, voxels in self._levels:
-            voxels.insert(self._sweep, pose)
-        self._is_empty = False
-
-    def _thinned(self, points: Floats) -> Any:
-        sweep = small_gicp.voxelgrid_sampling(points, SAMPLE_M * self._voxel_m)
-        small_gicp.estimate_covariances(sweep, None, NEIGHBOURS)
-        return sweep
 
 
 def register_steps(

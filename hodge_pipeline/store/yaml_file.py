@@ -67,7 +67,7 @@ def parse(text: str, name: str) -> Document:
     if root is None:
         root = CommentedMap()
     if not isinstance(root, CommentedMap):
-        raise RecipeError(f"{name}:1: a recipe is a mapping of keys to values, found {type(root).__name__}")
+        raise RecipeError(f"{name}:1: a recipe is a mapping of keys to values, found another kind of value")
     origins: dict[Keys, str] = {(): f"{name}:1"}
     budget = iter(range(MAX_NODES))
     data = _plain(root, (), 1, name, origins, budget)

@@ -57,13 +57,23 @@ WORDING: dict[str, tuple[Rank, str]] = {
         "The path may in part be that of objects: in {count} of {detail}, more than a quarter of the image "
         "moves otherwise than the camera is said to. Compare the model with the scene, or leave these frames out.",
     ),
+    "unheld": (
+        Rank.DOUBT,
+        "The path may slide: at {count} of {detail} what both frames see, such as a bare wall, does not hold the "
+        "camera in every direction, and no other edge tests the step.",
+    ),
+    "other scale": (
+        Rank.DOUBT,
+        "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
+        "source.reader.depth_scale), or with another camera's focal length.",
+    ),
     "clock": (
         Rank.LOOK,
-        "the clock goes back at {count} frames ({detail}): all frames of their sequence count as evenly spaced in time",
+        "the clock goes back at {detail}: the step there counts as long as the usual one",
     ),
     "holes": (
         Rank.LOOK,
-        "the recording stops at {count} places ({detail}): what the frames on both sides share tells the motion there",
+        "the recording stops for {detail}: what the frames on both sides share tells the motion there",
     ),
     "path broken": (
         Rank.LOOK,
@@ -77,6 +87,15 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "sweeps left out": (
         Rank.LOOK,
         "{count} sweeps are left out, and posed by their neighbours where these are known; the first: {detail}",
+    ),
+    "sweeps loose": (
+        Rank.LOOK,
+        "{count} of {detail} sweeps tell little of how far the scanner went, as in a tunnel, and it goes on as before",
+    ),
+    "path loose": (
+        Rank.DOUBT,
+        "The length of the path is in doubt: {count} of {detail} sweeps tell little of how far the scanner went, as on "
+        "a bare field, and it goes on as before there. Known positions (positions.path) would hold it.",
     ),
     "sweeps untimed": (
         Rank.FACT,

@@ -17,7 +17,7 @@ from hodge_adapters.seven_scenes.files import FRAME_FILE, sequence_folders
 from hodge_adapters.text_rows import read_text, to_floats, write_text_atomically
 from hodge_adapters.trajectories.euroc import NANO
 from hodge_adapters.trajectories.euroc import file_of as euroc_file
-from hodge_adapters.trajectories.text import COLUMNS
+from hodge_adapters.trajectories.text import COLUMNS, to_seconds
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Trajectory
@@ -56,7 +56,7 @@ class TumRewriter(_OneFile):
 
         def numbers(fields: list[str]) -> list[float] | None:
             values = to_floats(fields)
-            pose = poses.at(values[0]) if values and len(values) in COLUMNS else None
+            pose = poses.at(to_seconds(values[0])) if values and len(values) in COLUMNS else None
             return None if pose is None else [*pose[:3, 3], *se3.to_quat_xyzw(pose)]
 
         return _rewritten(folder, original, numbers, first=1)

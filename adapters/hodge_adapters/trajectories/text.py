@@ -21,6 +21,15 @@ COLUMNS = (8, 9)
 """Of a line of TUM's: RTAB-Map adds the number of the node."""
 
 
+UNITS = (("nanoseconds", 1e17, 1e9), ("microseconds", 1e14, 1e6), ("milliseconds", 1e11, 1e3))
+"""What a stamp from so much on counts, and how many make a second: as seconds 1e11 is the year 5138."""
+
+
+def to_seconds(stamp: float) -> float:
+    """The stamp in seconds: ORB-SLAM3, among others, writes nanoseconds since 1970."""
+    return next((stamp / per_second for _, least, per_second in UNITS if stamp >= least), stamp)
+
+
 @plain_dataclass(frozen=True)
 class ParsedTrajectory:
     """A trajectory, and what had to be left out or put in order to read it, one line each."""
@@ -30,15 +39,19 @@ class ParsedTrajectory:
 
 
 def parse_tum(path: Path) -> ParsedTrajectory:
-    """The trajectory in a TUM file, ascending by stamp; of poses with the same stamp the first is kept.
+    """The trajectory in a TUM file, ascending by stamp in seconds; of poses with the same stamp the first is kept.
 
     Lines that are no pose are left out and noted. Raises `SourceError` where no pose is left.
     """
     table, bad = _tum_table(read_rows(path))
     if not len(table):
         raise _unreadable(path, bad, "stamp tx ty tz qx qy qz qw")
+    unit = next((name for name, least, _ in UNITS if table[:, 0].max() >= least), "")
+    table[:, 0] = [to_seconds(stamp) for stamp in table[:, 0].tolist()]
     parsed = ordered(table)
     notes = [f"{path.name}: {note}" for note in parsed.notes]
+    if unit:
+        notes.append(f"{path.name}: stamps are read as {unit}, too large for seconds")
     if bad:
         notes.append(f"{path.name}: {len(bad)} lines that are no pose left out: {listed([r.line for r in bad])}")
     return ParsedTrajectory(parsed.trajectory, tuple(notes))

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, student
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, shifted, without_run
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, root, shifted, without_run
 from hodge_pipeline.solvers.backbone.places import places_along
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -108,16 +108,22 @@ class Testimony:
         return end, before + after + carried(se3.inverse(poses[high]) @ poses[b], chain.covariance[loop])
 
     def seeds(self, rows: Ints) -> list[int]:
-        """Loops of these with which others near them, yet of other places, agree most: each differs from the others."""
+        """Loops of these with which others near them agree most, those of their own place together as one: each differs
+        from the others.
+        """
         if not len(rows):
             return []
         near = cKDTree(self.ends[rows]).query(self.ends[rows], k=min(4 * NEIGHBOURS, len(rows)))[1]
         near = near.reshape(len(rows), -1)
         apart = np.abs(self.ends[rows[near]] - self.ends[rows][:, None]).max(axis=2) >= 1.0
-        first, nth = np.nonzero(apart & (np.cumsum(apart, axis=1) <= NEIGHBOURS))
-        second = rows[near[first, nth]]
-        gain = np.maximum(np.logaddexp(self.factor(rows[first], second), 0.0) - self.explained[second], 0.0)
-        potential = np.bincount(first, gain, minlength=len(rows))
+        same = ~apart & (near != np.arange(len(rows))[:, None])
+        potential = np.zeros(len(rows))
+        for kind in (apart, same):
+            first, nth = np.nonzero(kind & (np.cumsum(kind, axis=1) <= NEIGHBOURS))
+            second = rows[near[first, nth]]
+            gain = np.maximum(np.logaddexp(self.factor(rows[first], second), 0.0) - self.explained[second], 0.0)
+            share = 1.0 if kind is apart else 1 / np.bincount(first, minlength=len(rows))[first]
+            potential += np.bincount(first, share * gain, minlength=len(rows))
         out: list[int] = []
         left = np.ones(len(rows), bool)
         while left.any() and len(out) < SEEDS:
@@ -143,12 +149,15 @@ class Testimony:
 
 @dataclass(frozen=True)
 class Usual:
-    """How a chain's steps usually are: their `centre (4, 4)` and `covariance (p, p)`, and how many nats more `unusual
-    (n,)` each is than the most unusual of as many should be.
+    """How a chain's steps usually are: the `centres (K, 4, 4)` of their kinds, as ahead and round a corner, the most
+    frequent first, with their `shares (K,)` and one `covariance (p, p)`, which steps are of a `kind (n,)`, and how many
+    nats more `unusual (n,)` each is than the most unusual of as many should be.
     """
 
-    centre: Floats
+    centres: Floats
+    shares: Floats
     covariance: Floats
+    kind: Bools
     unusual: Floats
 
     @classmethod
@@ -168,7 +177,39 @@ class Usual:
         mean = float(np.mean(size[size > floor] - floor)) if (size > floor).any() else np.inf
         unusual = np.full(chain.size, -np.inf)
         unusual[rows] = np.maximum((size - floor) / mean + np.log(1 / TAIL), 0.0) - np.log(len(rows))
-        return cls(chain.exp(centre[None])[0], covariance, unusual)
+        centres, shares, of_one = _kinds(left, chi2, covariance)
+        kind = np.zeros(chain.size, bool)
+        kind[rows] = of_one
+        return cls(chain.exp(centre + centres), shares, covariance, kind, unusual)
+
+    def off(self, chain: Chain, motion: Floats) -> Floats:
+        """How far motions (M, 4, 4) are from each kind (K, M, p)."""
+        return chain.log(se3.inverse(self.centres)[:, None] @ motion)
+
+
+def _kinds(left: Floats, chi2: Floats, covariance: Floats) -> tuple[Floats, Floats, Bools]:
+    """The centres (K, p) of kinds of steps, the share of the steps that are of each, and which steps are of one."""
+    size = left.shape[1]
+    white, gate = left @ np.linalg.inv(root(covariance[None])[0]).T, ALIKE * size
+    other = chi2 > gate
+    centres, counts = [np.zeros(size)], [max(float((~other).sum()), 1.0)]
+    while other.sum() >= FEWEST_ALIKE and len(centres) < MOST_KINDS:
+        rows = np.flatnonzero(other)
+        some = white[rows[:: -(-len(rows) // MOST_COMPARED)]]
+        near = cKDTree(some).query_ball_point(some, np.sqrt(gate), return_length=True)
+        alike = rows[((white[rows] - some[np.argmax(near)]) ** 2).sum(axis=1) <= gate]
+        if len(alike) < FEWEST_ALIKE:
+            break
+        centres.append(np.median(left[alike], axis=0))
+        counts.append(float(len(alike)))
+        other[alike] = False
+    return np.stack(centres), np.array(counts) / len(left), ~other
+
+
+ALIKE, FEWEST_ALIKE = 3.0, 3
+"""χ² to an axis up to which steps are of one kind, and steps that a kind has at the least."""
+MOST_KINDS, MOST_COMPARED = 8, 2000
+"""Limits on cost."""
 
 
 def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:
@@ -196,10 +237,14 @@ def _over(chain: Chain, rows: Ints, gain: Floats) -> Floats:
 
 
 def _fits(told: Testimony, usual: Usual, loop: Ints, at: Ints) -> Floats:
-    """Log-density (K,) of these loops if they are right and the step at a position a usual one."""
+    """Log-density (K,) of these loops if they are right and the step at a position a usual one; of the most frequent
+    kind where what is measured is of a kind itself: nothing says that it turned a corner there.
+    """
     end, covariance = told.beyond(loop, at - 1, at)
-    residual = told.chain.log(se3.inverse(usual.centre) @ se3.inverse(told.linear.poses[at - 1]) @ end)
-    return np.asarray(student(residual, covariance + usual.covariance)[0])
+    off = usual.off(told.chain, se3.inverse(told.linear.poses[at - 1]) @ end)
+    each = np.stack([student(one, covariance + usual.covariance)[0] for one in off])
+    each[1:, usual.kind[at]] = -np.inf
+    return np.asarray(np.logaddexp.reduce(np.log(usual.shares)[:, None] + each, axis=0))
 
 
 def _break(told: Testimony, usual: Usual, loop: int, at: Ints, score: Floats) -> Break:
@@ -209,11 +254,13 @@ def _break(told: Testimony, usual: Usual, loop: int, at: Ints, score: Floats) ->
     row = int(np.argmax(score))
     one = at[row : row + 1]
     end, covariance = told.beyond(np.array([loop]), one - 1, one)
-    off = told.chain.log(se3.inverse(usual.centre) @ se3.inverse(told.linear.poses[one - 1]) @ end)
-    chi2 = gaussian(off, covariance + usual.covariance)[1]
-    wide = usual.covariance * max(1.0, float((FREEDOM + chi2[0]) / (FREEDOM + off.shape[1])))
-    towards = wide @ np.linalg.solve(wide + covariance[0], off[0])
-    return Break(int(one[0]), usual.centre @ told.chain.exp(towards), wide, float(score[row]))
+    off = usual.off(told.chain, se3.inverse(told.linear.poses[one - 1]) @ end)[:, 0]
+    whole = np.broadcast_to(covariance[0] + usual.covariance, (len(off), *covariance.shape[1:]))
+    kind = int(np.argmax(np.log(usual.shares) + student(off, whole)[0]))
+    chi2 = gaussian(off, whole)[1][kind]
+    wide = usual.covariance * max(1.0, float((FREEDOM + chi2) / (FREEDOM + off.shape[1])))
+    towards = wide @ np.linalg.solve(wide + covariance[0], off[kind])
+    return Break(int(one[0]), usual.centres[kind] @ told.chain.exp(towards), wide, float(score[row]))
 
 
 def unusual_breaks(usual: Usual) -> list[Break]:
@@ -221,7 +268,7 @@ def unusual_breaks(usual: Usual) -> list[Break]:
     how many nats one is.
     """
     rows = np.argsort(-usual.unusual)
-    return [Break(int(at), usual.centre, usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
+    return [Break(int(at), usual.centres[0], usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
 
 
 def strained_break(fit: Fit, usual: Usual) -> Break | None:

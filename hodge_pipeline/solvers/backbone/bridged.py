@@ -27,9 +27,10 @@ from hodge_pipeline.solvers.backbone.inference import (
     Inferred,
     by_chance,
     infer,
+    refused,
     thinned,
 )
-from hodge_pipeline.solvers.backbone.scales import learn_scales, mixture
+from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales, mixture
 from hodge_pipeline.types import Bools
 
 MOST_BREAKS, MOST_TRIED = 10, 2
@@ -44,21 +45,28 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     """
     chain = unbroken = joined(chain)
     wrong = Wrong.of(chain, chain.poses())  # one for all trials: evidence is against all loops being wrong
-    judge = partial(infer, wrong=wrong, always=always, thin=thin, sure=False)
-    found = judge(chain)
+    judge = partial(infer, wrong=wrong, always=always, thin=thin)
+    found = first = judge(chain)
+    if found is None or first is None:
+        return None
     for _ in range(MOST_BREAKS):
-        better = None if found is None else _better(chain, found, judge)
+        better = _better(chain, found, judge)
         if better is None:
             break
         chain, found = better
-    if found is not None and not found.confirmed:  # nor is a break that they speak of
-        chain, found = unbroken, judge(unbroken, sure=True)
-    return None if found is None else (chain, found)
+    if found.confirmed:
+        return chain, found
+    # nor is a break confirmed that they speak of
+    return unbroken, first if first.confirmed else refused(first, unbroken, always)
 
 
 def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> tuple[Chain, Inferred] | None:
     """The chain with one more step bridged, and its loops judged; None where it has none that is broken."""
-    for broken, least in _candidates(chain, found):
+    founds = [found]
+    if not found.confirmed and found.scales != Scales():
+        # a break that all loops see looks like larger errors of all steps: with these as stated, the loops agree on it
+        founds += [other for other in [judge(chain, scales=Scales())] if other is not None]
+    for broken, least in [each for one in founds for each in _candidates(chain, one)]:
         tried = bridged(chain, broken)
         for scales in (None, found.scales):  # as learned anew, and so that nothing but the step differs
             other = judge(tried, scales=scales)

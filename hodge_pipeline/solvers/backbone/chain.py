@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.solvers.weights import PLANAR_AXES
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -20,7 +21,8 @@ class Chain:
       edge `step_edge (n,)` that they come from; identity, zeros and −1 where a path begins.
     - `loop_edge (M,)`; `ends (M, 2)`, the first the lower position; `motion (M, 4, 4)`; `covariance (M, p, p)`.
     - `bridged (n,)`: steps with a guess in place of what the graph says; no scale is learned for its covariance.
-    - `axes (p,)`: of a twist those that are free, three in the plane.
+    - `axes (p,)`: of a twist those that are free, three in the plane; `stated`: whether the graph's information is more
+      than the identity that stands for unknown.
     """
 
     order: Ints
@@ -34,6 +36,7 @@ class Chain:
     covariance: Floats
     bridged: Bools
     axes: Ints
+    stated: bool
 
     @property
     def size(self) -> int:
@@ -135,6 +138,7 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
         loop_covariance,
         np.zeros(len(order), bool),
         axes,
+        not has_unit_information(graph),
     )
 
 

@@ -9,7 +9,7 @@ from scipy.special import gammaln
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.fit import scaled
+from hodge_pipeline.solvers.backbone.fit import root
 from hodge_pipeline.types import Floats
 
 PAIRS = 4000
@@ -74,8 +74,7 @@ def _floored(second_moment: Floats) -> Floats:
 
 def gaussian(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     """The log-density (M,) and χ² (M,) of residuals (M, p) with covariances (M, p, p)."""
-    ones, unit = scaled(covariance)
-    factor = np.linalg.cholesky(ones) * unit[:, :, None]
+    factor = root(covariance)
     white = np.linalg.solve(factor, residual[..., None])[..., 0]
     chi2 = np.einsum("mi,mi->m", white, white)
     half_log = np.log(np.einsum("mii->mi", factor)).sum(axis=1) + 0.5 * residual.shape[1] * np.log(2 * np.pi)

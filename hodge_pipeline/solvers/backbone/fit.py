@@ -102,6 +102,22 @@ def scaled(covariance: Floats) -> tuple[Floats, Floats]:
     return 0.5 * (ones + np.swapaxes(ones, 1, 2)) + ROUNDING * np.eye(covariance.shape[-1]), unit
 
 
+def root(covariance: Floats) -> Floats:
+    """Cholesky factors (M, p, p) of covariances; where long sums left one indefinite, its eigenvalues are lifted."""
+    ones, unit = scaled(covariance)
+    try:
+        factor = np.linalg.cholesky(ones)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(ones)
+        lifted = vectors * np.maximum(values, LIFTED)[:, None] @ np.swapaxes(vectors, 1, 2)
+        factor = np.linalg.cholesky(0.5 * (lifted + np.swapaxes(lifted, 1, 2)))
+    return np.asarray(factor * unit[:, :, None])
+
+
+LIFTED = 1e-9
+"""Of a diagonal of ones: the least eigenvalue then."""
+
+
 def inverse(covariance: Floats) -> Floats:
     """The inverses (M, p, p), symmetric."""
     ones, unit = scaled(covariance)
@@ -264,8 +280,7 @@ LEAST_LEFT = 1e-6
 
 def without(own: Floats, across: Floats) -> Floats:
     """`S (S − K)⁻¹ S` for the covariances S of edges and K of the same motions with all edges, S among them."""
-    ones, unit = scaled(own)
-    factor = np.linalg.cholesky(ones) * unit[:, :, None]
+    factor = root(own)
     inverse = np.linalg.inv(factor)
     values, vectors = np.linalg.eigh(inverse @ across @ np.swapaxes(inverse, 1, 2))
     left = np.maximum(1 - values, LEAST_LEFT)

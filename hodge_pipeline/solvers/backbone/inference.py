@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import Wrong, student
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, inverse, linearise, scaled, settled, without
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, inverse, linearise, root, settled, without
 from hodge_pipeline.solvers.backbone.places import one_of_each_place, places_along
 from hodge_pipeline.solvers.backbone.polish import LOCAL, polished
 from hodge_pipeline.solvers.backbone.scales import EVEN, Scales, learn_scales, mixture
@@ -40,7 +40,7 @@ class Inferred:
     were found to be: scales, and `step_width`, `loop_width (M,)`, factors on standard deviations for the last solve.
 
     `log_evidence`: of the loops as judged, against all being wrong. `confirmed`: whether they say more than chance; if
-    not, none is used where only confirmed ones were wanted, and the poses are those of the chain.
+    not, none should be used: see `refused`.
     """
 
     used: Bools
@@ -54,12 +54,12 @@ class Inferred:
 
 
 def infer(
-    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None, sure: bool = True
+    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None
 ) -> Inferred | None:
     """Judge the loops of a chain; those of `always (M,)` count whatever they say. Where they would leave more than
     `MOST_UNKNOWNS`, all are judged at the poses of some of the right ones, or None comes back without `thin`.
 
-    `scales`: of the errors; learned from the loops where none are given. `sure`: use none that are not confirmed.
+    `scales`: of the errors; learned from the loops where none are given.
     """
     poses = chain.poses()
     scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
@@ -88,10 +88,18 @@ def infer(
     judged, linear = best
     used = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
     confirmed = _confirmed(linear, judged, used, wrong)
-    used = (used & (confirmed or not sure)) | always
+    used |= always
     rows = thinned(chain, np.flatnonzero(used)).active
     linear, width = polished(rows, linear if used.any() else start)
     return Inferred(used, judged, linear.poses, scales, LOCAL, width, top, confirmed)
+
+
+def refused(found: Inferred, chain: Chain, always: Bools) -> Inferred:
+    """The result without the loops that nothing confirms: at the poses of the bare chain and of those of `always`."""
+    chain = found.scales.applied(chain)
+    rows = thinned(chain, np.flatnonzero(always)).active
+    linear, width = polished(rows, linearise(chain, chain.poses()))
+    return replace(found, used=always.copy(), poses=linear.poses, loop_width=width)
 
 
 SETTLING = 2
@@ -257,6 +265,4 @@ BATCH = 500
 def _samples(fit: Fit) -> Floats:
     """Moves (R, p, SAMPLES) of the ends drawn from their joint distribution: solves with noisy measurements."""
     size = (len(fit.precision), fit.precision.shape[-1], SAMPLES)
-    ones, unit = scaled(fit.precision)
-    factor = np.linalg.cholesky(ones) * unit[:, :, None]
-    return fit.factor.solve(fit.force(factor @ np.random.default_rng(0).standard_normal(size)))
+    return fit.factor.solve(fit.force(root(fit.precision) @ np.random.default_rng(0).standard_normal(size)))

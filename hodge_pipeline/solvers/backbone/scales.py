@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,12 @@ FIRST, FINEST = np.log(4.0), np.log(2.0) / 3
 """Steps of the search, in the logarithm of a scale."""
 MOST_RATIO = np.log(2.0)
 """Between the scales of rotation and of translation, where information is stated."""
+UNITS, TRIED = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8]), 3
+"""Logarithms of scales at which the search begins too where the information is the identity that stands for unknown,
+and how many of them, the likeliest: rotation and translation have each a unit of their own then.
+"""
+BY_CHANCE = float(np.log(100.0))
+"""Nats by which loops must be likelier there."""
 LEAST_SHARE = 1e-3
 EVEN = np.full(2, 0.5)
 MOST_LOOPS = 3000
@@ -60,25 +67,36 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     """
     own, decoys = _Model.of(chain, poses, wrong), _Model.of(decoyed(chain), poses, wrong)
 
-    def value(logs: Floats) -> float:
+    def value(logs: Floats, unit: float) -> float:
         ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
-        if (np.abs(ratios) > MOST_RATIO + 1e-9).any():
+        if not unit and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
             return -np.inf
-        prior = -0.5 * float(logs @ logs) / FOLD**2
+        prior = -0.5 * float((logs - unit) @ (logs - unit)) / FOLD**2
         return float(own.value(logs)[0] - max(decoys.value(logs)[0], 0.0) + prior)
 
-    best, width = np.zeros(4), FIRST
-    top = value(best)
+    found = _likeliest(value, 0.0)
+    if not chain.stated:
+        values = np.array([value(np.full(4, unit), unit) for unit in UNITS])
+        others = [_likeliest(value, unit) for unit in UNITS[np.argsort(-values, kind="stable")[:TRIED]].tolist()]
+        other = max(others, key=lambda each: each[1])
+        found = other if other[1] > found[1] + BY_CHANCE else found
+    return Scales(*map(float, np.exp(found[0]))), own.value(found[0])[1]
+
+
+def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Floats, float]:
+    """The logarithms (4,) of scales about that of a unit that have the largest value, and this."""
+    best, width = np.full(4, unit), FIRST
+    top = value(best, unit)
     while width >= FINEST:
         improved = False
         for axis in range(4):
             for sign in (-1, 1):
                 tried = best.copy()
                 tried[axis] += sign * width
-                if (found := value(tried)) > top:
+                if (found := value(tried, unit)) > top:
                     best, top, improved = tried, found, True
         width = width if improved else width / 2
-    return Scales(*map(float, np.exp(best))), own.value(best)[1]
+    return best, top
 
 
 def decoyed(chain: Chain) -> Chain:
