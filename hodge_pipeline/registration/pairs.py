@@ -74,7 +74,7 @@ def _slides(registered: Edges, min_spread: float) -> Bools:
 
 def unheld_steps(edges: Edges, min_spread: float) -> Bools:
     """Where (P,) consecutive frames share too little to hold translation in every direction, as before a bare wall."""
-    weak, _ = _weak_directions(edges, HELD_SPREADS * min_spread)
+    weak, _ = weak_directions(edges, HELD_SPREADS * min_spread)
     return np.asarray(weak.any(axis=1) & _consecutive(edges))
 
 
