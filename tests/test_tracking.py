@@ -117,14 +117,22 @@ def empty_depth(shape: tuple[int, int]) -> Floats32:
     return np.zeros(shape, np.float32)
 
 
-def with_dark(source: Source, rows: range, *, images: bool) -> Source:
-    """Frames `rows` without depth, and black where their `images` went dark as well."""
+def with_dark(source: Source, rows: range, *, images: bool, depth: bool = True) -> Source:
+    """Frames `rows` without `depth`, and black where their `images` went dark."""
     frames = list(source.frames)
     for row in rows:
-        frames[row] = replace(frames[row], read_depth=partial(empty_depth, (120, 160)))
+        if depth:
+            frames[row] = replace(frames[row], read_depth=partial(empty_depth, (120, 160)))
         if images:
             frames[row] = replace(frames[row], read_colour=partial(np.zeros, (120, 160, 3), np.uint8))
     return replace(source, frames=tuple(frames))
+
+
+def exposed(frame: Frame, share: float) -> Frame:
+    """The frame, its image so much brighter or darker."""
+    read = frame.read_colour
+    assert read is not None
+    return replace(frame, read_colour=lambda: np.clip(read() * share, 0, 255).astype(np.uint8))
 
 
 def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeline.Run) -> None:
@@ -192,6 +200,18 @@ def test_blocks_share_their_border_and_nothing_else() -> None:
     assert [int(part[0]) for part in own[1:]] == [int(part[-1]) for part in own[:-1]]
     np.testing.assert_array_equal(np.concatenate([own[0], *(part[1:] for part in own[1:])]), rows)
     assert [block.rows.tolist() for block in frame_blocks(np.array([3]), tuple(range(9)), np.arange(9.0))] == [[3]]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("blank", [range(0, 3), range(20, 26), range(46, 51)])
+def test_frames_with_depth_and_a_black_image_are_said(sequence: Path, tmp_path: Path, blank: range) -> None:
+    """Of several blocks each is counted once, and those without depth, or darker and brighter ones, are not."""
+    source = with_dark(TumReader().open(sequence), blank, images=True, depth=False)
+    frames = list(with_dark(source, range(30, 33), images=True).frames)
+    frames[35], frames[55] = exposed(frames[35], 0.1), exposed(frames[55], 4.0)
+    _, notes = track(replace(source, frames=tuple(frames)), tmp_path / "blank")
+    said = [note for note in notes if "shows nothing" in note]
+    assert len(said) == 1 and said[0].startswith(f"{len(blank)} frames have depth")
+    assert f"({blank[0]}–{blank[-1]})" in said[0]
 
 
 def test_a_sequence_without_any_depth_in_range_is_an_error(sequence: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 
 STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
-COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful")
+COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful", "blank")
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class BlockRows:
     fitness: Floats
     moving: Ints
     doubtful: Ints
+    blank: Ints
     notes: tuple[str, ...]
 
 

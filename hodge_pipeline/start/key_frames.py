@@ -257,6 +257,9 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
         notes.append(Note("holes", len(holes), ", ".join(told) + ", …" * (len(holes) > NOTES_SHOWN)))
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
+    blank = np.unique(np.concatenate([part.blank for part in parts]))
+    if len(blank):
+        notes.append(Note("blank images", len(blank), in_runs(blank, ids)))
     moving = np.unique(np.concatenate([part.moving for part in parts]))
     if len(moving):
         notes.append(Note("moving objects", len(moving), in_runs(moving, ids)))

@@ -47,6 +47,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
     ),
+    "blank images": (
+        Rank.LOOK,
+        "{count} frames have depth, but a colour image that shows nothing, black or of one even colour ({detail}): "
+        "surfaces alone place them",
+    ),
     "moving objects": (
         Rank.LOOK,
         "much of {count} frames moved otherwise than the camera ({detail}): people or objects that move? The camera's "
