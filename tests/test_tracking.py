@@ -25,8 +25,10 @@ from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import Odometry
+from hodge_pipeline.registration.readout import Readout
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import TrackingOptions, frame_blocks, track_block
+from hodge_pipeline.rounds.all_frames import pose_frames
 from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source
 from hodge_pipeline.sources.opening import fingerprints, remembered
 from hodge_pipeline.stages import Step, no_progress
@@ -368,6 +370,23 @@ def test_only_the_step_over_which_a_clock_goes_back_is_made_up(begin_s: float) -
 def test_stamps_that_are_no_clock_are_the_numbers_of_the_frames(stamps: list[float]) -> None:
     source = Source("s", Path("s"), tuple(Frame(row, stamp) for row, stamp in enumerate(stamps)))
     np.testing.assert_array_equal(tracked.stamps_of(source), np.arange(5))
+
+
+def test_an_estimated_read_out_is_told_and_used_by_the_frames(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = TumReader().open(sequence)
+    none, _ = track(source, tmp_path / "none")
+    monkeypatch.setattr(tracked, "estimate_readout", lambda *_: Readout(0.022, 0.02, 0.0239))
+    found, notes = track(source, tmp_path / "found")
+    assert none.readout_s == 0.0 and followers(source, found).readout_s == 0.022
+    assert any("estimated: 22 ms (20 to 24)" in note for note in notes)
+    step, poses = Step(tmp_path, no_progress, lambda *_: None), all_poses(source, none, none.world_from_key)
+    posed = [
+        pose_frames(source, followers(source, one), one.sightings, poses, 1.0, workers=InProcess(), step=step)
+        for one in (none, found)
+    ]
+    assert 0.001 < np.abs(posed[1] - posed[0]).max() < 0.1
 
 
 @pytest.mark.parametrize(

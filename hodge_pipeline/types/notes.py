@@ -106,6 +106,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.FACT,
         "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an instant",
     ),
+    "readout": (
+        Rank.FACT,
+        "the camera's read-out (rolling shutter), estimated: {detail}; readout_s in the camera's file would be exact",
+    ),
     "misfits": (
         Rank.LOOK,
         "{count} frames fit nothing that their key frame saw ({detail}): their poses follow from its own",
