@@ -75,7 +75,8 @@ class KeyFrames:
     `first (N, 4, 4)` are the first poses of all frames, `world_from_key (K, 4, 4)` those of the key frames; `part (N,)`
     is the part of the source that the start held together; `times (N,)` ascend within a part; `found (N,)` says which
     frames the start could place: the others lie between their neighbours by `stamps_s (N,)` in each `sequence (N,)`.
-    `key_of_frame (N,)` is the key frame, counted among the K, that each frame belongs to.
+    `key_of_frame (N,)` is the key frame, counted among the K, that each frame belongs to; `readout_s` is the estimated
+    read-out time of cameras that do not say theirs, 0 where there is no estimate.
     """
 
     rows: Ints
@@ -87,6 +88,7 @@ class KeyFrames:
     stamps_s: Floats
     sequence: Ints
     key_of_frame: Ints
+    readout_s: float = 0.0
 
     @classmethod
     def all_of(cls, source: Source, world_from_cam: Floats) -> KeyFrames:

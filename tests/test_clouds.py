@@ -136,6 +136,25 @@ def test_of_many_frames_with_the_same_fault_the_first_are_named_and_the_others_c
     assert notes[6:] == ("34 more frames: its cloud has no colours, as of those before",)
 
 
+@pytest.mark.parametrize(
+    ("seen", "said"),
+    [
+        (np.zeros((48, 64, 3), np.uint8), True),
+        (np.full((24, 32, 3), (90, 120, 200), np.uint8), True),
+        (np.arange(48 * 64 * 3, dtype=np.uint8).reshape(48, 64, 3) // 10, False),
+    ],
+    ids=["black", "blue", "underexposed"],
+)
+def test_frames_whose_colour_image_shows_nothing_are_said(seen: np.ndarray, said: bool) -> None:
+    frames = [frame(wall(WALL_M), k, read_colour=lambda: seen) for k in range(25)]
+    frames[0] = frame(wall(0.0), 0, read_colour=lambda: seen)
+    clouds, notes = prepare_clouds(frames, CloudOptions(), InProcess())
+    assert (clouds.sizes[1:] > 100).all()
+    named = [note for note in notes if "colour image shows nothing" in note]
+    assert len(named) == (6 if said else 0)
+    assert not said or (named[0].startswith("frame 1: ") and named[-1].startswith("19 more frames: "))
+
+
 def test_no_cloud_at_all_is_an_error_with_the_first_reason() -> None:
     for frames, reason in (
         ([Frame(k, 0.0, CAMERA, read_depth=unreadable) for k in range(3)], "none of the 3 frames.*truncated"),

@@ -10,11 +10,13 @@ from hodge_adapters.tum.reader import READOUT_S, TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.registration.flow import Corners, FlowImage, find_corners, flow_image, follow
+from hodge_pipeline.registration.readout import estimate_readout
 from hodge_pipeline.registration.reposing import PosedBlock, repose
-from hodge_pipeline.registration.resection import project, resect
+from hodge_pipeline.registration.resection import back_project, project, resect
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
 from hodge_pipeline.registration.sightings import Sightings
-from hodge_pipeline.types import Camera, Floats, Source
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.types import Camera, Floats, Frame, Source
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 ROLLING = Camera(640, 480, 525.0, 525.0, 319.5, 239.5, readout_s=0.0225)
@@ -197,3 +199,54 @@ def test_readers_tell_the_shutter_and_by_how_much_colour_is_late(tmp_path: Path,
     assert 0 < abs(before.colour_delay_s) < 0.006
     assert frame.colour_delay_s - before.colour_delay_s == pytest.approx(0.012, abs=1e-6)
     assert source.frames[0].camera is not None and source.frames[0].camera.readout_s == 0.0
+
+
+def shaken_views(folder: Path, readout_s: float, speed: float = 1.0) -> tuple[Floats, Floats]:
+    """Sightings of a shaken camera of this read-out: 12 key frames with three frames each; poses and velocities."""
+    times, rng = np.arange(49) / 30, np.random.default_rng(2)
+
+    def world_from_cam(times: Floats) -> Floats:
+        phases = speed * (1 + np.arange(6)) * times[:, None]
+        return se3.exp(0.1 * np.sin(7 * phases / np.arange(2, 8)) + 0.05 * np.cos(9 * phases / np.arange(3, 9)))
+
+    poses = world_from_cam(times)
+    keys, points, frames, seen = [], [], [], []
+    for key in range(0, 48, 4):
+        world = se3.transform(poses[key], points_in_view(80, key))
+        for row in range(key, key + 4):
+            late = np.full(80, times[row])
+            for _ in range(5):
+                views = se3.inverse(world_from_cam(late))
+                out = project(np.einsum("nij,nj->ni", views[:, :3, :3], world) + views[:, :3, 3], CAMERA)
+                late = times[row] + readout_s * (out[:, 1] / CAMERA.height - 0.5)
+            out[:, :2] += rng.normal(0, 0.3, (80, 2))
+            if row == key:
+                points.append(back_project(out, CAMERA))
+                keys.append(np.full(80, key))
+            else:
+                frames.append(np.full(80, row))
+                seen.append(out)
+    corner = np.concatenate([np.tile(np.arange(80), 3) + 80 * block for block in range(12)])
+    found = Sightings(*map(np.concatenate, (keys, points, frames)), corner, np.concatenate(seen))
+    artifacts.save(folder / "0.npz", found)
+    return poses, velocities(poses, times, np.zeros(49, np.int64), np.ones(49, bool))
+
+
+def frames_of(camera: Camera | None) -> list[Frame]:
+    return [Frame(row, row / 30, camera=camera) for row in range(49)]
+
+
+def test_the_read_out_is_estimated_where_nobody_gives_it(tmp_path: Path) -> None:
+    poses, twists = shaken_views(tmp_path, 0.0225)
+    found = estimate_readout(tmp_path, frames_of(CAMERA), poses, twists, 1.0)
+    assert found is not None and found.low_s < found.best_s < found.high_s
+    assert found.best_s == pytest.approx(0.0225, abs=0.002)
+    assert estimate_readout(tmp_path, frames_of(ROLLING), poses, twists, 1.0) is None
+    assert estimate_readout(tmp_path, frames_of(None), poses, twists, 1.0) is None
+    assert estimate_readout(tmp_path, frames_of(CAMERA), poses, np.zeros_like(twists), 1.0) is None
+
+
+@pytest.mark.parametrize(("readout_s", "speed"), [(0.0, 1.0), (0.06, 1.0), (0.0225, 0.01)])
+def test_no_read_out_is_estimated_without_a_clear_minimum(tmp_path: Path, readout_s: float, speed: float) -> None:
+    poses, twists = shaken_views(tmp_path, readout_s, speed)  # read at once; slower than video; hardly moves
+    assert estimate_readout(tmp_path, frames_of(CAMERA), poses, twists, 1.0) is None

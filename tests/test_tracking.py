@@ -25,8 +25,10 @@ from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import Odometry
+from hodge_pipeline.registration.readout import Readout
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import TrackingOptions, frame_blocks, track_block
+from hodge_pipeline.rounds.all_frames import pose_frames
 from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source
 from hodge_pipeline.sources.opening import fingerprints, remembered
 from hodge_pipeline.stages import Step, no_progress
@@ -115,14 +117,22 @@ def empty_depth(shape: tuple[int, int]) -> Floats32:
     return np.zeros(shape, np.float32)
 
 
-def with_dark(source: Source, rows: range, *, images: bool) -> Source:
-    """Frames `rows` without depth, and black where their `images` went dark as well."""
+def with_dark(source: Source, rows: range, *, images: bool, depth: bool = True) -> Source:
+    """Frames `rows` without `depth`, and black where their `images` went dark."""
     frames = list(source.frames)
     for row in rows:
-        frames[row] = replace(frames[row], read_depth=partial(empty_depth, (120, 160)))
+        if depth:
+            frames[row] = replace(frames[row], read_depth=partial(empty_depth, (120, 160)))
         if images:
             frames[row] = replace(frames[row], read_colour=partial(np.zeros, (120, 160, 3), np.uint8))
     return replace(source, frames=tuple(frames))
+
+
+def exposed(frame: Frame, share: float) -> Frame:
+    """The frame, its image so much brighter or darker."""
+    read = frame.read_colour
+    assert read is not None
+    return replace(frame, read_colour=lambda: np.clip(read() * share, 0, 255).astype(np.uint8))
 
 
 def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeline.Run) -> None:
@@ -190,6 +200,18 @@ def test_blocks_share_their_border_and_nothing_else() -> None:
     assert [int(part[0]) for part in own[1:]] == [int(part[-1]) for part in own[:-1]]
     np.testing.assert_array_equal(np.concatenate([own[0], *(part[1:] for part in own[1:])]), rows)
     assert [block.rows.tolist() for block in frame_blocks(np.array([3]), tuple(range(9)), np.arange(9.0))] == [[3]]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("blank", [range(0, 3), range(20, 26), range(46, 51)])
+def test_frames_with_depth_and_a_black_image_are_said(sequence: Path, tmp_path: Path, blank: range) -> None:
+    """Of several blocks each is counted once, and those without depth, or darker and brighter ones, are not."""
+    source = with_dark(TumReader().open(sequence), blank, images=True, depth=False)
+    frames = list(with_dark(source, range(30, 33), images=True).frames)
+    frames[35], frames[55] = exposed(frames[35], 0.1), exposed(frames[55], 4.0)
+    _, notes = track(replace(source, frames=tuple(frames)), tmp_path / "blank")
+    said = [note for note in notes if "shows nothing" in note]
+    assert len(said) == 1 and said[0].startswith(f"{len(blank)} frames have depth")
+    assert f"({blank[0]}–{blank[-1]})" in said[0]
 
 
 def test_a_sequence_without_any_depth_in_range_is_an_error(sequence: Path, tmp_path: Path) -> None:
@@ -348,6 +370,23 @@ def test_only_the_step_over_which_a_clock_goes_back_is_made_up(begin_s: float) -
 def test_stamps_that_are_no_clock_are_the_numbers_of_the_frames(stamps: list[float]) -> None:
     source = Source("s", Path("s"), tuple(Frame(row, stamp) for row, stamp in enumerate(stamps)))
     np.testing.assert_array_equal(tracked.stamps_of(source), np.arange(5))
+
+
+def test_an_estimated_read_out_is_told_and_used_by_the_frames(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = TumReader().open(sequence)
+    none, _ = track(source, tmp_path / "none")
+    monkeypatch.setattr(tracked, "estimate_readout", lambda *_: Readout(0.022, 0.02, 0.0239))
+    found, notes = track(source, tmp_path / "found")
+    assert none.readout_s == 0.0 and followers(source, found).readout_s == 0.022
+    assert any("estimated: 22 ms (20 to 24)" in note for note in notes)
+    step, poses = Step(tmp_path, no_progress, lambda *_: None), all_poses(source, none, none.world_from_key)
+    posed = [
+        pose_frames(source, followers(source, one), one.sightings, poses, 1.0, workers=InProcess(), step=step)
+        for one in (none, found)
+    ]
+    assert 0.001 < np.abs(posed[1] - posed[0]).max() < 0.1
 
 
 @pytest.mark.parametrize(

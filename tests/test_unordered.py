@@ -19,13 +19,14 @@ from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView
 from hodge_pipeline.stages import no_progress
 from hodge_pipeline.start.unordered.folds import Pieces, contradictions, unfolded, within_parts
-from hodge_pipeline.start.unordered.hypotheses import allowed_hue_conflict, allowed_violation
+from hodge_pipeline.start.unordered.hypotheses import _ambiguous, allowed_hue_conflict, allowed_violation
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
 from hodge_pipeline.start.unordered.start import Frames, Start, find_start
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
-from hodge_pipeline.types import Camera, CloudSet, Floats, Frame, PointCloud, ViewGraph
+from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, ViewGraph
+from hodge_pipeline.types.edges import USED
 from test_global_registration import furnished_corner
 
 OPTIONS = CloudOptions(voxel_m=0.05, min_range_m=0.0, max_range_m=100.0)
@@ -75,6 +76,22 @@ def test_scans_of_one_place_are_joined_and_a_stranger_and_a_wall_are_left_apart(
     said = "\n".join(found.notes)
     assert "scan 4: cannot be registered by its shape: its surfaces leave open" in said
     assert "falls into 3 pieces" in said
+
+
+def test_a_single_scan_gives_no_pair_along_its_tour() -> None:
+    none = propose_along_tour(
+        SequentialEdges(), [scan(0, np.eye(3))], CloudSet.from_clouds([read(np.eye(3))]), np.eye(4)[None]
+    )
+    assert len(none) == 0
+
+
+@pytest.mark.parametrize(("turned", "is_kept"), [(False, True), (True, False)])
+def test_a_motion_with_a_rival_that_fits_as_well_is_refused(turned: bool, is_kept: bool) -> None:
+    motions = se3.exp(np.array([[0.0] * 6, [0, 0, np.pi / 2 * turned, 0, 0, 0]]))
+    edges = Edges.of([[0, 1], [0, 1]]).put(slice(None), status=USED, overlap=np.array([0.8, 0.7]), i_from_j=motions)
+    told, one = np.array([0.02, 0.02]), np.zeros(1, np.int64)
+    found = _ambiguous(edges, np.zeros(2, np.int64), one, told, np.array([90, 30]), HypothesisLimits())
+    assert found.tolist() == [not is_kept]
 
 
 def unit(vectors: Floats) -> Floats:

@@ -22,6 +22,13 @@ MIN_POINTS_FOR_NORMALS = 5
 MANY_POINTS = 5_000_000
 LISTED_NOTES = 5
 MAX_VOXELS_ALONG_AXIS = 2_000_000  # its cube still fits the 64-bit voxel key
+BLANK_LEVELS = 6
+"""Of 255, by which nearly all pixels of a blank image differ at most: a covered camera's do by 5 where its noise is 2
+levels. Images of fr1/rpy, fr1/xyz, red kitchen, ICL-NUIM and rendered rooms span 113 and more, 11 at a tenth of their
+brightness."""
+BLANK_STRIDE = 4
+"""Pixels between two that are looked at for it."""
+BLANK = "its depth is sound, but its colour image shows nothing: black, or of one even colour"
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -85,12 +92,15 @@ class Oddity(NamedTuple):
 
 
 class CloudCounts(NamedTuple):
-    """What became of a frame: measurements looked at, those valid and in range, points kept; what is odd."""
+    """What became of a frame: measurements looked at, those valid and in range, points kept; what is odd, and whether
+    its colour image is `blank`.
+    """
 
     looked_at: int
     valid: int
     points: int
     odd: Oddity | None = None
+    blank: bool = False
 
 
 class _Samples(NamedTuple):
@@ -99,6 +109,7 @@ class _Samples(NamedTuple):
     looked_at: int
     odd: Oddity | None = None
     why_none: str = ""
+    blank: bool = False
 
 
 def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:
@@ -117,7 +128,7 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     elif samples.looked_at > MANY_POINTS:
         kept = f"{samples.looked_at} points to {len(points)}, one a voxel of {options.voxel_m:.3g} m"
         odd = Oddity(frame.frame_id, "down-sampled in parts", kept)
-    return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), odd)
+    return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), odd, samples.blank)
 
 
 def landmarks_of(options: CloudOptions, frames: Sequence[Frame]) -> list[Landmarks]:
@@ -154,7 +165,14 @@ def prepare_clouds(
     if not any(counts.points for _, counts in results):
         reason = odd[0] if odd else "the source has no frames"
         raise SourceError(f"none of the {len(frames)} frames gave a point cloud; the first: {reason}")
+    odd += [Oddity(frame.frame_id, BLANK) for frame, (_, counts) in zip(frames, results, strict=True) if counts.blank]
     return CloudSet.from_clouds([cloud for cloud, _ in results]), shortened(odd)
+
+
+def is_blank(image: Bytes) -> bool:
+    """Whether an image, (H, W) or (H, W, 3), shows nothing: black, or of one even colour, a few pixels aside."""
+    darkest, brightest = np.percentile(image[::BLANK_STRIDE, ::BLANK_STRIDE], (1, 99), axis=(0, 1))
+    return bool(np.max(brightest - darkest) <= BLANK_LEVELS)
 
 
 def shortened(odd: Sequence[Oddity]) -> tuple[str, ...]:
@@ -206,17 +224,17 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
     z_kept = z[rows, columns].astype(np.float32)
     x = ((columns * stride - camera.cx) / camera.fx).astype(np.float32) * z_kept
     y = ((rows * stride - camera.cy) / camera.fy).astype(np.float32) * z_kept
-    colours, odd = None, None
+    colours, odd, blank = None, None, False
     if options.colours and frame.read_colour is not None and len(rows):
         try:
             image = frame.read_colour()
             # A colour image of another size covers the same view: take the pixel at the same share of it.
             v = rows * stride * image.shape[0] // depth.shape[0]
             u = columns * stride * image.shape[1] // depth.shape[1]
-            colours = image[v, u]
+            colours, blank = image[v, u], is_blank(image)
         except (SourceError, OSError) as error:
             odd = Oddity(frame.frame_id, "its cloud has no colours", str(error))
-    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd)
+    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd, blank=blank)
 
 
 def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:

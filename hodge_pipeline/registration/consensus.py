@@ -23,13 +23,18 @@ REFINEMENTS = 8
 
 @dataclass(frozen=True)
 class Consensus:
-    """The motion `i_from_j` (4, 4), the matches (M,) that it explains, and the count that its best rival explains of
-    the matches left over: where places look alike, or surfaces slide on each other, that is nearly as many.
+    """The motion `i_from_j` (4, 4), the matches (M,) that it explains, and its best rival, by the matches left over:
+    where places look alike, or surfaces slide on each other, it explains nearly as many.
     """
 
     i_from_j: Floats
     inlier: Bools
-    rival_count: int = 0
+    rival: Consensus | None = None
+
+    @property
+    def rival_count(self) -> int:
+        """How many of the matches left over the rival explains."""
+        return 0 if self.rival is None else self.rival.count
 
     @property
     def count(self) -> int:
@@ -54,7 +59,7 @@ def rigid_consensus(points_in_i: Floats, points_in_j: Floats, tolerance_m: float
     best = _refined(all_target, all_source, motions[int(support.sum(axis=1).argmax())], tolerance_m)
     left = ~best.inlier
     rival = motions[int(support[:, left[:MOST_MATCHES]].sum(axis=1).argmax())]
-    return replace(best, rival_count=_refined(all_target[left], all_source[left], rival, tolerance_m).count)
+    return replace(best, rival=_refined(all_target[left], all_source[left], rival, tolerance_m))
 
 
 def _compatible_groups(target: Floats, source: Floats, tolerance_m: float) -> tuple[Ints, Floats]:

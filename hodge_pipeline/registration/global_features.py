@@ -25,11 +25,14 @@ FAR_RADII = 3.0
 
 @dataclass(frozen=True)
 class DescribedCloud:
-    """Points (N, 3), unit normals (N, 3) and FPFH features (N, 33) of a cloud down-sampled to one scale."""
+    """Points (N, 3), unit normals (N, 3) and FPFH features (N, 33) of a cloud down-sampled to one scale; the same cloud
+    at coarser scales.
+    """
 
     points: Floats
     normals: Floats
     features: Floats32
+    coarser: tuple[DescribedCloud, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)
@@ -49,8 +52,9 @@ class DescribedCloud:
         return out
 
 
-def describe(cloud: PointCloud, voxel_m: float) -> DescribedCloud:
-    """The features of a cloud at a scale of `voxel_m`; none where it has fewer than 20 points at that scale.
+def describe(cloud: PointCloud, voxel_m: float, most_points: float = np.inf) -> DescribedCloud:
+    """The features of a cloud at a scale of `voxel_m`; none where it has fewer than 20 points at that scale, or more
+    than `most_points`.
 
     Normals are of 30 neighbours and turned to the `viewpoint`, since features know one side from the other; a feature
     looks at what is within 5 voxels.
@@ -59,7 +63,7 @@ def describe(cloud: PointCloud, voxel_m: float) -> DescribedCloud:
 
     points = np.asarray(cloud.points_in_cam, np.float64)
     coarse = _geometry(points[np.isfinite(points).all(axis=1)], None).voxel_down_sample(voxel_m)
-    if len(coarse.points) < FEWEST_POINTS:
+    if not FEWEST_POINTS <= len(coarse.points) <= most_points:
         nothing = np.zeros((0, 3))
         return DescribedCloud(nothing, nothing, np.zeros((0, 33), np.float32))
     coarse.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))

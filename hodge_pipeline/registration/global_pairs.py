@@ -26,7 +26,7 @@ DESCRIPTIONS_KEPT = 128
 
 @dataclass(frozen=True)
 class Matches:
-    """Matches in columns, in the order of their pairs (P, 2); see `Match` for each field."""
+    """Matches in columns, in the order of their pairs (P, 2), each with its `others` behind it; see `Match`."""
 
     pairs: Ints
     i_from_j: Floats
@@ -36,9 +36,11 @@ class Matches:
 
     @classmethod
     def of(cls, pairs: Ints, found: Sequence[Match]) -> Matches:
-        """The columns of these matches."""
+        """The columns of these matches, one for each pair."""
+        counts = [1 + len(one.others) for one in found]
+        found = [each for one in found for each in (one, *one.others)]
         return cls(
-            np.asarray(pairs, np.int64).reshape(-1, 2),
+            np.repeat(np.asarray(pairs, np.int64).reshape(-1, 2), counts, axis=0),
             np.array([one.i_from_j for one in found], float).reshape(-1, 4, 4),
             np.array([one.inliers for one in found], np.int64),
             np.array([one.matches for one in found], np.int64),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from hodge_pipeline.registration.global_features import DescribedCloud
 
 TOLERANCE_VOXELS = 1.5
+MOST_POINTS = 12_000
+"""Of a cloud at one of several scales: beyond it two take a second to match, and a coarser scale serves."""
 FEWEST_KISS_VOXELS = 200
 KISS_RADIUS_VOXELS, FEWEST_KISS_NEIGHBOURS = 3.0, 5
 """KISS-Matcher brings the process down where its own down-sampling leaves it too few points with a neighbourhood."""
@@ -28,19 +31,39 @@ _VOXEL = "metres: the scale of the features. 0.05 serves rooms; about 1/60 of a 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class FpfhConsensus:
-    """Mutual FPFH matches, judged by how many others keep their distances: quick, and the same every time."""
+    """Mutual FPFH matches, judged by how many others keep their distances: the same every time.
+
+    At each of the `scales` the best motion and its rival are found; what the clouds show decides between them.
+    """
 
     voxel_m: float = Field(default=0.05, gt=0, description=_VOXEL)
+    scales: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        default=(1.0, 2.0, 4.0),
+        min_length=1,
+        description="factors on voxel_m: a scanner's noise and rings hide small shapes, low overlap the large ones",
+    )
 
     def describe(self, cloud: PointCloud) -> DescribedCloud:
-        """The features of a cloud."""
-        return _describe(cloud, self.voxel_m)
+        """The features of a cloud, coarser ones beside them."""
+        *finer, coarsest = (factor * self.voxel_m for factor in self.scales)
+        levels = [*(_describe(cloud, voxel_m, MOST_POINTS) for voxel_m in finer), _describe(cloud, coarsest)]
+        return replace(levels[0], coarser=tuple(levels[1:]))
 
     def match(self, target: DescribedCloud, source: DescribedCloud) -> Match:
-        """Where the source lies in the target."""
-        rows = _mutual_matches(target, source)
-        found = rigid_consensus(target.points[rows[:, 0]], source.points[rows[:, 1]], TOLERANCE_VOXELS * self.voxel_m)
-        return Match(found.i_from_j, found.count, len(rows), found.rival_count)
+        """Where the source lies in the target: the motion that leads its rival most, the others beside it."""
+        found: list[Match] = []
+        levels = zip((target, *target.coarser), (source, *source.coarser), self.scales, strict=True)
+        for level_i, level_j, factor in levels:
+            rows = _mutual_matches(level_i, level_j)
+            tolerance_m = TOLERANCE_VOXELS * factor * self.voxel_m
+            best = rigid_consensus(level_i.points[rows[:, 0]], level_j.points[rows[:, 1]], tolerance_m)
+            found.append(Match(best.i_from_j, best.count, len(rows), best.rival_count))
+            if best.rival is not None:
+                found.append(Match(best.rival.i_from_j, best.rival_count, len(rows), best.count))
+        if len(self.scales) == 1:
+            return found[0]
+        first, *others = sorted(found, key=lambda one: one.rivals - one.inliers)
+        return replace(first, others=tuple(others))
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -152,10 +175,10 @@ def _kiss_matcher() -> Any:
     return kiss_matcher
 
 
-def _describe(cloud: PointCloud, voxel_m: float) -> DescribedCloud:
+def _describe(cloud: PointCloud, voxel_m: float, most_points: float = np.inf) -> DescribedCloud:
     from hodge_pipeline.registration.global_features import describe
 
-    return describe(cloud, voxel_m)
+    return describe(cloud, voxel_m, most_points)
 
 
 def _mutual_matches(target: DescribedCloud, source: DescribedCloud) -> Ints:

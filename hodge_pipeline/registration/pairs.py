@@ -68,13 +68,13 @@ class Acceptance:
 
 def _slides(registered: Edges, min_spread: float) -> Bools:
     """Where (P,) translation is hardly known in some direction, for pairs that are not next to each other."""
-    weak, _ = _weak_directions(registered, min_spread)
+    weak, _ = weak_directions(registered, min_spread)
     return np.asarray(weak.any(axis=1) & ~_consecutive(registered))
 
 
 def unheld_steps(edges: Edges, min_spread: float) -> Bools:
     """Where (P,) consecutive frames share too little to hold translation in every direction, as before a bare wall."""
-    weak, _ = _weak_directions(edges, HELD_SPREADS * min_spread)
+    weak, _ = weak_directions(edges, HELD_SPREADS * min_spread)
     return np.asarray(weak.any(axis=1) & _consecutive(edges))
 
 
@@ -82,7 +82,7 @@ def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) ->
     """The table with pairs at their guesses `i_from_j (P, 4, 4)` in directions in which what they share may let them
     slide (solution remapping, Zhang et al., ICRA 2016).
     """
-    weak, directions = _weak_directions(registered, HELD_SPREADS * min_spread)
+    weak, directions = weak_directions(registered, HELD_SPREADS * min_spread)
     rows = np.flatnonzero(weak.any(axis=1))
     if not len(rows):
         return registered
@@ -92,7 +92,7 @@ def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) ->
     return registered.put(rows, i_from_j=guesses[rows] @ se3.exp(twist))
 
 
-def _weak_directions(registered: Edges, min_spread: float) -> tuple[Bools, Floats]:
+def weak_directions(registered: Edges, min_spread: float) -> tuple[Bools, Floats]:
     """Which directions (P, 3) translation is hardly known in, and these as columns (P, 3, 3), in the axes of j."""
     values, vectors = np.linalg.eigh(np.nan_to_num(registered.information[:, 3:, 3:]))
     return np.asarray(np.maximum(values, 0.0) < min_spread * values.sum(axis=1, keepdims=True)), vectors

@@ -48,7 +48,7 @@ def repose(block: PosedBlock) -> Reposed:
     seen = _at_stamps(block, at)
     corners = _solved_corners(block, at, seen)
     rows, poses, misfits = [], [], []
-    for row, own in _groups(sightings.frame):
+    for row, own in groups(sightings.frame):
         place = at[row]
         if block.is_key[place]:
             continue
@@ -62,7 +62,7 @@ def repose(block: PosedBlock) -> Reposed:
     return Reposed(np.array(rows, np.int64), np.array(poses).reshape(-1, 4, 4), np.array(misfits, np.int64))
 
 
-def _groups(labels: Ints) -> list[tuple[int, Ints]]:
+def groups(labels: Ints) -> list[tuple[int, Ints]]:
     """The rows of each label, labels ascending; none of a block that saw nothing, as in the dark."""
     if not len(labels):
         return []
@@ -76,29 +76,33 @@ def _at_stamps(block: PosedBlock, at: dict[int, int]) -> Floats:
     sightings, out = block.sightings, block.sightings.seen.copy()
     world_from_key = block.world_from_cam[[at[int(row)] for row in sightings.key]]
     corners_in_world = np.einsum("nij,nj->ni", world_from_key[:, :3, :3], sightings.points) + world_from_key[:, :3, 3]
-    for row, own in _groups(sightings.frame):
+    for row, own in groups(sightings.frame):
         place = at[row]
         camera, delay_s, twist = block.cameras[place], float(block.colour_delays_s[place]), block.twists[place]
-        seen = sightings.seen[own]
         expected = se3.transform(se3.inverse(block.world_from_cam[place]), corners_in_world[sightings.corner[own]])
-        no_depth = np.isnan(seen[:, 2])
-        whole = np.column_stack([seen[:, :2], np.where(no_depth, expected[:, 2], seen[:, 2])])
-        moved = project(at_frame_stamp(back_project(whole, camera), camera, delay_s, twist), camera)
-        moved[no_depth, 2] = np.nan
-        out[own] = moved
+        out[own] = seen_at_stamp(sightings.seen[own], expected[:, 2], camera, delay_s, twist)
     return out
+
+
+def seen_at_stamp(seen: Floats, expected_z: Floats, camera: Camera, colour_delay_s: float, twist: Floats) -> Floats:
+    """Columns u, v, z (n, 3) as they would be at the frame's stamp; `expected_z (n,)` stands in where z is NaN."""
+    no_depth = np.isnan(seen[:, 2])
+    whole = np.column_stack([seen[:, :2], np.where(no_depth, expected_z, seen[:, 2])])
+    moved = project(at_frame_stamp(back_project(whole, camera), camera, colour_delay_s, twist), camera)
+    moved[no_depth, 2] = np.nan
+    return moved
 
 
 def _solved_corners(block: PosedBlock, at: dict[int, int], seen: Floats) -> Floats:
     """Corners (C, 3) in the world: the mean of what their own key frame and the others that saw them measured."""
     sightings = block.sightings
     total, count = np.zeros((len(sightings.key), 3)), np.ones(len(sightings.key))
-    for row, own in _groups(sightings.key):
+    for row, own in groups(sightings.key):
         place = at[row]
         delay_s = float(block.colour_delays_s[place])
         points = at_frame_stamp(sightings.points[own], block.cameras[place], delay_s, block.twists[place])
         total[own] = se3.transform(block.world_from_cam[place], points)
-    for row, own in _groups(sightings.frame):
+    for row, own in groups(sightings.frame):
         place = at[row]
         own = own[np.isfinite(seen[own]).all(axis=1)]
         if block.is_key[place] and len(own):

@@ -72,6 +72,22 @@ def resect(
     return Resection(se3.rescaled(pose, unit_m), se3.rescaled_information(information, unit_m), inliers)
 
 
+def robust_cost(points: Floats, seen: Floats, camera: Camera, known_from_cam: Floats, unit_m: float = 1.0) -> float:
+    """What a pose leaves over, Cauchy's cost at scale 1; inputs as of `resect`. A point behind the camera costs as one
+    at the gate.
+    """
+    pose = se3.rescaled(known_from_cam, 1 / unit_m)
+    in_cam, residual = _residuals(points / unit_m, seen / [1.0, 1.0, unit_m], camera, pose)
+    squares = (_white(in_cam, residual) ** 2).sum(axis=1)
+    return float(1.5 * np.log1p(np.nan_to_num(squares, nan=(GATE_PX / PIXEL_SIGMA) ** 2) / 3).sum())
+
+
+def _white(in_cam: Floats, residual: Floats) -> Floats:
+    """Residuals (n, 3) over their standard deviations."""
+    pixel = np.full(len(in_cam), PIXEL_SIGMA)
+    return np.asarray(residual / np.stack([pixel, pixel, DEPTH_SIGMAS * depth_sigma(in_cam[:, 2])], axis=1))
+
+
 def _residuals(points: Floats, seen: Floats, camera: Camera, pose: Floats) -> tuple[Floats, Floats]:
     """Points (n, 3) in the camera, and seen less expected u, v, z; of no depth 0, of a point behind it NaN."""
     in_cam = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -96,7 +112,7 @@ def _step(points: Floats, seen: Floats, camera: Camera, pose: Floats, scale: flo
     in_cam, residual = in_cam[usable], residual[usable]
     x, y, z = in_cam.T
     sigma_z = DEPTH_SIGMAS * depth_sigma(z)
-    white = residual / np.stack([np.full_like(z, PIXEL_SIGMA), np.full_like(z, PIXEL_SIGMA), sigma_z], axis=1)
+    white = _white(in_cam, residual)
     weight = 1 / (1 + (white**2).sum(axis=1) / (3 * scale**2))
     no_depth = np.isnan(seen[usable, 2])
     rows_u = _pixel_rows(camera.fx / (PIXEL_SIGMA * z), x / z, 0, in_cam)

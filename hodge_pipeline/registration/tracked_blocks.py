@@ -17,7 +17,7 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Edges, Ints
 
 STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
-COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful")
+COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful", "blank")
 
 
 class TrackedBlocks:

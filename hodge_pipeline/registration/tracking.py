@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note
+from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, is_blank
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
 from hodge_pipeline.registration.moving import contradicting, misplaced, rival_motion
 from hodge_pipeline.registration.odometry import OdometryOptions
@@ -71,10 +71,10 @@ class FrameBlock:
 
 @dataclass(frozen=True)
 class BlockRows:
-    """What became of a block's rows: its key frames, the steps from each to the next, and for every row the row of the
-    key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess; and the rows
-    `moving` of frames much of which moved otherwise than the camera, and `doubtful` of those whose motion may be that
-    of an object.
+    """What became of a block's rows: its key frames, the steps from each to the next, and for every row the row
+    of the key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess; and the
+    rows `moving` of frames much of which moved otherwise than the camera, `doubtful` of those whose motion may be
+    that of an object, and `blank` of those that have depth but show nothing.
 
     A step of fitness 0 is a guess too. The block's last row is the first of the next one.
     """
@@ -87,6 +87,7 @@ class BlockRows:
     fitness: Floats
     moving: Ints
     doubtful: Ints
+    blank: Ints
     notes: tuple[str, ...]
 
 
@@ -132,6 +133,11 @@ class _View:
         """None of a frame that flow cannot follow."""
         clouds = self._options.clouds
         return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m), clouds.unit_m)
+
+    @property
+    def is_blank(self) -> bool:
+        """Whether the frame has depth, and an image that shows nothing."""
+        return self.image is not None and bool((self.image.depth > 0).any()) and is_blank(self.image.grey)
 
     @cached_property
     def corners(self) -> Corners | None:
@@ -181,7 +187,7 @@ class _Tracker:
         self._steps: list[tuple[int, int, Registration]] = []
         self._corner_points: dict[int, Floats] = {}
         self._sightings: dict[tuple[int, int], Followed] = {}
-        self._moving, self._doubtful = set[int](), set[int]()
+        self._moving, self._doubtful, self._blank = set[int](), set[int](), set[int]()
         self._velocity: Floats = np.zeros(6)
         self._usual_step = float(np.median(np.diff(block.times))) if len(block.times) > 1 else 1.0
 
@@ -191,8 +197,11 @@ class _Tracker:
         if self._block.warm_up:
             self._warm_up(start)
         self._begin(start)
+        self._blank |= {first} if start.is_blank else set()
         for place in range(first + 1, count):
-            self._follow(self._view(place), is_last=place == count - 1)
+            view = self._view(place)
+            self._blank |= {place} if view.is_blank else set()
+            self._follow(view, is_last=place == count - 1)
         self._keep_cloud(self._keys[-1])
         rows = self._block.rows
         anchors, motions, fitness = zip(*(self._rows[place] for place in range(first, count)), strict=True)
@@ -205,11 +214,16 @@ class _Tracker:
             anchors=rows[list(anchors)],
             key_from_row=np.array(motions),
             fitness=np.array(fitness),
-            moving=rows[np.array([place for place in sorted(self._moving) if place > first], np.int64)],
-            doubtful=rows[np.array([place for place in sorted(self._doubtful) if place > first], np.int64)],
+            moving=self._rows_at(self._moving),
+            doubtful=self._rows_at(self._doubtful),
+            blank=self._rows_at(self._blank),
             notes=tuple(note for _, note in self._clouds.values() if note),
             sightings=self._kept_sightings(first),
         )
+
+    def _rows_at(self, places: set[int]) -> Ints:
+        """The rows at these places, the one of the warm-up left out."""
+        return self._block.rows[[place for place in sorted(places) if place >= self._block.warm_up]]
 
     def _view(self, place: int) -> _View:
         return _View(self._options, self._block.frames[place], place)

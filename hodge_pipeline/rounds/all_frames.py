@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline.complex.components import in_runs
+from hodge_pipeline.registration.readout import with_readout
 from hodge_pipeline.registration.reposing import PosedBlock, repose
 from hodge_pipeline.registration.shutter import velocities
 from hodge_pipeline.registration.sightings import Sightings
@@ -48,7 +49,8 @@ def pose_frames(
         own = artifacts.load(path, Sightings)
         rows = np.union1d(own.key, own.frame)
         frames = [source.frames[row] for row in rows]
-        cameras = tuple(frame.camera for frame in frames if frame.camera is not None)
+        readout_s = key_frames.readout_s
+        cameras = tuple(with_readout(frame.camera, readout_s) for frame in frames if frame.camera is not None)
         delays_s = np.array([frame.colour_delay_s for frame in frames])
         return PosedBlock(own, rows, world_from_cam[rows], is_key[rows], twists[rows], cameras, delays_s, unit_m)
 

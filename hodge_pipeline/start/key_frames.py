@@ -18,6 +18,7 @@ from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
+from hodge_pipeline.registration.readout import estimate_readout, with_readout
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import BlockRows, FrameBlock, TrackingOptions, frame_blocks, track_block
@@ -52,7 +53,7 @@ class Tracked:
 
     `anchors (N,)` counts among the K, `key_from_frame (N, 4, 4)` is the motion, `found (N,)` whether there is one;
     `world_from_key (K, 4, 4)` are the poses that `steps` led to, `piece (K,)` the part that they hold together;
-    `sightings` is the folder of what the frames of each block saw of their key frames.
+    `sightings` is the folder of what the frames of each block saw of their key frames; `readout_s` as of `KeyFrames`.
     """
 
     clouds: CloudSet
@@ -64,6 +65,7 @@ class Tracked:
     piece: Ints
     steps: Edges
     sightings: Path
+    readout_s: float = 0.0
 
 
 @dataclass(frozen=True, config=OPTIONS)
@@ -135,6 +137,7 @@ def followers(source: Source, tracked: Tracked) -> KeyFrames:
         stamps_s=stamps_of(source),
         sequence=sequence_numbers(source),
         key_of_frame=tracked.anchors,
+        readout_s=tracked.readout_s,
     )
 
 
@@ -176,9 +179,17 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
         **_anchored(parts, cut, key_of_row),
     )
     tracked = _without_lonely(tracked)
-    _move_landmarks(source, tracked)
+    first = tracked.world_from_key[tracked.anchors] @ tracked.key_from_frame
+    twists = velocities(first, stamps_of(source), sequence_numbers(source), tracked.found)
+    notes = _notes(source, tracked, parts)
+    readout = estimate_readout(sightings, source.frames, first, twists, options.clouds.unit_m)
+    if readout is not None:
+        tracked = replace(tracked, readout_s=readout.best_s)
+        best, low, high = (f"{1e3 * time_s:.0f}" for time_s in (readout.best_s, readout.low_s, readout.high_s))
+        notes = (*notes, Note("readout", detail=f"{best} ms ({low} to {high})"))
+    _move_landmarks(source, tracked, twists)
     blocks.remove()
-    step.note(*_notes(source, tracked, parts))
+    step.note(*notes)
     return tracked
 
 
@@ -219,18 +230,17 @@ def _without_lonely(tracked: Tracked) -> Tracked:
     return tracked if lonely.all() else replace(tracked, found=tracked.found & ~lonely[tracked.anchors])
 
 
-def _move_landmarks(source: Source, tracked: Tracked) -> None:
+def _move_landmarks(source: Source, tracked: Tracked, twists: Floats) -> None:
     """Move the landmarks of the key frames, in their file, to where they were at the stamps of their frames."""
     if not len(tracked.clouds.mark_points):
         return
-    first = tracked.world_from_key[tracked.anchors] @ tracked.key_from_frame
-    twists = velocities(first, stamps_of(source), sequence_numbers(source), tracked.found)
     assert tracked.clouds.folder is not None
     points = np.load(tracked.clouds.folder / "mark_points.npy", mmap_mode="r+")
     for key, row in enumerate(tracked.key_rows.tolist()):
         own, frame = slice(*tracked.clouds.marks[key : key + 2].tolist()), source.frames[row]
         if frame.camera is not None:
-            points[own] = at_frame_stamp(points[own].astype(float), frame.camera, frame.colour_delay_s, twists[row])
+            camera = with_readout(frame.camera, tracked.readout_s)
+            points[own] = at_frame_stamp(points[own].astype(float), camera, frame.colour_delay_s, twists[row])
     points.flush()
 
 
@@ -247,6 +257,9 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
         notes.append(Note("holes", len(holes), ", ".join(told) + ", …" * (len(holes) > NOTES_SHOWN)))
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
+    blank = np.unique(np.concatenate([part.blank for part in parts]))
+    if len(blank):
+        notes.append(Note("blank images", len(blank), in_runs(blank, ids)))
     moving = np.unique(np.concatenate([part.moving for part in parts]))
     if len(moving):
         notes.append(Note("moving objects", len(moving), in_runs(moving, ids)))

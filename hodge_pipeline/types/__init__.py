@@ -190,13 +190,14 @@ class Match:
     """Where cloud j lies in cloud i, found with no guess: `inliers` of the `matches` between them agree with it.
 
     The identity with no inlier where nothing was found. `rivals` of the other matches agree with another motion; 0
-    where nobody has looked for one.
+    where nobody has looked for one. `others` are further motions, to be weighed beside this one by the clouds.
     """
 
     i_from_j: Floats
     inliers: int
     matches: int
     rivals: int = 0
+    others: tuple[Match, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
         Rank.LOOK,
         "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
     ),
+    "blank images": (
+        Rank.LOOK,
+        "{count} frames have depth, but a colour image that shows nothing, black or of one even colour ({detail}): "
+        "surfaces alone place them",
+    ),
     "moving objects": (
         Rank.LOOK,
         "much of {count} frames moved otherwise than the camera ({detail}): people or objects that move? The camera's "
@@ -100,6 +105,10 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "sweeps untimed": (
         Rank.FACT,
         "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an instant",
+    ),
+    "readout": (
+        Rank.FACT,
+        "the camera's read-out (rolling shutter), estimated: {detail}; readout_s in the camera's file would be exact",
     ),
     "misfits": (
         Rank.LOOK,

@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hodge_pipeline import se3
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView, violation
 from hodge_pipeline.registration.global_pairs import Matches
-from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.pairs import register_pairs, weak_directions
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
 from hodge_pipeline.start.unordered.options import HypothesisLimits
-from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import REJECTED, USED
 
 POINTS_PROJECTED = 1500
 LEAD_SIGMAS = 2.0
 """Of the Poisson noise of a count: how far a motion's matches must exceed those of the best other motion."""
+ANOTHER_M, ANOTHER_RAD = 0.3, np.radians(10.0)
+"""Metres in a room and radians from which two refined motions are two: refinement forgives no more."""
+LEAST_SPREAD = 0.025
+"""Of the information on translation in its weakest direction: wrong matches of a bare hill have 0.009 to 0.023, streets
+0.04 and more.
+"""
+RIVAL_OVERLAP, RIVAL_VIOLATION = 0.8, 2.0
+"""Of the best motion's: in bare rooms, turned by a half or a quarter, a wrong one has 0.84 to 1.1 of the right overlap,
+since rings of a scanner fit each other; in furnished ones it is seen through by 4 to 20 times as much.
+"""
+AMBIGUOUS, NO_LEAD = "it fits in several ways", "another motion explains as many matches"
 USUAL_VIOLATIONS = 8.0
 USUAL_HUE_CONFLICTS = 12.0
 ViewOf = Callable[[int], DepthView | None]
@@ -34,34 +47,110 @@ def weigh(
     workers: Workers,
     advance: Advance = no_progress,
 ) -> Edges:
-    """The matches (P,), those with enough inliers refined; what is good enough to be judged with the others counts.
+    """A row for each pair that was matched: its best motion, refined, which counts where it is good enough to be judged
+    with the others.
 
-    `folder` holds the clouds. `overlap` is the share of the smaller cloud near the other.
-
-    A motion that hardly more matches explain than the best other one is refused: places look alike there, or what the
-    clouds share lets them slide.
+    `folder` holds the clouds. `overlap` is the share of the smaller cloud near the other. Of several motions of a pair
+    each is refined, and what the clouds show decides: another that fits as well makes the pair ambiguous. Where a
+    registrar gives but one, it is refused where hardly more matches explain it than its rival: places look alike there,
+    or what the clouds share lets them slide.
     """
     clouds = CloudSet.open(folder)
-    edges = Edges.of(matches.pairs).put(slice(None), status=REJECTED, why="too few matches agree")
-    enough = matches.inliers >= limits.min_inliers
-    leads = matches.inliers - matches.rivals >= LEAD_SIGMAS * np.sqrt(matches.rivals)
-    edges = edges.put(enough & ~leads, why="another motion explains as many matches")
-    worth = np.flatnonzero(enough & leads)
-    advance(len(edges) - len(worth))
+    _, pair, motions = np.unique(matches.pairs, axis=0, return_inverse=True, return_counts=True)
+    pair = pair.reshape(-1)
+    leads = _leads(matches.inliers, matches.rivals)
+    why = np.where(leads | (motions[pair] > 1), "", NO_LEAD).astype("U64")
+    why[matches.inliers < limits.min_inliers] = "too few matches agree"
+    worth = np.flatnonzero(why == "")
     chosen = Edges.of(matches.pairs[worth])
     registered = register_pairs(folder, refine, chosen, matches.i_from_j[worth], workers, advance)
-    sizes = clouds.sizes
-    smaller = np.minimum(sizes[chosen.pairs[:, 0]], sizes[chosen.pairs[:, 1]])
-    overlap = np.minimum(1.0, registered.fitness * sizes[chosen.pairs[:, 1]] / np.maximum(smaller, 1))
-    seen_through = violations(clouds, chosen.pairs, registered.i_from_j, view_of, limits.room_m)
-    reason = np.full(len(chosen), "", "U64")
-    hue = hue_conflicts(clouds, chosen.pairs, registered.i_from_j)
-    reason[hue > allowed_hue_conflict(hue, limits)] = "their colours differ"
-    reason[seen_through > allowed_violation(seen_through, limits)] = "one camera saw through the other's surface"
-    reason[~(registered.rmse_m <= limits.max_rmse_m)] = "points too far apart"
-    reason[~(overlap >= limits.min_overlap)] = "too little overlap"
-    status = np.where(reason == "", USED, REJECTED)
-    return edges.put(worth, **vars(replace(registered, overlap=overlap, why=reason, status=status)))
+    evidence = _evidence(clouds, registered, view_of, limits)
+    score = np.full(len(why), -np.inf)
+    score[worth] = evidence.overlap - np.nan_to_num(evidence.seen_through)
+    why[worth] = evidence.reasons(_best(pair[worth], score[worth]), limits)
+    status = np.where(why == "", USED, REJECTED)
+    edges = Edges.of(matches.pairs).put(worth, **vars(replace(registered, overlap=evidence.overlap)))
+    edges = edges.put(slice(None), status=status, why=why)
+    best = _best(pair, np.where(edges.counts, score + 2.0, score))
+    seen_through = np.full(len(why), np.nan)
+    seen_through[worth] = evidence.seen_through
+    ambiguous = _ambiguous(edges, pair, best, seen_through, matches.inliers, limits)
+    edges = edges.put(best[ambiguous], status=REJECTED, why=AMBIGUOUS)
+    bare = edges.counts & ~_supported(edges, pair, best, leads, limits)
+    return edges.put(bare, status=REJECTED, why=NO_LEAD).select(best)
+
+
+def _leads(count: Ints, rival: Ints) -> Bools:
+    """Where clearly more matches explain a motion than another."""
+    return np.asarray(count - rival >= LEAD_SIGMAS * np.sqrt(rival))
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What the clouds show of motions (P,): overlap, the share seen through, and hue conflicts, both NaN where untold;
+    the distance of common points, metres; whether these leave a direction of translation open.
+    """
+
+    overlap: Floats
+    seen_through: Floats
+    hue: Floats
+    rmse_m: Floats
+    slides: Bools
+
+    def reasons(self, best: Ints, limits: HypothesisLimits) -> NDArray[np.str_]:
+        """Why each motion is refused, an empty word where it is not; the rows `best` say what is usual in this run."""
+        out = np.full(len(self.hue), "", "U64")
+        out[self.hue > allowed_hue_conflict(self.hue[best], limits)] = "their colours differ"
+        violated = self.seen_through > allowed_violation(self.seen_through[best], limits)
+        out[violated] = "one camera saw through the other's surface"
+        out[self.slides] = "what they share lets them slide"
+        out[~(self.rmse_m <= limits.max_rmse_m)] = "points too far apart"
+        out[~(self.overlap >= limits.min_overlap)] = "too little overlap"
+        return out
+
+
+def _evidence(clouds: CloudSet, registered: Edges, view_of: ViewOf, limits: HypothesisLimits) -> _Evidence:
+    sizes, pairs = clouds.sizes, registered.pairs
+    smaller = np.minimum(sizes[pairs[:, 0]], sizes[pairs[:, 1]])
+    overlap = np.minimum(1.0, registered.fitness * sizes[pairs[:, 1]] / np.maximum(smaller, 1))
+    seen_through = violations(clouds, pairs, registered.i_from_j, view_of, limits.room_m)
+    hue = hue_conflicts(clouds, pairs, registered.i_from_j)
+    weak, _ = weak_directions(registered, LEAST_SPREAD)
+    return _Evidence(overlap, seen_through, hue, registered.rmse_m, np.asarray(weak.any(axis=1)))
+
+
+def _best(pair: Ints, score: Floats) -> Ints:
+    """The row of each pair (P,) with the highest score, the first of equals."""
+    order = np.lexsort((np.arange(len(pair)), -score, pair))
+    return np.asarray(order[np.unique(pair[order], return_index=True)[1]])
+
+
+def _differs(edges: Edges, mine: Ints, limits: HypothesisLimits) -> Bools:
+    """Which rows have another motion than the rows `mine` (P,)."""
+    apart = se3.inverse(edges.i_from_j[mine]) @ edges.i_from_j
+    far = np.linalg.norm(apart[:, :3, 3], axis=1) > ANOTHER_M * limits.room_m
+    return np.asarray(far | (np.linalg.norm(se3.so3_log(apart[:, :3, :3]), axis=1) > ANOTHER_RAD))
+
+
+def _supported(edges: Edges, pair: Ints, best: Ints, leads: Bools, limits: HypothesisLimits) -> Bools:
+    """The rows of pairs of which a motion that became the best one led its rival at some scale."""
+    became = ~_differs(edges, best[pair], limits) & (edges.correspondences > 0)
+    return np.isin(pair, pair[became & leads])
+
+
+def _ambiguous(
+    edges: Edges, pair: Ints, best: Ints, seen_through: Floats, inliers: Ints, limits: HypothesisLimits
+) -> Bools:
+    """Which of the `best` rows have a rival of their pair: another motion that may be an edge, and fits as well.
+
+    Free space decides; where it says nothing, the count of matches does.
+    """
+    mine = best[pair]
+    fits = edges.overlap >= RIVAL_OVERLAP * edges.overlap[mine]
+    told = np.isfinite(seen_through) & np.isfinite(seen_through[mine])
+    as_free = seen_through <= np.maximum(RIVAL_VIOLATION * seen_through[mine], limits.violation_floor)
+    fits &= np.where(told, as_free, ~_leads(inliers[mine], inliers))
+    return np.isin(pair[best], pair[edges.counts & edges.counts[mine] & _differs(edges, mine, limits) & fits])
 
 
 def allowed_violation(seen_through: Floats, limits: HypothesisLimits) -> float:

@@ -27,7 +27,8 @@ class LocalDescriptors:
             return found.descriptors
         if not isinstance(found, DescribedCloud):  # another registrar's own: geometry is compared by FPFH all the same
             found = describe(self._clouds[row], self._voxel_m)
-        positive = np.maximum(found.features, 0)
+        features = max((found, *found.coarser), key=len).features
+        positive = np.maximum(features, 0)
         return np.asarray(np.sqrt(positive / np.maximum(positive.sum(axis=1, keepdims=True), 1e-12)))
 
 

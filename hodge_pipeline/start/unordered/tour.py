@@ -42,6 +42,8 @@ def propose_along_tour(
     found = edges.propose(
         [frames[row] for row in order], CloudSet.from_clouds([clouds[row] for row in order]), world_from_cam[order]
     )
+    if not len(found):  # a single scan; np.char.replace wants one word at least
+        return found
     pairs = order[found.pairs]
     back = Edges.proposed(pairs, "", found.overlap)
     low, high = np.sort(pairs, axis=1).T

@@ -1,0 +1,139 @@
+"""The read-out time of a rolling shutter that nobody gave, from what frames saw of their key frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.registration.reposing import groups, seen_at_stamp
+from hodge_pipeline.registration.resection import resect, robust_cost
+from hodge_pipeline.registration.shutter import at_frame_stamp
+from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.types import Camera, Floats, Frame
+
+T = TypeVar("T")
+TRIED_S = np.linspace(0.0, 0.035, 8)
+"""Seconds: video has 30 images a second, and a read-out is no longer than the time between two images."""
+LONGEST_S = 1 / 30
+SHORTEST_S = 0.005
+"""A shorter one moves no pixel by one at 30 degrees a second; on rendered frames estimates are off by up to 2 ms."""
+WIDEST = 0.5
+"""Width of the interval over the value: a quarter of the shutter's effect is left at its ends."""
+MOST_BLOCKS, MOST_VIEWS = 10, 100
+"""That are looked at, evenly spread: a view takes 10 CPU ms."""
+FEWEST_CORNERS = 60
+FEWEST_KEYS = 5
+"""Key frames, by which the interval is drawn anew: what is seen of one shares its errors."""
+DRAWS = 500
+
+
+@dataclass(frozen=True)
+class Readout:
+    """Seconds: the value, and the ends of its 98 % interval."""
+
+    best_s: float
+    low_s: float
+    high_s: float
+
+
+@dataclass(frozen=True)
+class View:
+    """What a frame saw of its key frame: `points (n, 3)` in the key frame's axes, `seen (n, 3)` columns u, v, z."""
+
+    key: int
+    row: int
+    points: Floats
+    seen: Floats
+
+
+def with_readout(camera: Camera, readout_s: float) -> Camera:
+    """The camera with its own read-out time where that is known, else with this one."""
+    return camera if camera.readout_s else replace(camera, readout_s=readout_s)
+
+
+def estimate_readout(
+    sightings: Path, frames: Sequence[Frame], world_from_cam: Floats, twists: Floats, unit_m: float
+) -> Readout | None:
+    """The read-out time at which views (a folder of `Sightings`) fit best, each posed anew at each time tried.
+
+    `twists (N, 6)` as of `velocities`. None where a camera's is known or cameras differ, and where the minimum is not
+    clear: at either end of what was tried, in too wide an interval, or seen from too few key frames.
+    """
+    cameras = {frame.camera for frame in frames}
+    camera = next(iter(cameras))
+    moves = np.asarray(twists.any(axis=1))
+    if len(cameras) > 1 or camera is None or camera.readout_s or not moves.any():
+        return None
+    views = [view for view in _views(sightings) if moves[view.key] and moves[view.row]]
+    keys, costs = list[int](), list[Floats]()
+    for view in _spread(views, MOST_VIEWS):
+        delays_s = frames[view.key].colour_delay_s, frames[view.row].colour_delay_s
+        start = se3.inverse(world_from_cam[view.key]) @ world_from_cam[view.row]
+        cost = _costs(view, camera, delays_s, (twists[view.key], twists[view.row]), start, unit_m)
+        if cost is not None:
+            keys.append(view.key)
+            costs.append(cost)
+    return _minimum(np.array([np.sum([costs[own] for own in rows], axis=0) for _, rows in groups(np.array(keys))]))
+
+
+def _spread(items: Sequence[T], most: int) -> list[T]:
+    return [items[at] for at in np.linspace(0, len(items) - 1, min(most, len(items)), dtype=int)]
+
+
+def _views(sightings: Path) -> Iterator[View]:
+    for path in _spread(sorted(sightings.glob("*.npz")), MOST_BLOCKS):
+        block = artifacts.load(path, Sightings)
+        for row, own in groups(block.frame):
+            for key, part in groups(block.key[block.corner[own]]):
+                if key != row and len(part) >= FEWEST_CORNERS:
+                    yield View(key, row, block.points[block.corner[own[part]]], block.seen[own[part]])
+
+
+def _costs(
+    view: View,
+    camera: Camera,
+    delays_s: tuple[float, float],
+    twists: tuple[Floats, Floats],
+    start: Floats,
+    unit_m: float,
+) -> Floats | None:
+    """Robust cost (T,) of a view at each time tried; delays and twists are the key frame's and the frame's."""
+    costs = []
+    for readout_s in TRIED_S.tolist():
+        tried = replace(camera, readout_s=readout_s)
+        points = at_frame_stamp(view.points, tried, delays_s[0], twists[0])
+        expected_z = se3.transform(se3.inverse(start), points)[:, 2]
+        seen = seen_at_stamp(view.seen, expected_z, tried, delays_s[1], twists[1])
+        found = resect(points, seen, tried, start, unit_m)
+        if found is None:
+            return None
+        costs.append(robust_cost(points, seen, tried, found.known_from_cam, unit_m))
+    return np.array(costs)
+
+
+def _minimum(costs: Floats) -> Readout | None:
+    """Where the sum of costs (K, T) is least, with its interval over draws of the K rows; None where unclear."""
+    if len(costs) < FEWEST_KEYS:
+        return None
+    drawn = np.random.default_rng(0).integers(0, len(costs), (DRAWS, len(costs)))
+    lowest = [_vertex(costs[rows].sum(axis=0)) for rows in drawn]
+    low, high = np.quantile(lowest, [0.01, 0.99]).tolist()
+    best = _vertex(costs.sum(axis=0))
+    clear = low >= SHORTEST_S and high <= LONGEST_S and high - low <= WIDEST * best
+    return Readout(best, low, high) if clear else None
+
+
+def _vertex(costs: Floats) -> float:
+    """The time of the vertex of the parabola through the least cost and its neighbours; an end where that is least."""
+    at = int(np.argmin(costs))
+    if at in (0, len(costs) - 1):
+        return float(TRIED_S[at])
+    before, least, after = costs[at - 1 : at + 2]
+    step = float(TRIED_S[1] - TRIED_S[0])
+    return float(TRIED_S[at] + step / 2 * (before - after) / (before - 2 * least + after))
