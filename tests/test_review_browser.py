@@ -88,7 +88,7 @@ def test_three_wrong_edges_taken_out_by_mouse_and_the_run_solved(
         page.choose(name)
         page.decided(lambda: page.click("#disable"))
     mended_m = session.settled.error_m
-    assert before_m > 0.5 and mended_m is not None and mended_m < 0.05
+    assert before_m > 0.3 and mended_m is not None and mended_m < 0.05
     page.decided(lambda: page.click("#undo"))
     assert session.settled.error_m is not None and session.settled.error_m > 0.1
     page.choose(sorted(PLANTED)[-1])
@@ -240,7 +240,12 @@ def matching(page: Page, i: int, j: int, i_from_j: Any) -> list[tuple[Any, Any]]
     eye = np.asarray(page.scene.camera.position)
 
     def picked(points: Any, row: int) -> bool:
-        return page.place(points[row]) is not None and nearest_point(eye, points[row] - eye, points) == row
+        if page.place(points[row]) is None or nearest_point(eye, points[row] - eye, points) != row:
+            return False
+        away = points[row] - eye
+        beside = [away + sign * np.cross(away, axis) * 1e-3 for sign in (-1, 1) for axis in np.eye(3)]  # a pixel off
+        found = [nearest_point(eye, ray, points) for ray in beside]
+        return all(one is not None and np.linalg.norm(points[one] - points[row]) < 0.1 for one in found)
 
     near = np.flatnonzero(distance < 0.04)
     seen = np.array([row for row in near[::12] if picked(shown[0], row) and picked(shown[1], at[row])])

@@ -22,12 +22,16 @@ COLUMNS = (8, 9)
 
 
 UNITS = (("nanoseconds", 1e17, 1e9), ("microseconds", 1e14, 1e6), ("milliseconds", 1e11, 1e3))
-"""What a stamp from so much on counts, and how many make a second: as seconds 1e11 is the year 5138."""
+"""What all stamps from so much on count, and how many make a second: as seconds 1e11 is the year 5138."""
 
 
-def to_seconds(stamp: float) -> float:
-    """The stamp in seconds: ORB-SLAM3, among others, writes nanoseconds since 1970."""
-    return next((stamp / per_second for _, least, per_second in UNITS if stamp >= least), stamp)
+def unit_of(stamps: Floats) -> tuple[str, float]:
+    """What the stamps of one file count, and how many make a second: ORB-SLAM3, among others, writes nanoseconds since
+    1970. Numbers of which some are small are seconds, or no time at all.
+    """
+    least = stamps.min(initial=np.inf)
+    known = ((name, per_second) for name, smallest, per_second in UNITS if smallest <= least < np.inf)
+    return next(known, ("seconds", 1.0))
 
 
 @plain_dataclass(frozen=True)
@@ -46,15 +50,20 @@ def parse_tum(path: Path) -> ParsedTrajectory:
     table, bad = _tum_table(read_rows(path))
     if not len(table):
         raise _unreadable(path, bad, "stamp tx ty tz qx qy qz qw")
-    unit = next((name for name, least, _ in UNITS if table[:, 0].max() >= least), "")
-    table[:, 0] = [to_seconds(stamp) for stamp in table[:, 0].tolist()]
+    unit, per_second = unit_of(table[:, 0])
+    table[:, 0] /= per_second
     parsed = ordered(table)
     notes = [f"{path.name}: {note}" for note in parsed.notes]
-    if unit:
+    if per_second > 1:
         notes.append(f"{path.name}: stamps are read as {unit}, too large for seconds")
     if bad:
         notes.append(f"{path.name}: {len(bad)} lines that are no pose left out: {listed([r.line for r in bad])}")
     return ParsedTrajectory(parsed.trajectory, tuple(notes))
+
+
+def tum_stamps(path: Path) -> Floats:
+    """The stamps (N,) in a TUM file, as it writes them."""
+    return _tum_table(read_rows(path))[0][:, 0]
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
