@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -16,8 +15,8 @@ from hodge_pipeline.registration.shutter import at_frame_stamp
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Camera, Floats, Frame
+from hodge_pipeline.types.arrays import evenly
 
-T = TypeVar("T")
 TRIED_S = np.linspace(0.0, 0.035, 8)
 """Seconds: video has 30 images a second, and a read-out is no longer than the time between two images."""
 LONGEST_S = 1 / 30
@@ -72,7 +71,7 @@ def estimate_readout(
         return None
     views = [view for view in _views(sightings) if moves[view.key] and moves[view.row]]
     keys, costs = list[int](), list[Floats]()
-    for view in _spread(views, MOST_VIEWS):
+    for view in (views[at] for at in evenly(len(views), MOST_VIEWS)):
         delays_s = frames[view.key].colour_delay_s, frames[view.row].colour_delay_s
         start = se3.inverse(world_from_cam[view.key]) @ world_from_cam[view.row]
         cost = _costs(view, camera, delays_s, (twists[view.key], twists[view.row]), start, unit_m)
@@ -82,13 +81,10 @@ def estimate_readout(
     return _minimum(np.array([np.sum([costs[own] for own in rows], axis=0) for _, rows in groups(np.array(keys))]))
 
 
-def _spread(items: Sequence[T], most: int) -> list[T]:
-    return [items[at] for at in np.linspace(0, len(items) - 1, min(most, len(items)), dtype=int)]
-
-
 def _views(sightings: Path) -> Iterator[View]:
-    for path in _spread(sorted(sightings.glob("*.npz")), MOST_BLOCKS):
-        block = artifacts.load(path, Sightings)
+    paths = sorted(sightings.glob("*.npz"))
+    for at in evenly(len(paths), MOST_BLOCKS):
+        block = artifacts.load(paths[at], Sightings)
         for row, own in groups(block.frame):
             for key, part in groups(block.key[block.corner[own]]):
                 if key != row and len(part) >= FEWEST_CORNERS:

@@ -1,10 +1,10 @@
-"""Tracked blocks on disk: a killed run goes on with the next one, and the clouds of all are joined file by file."""
+"""Tracked blocks, also on disk: a killed run goes on with the next one; the clouds of all are joined file by file."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.registration.sightings import Sightings
-from hodge_pipeline.registration.tracking import BlockRows, TrackedBlock
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import CloudSet, Edges, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, PointCloud
 
 STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
 COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful", "blank")
+
+
+@dataclass(frozen=True)
+class BlockRows:
+    """What became of a block's rows: its key frames, the steps from each to the next, and for every row the row
+    of the key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess; and the
+    rows `moving` of frames much of which moved otherwise than the camera, `doubtful` of those whose motion may be
+    that of an object, and `blank` of those that have depth but show nothing.
+
+    A step of fitness 0 is a guess too. The block's last row is the first of the next one.
+    """
+
+    keys: Ints
+    steps: Edges
+    rows: Ints
+    anchors: Ints
+    key_from_row: Floats
+    fitness: Floats
+    moving: Ints
+    doubtful: Ints
+    blank: Ints
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TrackedBlock(BlockRows):
+    """These, with the key frames' clouds, and what the frames saw of the key frames' corners."""
+
+    clouds: tuple[PointCloud, ...]
+    sightings: Sightings
 
 
 class TrackedBlocks:

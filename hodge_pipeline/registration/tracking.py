@@ -20,6 +20,7 @@ from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_
 from hodge_pipeline.registration.moving import contradicting, misplaced, rival_motion
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.registration.tracked_blocks import TrackedBlock
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.types import Bytes, Edges, Floats, Frame, Ints, PointCloud, Registration
 
@@ -67,36 +68,6 @@ class FrameBlock:
     frames: tuple[Frame, ...]
     times: Floats
     warm_up: bool
-
-
-@dataclass(frozen=True)
-class BlockRows:
-    """What became of a block's rows: its key frames, the steps from each to the next, and for every row the row
-    of the key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess; and the
-    rows `moving` of frames much of which moved otherwise than the camera, `doubtful` of those whose motion may be
-    that of an object, and `blank` of those that have depth but show nothing.
-
-    A step of fitness 0 is a guess too. The block's last row is the first of the next one.
-    """
-
-    keys: Ints
-    steps: Edges
-    rows: Ints
-    anchors: Ints
-    key_from_row: Floats
-    fitness: Floats
-    moving: Ints
-    doubtful: Ints
-    blank: Ints
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class TrackedBlock(BlockRows):
-    """These, with the key frames' clouds, and what the frames saw of the key frames' corners."""
-
-    clouds: tuple[PointCloud, ...]
-    sightings: Sightings
 
 
 def frame_blocks(rows: Ints, frames: tuple[Frame, ...], times: Floats) -> list[FrameBlock]:

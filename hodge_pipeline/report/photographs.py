@@ -30,6 +30,8 @@ CLOSER = 2
 """How many times the place that changed most is enlarged."""
 DOWN = np.diag([1.0, -1.0, -1.0])
 """Right, down and look of a view from above, in the axes of a scanner."""
+LOOKED_AT = 9
+"""Clouds that tell whether they are a scanner's: all are of one sensor."""
 SEEN_BEHIND = 0.01
 """Share of points behind the image plane, which no camera has: of those of a scanner, whose z is up, it is the ground.
 """
@@ -131,8 +133,9 @@ def _laid_on(before: Floats, after: Floats, rows: Ints) -> Floats:
 
 
 def _is_scanner(clouds: CloudSet, rows: Ints) -> bool:
-    """Whether these rows hold points behind an image plane."""
-    return bool(np.mean([np.mean(clouds[int(row)].points_in_cam[:, 2] < 0) for row in rows]) > SEEN_BEHIND)
+    """Whether these rows, or a few of them, hold points behind an image plane."""
+    looked_at = rows[evenly(len(rows), LOOKED_AT)].tolist()
+    return bool(np.mean([np.mean(clouds[row].points_in_cam[:, 2] < 0) for row in looked_at]) > SEEN_BEHIND)
 
 
 def sides(scenes: Sequence[raster.Points], views: Mapping[str, raster.View], caption: str) -> tuple[Picture, ...]:

@@ -20,8 +20,8 @@ from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.readout import estimate_readout, with_readout
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
-from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
-from hodge_pipeline.registration.tracking import BlockRows, FrameBlock, TrackingOptions, frame_blocks, track_block
+from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
+from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,

@@ -46,9 +46,10 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     chain = unbroken = joined(chain)
     wrong = Wrong.of(chain, chain.poses())  # one for all trials: evidence is against all loops being wrong
     judge = partial(infer, wrong=wrong, always=always, thin=thin)
-    found = first = judge(chain)
-    if found is None or first is None:
+    first = judge(chain)
+    if first is None:
         return None
+    found = first
     for _ in range(MOST_BREAKS):
         better = _better(chain, found, judge)
         if better is None:
