@@ -77,6 +77,29 @@ def test_models_without_an_observation_are_refused_in_one_line(sparse: Path) -> 
     assert "\n" not in told
 
 
+def test_points_that_are_not_finite_are_left_out_and_noted(sparse: Path) -> None:
+    spoiled = pycolmap.Reconstruction(sparse / "1")
+    for key in sorted(spoiled.points3D)[:2]:
+        spoiled.points3D[key].xyz = np.array([np.nan, 0.0, np.inf])
+    count = spoiled.num_points3D()
+    spoiled.write(sparse / "1")
+    note = "2 points not finite: left out"
+    assert note in ColmapReader(edges="none").open(sparse / "1").notes
+    for given in (sparse / "1", spoiled):
+        (result,) = hodge_pipeline.refine_colmap(given, overrides=FREE).results
+        assert result.start.quality.points == count - 2 and note in result.notes
+    assert spoiled.num_points3D() == count
+
+
+def test_a_name_of_two_images_is_told(sparse: Path) -> None:
+    model = pycolmap.Reconstruction(sparse / "1")
+    first, second = sorted(model.images)[:2]
+    model.images[second].name = name = model.images[first].name
+    model.write(sparse / "1")
+    with pytest.raises(SourceError, match=f"two images have the name '{name}': rename one"):
+        ColmapReader().open(sparse / "1")
+
+
 def contradict(model: Path) -> None:
     """Let the first entry of the first track name another observation of its image."""
     path = model / "points3D.bin"
