@@ -84,7 +84,7 @@ def read_records(
 
 
 def _text(contents: bytes) -> str:
-    """The text, whatever the encoding of its comments and the ends of its lines; raises `ValueError` for what is none."""
+    """The text, whatever its comments are encoded in and its lines end in; raises `ValueError` for what is none."""
     if b"\0" in contents:
         raise ValueError("it has zero bytes")
     return contents.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n").decode("latin-1")
