@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import hodge_pipeline
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.reader import ColmapReader
+from hodge_adapters.colmap.writer import ColmapWriter
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.store.edge_table import read_edges
@@ -98,6 +99,24 @@ def test_a_name_of_two_images_is_told(sparse: Path) -> None:
     model.write(sparse / "1")
     with pytest.raises(SourceError, match=f"two images have the name '{name}': rename one"):
         ColmapReader().open(sparse / "1")
+
+
+def test_names_with_blanks_in_text_stay_whole(sparse: Path, tmp_path: Path) -> None:
+    """COLMAP writes such names as they are, and reads them up to the blank."""
+    model, text = pycolmap.Reconstruction(sparse / "1"), tmp_path / "text"
+    for image_id, image in model.images.items():
+        image.name = f"cam 1/image {image_id}.jpg"
+    text.mkdir()
+    model.write_text(text)
+    names = [f"cam 1/image {image_id}.jpg" for image_id in sorted(model.images)]
+    source = ColmapReader(edges="none").open(text)
+    assert sorted(frame.frame_id for frame in source.frames) == names
+    refined = hodge_pipeline.refine_colmap(text, out=tmp_path / "out", overrides=FREE)
+    assert sorted(image.name for image in refined.models[0].images.values()) == names
+    lines = (tmp_path / "out/sparse/0/images.txt").read_text().splitlines()
+    assert sorted(line.split(maxsplit=9)[9] for line in lines if "jpg" in line) == names
+    with pytest.raises(SourceError, match="names with blanks"):
+        ColmapWriter(form="txt").write(tmp_path / "copy", source)
 
 
 def contradict(model: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.colmap.check import REMEDY, check_files, check_words
+from hodge_adapters.colmap.check import REMEDY, check_files, check_words, names_with_blanks
 from hodge_adapters.colmap.files import MODEL_FILES, model_ending
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, Points, matrix_of
@@ -72,9 +72,12 @@ def read_model(folder: Path, tracks: bool = True) -> tuple[pycolmap.Reconstructi
 def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
     """The model of a folder whose files have the right sizes. Raises `SourceError` with a reason."""
     try:
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
     except Exception as error:  # pycolmap raises what its C++ checks raise: RuntimeError, ValueError, IndexError
         raise SourceError(f"{folder}: {_reason(str(error) or type(error).__name__)}: {REMEDY}") from error
+    for image_id, name in names_with_blanks(folder / "images.txt").items() if model_ending(folder) == ".txt" else ():
+        model.images[image_id].name = name
+    return model
 
 
 def content_of(reconstruction: pycolmap.Reconstruction, tracks: bool = True) -> Model:
