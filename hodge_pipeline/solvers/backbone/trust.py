@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hodge_pipeline import se3
-from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import infer_bridged
 from hodge_pipeline.solvers.backbone.chain import Chain, linear_forest, make_chain, sequential_edges
@@ -50,18 +48,6 @@ class Backbone:
     right: Floats
     chi2: Floats
     world_from_cam: Floats
-
-    def placed(self, start: Floats | None) -> Floats:
-        """The poses (V, 4, 4), the first vertex of each component where it starts."""
-        poses = self.world_from_cam
-        if start is None:
-            return poses
-        ends = self.chain.order[self.chain.ends[self.found.used]]
-        steps = np.flatnonzero((self.chain.step_edge >= 0) & ~self.chain.bridged)
-        joined = np.concatenate([np.stack([self.chain.order[steps - 1], self.chain.order[steps]], axis=1), ends])
-        component = connected_components(joined, len(poses))
-        first = np.unique(component, return_index=True)[1]
-        return np.asarray((start[first] @ se3.inverse(poses[first]))[component] @ poses)
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
         """The graph of the edges that count, with the information that their errors were found to have."""
