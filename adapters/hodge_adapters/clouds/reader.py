@@ -22,6 +22,7 @@ from hodge_adapters.clouds.scan_files import LIBRARIES, e57_scans, las_corner, l
 from hodge_adapters.posed import posed_frames, written
 from hodge_adapters.text_rows import listed, natural
 from hodge_adapters.trajectories.log import read_log_file
+from hodge_adapters.trajectories.text import unit_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -31,8 +32,6 @@ OTHER_SCANS = frozenset((".xyz", ".pts", ".ptx", ".asc", ".obj", ".stl", ".off",
 _NUMBER = re.compile(r"(\d{1,19})\D*$")
 _CLOCK = re.compile(r"(?<!\d)(\d{9,10})([._])(\d{1,9})$")
 """Seconds since 1970 with a fraction, as bag_to_pcd names its files, or with nanoseconds of their own."""
-A_SECOND = ((10**17, 10**9), (10**14, 10**6), (10**11, 10**3))
-"""From the first number on, a whole number is a time since 1973, counted in so many a second."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -288,8 +287,7 @@ def _number(stem: str) -> _Number | None:
     if not number:
         return None
     count = int(number[1])
-    a_second = next((per for least, per in A_SECOND if count >= least), 1)
-    return _Number(count / a_second, number.start(1), number.end(1))
+    return _Number(count / int(unit_of(np.array([count], float))[1]), number.start(1), number.end(1))
 
 
 def _graph(names: Mapping[float, str], pairs: Any, i_from_j: Any, notes: list[str]) -> ViewGraph:
