@@ -171,8 +171,8 @@ class Scene:
     `drift`: None where the first poses are not odometry's; `given`: the file that they come from, where there is one;
     `in_order`: whether frames that follow each other in the source do so in time; `sightings`: the folder of what
     frames that are no key frames saw of these, where they were tracked; `closed`: the first poses with
-    the loops along the path closed, None where nobody looked for any; `mapped`: how many frames before each one were in
-    the map that it was tracked against: steps are then more exact than a registration of their two clouds.
+    the loops along the path closed, None where nobody looked for any; `steps_stand`: whether the first steps are more
+    exact than a registration of their two clouds.
     """
 
     whole: Source
@@ -186,13 +186,7 @@ class Scene:
     in_order: bool = True
     sightings: Path | None = None
     closed: Closed | None = None
-    mapped: int = 0
-
-    def is_tracked(self, pairs: Ints) -> Bools:
-        """Which pairs (P, 2) of key frames say nothing that steps do not: one was in the map for the other."""
-        own, keys = self.key_frames.rows[pairs], self.key_frames
-        joined = (keys.part[own[:, 0]] == keys.part[own[:, 1]]) & (keys.sequence[own[:, 0]] == keys.sequence[own[:, 1]])
-        return np.asarray(joined & (np.abs(np.diff(own, axis=1)[:, 0]) <= self.mapped))
+    steps_stand: bool = False
 
 
 def key_source(whole: Source, rows: Ints) -> Source:

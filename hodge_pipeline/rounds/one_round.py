@@ -102,14 +102,12 @@ class Work:
         )  # fmt: skip
         if scene.closed is not None:
             proposed = merge([proposed, Edges.proposed(scene.closed.pairs, REVISIT)])[0]
-        proposed = with_start_edges(proposed, scene.first)
-        is_step = np.abs(np.diff(proposed.pairs, axis=1)[:, 0]) == 1
-        return proposed.select(is_step | ~scene.is_tracked(proposed.pairs))
+        return with_start_edges(proposed, scene.first)
 
     def register(self, number: int, edges: Edges, before: Round) -> Registered:
         """The candidates registered from the poses of the round before, and accepted or rejected."""
         world_from_cam, earlier = before.world_from_cam, before.registered(self.measured) if number > 1 else None
-        if number == 1 and self.scene.mapped:
+        if number == 1 and self.scene.steps_stand:
             earlier = before.edges.select(np.abs(np.diff(before.edges.pairs, axis=1)[:, 0]) == 1)
         registered = self.steps.step(
             register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,

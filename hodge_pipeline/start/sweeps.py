@@ -24,7 +24,7 @@ from hodge_pipeline.registration.clouds import (
 )
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
-from hodge_pipeline.registration.scan_to_map import SWEEPS_KEPT, ScanToMap, first_velocity
+from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity
 from hodge_pipeline.registration.sweeps import deskewed_frame, velocities
 from hodge_pipeline.scene import (
     KeyFrames,
@@ -108,7 +108,7 @@ class SweepsStart(OdometryStart):
             title="odometry", total=max(1, len(rows) - len(sequences)), workers=workers,
         )  # fmt: skip
         key_frames = _followers(whole, rows, found, joined, sequences)
-        return replace(self.joined(whole, made, clouds, joined, key_frames, steps, workers), mapped=SWEEPS_KEPT)
+        return replace(self.joined(whole, made, clouds, joined, key_frames, steps, workers), steps_stand=True)
 
 
 def follow(
