@@ -9,13 +9,13 @@ from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.clouds.kitti import is_scan, read_bin, scan_poses
+from hodge_adapters.clouds.kitti import KITTI_RAISE_DEG, are_of_hdl64, is_scan, raised, read_bin, scan_poses
 from hodge_adapters.clouds.pcd import read_pcd
 from hodge_adapters.clouds.ply import read_ply, write_ply
 from hodge_adapters.clouds.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
@@ -46,6 +46,11 @@ class CloudFolderReader:
     )
     units_per_metre: float = Field(1.0, gt=0, description="stored units per metre; 1000 for millimetres")
     every: int = Field(1, ge=1, description="take every n-th fragment")
+    raise_deg: float | Literal["auto"] = Field(
+        "auto",
+        description="degrees by which the points of `.bin` scans are raised; auto: 0.205, the error of KITTI's "
+        "calibration, where the angles of the points are those of its scanner, an HDL-64E; 0: not",
+    )
 
     def sniff(self, path: Path) -> Sniff:
         """By the endings of the files."""
@@ -83,6 +88,7 @@ class CloudFolderReader:
         beside = tuple(filter(None, [log]))
         if not poses and is_scan(fragments[0].path.name):
             poses, beside = scan_poses(fragments[0].path.parent, numbers, notes)
+        raise_deg = self._raise_deg([fragment.path for fragment in fragments], notes)
         names = {number: fragment.name for number, fragment in zip(numbers, fragments, strict=True)}
         without = [name for number, name in names.items() if number not in poses]
         if poses and without:
@@ -91,7 +97,7 @@ class CloudFolderReader:
             Frame(
                 frame_id=fragment.name,
                 stamp_s=number,
-                read_points=partial(read_fragment, fragment, units_per_metre=self.units_per_metre),
+                read_points=partial(read_fragment, fragment, units_per_metre=self.units_per_metre, raise_deg=raise_deg),
                 world_from_cam=poses.get(number, fragment.in_metres(self.units_per_metre)),
                 sequence=scanner,
             )
@@ -116,6 +122,19 @@ class CloudFolderReader:
         if others:
             notes.append(f"{len(others)} files are scans of another format, left out: {listed(others)}: convert to PLY")
         return sorted(found, key=lambda file: natural(file.name))
+
+    def _raise_deg(self, files: list[Path], notes: list[str]) -> float:
+        """By how much the points of `.bin` scans are raised; told where the scans themselves decide it."""
+        if self.raise_deg != "auto":
+            return self.raise_deg
+        scans = [file for file in files if file.suffix.lower() == ".bin"]
+        if not scans or not are_of_hdl64(scans):
+            return 0.0
+        notes.append(
+            f"the angles of {len(scans)} .bin scans are those of KITTI's HDL-64E: their points are raised by "
+            f"{KITTI_RAISE_DEG:g} degrees, the known error of its calibration (source.reader.raise_deg=0: not)"
+        )
+        return KITTI_RAISE_DEG
 
     def _log(self, folder: Path) -> Path | None:
         if not self.log:
@@ -176,14 +195,16 @@ class Fragment:
         return pose
 
 
-def read_fragment(fragment: Fragment, *, units_per_metre: float) -> PointCloud:
-    """The points of a fragment in metres, by the ending of its file."""
+def read_fragment(fragment: Fragment, *, units_per_metre: float, raise_deg: float = 0.0) -> PointCloud:
+    """The points of a fragment in metres, by the ending of its file; those of a `.bin` raised by an angle."""
     if fragment.row is not None:
         cloud = read_e57(fragment.path, fragment.row)
     elif fragment.corner is not None:
         cloud = read_las(fragment.path, fragment.corner)
     else:
         cloud = READERS[fragment.path.suffix.lower()](fragment.path)
+    if raise_deg and fragment.path.suffix.lower() == ".bin":
+        cloud = raised(cloud, raise_deg)
     if units_per_metre == 1.0:
         return cloud
     return replace(cloud, points_in_cam=cloud.points_in_cam / np.float32(units_per_metre))
