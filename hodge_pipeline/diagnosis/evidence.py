@@ -82,7 +82,7 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
     bounds = _bounds(vertex_count)
     place = np.maximum(np.searchsorted(bounds, np.abs(edges[:, 1] - edges[:, 0]), side="right") - 1, 0)
     loops = cycles.loops.select(np.flatnonzero(~cycles.closes))
-    row, entry = np.repeat(np.arange(len(loops)), loops.lengths), place[loops.edge]
+    row, entry = loops.rows, place[loops.edge]
     passes = np.bincount(place[cycles.loops.edge], minlength=len(bounds))
     number = np.bincount(place, minlength=len(bounds))
     share = np.full(len(bounds), min(usual, CEILING))

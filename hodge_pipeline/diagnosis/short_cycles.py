@@ -174,7 +174,7 @@ def tree_loops(edges: Ints, vertex_count: int) -> Loops:
 
 def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
     """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
-    row = _rows(loops)
+    row = loops.rows
     turn = np.bincount(row, noise.rotation_rad[loops.edge] ** 2, len(loops))
     shift = np.bincount(row, noise.translation_m[loops.edge] ** 2, len(loops))
     swing = turn * (reach_m * loops.lengths) ** 2 / 12
@@ -195,7 +195,7 @@ def usual_share(cycles: Cycles) -> float:
 
 def closing_support(cycles: Cycles, prior: Floats) -> Floats:
     """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
-    row, edge = _rows(cycles.loops), cycles.loops.edge
+    row, edge = cycles.loops.rows, cycles.loops.edge
     total = np.bincount(row, np.log(prior[edge]), len(cycles.loops))
     others = np.exp(total[row] - np.log(prior[edge]))
     strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)[row]
@@ -206,7 +206,7 @@ def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
     """For each edge (E, 3) the closing, or failing, cycles whose other edges are the likeliest; −1 for none."""
     wanted = np.flatnonzero(cycles.closes == closing)
     loops = cycles.loops.select(wanted)
-    row, edge = _rows(loops), loops.edge
+    row, edge = loops.rows, loops.edge
     logs = np.log(np.clip(np.nan_to_num(probability, nan=0.5), 1e-3, 1.0))
     others = np.bincount(row, logs[edge], len(loops))[row] - logs[edge]
     order = np.lexsort((row, -others, edge))
@@ -216,7 +216,3 @@ def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
     top = rank < WITNESSES
     out[ranked[top], rank[top]] = wanted[row[order[top]]]
     return out
-
-
-def _rows(loops: Loops) -> Ints:
-    return np.repeat(np.arange(len(loops)), loops.lengths)

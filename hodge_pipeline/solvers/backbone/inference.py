@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline.solvers.backbone.chain import Chain, one_of_each_place, places_along
-from hodge_pipeline.solvers.backbone.evidence import Wrong, student
+from hodge_pipeline.solvers.backbone.evidence import EVEN, Scales, Wrong, learn_scales, mixture, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, inverse, linearise, root, settled, without
 from hodge_pipeline.solvers.backbone.polish import polished
-from hodge_pipeline.solvers.backbone.scales import EVEN, Scales, learn_scales, mixture
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
