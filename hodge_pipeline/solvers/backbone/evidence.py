@@ -1,4 +1,6 @@
-"""What speaks for a loop: the density of its residual if it is right, against that if it joins places at random."""
+"""What speaks for a loop: the density of its residual if it is right, against that if it joins places at random; and
+how large errors are, as factors on what the information of steps and loops states.
+"""
 
 from __future__ import annotations
 
