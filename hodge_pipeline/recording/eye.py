@@ -1,4 +1,4 @@
-"""Initial viewpoint of the 3-D views: above and behind the cameras."""
+"""Initial viewpoint of the 3-D views: above and behind the cameras, or scanners."""
 
 from __future__ import annotations
 
@@ -32,16 +32,19 @@ class Eye:
         return Eye(_triple(target + times * (position - target)), self.target, self.up)
 
 
-def look_at(model_chunks: Iterable[Chunk], pose_chunks: Iterable[Chunk]) -> Eye | None:
-    """An eye that has the model in view, or the cameras where there is no model; None where there are no poses."""
-    poses = _poses(pose_chunks)
+def look_at(model_chunks: Iterable[Chunk], pose_chunks: Iterable[Chunk], is_scanner: bool = False) -> Eye | None:
+    """An eye that has the model in view, or the sensors where there is no model; None where there are no poses."""
+    return look_from(_poses(pose_chunks), _points(model_chunks), is_scanner)
+
+
+def look_from(poses: Floats, points: Floats, is_scanner: bool) -> Eye | None:
+    """As `look_at`, of the poses (N, 4, 4) and the points (P, 3) themselves."""
     if not len(poses):
         return None
-    points = _points(model_chunks)
     scene = points if len(points) else poses[:, :3, 3]
     low, high = np.percentile(scene, [3, 97], axis=0)
     size = max(float(np.linalg.norm(high - low)), 0.5)
-    up, ahead = up_and_ahead(poses)
+    up, ahead = up_and_ahead(poses, is_scanner)
     target = (low + high) / 2
     position = target - DISTANCE * size * (ahead - ELEVATION * up)
     return Eye(_triple(position), _triple(target), _triple(up))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from rerun.chunk import Chunk, RrdReader
 
 from hodge_pipeline.recording import binary, layout
 from hodge_pipeline.recording.blueprint import Contents, legend, make_blueprint
-from hodge_pipeline.recording.eye import look_at
+from hodge_pipeline.recording.eye import Eye, look_at
 from hodge_pipeline.recording.stream import log_markdown, log_notes, partial_path, writing
 
 
@@ -37,10 +37,9 @@ def merge(parts: Iterable[Path], out: Path, recording_id: str, *, active_tab: in
     notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="hodge-recording-") as scratch:
         readers = [(part, reader) for part in parts if (reader := _open(part, Path(scratch), notes)) is not None]
-        contents = with_pairs(contents, readers)
+        contents = with_entities(contents, readers)
         poses = layout.poses(contents.trajectory)
-        room = look_at(_chunks(readers, layout.MODEL), _chunks(readers, poses))
-        graph = look_at((), _chunks(readers, poses))
+        room, graph = eyes(contents, readers)
         with writing(out, recording_id, make_blueprint(contents, room, graph, active_tab)) as stream:
             for _, reader in readers:
                 send(stream, reader, poses)
@@ -75,14 +74,20 @@ def contents_of(parts: Iterable[Path]) -> Contents:
         trajectory=best,
         last_graph=max(rounds, default=0),
         last_solution=max(solved, default=0),
+        is_scanner=("frames", layout.SCANNER) in stages,
     )
 
 
-def with_pairs(contents: Contents, readers: Iterable[tuple[Path, RrdReader]]) -> Contents:
-    """The contents with the names of the pairs whose clouds are shown."""
-    paths = {chunk.entity_path for chunk in _chunks(readers, f"{layout.PAIRS}/**")}
-    names = dict.fromkeys(path.split("/")[2] for path in sorted(paths))
-    return replace(contents, pairs=tuple(names))
+def with_entities(contents: Contents, readers: Sequence[tuple[Path, RrdReader]]) -> Contents:
+    """The contents with the paths of all entities."""
+    return replace(contents, entities=frozenset(c.entity_path for _, reader in readers for c in reader.stream()))
+
+
+def eyes(contents: Contents, readers: Sequence[tuple[Path, RrdReader]]) -> tuple[Eye | None, Eye | None]:
+    """Where the model, and where the graph alone, is looked at from."""
+    poses = layout.poses(contents.trajectory)
+    room = look_at(_chunks(readers, layout.MODEL), _chunks(readers, poses), contents.is_scanner)
+    return room, look_at((), _chunks(readers, poses), contents.is_scanner)
 
 
 def _open(part: Path, scratch: Path, notes: list[str]) -> RrdReader | None:

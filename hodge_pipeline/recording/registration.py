@@ -28,6 +28,7 @@ def log_registration(
     guesses: Floats,
     clouds: CloudSet,
     options: RecordingOptions,
+    is_scanner: bool = False,
 ) -> tuple[str, ...]:
     """Log histograms and columns of all pairs (P,), and the clouds of chosen ones in i's axes; nothing is left out.
 
@@ -40,6 +41,8 @@ def log_registration(
         chosen = chosen_pairs(registered, guesses)
         for name, row in chosen.items():
             _log_pair(stream, name, registered, row, guesses, clouds)
+            axes = rr.ViewCoordinates.FLU if is_scanner else rr.ViewCoordinates.RDF
+            stream.log(layout.pair(name), axes, static=True)
         log_markdown(stream, layout.PAIRS_TEXT, _text(registered, guesses, chosen))
     return ()
 
@@ -93,7 +96,6 @@ def _log_pair(
     ):
         shown = rr.Points3D(points, colors=[colour], radii=[POINT_RADIUS])
         stream.log(f"{layout.pair(name)}/{part}", shown, static=True)
-    stream.log(layout.pair(name), rr.ViewCoordinates.RDF, static=True)
 
 
 def _thinned(clouds: CloudSet, row: int) -> Floats32:
