@@ -57,6 +57,10 @@ def test_registration_reads_back_with_the_clouds_of_chosen_pairs(tmp_path: Path)
     np.testing.assert_array_equal(np.float32(rows(part, columns, "rmse_m")[0]), np.float32(found.rmse_m))
     assert rows(part, columns, "iterations")[0] == found.iterations.tolist()
     assert rows(part, columns, "rejected")[0] == found.why.tolist()
+    judged = found.put(np.array([0]), why="3 of 3 cycles close")
+    record(tmp_path / "judged").registration(1, judged, guesses, seen)
+    (told,) = rows(tmp_path / "judged" / part.name, columns, "rejected")
+    assert told == found.why.tolist(), "an edge is not rejected for what the diagnosis says"
     pair = layout.pair("rejected")
     (after,) = rows(part, f"{pair}/after", "Points3D:positions")
     moved = np.asarray(seen[4].points_in_cam, float) + [0.3, 0, 0]
@@ -162,12 +166,21 @@ def test_what_is_not_there_has_no_view_and_a_scanner_is_no_camera(tmp_path: Path
         readers = [(path, RrdReader(path)) for path in find_parts(folder)]
         contents = with_entities(contents_of(find_parts(folder)), readers)
         assert contents.is_scanner == scanner and contents.holds(layout.CAMERA) and not contents.holds(layout.COLOUR)
-        eye, _ = eyes(contents, readers)
+        eye = eyes(contents, readers).graph
         assert eye is not None
         np.testing.assert_allclose(eye.up, [0, 0, 1] if scanner else [0, -1, 0], atol=1e-9)
         (line, *_) = rows(find_parts(folder)[1], layout.frusta("odometry"), "LineStrips3D:strips")[0]
         size_m = 0.6 * np.array([1, 0.4, 0.5] if scanner else [1.6, 1.2, 1])  # of 30 m a fiftieth, times the shape
         np.testing.assert_allclose(np.ptp(np.array(line), axis=0), size_m, rtol=1e-5)
+
+
+def test_points_without_a_colour_are_grey(tmp_path: Path) -> None:
+    points = np.float32([[1, 0, 1], [0, 0, 1]])
+    seen = CloudSet.from_clouds([PointCloud(points)])
+    record(tmp_path).clouds([Frame(0, 0.0)], seen)
+    record(tmp_path).model(Model("m", points), seen, np.eye(4)[None])
+    for part, path in (("001-clouds", layout.CLOUD), ("900-model", layout.MODEL), ("900-model", layout.growth(0))):
+        assert (rgb(rows(tmp_path / f"{part}.rrd", path, "Points3D:colors")[0]) == 190).all()
 
 
 def test_growth_holds_one_cloud_at_a_time() -> None:

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import rerun.blueprint as rrb
 
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.eye import Eye
+from hodge_pipeline.recording.eye import Eye, Eyes
 
 BACKGROUND = (24, 26, 32)
 COLOUR_NAMES = {"truth": "green", "odometry": "orange", "start": "violet"}
-PAIR_EYE = Eye((0.6, -1.6, -2.2), (0.0, 0.0, 1.8), (0.0, -1.0, 0.0))
-"""In the axes of a camera: behind it, above, to the right."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +37,9 @@ class Contents:
         return any(path == parent or path.startswith(f"{parent}/") for path in self.entities)
 
 
-def make_blueprint(contents: Contents, room: Eye | None, graph: Eye | None, active_tab: int = 0) -> rrb.Blueprint:
-    """The default blueprint: a tab for each part of the run that is there, the story first.
-
-    `room` sees the model, `graph` the cameras alone.
-    """
-    return without_panels(rrb.Tabs(*make_tabs(contents, room, graph), active_tab=active_tab), layout.STORY)
+def make_blueprint(contents: Contents, eyes: Eyes, active_tab: int = 0) -> rrb.Blueprint:
+    """The default blueprint: a tab for each part of the run that is there, the story first."""
+    return without_panels(rrb.Tabs(*make_tabs(contents, eyes), active_tab=active_tab), layout.STORY)
 
 
 def without_panels(root: rrb.Container, timeline: str) -> rrb.Blueprint:
@@ -58,35 +53,32 @@ def without_panels(root: rrb.Container, timeline: str) -> rrb.Blueprint:
     )
 
 
-def make_tabs(contents: Contents, room: Eye | None, graph: Eye | None) -> list[rrb.Container]:
+def make_tabs(contents: Contents, eyes: Eyes) -> list[rrb.Container]:
     """The tabs in the order of the run."""
     has_pairs = {"registration", "diagnosis"} & contents.stages
     return [
-        _story_tab(contents, room),
-        *([_frames_tab(contents, room)] if contents.holds(layout.CAMERA) else []),
-        *([registration_tab(contents)] if "registration" in contents.stages else []),
-        *([complex_tab(contents, graph)] if has_pairs else []),
-        _solver_tab(contents, graph),
-        *([model_tab(room)] if "model" in contents.stages else []),
-        *([evaluation_tab(contents, graph)] if "evaluation" in contents.stages else []),
+        _story_tab(contents, eyes.room),
+        *([_frames_tab(contents, eyes.room)] if contents.holds(layout.CAMERA) else []),
+        *([registration_tab(contents, eyes.pair)] if "registration" in contents.stages else []),
+        *([complex_tab(contents, eyes.graph)] if has_pairs else []),
+        _solver_tab(contents, eyes.graph),
+        *([model_tab(eyes.room)] if "model" in contents.stages else []),
+        *([evaluation_tab(contents, eyes.graph)] if "evaluation" in contents.stages else []),
         _text_tab(contents),
     ]
 
 
-def scene_view(name: str, contents: list[str], eye: Eye | None) -> rrb.Spatial3DView:
+def scene_view(name: str, contents: list[str], eye: Eye | None, origin: str = layout.WORLD) -> rrb.Spatial3DView:
     """A view of the world with these entities, seen from `eye` where one is given."""
+    controls = rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up) if eye else None
     return rrb.Spatial3DView(
-        origin=layout.WORLD,
+        origin=origin,
         name=name,
         contents=contents,
         background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=None if eye is None else _controls(eye),
+        eye_controls=controls,
     )
-
-
-def _controls(eye: Eye) -> rrb.EyeControls3D:
-    return rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up)
 
 
 def _lines(name: str) -> list[str]:
@@ -159,16 +151,14 @@ def _solver_tab(contents: Contents, eye: Eye | None) -> rrb.Vertical:
     return rrb.Vertical(graphs, plots, row_shares=[3, 1], name="Edges and solver")
 
 
-def registration_tab(contents: Contents) -> rrb.Vertical:
+def registration_tab(contents: Contents, eye: Eye | None) -> rrb.Vertical:
     """Chosen pairs before and after, and the numbers of all."""
     views = [
-        rrb.Spatial3DView(
-            origin=layout.pair(name),
-            name=f"{name.replace('_', ' ').capitalize()}, {when}",
-            contents=[f"+ {layout.pair(name)}/target", f"+ {layout.pair(name)}/{when}"],
-            background=BACKGROUND,
-            line_grid=rrb.LineGrid3D(visible=False),
-            eye_controls=None if contents.is_scanner else _controls(PAIR_EYE),
+        scene_view(
+            f"{name.replace('_', ' ').capitalize()}, {when}",
+            [f"+ {layout.pair(name)}/target", f"+ {layout.pair(name)}/{when}"],
+            eye,
+            layout.pair(name),
         )
         for when in ("before", "after")
         for name in contents.pairs

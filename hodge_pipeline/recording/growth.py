@@ -37,15 +37,14 @@ def log_growth(
     if not options.has_images or not len(rows) or not len(clouds):
         return
     points = model.points_in_world[rows]
-    colours = None if model.colours is None else model.colours[rows]
+    colours = shapes.or_grey(model.colours, len(model.points_in_world))[rows]
     first = first_frame(points, clouds, world_from_cam)
     cuts = np.unique(np.linspace(0, len(clouds), STEPS + 1).astype(np.int64))
     for step, (start, end) in enumerate(zip(cuts, cuts[1:], strict=False)):
         lot = np.flatnonzero((first >= start) & (first < end))
         if not len(lot):
             continue
-        coloured = None if colours is None else colours[lot]
-        columns = rr.Points3D.columns(positions=points[lot], colors=coloured).partition([len(lot)])
+        columns = rr.Points3D.columns(positions=points[lot], colors=colours[lot]).partition([len(lot)])
         share = np.array([step / STEPS])
         times = [rr.TimeColumn(layout.FRAME, sequence=np.array([start])), *story_columns(slot, share)]
         stream.send_columns(layout.growth(step), times, columns)

@@ -45,9 +45,8 @@ class Live:
             if part not in self._sent:
                 send(self._stream, reader, poses)
                 self._sent.add(part)
-        room, graph = eyes(contents, readers)
         log_markdown(self._stream, layout.LEGEND, legend(contents))
-        self._stream.send_blueprint(make_blueprint(contents, room, graph))
+        self._stream.send_blueprint(make_blueprint(contents, eyes(contents, readers)))
         self._stream.flush()
 
     def close(self) -> None:

@@ -14,6 +14,8 @@ RESIDUAL_COLOURS = np.array([[60, 115, 225], [130, 145, 170], [190, 180, 120], [
 IGNORED_COLOUR = (230, 60, 160)
 REJECTED_COLOUR = (110, 110, 110)
 RESULT_COLOUR = (255, 255, 255)
+GREY = 190
+"""Of points without a colour."""
 TRAJECTORY_COLOURS = {"truth": (0, 200, 140), "odometry": (230, 130, 0), "start": (185, 130, 235)}
 """Bluish green, orange and purple of Okabe and Ito's colour-blind safe set, brightened for the dark background."""
 
@@ -57,6 +59,11 @@ def residual_colours(residual_m: Floats, scale_m: float) -> Bytes:
 def segments(world_from_cam: Floats, pairs: Ints) -> Floats32:
     """Lines (P, 2, 3) between the camera centres of each pair."""
     return np.asarray(world_from_cam[pairs, :3, 3], np.float32)
+
+
+def or_grey(colours: Bytes | None, count: int) -> Bytes:
+    """Colours (count, 3); grey where none is known."""
+    return colours if colours is not None and colours.any() else np.full((count, 3), GREY, np.uint8)
 
 
 def is_drawable(world_from_cam: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG
-from hodge_pipeline.recording.shapes import is_scanner, up_and_ahead
+from hodge_pipeline.recording.shapes import is_scanner, or_grey, up_and_ahead
 from hodge_pipeline.report.diagnosis_plots import COLOURS as REPORTED
 from hodge_pipeline.review.closeup import Closeup, placed, quat_wxyz
 from hodge_pipeline.review.listing import witnesses
@@ -248,7 +248,7 @@ def thinned(clouds: CloudSet, row: int, step: int) -> tuple[Floats32, np.ndarray
     """Points and colours of a frame, each `step`th; grey where there is no colour."""
     entry = slice(int(clouds.offsets[row]), int(clouds.offsets[row + 1]), step)
     points, colours = np.asarray(clouds.points[entry]), np.asarray(clouds.colours[entry])
-    return points, colours if colours.any() else np.full_like(colours, 150)
+    return points, or_grey(colours, len(points))
 
 
 def _ball(points: Floats) -> tuple[Floats, float]:
