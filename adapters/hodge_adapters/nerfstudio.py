@@ -101,16 +101,20 @@ class NerfstudioWriter:
     """Writes posed frames as a `transforms.json`, with images that its cameras fit."""
 
     def write(self, path: Path, source: Source) -> tuple[str, ...]:
-        """The file, atomically, after the images: each stays where it is below the file's folder, else a copy goes to
-        `images/` beside it. Lens distortion passes through where nerfstudio knows the lens (k1 to k4, p1, p2, for all
-        images alike); else undistorted images are written there. Without an image `file_path` is the frame's id.
+        """A `.json`, or `transforms.json` in a folder of that name, atomically, after the images: each stays where it
+        is below the file's folder, else a copy goes to `images/` beside it. Lens distortion passes through where
+        nerfstudio knows the lens (k1 to k4, p1, p2, for all images alike); else undistorted images are written there.
+        Without an image `file_path` is the frame's id.
         """
-        path = Path(path)
+        path = Path(path) if Path(path).suffix == ".json" else Path(path) / FILE
         posed = [frame for frame in source.frames if frame.world_from_cam is not None]
         if not posed:
             poses = trajectory_of(source).world_from_cam
             bare = [_entry(f"{row:06d}", pose, None) for row, pose in enumerate(poses)]
-            write_json(path, {"camera_model": PERSPECTIVE, "orientation_override": "none", "frames": bare})
+            write_json(
+                _target(path.parent, path.name),
+                {"camera_model": PERSPECTIVE, "orientation_override": "none", "frames": bare},
+            )
             return written(f"{len(bare)} poses without images", source)
         lenses = [None if frame.image is None else named(frame.image) for frame in posed]
         models = {lens[0] for lens in lenses if lens}
@@ -124,7 +128,10 @@ class NerfstudioWriter:
                 name, how = _undistorted(path.parent, frame)
                 entries.append(_entry(name, frame.world_from_cam, _pinhole(frame.camera)))
             done[how] += 1
-        write_json(path, {"camera_model": model or PERSPECTIVE, "orientation_override": "none", "frames": entries})
+        write_json(
+            _target(path.parent, path.name),
+            {"camera_model": model or PERSPECTIVE, "orientation_override": "none", "frames": entries},
+        )
         how = ", ".join(f"{count} {what}" for what, count in done.items())
         return written(f"{len(entries)} frames: {how}", source, {"cameras", "names", "images"})
 
@@ -147,7 +154,7 @@ def _placed(folder: Path, image: Path, frame_id: int | str) -> tuple[str, str]:
     base = folder.resolve()
     if image.resolve().is_relative_to(base):
         return image.resolve().relative_to(base).as_posix(), "images where they are"
-    target = _target(folder, image.name if isinstance(frame_id, int) else _bare(frame_id) + image.suffix)
+    target = _target(folder / IMAGES, image.name if isinstance(frame_id, int) else _bare(frame_id) + image.suffix)
     write_bytes_atomically(target, read_input(image))
     return target.relative_to(folder).as_posix(), "images copied"
 
@@ -156,7 +163,7 @@ def _undistorted(folder: Path, frame: Frame) -> tuple[str, str]:
     """The `file_path` of the image that a frame's pinhole camera sees, written as PNG."""
     if frame.read_colour is None:
         return str(frame.frame_id), "without an image"
-    target = _target(folder, _bare(str(frame.frame_id)) + ".png")
+    target = _target(folder / IMAGES, _bare(str(frame.frame_id)) + ".png")
     done, contents = cv2.imencode(".png", cv2.cvtColor(frame.read_colour(), cv2.COLOR_RGB2BGR))
     assert done
     write_bytes_atomically(target, bytes(contents))
@@ -170,8 +177,8 @@ def _bare(name: str) -> str:
 
 
 def _target(folder: Path, name: str) -> Path:
-    """The path of this image in the folder of images, which is made."""
-    target = inside(folder / IMAGES, name)
+    """The path of this file in the folder, which is made."""
+    target = inside(folder, name)
     if target is None:
         raise SourceError(f"{name!r}: the name of an image leaves its folder: rename it")
     try:

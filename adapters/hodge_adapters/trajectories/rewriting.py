@@ -39,11 +39,14 @@ class _Poses:
 
 
 class _OneFile:
-    """A format of one file."""
+    """A format of one file, which EuRoC has in folders of its own."""
 
     def copy(self, folder: Path, original: Path) -> Path:
         """See `PoseRewriter`."""
-        return _copied(folder, original)
+        original = euroc_file(original)
+        out = folder / f"refined{original.suffix}"
+        shutil.copyfile(original, out)
+        return out
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
@@ -78,7 +81,7 @@ class KittiRewriter(_OneFile):
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
-class EurocRewriter:
+class EurocRewriter(_OneFile):
     """Lines of `nanoseconds,x,y,z,qw,qx,qy,qz,…`: further columns (velocities, biases) stay as they are."""
 
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
@@ -91,10 +94,6 @@ class EurocRewriter:
             return None if pose is None else [*pose[:3, 3], *np.roll(se3.to_quat_xyzw(pose), 1)]
 
         return _rewritten(folder, euroc_file(original), numbers, first=1)
-
-    def copy(self, folder: Path, original: Path) -> Path:
-        """See `PoseRewriter`."""
-        return _copied(folder, euroc_file(original))
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
@@ -136,10 +135,7 @@ class SevenScenesRewriter:
 
     def copy(self, folder: Path, original: Path) -> Path:
         """See `PoseRewriter`."""
-        out = _emptied(folder / "refined")
-        for file in _pose_files(original):
-            shutil.copyfile(file, _beside(out, original, file))
-        return out
+        return self.rewrite(folder, original, Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
@@ -170,12 +166,6 @@ def _rewritten(folder: Path, original: Path, numbers: Callable[[list[str]], list
         lines.append(line)
     out = folder / f"refined{original.suffix}"
     write_text_atomically(out, "".join(lines))
-    return out
-
-
-def _copied(folder: Path, original: Path) -> Path:
-    out = folder / f"refined{original.suffix}"
-    shutil.copyfile(original, out)
     return out
 
 
