@@ -61,9 +61,12 @@ def has_verified_pairs(path: Path) -> bool:
 
     Raises `SourceError` where it is no database.
     """
-    query = "SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'two_view_geometries'"
     with _opened(path) as database:
-        return bool(database.execute(query).fetchone()[0])
+        return _has_table(database, "two_view_geometries")
+
+
+def _has_table(database: sqlite3.Connection, name: str) -> bool:
+    return bool(database.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone())
 
 
 class PriorRow(NamedTuple):
@@ -82,8 +85,7 @@ class PriorRow(NamedTuple):
 def prior_rows(path: Path) -> Sequence[PriorRow]:
     """The pose priors of a database, empty where it has none. Raises `SourceError` where it is none."""
     with _opened(path) as database:
-        there = database.execute("SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'pose_priors'")
-        if not there.fetchone()[0]:
+        if not _has_table(database, "pose_priors"):
             return ()
         names = dict(database.execute("SELECT image_id, name FROM images"))
         table = database.execute("SELECT * FROM pose_priors")
