@@ -42,7 +42,7 @@ class NerfstudioReader:
     def sniff(self, path: Path) -> Sniff:
         """By the name, or by the keys near the first_text."""
         path = Path(path)
-        text = first_text(path / FILE if path.is_dir() else path)
+        text = first_text(transforms_file(path))
         if '"transform_matrix"' in text or '"frames"' in text:
             return Sniff(0.9, "frames with a transform_matrix")
         return Sniff(0.0, "no transforms.json")
@@ -50,7 +50,7 @@ class NerfstudioReader:
     def open(self, path: Path) -> Source:
         """Frames in the file's order: id is `file_path`, stamp the row. World and scale are the file's own."""
         path = Path(path)
-        file = path / FILE if path.is_dir() else path
+        file = transforms_file(path)
         content = read_json(file)
         entries = objects(content.get("frames"), f"{file}: frames")
         if not entries:
@@ -136,8 +136,18 @@ class NerfstudioWriter:
         return written(f"{len(entries)} frames: {how}", source, {"cameras", "names", "images"})
 
 
+def transforms_file(path: Path) -> Path:
+    """The file itself, or the one in a folder."""
+    return path / FILE if path.is_dir() else path
+
+
+def opengl_matrix(world_from_cam: Any) -> list[list[float]]:
+    """The rows of a `transform_matrix`."""
+    return (world_from_cam @ OPENGL_FROM_CAM + 0.0).tolist()  # type: ignore[no-any-return]
+
+
 def _entry(name: str, world_from_cam: Any, camera: Mapping[str, float] | None) -> dict[str, Any]:
-    return {"file_path": name, **(camera or {}), "transform_matrix": (world_from_cam @ OPENGL_FROM_CAM + 0.0).tolist()}
+    return {"file_path": name, **(camera or {}), "transform_matrix": opengl_matrix(world_from_cam)}
 
 
 def _pinhole(camera: Camera | None) -> dict[str, float]:

@@ -12,6 +12,8 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
+from hodge_adapters.json_files import read_json, write_json
+from hodge_adapters.nerfstudio import opengl_matrix, transforms_file
 from hodge_adapters.open3d_json import Open3dReader, Open3dTrajectoryWriter
 from hodge_adapters.seven_scenes.files import FRAME_FILE, sequence_folders
 from hodge_adapters.text_rows import read_text, to_floats, write_text_atomically
@@ -151,6 +153,25 @@ class Open3dRewriter(_OneFile):
         out = folder / f"refined{original.suffix}"
         Open3dTrajectoryWriter().write(out, dataclasses.replace(source, frames=frames, trajectory=trajectory))
         return out
+
+
+@dataclass(frozen=True, config=NO_OPTIONS)
+class NerfstudioRewriter:
+    """nerfstudio's `transforms.json`: the poses of its frames; cameras, paths and all else stay."""
+
+    def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
+        """See `PoseRewriter`."""
+        content, poses, out = read_json(transforms_file(original)), _Poses(trajectory), folder / "refined.json"
+        for row, entry in enumerate(content["frames"]):
+            pose = poses.at(float(row))
+            if pose is not None:
+                entry["transform_matrix"] = opengl_matrix(pose)
+        write_json(out, content)
+        return out
+
+    def copy(self, folder: Path, original: Path) -> Path:
+        """See `PoseRewriter`."""
+        return Path(shutil.copyfile(transforms_file(original), folder / "refined.json"))
 
 
 def _rewritten(folder: Path, original: Path, numbers: Callable[[list[str]], list[float] | None], *, first: int) -> Path:
