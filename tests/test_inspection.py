@@ -58,6 +58,9 @@ def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
     assert next_command(Path("my data"), {"frames": 0}, None).split(" --")[0] == "hodge refine trajectory 'my data'"
     command = next_command(Path("in"), {"frames": 3, "frames with depth": 0, "formats": []}, "mine")
     assert command == "hodge run clouds --source in --set source.reader=mine --out runs/in"
+    facts = {"frames": 3, "frames with depth": 3, "formats": []}
+    command = next_command(Path("in"), facts, "tum", ["depth_scale=1000"])
+    assert command == "hodge run tum --source in --set source.reader.depth_scale=1000 --out runs/in"
 
 
 def test_a_sound_sequence_has_no_oddities() -> None:
