@@ -95,6 +95,8 @@ def test_an_oddity_is_named(row: int, change: dict[str, Any], expected: str) -> 
 def test_a_wrong_depth_scale_is_suspected() -> None:
     frames = [replace(frame, read_depth=partial(constant_depth, 2000.0)) for frame in walk(3)]
     assert oddities_of(frames) == ["the median depth is 2e+03 m: is the depth scale right?"]
+    near = [replace(frame, read_depth=partial(constant_depth, 0.4)) for frame in frames]
+    assert oddities_of(near) == ["all depth lies within 0.4 m: is this a close-up, or is the depth scale wrong?"]
 
 
 def test_frames_that_cannot_be_read_are_told() -> None:

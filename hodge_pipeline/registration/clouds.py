@@ -234,7 +234,8 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
             colours, blank = image[v, u], is_blank(image)
         except (SourceError, OSError) as error:
             odd = Oddity(frame.frame_id, "its cloud has no colours", str(error))
-    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd, blank=blank)
+    why_none = "" if len(rows) else _out_of_range(z, "depth_scale", options)
+    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd, why_none, blank)
 
 
 def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
@@ -261,13 +262,16 @@ def in_range(cloud: PointCloud, options: CloudOptions) -> PointCloud:
 
 def out_of_range(cloud: PointCloud, options: CloudOptions) -> str:
     """What to do about points none of which is in range: scanners store millimetres as often as metres."""
-    ranges = _ranges(cloud)
+    return _out_of_range(_ranges(cloud), "units_per_metre", options)
+
+
+def _out_of_range(ranges: Floats32, option: str, options: CloudOptions) -> str:
     finite = ranges[np.isfinite(ranges) & (ranges > 0)]
     if not len(finite):
         return "there is no point in it"
     usual = float(np.median(finite))
     limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
-    unit = " (millimetres? then source.reader.units_per_metre=1000)" if usual > options.max_range_m else ""
+    unit = f" (millimetres? then source.reader.{option}=1000)" if usual > options.max_range_m else ""
     return f"its points lie {usual:.3g} m away, in range are {limits}{unit}"
 
 
