@@ -57,7 +57,7 @@ def test_errors_that_disagree_are_mixed(report: Report) -> None:
     best, bad = verdict.headline.split(", but ")
     assert best == "Mixed against odometry: RPE of the rotation 4.43° → 0.443° and 2 more better"
     assert bad.startswith("distance of clouds (near-centroid pairs) 10 mm → 20 mm, distance of clouds (overlapping")
-    assert [change.sign for change in verdict.changes] == [-1, -1, 1, 1, 1]
+    assert [change.sign for change in verdict.changes] == [1, 1, 1, -1, -1]
 
 
 def test_a_measure_that_got_worse_is_named_in_the_headline() -> None:

@@ -70,11 +70,13 @@ class Loops:
         return Loops(self.offsets, self.edge, np.where(turned[self.edge], -self.sign, self.sign))
 
 
-def spanning_forest(edges: Ints, vertex_count: int) -> SpanningForest:
-    """A breadth-first tree of each component from its first vertex; the first of parallel edges is in the tree."""
+def spanning_forest(edges: Ints, vertex_count: int, roots: Ints | None = None) -> SpanningForest:
+    """A breadth-first tree of each component from its first vertex, or from `roots`, one of each component; the first
+    of parallel edges is in the tree.
+    """
     edges = np.asarray(edges, np.int64).reshape(-1, 2)
-    component = connected_components(edges, vertex_count)
-    roots = np.flatnonzero(first_of_component(component))
+    if roots is None:
+        roots = np.flatnonzero(first_of_component(connected_components(edges, vertex_count)))
     parent = _breadth_first_parents(edges, roots, vertex_count)
     child = np.flatnonzero(parent >= 0)
     parent_edge = np.full(vertex_count, -1, np.int64)

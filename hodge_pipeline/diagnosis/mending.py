@@ -14,8 +14,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.growth import Alignment
-from hodge_pipeline.diagnosis.proposals import Proposals
+from hodge_pipeline.diagnosis.growth import Alignment, Proposals
 from hodge_pipeline.diagnosis.robust_poses import GATE, TWICE, Fit, chi2_at, fit
 from hodge_pipeline.types import Bools, Floats, Ints
 

@@ -31,7 +31,7 @@ def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     if (bare := _uncovered(loops, len(edges))).any():
         loops = _joined([loops, _squares(edges, vertex_count, np.flatnonzero(bare))])
     if _uncovered(loops, len(edges)).any():
-        loops = _joined([loops, _tree_loops(edges, vertex_count)])
+        loops = _joined([loops, tree_loops(edges, vertex_count)])
     return _distinct(loops, len(edges))
 
 
@@ -41,7 +41,7 @@ def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, 
     Two cycles that fail over one edge make a third without it, which may be the only one that closes.
     """
     rows = np.flatnonzero(chosen)
-    more = _tree_loops(edges[rows], vertex_count)
+    more = tree_loops(edges[rows], vertex_count)
     more = Loops(more.offsets, rows[more.edge], more.sign)
     passes = np.add.reduceat(wanted[more.edge], more.offsets[:-1]) > 0 if len(more) else np.zeros(0, bool)
     return _distinct(_joined([loops, more.select(np.flatnonzero(passes))]), len(edges))
@@ -162,7 +162,7 @@ def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
     return out
 
 
-def _tree_loops(edges: Ints, vertex_count: int) -> Loops:
+def tree_loops(edges: Ints, vertex_count: int) -> Loops:
     """The loops of the chords of a tree, the shortest of them, as long as together they are not too long."""
     forest = spanning_forest(edges, vertex_count)
     chords = forest.chords[edges[forest.chords, 0] != edges[forest.chords, 1]]

@@ -49,6 +49,11 @@ class SourceSummary:
         """What the vertices of the viewing graph are."""
         return self.kind if self.key_frames is None else "key frames"
 
+    @property
+    def vertex(self) -> str:
+        """What one of them is."""
+        return self.vertex_name.removesuffix("s")
+
 
 @dataclass(frozen=True)
 class TrajectoryRow:
@@ -256,7 +261,8 @@ class Report:
     `before` and `after` name the sets of poses that the verdict compares, as in `scores` and `trajectories`.
     `last_shift_m` is how far the last round moved the positions (root mean square), None where it had none before it.
     `wrong_edges` is None where nobody judged; `unmeasured` says why no measure was taken; without `has_metres` lengths
-    are in the source's own unit. `position_fit` is None without known positions.
+    are in the source's own unit. `position_fit` is None without known positions. `shows_rejected`: the pictures and
+    scores are of a refinement that is not kept.
     """
 
     title: str
@@ -279,6 +285,7 @@ class Report:
     unmeasured: str = ""
     position_fit: PositionFit | None = None
     has_metres: bool = True
+    shows_rejected: bool = False
     pictures: Pictures = field(default_factory=Pictures)
 
     @property

@@ -171,13 +171,19 @@ def _shades(colours: Bytes, facing: Floats32) -> Floats32:
 
 def _filled(image: Bytes, depth: Floats32, passes: int) -> Bytes:
     """The picture with the gaps between points closed by their nearest neighbours."""
+    height, width = depth.shape
     for _ in range(passes):
-        best, colour = depth.copy(), image.copy()
-        for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-            moved = np.roll(depth, (down, right), axis=(0, 1))
-            nearer = np.isinf(depth) & (moved < best)
-            best[nearer], colour[nearer] = moved[nearer], np.roll(image, (down, right), axis=(0, 1))[nearer]
-        depth, image = best, colour
+        # beyond the border there is nothing
+        best, near, colours = (
+            depth.copy(),
+            np.pad(depth, 1, constant_values=np.inf),
+            np.pad(image, ((1, 1), (1, 1), (0, 0))),
+        )
+        for row, column in ((1, 0), (0, 1), (1, 2), (2, 1)):
+            window = np.s_[row : row + height, column : column + width]
+            nearer = np.isinf(depth) & (near[window] < best)
+            best[nearer], image[nearer] = near[window][nearer], colours[window][nearer]
+        depth = best
     return image
 
 

@@ -40,6 +40,7 @@ from hodge_pipeline.scene import (
     Scene,
     given_poses,
     has_given,
+    has_real_stamps,
     has_truth,
     pose_sets,
     sequences_of,
@@ -144,6 +145,7 @@ def make_report(
             worst_pairs=worst_pairs(source, worst),
         ),
         refinement=None if refined is None else summary(refined.decision),
+        shows_rejected=kept,
     )
 
 
@@ -250,8 +252,8 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
         for number, one in enumerate(rounds)
         if one.solution is not None
     }
-    names = tuple(str(frame.frame_id) for frame in source.frames)
-    stamps = np.array([frame.stamp_s for frame in source.frames])
+    names, is_clocked = tuple(str(frame.frame_id) for frame in source.frames), has_real_stamps(source.frames)
+    stamps = np.array([frame.stamp_s for frame in source.frames if is_clocked])
     return Pictures(tuple(paths), component, residuals, last.graph, convergence, names, stamps)
 
 

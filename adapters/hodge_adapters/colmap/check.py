@@ -54,6 +54,12 @@ def image_count(path: Path) -> int:
         return int(_U64.unpack(file.read(8))[0])
 
 
+def names_with_blanks(path: Path) -> dict[int, str]:
+    """The whole names of images in `images.txt` by their ids: COLMAP itself reads each up to its first blank."""
+    poses = (text.split(maxsplit=9) for _, text, _ in _image_lines(path))
+    return {int(float(words[0])): words[9] for words in poses if len(words[9].split()) > 1}
+
+
 def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Each line with its number, without comments and empty ones."""
     for line, raw in enumerate(read_text(path).split("\n"), 1):

@@ -32,7 +32,7 @@ MAX_VALUE_BYTES = 1 << 26
 
 
 @contextmanager
-def _opened(path: Path, instead: str = "leave it out") -> Iterator[sqlite3.Connection]:
+def _opened(path: Path, instead: str = "give --database none") -> Iterator[sqlite3.Connection]:
     """The database. Raises `SourceError` for a file that is none, or one that is damaged."""
     try:
         with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:

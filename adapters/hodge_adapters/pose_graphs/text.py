@@ -70,8 +70,8 @@ def read_records(
     rests: dict[str, list[str]] = {tag: [] for tag in keys}
     other: Counter[str] = Counter()
     for number, line in enumerate(lines, 1):
-        parts = line.split(None, 1)
-        if not parts or parts[0].startswith("#"):
+        parts = line.partition("#")[0].split(None, 1)
+        if not parts:
             continue
         tag = other_names.get(parts[0], parts[0])
         if tag in numbers:
@@ -84,10 +84,10 @@ def read_records(
 
 
 def _text(contents: bytes) -> str:
-    """The text, whatever the encoding of its comments; raises `ValueError` for what is none."""
+    """The text, whatever its comments are encoded in and its lines end in; raises `ValueError` for what is none."""
     if b"\0" in contents:
         raise ValueError("it has zero bytes")
-    return contents.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
+    return contents.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n").decode("latin-1")
 
 
 def _parse(

@@ -17,7 +17,7 @@ from hodge_adapters.seven_scenes.files import FRAME_FILE, sequence_folders
 from hodge_adapters.text_rows import read_text, to_floats, write_text_atomically
 from hodge_adapters.trajectories.euroc import NANO
 from hodge_adapters.trajectories.euroc import file_of as euroc_file
-from hodge_adapters.trajectories.text import COLUMNS, tum_stamps, unit_of
+from hodge_adapters.trajectories.text import COLUMNS, has_w_first, tum_stamps, unit_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Trajectory
@@ -53,11 +53,12 @@ class TumRewriter(_OneFile):
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
         """See `PoseRewriter`; lines that hold no pose stay as they are."""
         poses, per_second = _Poses(trajectory), unit_of(tum_stamps(original))[1]
+        shift = int(has_w_first(original))
 
         def numbers(fields: list[str]) -> list[float] | None:
             values = to_floats(fields)
             pose = poses.at(values[0] / per_second) if values and len(values) in COLUMNS else None
-            return None if pose is None else [*pose[:3, 3], *se3.to_quat_xyzw(pose)]
+            return None if pose is None else [*pose[:3, 3], *np.roll(se3.to_quat_xyzw(pose), shift)]
 
         return _rewritten(folder, original, numbers, first=1)
 

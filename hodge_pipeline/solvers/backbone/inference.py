@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.chain import Chain, one_of_each_place, places_along
 from hodge_pipeline.solvers.backbone.evidence import Wrong, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, inverse, linearise, root, settled, without
-from hodge_pipeline.solvers.backbone.places import one_of_each_place, places_along
-from hodge_pipeline.solvers.backbone.polish import LOCAL, polished
+from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import EVEN, Scales, learn_scales, mixture
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -37,7 +36,7 @@ class Judged:
 @dataclass(frozen=True)
 class Inferred:
     """The result: loops that are `used (M,)`, how all were judged, the poses of the used ones, and what their errors
-    were found to be: scales, and `step_width`, `loop_width (M,)`, factors on standard deviations for the last solve.
+    were found to be: scales, and `loop_width (M,)`, factors on standard deviations for the last solve.
 
     `log_evidence`: of the loops as judged, against all being wrong. `confirmed`: whether they say more than chance; if
     not, none should be used: see `refused`.
@@ -47,7 +46,6 @@ class Inferred:
     judged: Judged
     poses: Floats
     scales: Scales
-    step_width: float
     loop_width: Floats
     log_evidence: float
     confirmed: bool
@@ -91,7 +89,7 @@ def infer(
     used |= always
     rows = thinned(chain, np.flatnonzero(used)).active
     linear, width = polished(rows, linear if used.any() else start)
-    return Inferred(used, judged, linear.poses, scales, LOCAL, width, top, confirmed)
+    return Inferred(used, judged, linear.poses, scales, width, top, confirmed)
 
 
 def refused(found: Inferred, chain: Chain, always: Bools) -> Inferred:
