@@ -162,7 +162,8 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, lattice: bool = False)
         return None
     if trust == AUTO and tested_steps(chain, chain.poses()).sum() > TESTED * steps.sum():
         return None
-    many_loops = _many_loops(chain, steps)
+    loops = len(chain.loop_edge)
+    many_loops = loops > LOOPS_AT_A_STEP * steps.sum()
     if lattice and not many_loops:
         return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
@@ -170,21 +171,10 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, lattice: bool = False)
     if inferred is None:
         return None
     chain, found = inferred
-    if trust == AUTO and not found.confirmed and _loops_agree(chain, steps):
-        return None
+    doubted = trust == AUTO and not found.confirmed and loops > steps.sum()
+    if doubted and tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum():
+        return None  # many loops agree with each other, and none with the backbone: it is what is wrong
     return _backbone(graph, chain, found, steps)
-
-
-def _loops_agree(chain: Chain, steps: Bools) -> bool:
-    """Whether many loops agree with each other, though none with the backbone: it is what is wrong then."""
-    return len(chain.loop_edge) > steps.sum() and bool(
-        tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum()
-    )
-
-
-def _many_loops(chain: Chain, steps: Bools) -> bool:
-    """As in a lattice, in which no edge needs to be trusted."""
-    return bool(len(chain.loop_edge) > LOOPS_AT_A_STEP * steps.sum())
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
