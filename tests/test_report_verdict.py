@@ -253,3 +253,14 @@ def test_clouds_that_fit_better_than_at_the_truth_are_explained(report: Report) 
     better = replace(report, scores=scored(0.010, 0.020, 0.009))
     assert [note.kind for note in suspicions(better)].count("above truth") == 1
     assert "above truth" not in [note.kind for note in suspicions(report)]
+
+
+def test_scans_that_fit_in_several_ways_are_told_first(report: Report) -> None:
+    drawn = report.pictures.graph
+    assert drawn is not None
+    graph = graph_summary(Edges.measured(drawn), drawn.vertex_ids, np.arange(20))
+    source = replace(report.source, unordered=True, kind="scans")
+    verdict = judge(replace(report, graph=graph, source=source, notes=(Note("ambiguous", 9, "190"),)))
+    assert verdict.headline.startswith(
+        "No two of 20 scans joined, and 9 of 190 pairs fit in several ways (take scans in"
+    )

@@ -33,6 +33,9 @@ LEAST_DEGREE = 4
 def order_prior(edges: Ints, vertex_count: int) -> Floats:
     """The probability (E,) that an edge is right, from its gap |i − j|.
 
+    A wrong edge joins any two views; a right one joins views that overlap, in a sequence mostly neighbours, and takes
+    the place of a wrong one. With f the share of all far pairs that are joined, a share r of near pairs holds q right
+    edges and (1 - q) f wrong ones, so q = (r - f) / (1 - f), and an edge between them is right with probability q / r.
     All are equal where neighbours are hardly more often joined than far pairs. Vertex rows are the order.
     """
     gap = np.abs(edges[:, 1] - edges[:, 0])
@@ -84,7 +87,7 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
     bounds = _bounds(vertex_count)
     place = np.maximum(np.searchsorted(bounds, np.abs(edges[:, 1] - edges[:, 0]), side="right") - 1, 0)
     loops = cycles.loops.select(np.flatnonzero(~cycles.closes))
-    row, entry = np.repeat(np.arange(len(loops)), loops.lengths), place[loops.edge]
+    row, entry = loops.rows, place[loops.edge]
     passes = np.bincount(place[cycles.loops.edge], minlength=len(bounds))
     number = np.bincount(place, minlength=len(bounds))
     share = np.full(len(bounds), min(usual, CEILING))

@@ -24,7 +24,8 @@ class SourceSummary:
     """What was read: how many frames, how many of them with a true pose, and what the reader remarked.
 
     `key_frames` is None where every frame is a vertex of the graph. `format` is the reader's name, `kind`
-    says what a frame is, `unordered` that all were joined from nothing.
+    says what a frame is, `unordered` that all were joined from nothing; `is_scanner`: x is ahead and z up, where a
+    camera has z ahead and y down.
     """
 
     name: str
@@ -37,6 +38,7 @@ class SourceSummary:
     format: str = ""
     kind: Literal["frames", "scans", "images", "poses"] = "frames"
     unordered: bool = False
+    is_scanner: bool = False
 
     @property
     def counted(self) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from hodge_pipeline import se3
-from hodge_pipeline.recording.shapes import unit, up_and_ahead
+from hodge_pipeline.recording.shapes import or_grey, unit, up_and_ahead
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Floats32, Ints, PointCloud
 
 WIDTH, HEIGHT = 560, 400
@@ -29,7 +29,6 @@ STRAY_PERCENT = 0.5
 MARGIN = 1.06
 NEAR_M = 0.1
 """Before the eye of a picture in perspective."""
-GREY = 190
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,8 @@ class Points:
     @classmethod
     def of(cls, points: Floats32, normals: Floats32 | None = None, colours: Bytes | None = None) -> Points:
         """These points; without colours they are grey."""
-        if colours is None or not colours.any():
-            colours = np.full((len(points), 3), GREY, np.uint8)
-        return cls(points, np.zeros((len(points), 3), np.float32) if normals is None else normals, colours)
+        normals = np.zeros((len(points), 3), np.float32) if normals is None else normals
+        return cls(points, normals, or_grey(colours, len(points)))
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:

@@ -15,6 +15,7 @@ from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.schema import Recipe
+from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import (
@@ -123,6 +124,7 @@ def make_report(
             format="" if recipe.source.reader is None else registry.name_of(recipe.source.reader),
             kind="scans" if scans else "frames",
             unordered=not scene.in_order,
+            is_scanner=is_scanner(scene.clouds),
         ),
         scores=scores,
         trajectories=_trajectories(recipe, scene, sets, world_from_cam, component, kept=kept),
