@@ -139,7 +139,7 @@ class Bending:
             poses = se3.exp(step) @ poses
             if np.abs(step / ([1.0] * 3 + [self._size_m] * 3)).max() < SETTLED:
                 break
-        spread = np.linalg.inv(hessian).reshape(way.count, 6, way.count, 6) * point_factor**2
+        spread = np.asarray(np.linalg.inv(hessian) * point_factor**2).reshape(way.count, 6, way.count, 6)
         edge_factor = float(np.sqrt(soft)) * point_factor
         return Bent(_shifted(poses, self._centre), edge_factor, point_factor, spread, self._centre, way)
 
