@@ -175,6 +175,10 @@ def test_a_street_is_followed_and_deskewed(tmp_path: Path) -> None:
     every = se3.inverse(done.poses[0]) @ done.poses, se3.inverse(exact[0]) @ exact
     assert np.linalg.norm((every[0] - every[1])[:, :3, 3], axis=1).max() < 0.5  # the first sweeps too: no start at rest
     assert len(done.key_frames.rows) < 20
+    keys, edges = done.key_frames, done.rounds[1].edges
+    steps = np.flatnonzero(np.diff(edges.pairs, axis=1)[:, 0] == 1)
+    by_map = se3.inverse(keys.world_from_key[:-1]) @ keys.world_from_key[1:]
+    assert edges.i_from_j[steps] == pytest.approx(by_map, abs=1e-9)  # not as registration of two clouds has them
     assert done.source.frames[0].true_world_from_cam is not None
 
 

@@ -50,11 +50,15 @@ class Loops:
         """Edges of each loop, (L,)."""
         return np.diff(self.offsets)
 
+    @property
+    def rows(self) -> Ints:
+        """The loop (N,) that each entry of `edge` belongs to."""
+        return np.repeat(np.arange(len(self)), self.lengths)
+
     def incidence(self, edge_count: int) -> csr_matrix:
         """The loops as 1-chains, (L, E): how often each passes each edge, with sign."""
-        rows = np.repeat(np.arange(len(self)), self.lengths)
         values = self.sign.astype(float)
-        matrix = csr_matrix((values, (rows, self.edge)), shape=(len(self), edge_count))
+        matrix = csr_matrix((values, (self.rows, self.edge)), shape=(len(self), edge_count))
         matrix.eliminate_zeros()
         return matrix
 
@@ -199,7 +203,7 @@ def loop_products(loops: Loops, i_from_j: Floats) -> Floats:
 
 def _batch_products(loops: Loops, i_from_j: Floats) -> Floats:
     motion = _directed(i_from_j, loops.edge, loops.sign)
-    row = np.repeat(np.arange(len(loops)), loops.lengths)
+    row = loops.rows
     place = np.arange(len(row)) - loops.offsets[:-1][row]
     while len(place) and place.max() > 0:
         # neighbours (0, 1), (2, 3), … of every loop at once; a last one without a partner stays

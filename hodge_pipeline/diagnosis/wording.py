@@ -114,7 +114,7 @@ def _in_loop(graph: ViewGraph, wanted: Bools) -> Bools:
 def _sound(cycles: Cycles, kept: Bools) -> Ints:
     """How many cycles (E,) close over an edge of which all other edges are kept."""
     loops = cycles.loops
-    row = np.repeat(np.arange(len(loops)), loops.lengths)
+    row = loops.rows
     left_out = np.bincount(row, ~kept[loops.edge], len(loops))
     others = left_out[row] - ~kept[loops.edge]
     return np.bincount(loops.edge, cycles.closes[row] & (others == 0), len(kept)).astype(np.int64)

@@ -65,12 +65,12 @@ def first_frame(points: Floats32, clouds: CloudSet, world_from_cam: Floats) -> I
     low = cells.min(axis=0) - 1
     size = cells.max(axis=0) + 2 - low
     around = (cells[:, None] + [[0, 0, 0], *np.eye(3, dtype=int), *-np.eye(3, dtype=int)]).reshape(-1, 3)
-    keys, cell_of = np.unique(_keys(around - low, size), return_inverse=True)
+    keys, cell_of = np.unique(shapes.numbered(around - low, size), return_inverse=True)
     first = np.full(len(keys), len(clouds) - 1)
     for row in known[::-1].tolist():
         seen = se3.transform(world_from_cam[row], np.asarray(clouds[row].points_in_cam, float))
         own = np.floor(seen / cell_m).astype(np.int64) - low
-        own = _keys(own[((own >= 0) & (own < size)).all(axis=1)], size)
+        own = shapes.numbered(own[((own >= 0) & (own < size)).all(axis=1)], size)
         place = np.minimum(np.searchsorted(keys, own), len(keys) - 1)
         first[place[keys[place] == own]] = row
     clouds.forget()
@@ -82,8 +82,3 @@ def grid_m(points: Floats) -> float:
     if len(points) < 2:
         return USUAL_GRID_M
     return max(float(np.median(cKDTree(points).query(points, k=2)[0][:, 1])), float(np.finfo(np.float32).eps))
-
-
-def _keys(cells: Ints, size: Ints) -> Ints:
-    """A number (N,) for each cell (N, 3) of a grid."""
-    return np.asarray((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2])

@@ -117,7 +117,7 @@ def _clustered(model: Model, kept: int) -> Model:
     low = points.min(axis=0)
     voxel_m = max(float(np.ptp(points, axis=0).max()) / 2000, 1e-9)
     while True:
-        _, first, cluster = np.unique(_keys(points - low, voxel_m), return_index=True, return_inverse=True)
+        _, first, cluster = np.unique(_voxels(points - low, voxel_m), return_index=True, return_inverse=True)
         if len(first) <= kept:
             break
         voxel_m *= max(1.05, float(np.sqrt(len(first) / kept)))
@@ -126,9 +126,13 @@ def _clustered(model: Model, kept: int) -> Model:
     return _replace(model, first, triangles[(a != b) & (b != c) & (a != c)].astype(np.int32))
 
 
-def _keys(offsets: Floats, voxel_m: float) -> Ints:
+def _voxels(offsets: Floats, voxel_m: float) -> Ints:
     cells = np.floor(offsets / voxel_m).astype(np.int64)
-    size = cells.max(axis=0) + 1
+    return numbered(cells, cells.max(axis=0) + 1)
+
+
+def numbered(cells: Ints, size: Ints) -> Ints:
+    """A number (N,) for each cell (N, 3) of a grid of this size (3,)."""
     return np.asarray((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2])
 
 

@@ -21,6 +21,8 @@ FRAMES_IN_BLOCK = 16
 MIN_POINTS_FOR_NORMALS = 5
 MANY_POINTS = 5_000_000
 LISTED_NOTES = 5
+MAP_AWAY = 10.0
+"""Times the spread of a cloud's points: from there on they are not seen from the origin, but counted from it."""
 MAX_VOXELS_ALONG_AXIS = 2_000_000  # its cube still fits the 64-bit voxel key
 BLANK_LEVELS = 6
 """Of 255, by which nearly all pixels of a blank image differ at most: a covered camera's do by 5 where its noise is 2
@@ -234,7 +236,8 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
             colours, blank = image[v, u], is_blank(image)
         except (SourceError, OSError) as error:
             odd = Oddity(frame.frame_id, "its cloud has no colours", str(error))
-    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd, blank=blank)
+    why_none = "" if len(rows) else _out_of_range(z, "depth_scale", options)
+    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd, why_none, blank)
 
 
 def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
@@ -260,14 +263,29 @@ def in_range(cloud: PointCloud, options: CloudOptions) -> PointCloud:
 
 
 def out_of_range(cloud: PointCloud, options: CloudOptions) -> str:
-    """What to do about points none of which is in range: scanners store millimetres as often as metres."""
+    """What to do about points none of which is in range: scanners store millimetres as often as metres, and maps count
+    from far away.
+    """
     ranges = _ranges(cloud)
+    finite = np.isfinite(ranges) & (ranges > 0)
+    points, usual = cloud.points_in_cam[finite], float(np.median(ranges[finite])) if finite.any() else 0.0
+    spread_m = float(np.ptp(np.quantile(points, (0.05, 0.95), axis=0), axis=0).max()) if finite.any() else 0.0
+    if usual > max(options.max_range_m, MAP_AWAY * spread_m):
+        rounding_m = float(np.spacing(np.float32(usual)))
+        return (
+            f"its points lie {usual:.3g} m away, all near each other: map coordinates? Subtract one corner from all "
+            f"scans, in double precision, and write them again: float32 rounds them to {rounding_m:.2g} m there"
+        )
+    return _out_of_range(ranges, "units_per_metre", options)
+
+
+def _out_of_range(ranges: Floats32, option: str, options: CloudOptions) -> str:
     finite = ranges[np.isfinite(ranges) & (ranges > 0)]
     if not len(finite):
         return "there is no point in it"
     usual = float(np.median(finite))
     limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
-    unit = " (millimetres? then source.reader.units_per_metre=1000)" if usual > options.max_range_m else ""
+    unit = f" (millimetres? then source.reader.{option}=1000)" if usual > options.max_range_m else ""
     return f"its points lie {usual:.3g} m away, in range are {limits}{unit}"
 
 

@@ -16,7 +16,7 @@ from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import EdgePictures
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.matches import side_by_side
-from hodge_pipeline.report.painting import painted
+from hodge_pipeline.report.painting import UNKNOWN_UNIT, painted
 from hodge_pipeline.report.photographs import images_of
 from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, PointCloud, ViewGraph
 
@@ -132,7 +132,7 @@ def _cut(
                 axes.scatter(x, y, s=2, color=np.array(colour) / 255, marker=marker, linewidths=0)
             axes.set_aspect("equal", adjustable="datalim")
             axes.set_title(title, fontsize=9)
-            axes.set_xlabel("m" if said is length else "the source's unit", fontsize=8)
+            axes.set_xlabel("m" if said is length else UNKNOWN_UNIT, fontsize=8)
             axes.tick_params(labelsize=7)
 
     told = f", here {times} times as large" if times > 1 else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -19,6 +20,8 @@ DOTS_PER_INCH = 150
 SIZE = 5.0, 3.9
 """Inches."""
 TRUTH = "truth"
+UNKNOWN_UNIT = "units"
+"""Of lengths that nothing relates to metres."""
 LINES = (":", "#D55E00"), ("-", "#0072B2")
 """Before and after, as in every plot."""
 
@@ -104,7 +107,7 @@ def turns_deg(report: Report) -> dict[str, Floats]:
 def _unit(report: Report, offsets: Sequence[Floats]) -> tuple[str, float]:
     """The unit that suits these offsets, and how many of them a metre has."""
     if not report.has_metres:
-        return "units", 1.0
+        return UNKNOWN_UNIT, 1.0
     largest = max(float(np.nanmax(np.abs(each), initial=0.0)) for each in offsets)
     return ("mm", 1000.0) if largest < 0.02 else ("cm", 100.0) if largest < 1 else ("m", 1.0)
 
@@ -149,9 +152,14 @@ def _coloured_path(figure: Figure, report: Report, name: str) -> None:
         along[worst_last], across[worst_last], c=size[worst_last] * factor, s=14, cmap="viridis_r", linewidths=0
     )
     figure.colorbar(dots, ax=axes, label=unit, shrink=0.8)
+    map_axes(axes, report)
+
+
+def map_axes(axes: Any, report: Report) -> None:
+    """Axes of a map: a metre is as long along both."""
     axes.set_aspect("equal", adjustable="datalim")
-    for label in (axes.set_xlabel, axes.set_ylabel):
-        label("m" if report.has_metres else "the source's unit")
+    unit = "m" if report.has_metres else UNKNOWN_UNIT
+    axes.set(xlabel=unit, ylabel=unit)
 
 
 def flattest_plane(positions: Floats) -> tuple[Floats, Floats]:

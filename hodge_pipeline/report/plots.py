@@ -12,7 +12,7 @@ from matplotlib.ticker import NullFormatter
 
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.report.painting import error_plots, flattest_plane, has_truth, painted
+from hodge_pipeline.report.painting import UNKNOWN_UNIT, error_plots, flattest_plane, has_truth, map_axes, painted
 from hodge_pipeline.report.tables import counted_pairs
 from hodge_pipeline.types import Floats, Ints
 
@@ -87,9 +87,7 @@ def _paths(figure: Figure, report: Report) -> None:
     for path in paths:
         along, across = plane @ (_broken(path.positions, component) - origin).T
         axes.plot(along, across, label=path.name, **_style(report, path.name))
-    axes.set_aspect("equal", adjustable="datalim")
-    for label in (axes.set_xlabel, axes.set_ylabel):
-        label("m" if report.has_metres else "the source's unit")
+    map_axes(axes, report)
     axes.legend(frameon=False, fontsize=9)
 
 
@@ -135,7 +133,7 @@ def _residuals(figure: Figure, report: Report) -> None:
 
 def _small_unit(report: Report) -> tuple[str, float]:
     """The unit of residuals, and how many of them a metre has."""
-    return ("cm", 100.0) if report.has_metres else ("the source's unit", 1.0)
+    return ("cm", 100.0) if report.has_metres else (UNKNOWN_UNIT, 1.0)
 
 
 def _log_histogram(axes: Any, report: Report, columns: list[tuple[str, Floats]]) -> None:

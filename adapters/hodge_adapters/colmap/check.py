@@ -193,14 +193,6 @@ def _is_pose(text: str) -> bool:
     return len(words) == 10 and to_floats(words[:9]) is not None
 
 
-def _is_camera(words: list[str]) -> bool:
-    return len(words) > 4
-
-
-def _is_point(words: list[str]) -> bool:
-    return len(words) >= 8 and len(words) % 2 == 0
-
-
 def _is_rig(words: list[str]) -> bool:
     at, sensors = 4, 1
     while at < len(words):
@@ -216,8 +208,11 @@ def _is_frame(words: list[str]) -> bool:
 
 
 _LINES: Mapping[str, tuple[Callable[[list[str]], bool], str]] = {
-    "cameras": (_is_camera, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"),
-    "points3D": (_is_point, "POINT3D_ID X Y Z R G B ERROR and pairs of IMAGE_ID POINT2D_IDX"),
+    "cameras": (lambda words: len(words) > 4, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"),
+    "points3D": (
+        lambda words: len(words) >= 8 and len(words) % 2 == 0,
+        "POINT3D_ID X Y Z R G B ERROR and pairs of IMAGE_ID POINT2D_IDX",
+    ),
     "rigs": (
         _is_rig,
         "RIG_ID NUM_SENSORS and so many sensors: SENSOR_TYPE (CAMERA, IMU) SENSOR_ID, after the first "

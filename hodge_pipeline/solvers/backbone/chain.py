@@ -206,7 +206,7 @@ STEPS_OF_PLACE, FEWEST_PLACES = 20, 50
 
 def places_along(chain: Chain) -> Floats:
     """Where the ends of each loop (M, 2) lie along the chain, in places: of one place are loops both ends of which lie
-    within 1.
+    within 1. These are one testimony, however many agree, since a place may be mistaken for another.
     """
     own = np.median(np.einsum("mii->mi", chain.covariance), axis=0)
     steps = np.where(chain.bridged[:, None], 0.0, np.einsum("nii->ni", chain.step_covariance))
