@@ -53,7 +53,7 @@ def document(report: Report, folder: str) -> Document:
             Section(
                 "The scene from four sides",
                 f"The frames' clouds laid together by their poses: {report.before} on the left, {report.after} on "
-                f"the right. {of}",
+                f"the right. {of}".rstrip(),
                 pictures=pictures.sides,
             ),
             *([Section.of(worst_edges_table(report))] if report.worst_edges else []),
