@@ -6,9 +6,9 @@
 Errors are of positions, metres RMS, after a rigid fit. A loop is right where its ends lie within 1.5 m (Bicocca, planar
 pose) or 5 m (RobotCar, distance of the places alone) of where the truth says; loops without truth are not counted. AUC
 is of the probability that a loop is right. GTSAM's GNC is told that consecutive edges are right, and so is Open3D's
-line process; GNC has the information that the graphs state. Each row's peers run in the same process, one after the other,
-and errors and CPU seconds are the medians of three runs (GTSAM may be another environment's of the same Python: its folder
-`site-packages` last in PYTHONPATH). One set of defaults.
+line process; GNC has the information that the graphs state. Each row's peers run in the same process, one after the
+other; errors and CPU seconds are the medians of three runs (GTSAM may be another environment's of the same Python: its
+folder `site-packages` last in PYTHONPATH). One set of defaults.
 """
 
 from __future__ import annotations
