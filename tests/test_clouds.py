@@ -228,3 +228,17 @@ def test_clouds_on_disk_give_their_memory_back(tmp_path: Path) -> None:
     clouds.forget()
     assert resident_kb() < 1_000
     assert clouds[0].points_in_cam.sum(dtype=float) == total
+
+
+@pytest.mark.parametrize(
+    ("scale", "away_m", "told"),
+    [
+        (1, (500_000, 5_000_000, 100), "map coordinates? Subtract one corner from all scans"),
+        (1000, (0, 0, 0), "millimetres? then source.reader.units_per_metre=1000"),
+    ],
+)
+def test_points_out_of_range_are_told_by_where_they_lie(scale: float, away_m: tuple[float, ...], told: str) -> None:
+    points = scale * np.random.default_rng(0).uniform(-3, 3, (200, 3)) + away_m
+    _, counts = make_cloud(Frame(0, 0.0, read_points=lambda: PointCloud(points.astype(np.float32))), CloudOptions())
+    assert told in str(counts.odd)
+    assert ("rounds them to 0.5 m" in str(counts.odd)) == (scale == 1)

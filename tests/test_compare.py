@@ -59,13 +59,31 @@ def test_options_that_differ_and_frames_that_are_shared(tmp_path: Path) -> None:
     assert tables(found)[1].rows == (("edges.min_iou", "0.3", "0.5"),)
 
 
+def test_another_stage_is_told_by_its_name_and_a_list_by_what_differs(tmp_path: Path) -> None:
+    """And no recipe's description: what its options do is told already."""
+    a = "description: A\nbuilders: [{stage: near, k: 1}, {stage: far, k: 2}]\nstart: {stage: given, reach: {x: 1}}\n"
+    b = "description: B\nbuilders: [{stage: near, k: 1}, {stage: far, k: 3}]\nstart: {stage: sweeps}\n"
+    found = compare(make_run(tmp_path / "a", circle(), a), make_run(tmp_path / "b", circle(), b))
+    assert tables(found)[1].rows == (("builders.2.k", "2", "3"), ("start", "given", "sweeps"))
+
+
+def test_numbers_of_frames_in_other_sources_are_no_shared_frames(tmp_path: Path) -> None:
+    """Scans have no clock: the fifth of a street is not the fifth of a room."""
+    a, b = make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", circle()[:9])
+    assert len(compare(a, b).apart_m) == 9, "the same source by its name"
+    report = json.loads((b / "report.json").read_text())
+    report["source"]["name"] = "street"
+    (b / "report.json").write_text(json.dumps(report))
+    assert not len(compare(a, b).apart_m)
+
+
 def test_page_and_recording(tmp_path: Path) -> None:
     a, b = make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", MOVED @ circle())
     found = compare(a, b)
     page, recording = write_comparison(tmp_path / "out", found)
     text, addresses = read_page(page)
     assert "a and b" in text and "laid onto A by the 12 frames" in text
-    assert len(addresses) == 7 and all(address.startswith("data:image/") for address in addresses)
+    assert len(addresses) == 5 and all(address.startswith("data:image/") for address in addresses)
     for side in "ab":
         poses = np.squeeze(rows(recording, f"{layout.WORLD}/{side}/poses", "Transform3D:translation"))
         np.testing.assert_allclose(np.float32(poses), np.float32(circle()[:, :3, 3]), atol=2e-6)

@@ -143,6 +143,13 @@ def test_a_lens_passes_through_to_nerfstudio_and_back_to_colmap(tmp_path: Path) 
         ColmapWriter(form="txt").write(tmp_path / "text", guess_reader(tmp_path / "far").open(tmp_path / "far"))
 
 
+def test_a_name_without_an_ending_is_the_folder_that_nerfstudio_trains_on(tmp_path: Path) -> None:
+    folder, out = binary_model(tmp_path / "scene", "PINHOLE", [30, 30, 16, 12]), tmp_path / "for nerfstudio"
+    convert(folder, out, to="nerfstudio", settings=["edges=none"])
+    assert sorted(path.name for path in out.iterdir()) == ["images", "transforms.json"]
+    assert not (tmp_path / "images").exists() and len(guess_reader(out).open(out).frames) == 2
+
+
 def test_images_of_a_lens_that_nerfstudio_lacks_are_undistorted(tmp_path: Path) -> None:
     folder = binary_model(tmp_path / "scene", "FOV", [30, 30, 16, 12, 0.4])
     convert(folder, tmp_path / "out/transforms.json", settings=["edges=none"])

@@ -10,7 +10,7 @@ from benchmarks.simulated_edges import simulated
 from diagnosis_graphs import measured, near_pairs, poses_on_a_ring
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.order import right_by_gap
+from hodge_pipeline.diagnosis.evidence import right_by_gap
 from hodge_pipeline.diagnosis.result import Cycles
 from hodge_pipeline.diagnosis.short_cycles import short_cycles
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph

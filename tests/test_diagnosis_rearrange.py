@@ -7,7 +7,7 @@ from benchmarks.edge_scores import precision_and_recall
 from diagnosis_graphs import every_pair_tried, measured, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.order import order_prior, prior_by_cycles
+from hodge_pipeline.diagnosis.evidence import order_prior, prior_by_cycles
 from hodge_pipeline.diagnosis.placement import run_sums, sums_of
 from hodge_pipeline.diagnosis.scene_model import Joining, learn_joining
 from hodge_pipeline.types import Floats

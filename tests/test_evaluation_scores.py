@@ -87,6 +87,17 @@ def test_sliding_along_the_plane_costs_nothing(tmp_path: Path) -> None:
     assert edge_distances(saved(clouds, tmp_path), np.array([(0, 1)]), poses, Inline()) == pytest.approx(0, abs=1e-7)
 
 
+def test_of_a_large_cloud_some_points_are_measured_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bumpy = square(0.01)
+    bumpy.points_in_cam[1::4, 2] = 0.05
+    folder = saved(CloudSet.from_clouds([square(0.0), bumpy]), tmp_path)
+    monkeypatch.setattr(scores, "LEAST_POINTS", 10)
+    monkeypatch.setattr(scores, "MOST_POINTS", 800)
+    for pairs, mean_m in ((2, 0.02), (8, 0.01)):  # 400 points of each: all; 100 of each: every fourth
+        found = edge_distances(folder, np.array([(0, 1)] * pairs), identities(2), Inline())
+        np.testing.assert_allclose(found, mean_m, atol=1e-7)
+
+
 def test_moving_the_world_changes_no_distance(tmp_path: Path) -> None:
     folder, pairs = saved(random_clouds(4), tmp_path), np.array([(0, 1), (1, 3), (2, 3)])
     poses = se3.exp(np.random.default_rng(2).normal(scale=0.1, size=(4, 6)))

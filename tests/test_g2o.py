@@ -70,6 +70,15 @@ def test_the_information_is_over_half_an_angle(tmp_path):
     np.testing.assert_array_equal(information_of_file(information_for_file(information)), information)
 
 
+def test_comments_behind_numbers_and_lines_that_end_in_cr_alone_are_read(tmp_path):
+    path = tmp_path / "a.g2o"
+    path.write_bytes(f"# head\r{EDGE} # odometry\r{EDGE}\r".encode())
+    assert load_g2o(path).graph.edge_count == 2
+    path.write_bytes(f"# head\r\n{EDGE}\r\nEDGE_SE3:QUAT 1\r\n".encode())
+    with pytest.raises(SourceError, match="a.g2o:3:"):
+        load_g2o(path)
+
+
 def test_edges_alone_name_their_vertices_in_order_of_appearance(tmp_path):
     file = load_g2o(write(tmp_path / "a.g2o", "# a comment", "", EDGE.replace(" ", "\t") + "\r"))
     assert file.graph.vertex_ids.tolist() == [7, 3]

@@ -15,7 +15,7 @@ from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.flow import find_corners, flow_image, follow
-from hodge_pipeline.registration.moving import rival_motion
+from hodge_pipeline.registration.moving import agreement, rival_motion
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, track
 from hodge_pipeline.types import Frame, Source
@@ -129,8 +129,10 @@ def test_the_vote_is_by_area_whichever_motion_is_found_first(still: Source) -> N
     corners = find_corners(first)
     by_board = follow(corners, later, np.eye(4))
     assert by_board is not None
-    share, rival = rival_motion(corners, later, by_board, np.eye(4))
-    assert rival is not None and rival.fits_better and share > 0.5
+    against, rival = rival_motion(corners, later, by_board, np.eye(4))
+    assert rival is not None and rival.fits_better and against.contradicting > 0.5
+    assert against == agreement(first, later, by_board.key_from_view)
+    assert against.misplaced > 0.5
     board = np.zeros((HEIGHT, WIDTH), bool)
     side = int(np.sqrt(0.2 * WIDTH * HEIGHT))
     board[20 : 20 + side, 20 : 20 + side] = True

@@ -267,11 +267,45 @@ def test_a_folder_of_kitti_with_calibration_and_poses(tmp_path: Path) -> None:
         read_bin(folder / "000002.bin")
 
 
+HDL_64E = (*np.linspace(2.0, -8.33, 32), *np.linspace(-8.83, -24.33, 32))
+FANS = {
+    "an HDL-64E": (HDL_64E, 360),
+    "half of it": (HDL_64E, 180),
+    "an OS1-64": (np.linspace(-16.6, 16.6, 64), 360),
+    "an HDL-32E": (np.linspace(-30.67, 10.67, 32), 360),
+    "64 beams from -24 to 6": (np.linspace(-24.0, 6.0, 64), 360),
+}
+
+
+@pytest.mark.parametrize("fan", FANS)
+def test_points_of_kittis_scanner_are_raised_by_the_error_of_its_angles(tmp_path: Path, fan: str) -> None:
+    beams_deg, round_deg = FANS[fan]
+    rng = np.random.default_rng(0)
+    for number in range(3):
+        up, turn = (v.ravel() for v in np.meshgrid(np.radians(beams_deg), np.radians(np.arange(0, round_deg, 0.5))))
+        up = up + np.radians(rng.normal(0, 0.05, up.size))
+        away = rng.uniform(6, 60, (up.size, 1))
+        points = away * np.column_stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
+        (tmp_path / f"{number:06d}.bin").write_bytes(points.astype("<f4").tobytes())
+    source = CloudFolderReader().open(tmp_path)
+    found = source.frames[2].read_points().points_in_cam.astype(float)
+    by_deg = 0.205 if fan == "an HDL-64E" else 0.0
+    risen_deg = np.degrees(np.arcsin(found[:, 2] / np.linalg.norm(found, axis=1)) - up)
+    np.testing.assert_allclose(risen_deg, by_deg, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), away[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(np.cos(np.arctan2(found[:, 1], found[:, 0]) - turn), 1, atol=1e-9)
+    assert any("raised by 0.205 degrees" in note for note in source.notes) == bool(by_deg)
+    as_stored = CloudFolderReader(raise_deg=0).open(tmp_path)
+    np.testing.assert_array_equal(as_stored.frames[2].read_points().points_in_cam, points.astype("<f4"))
+    assert not any("raised" in note for note in as_stored.notes)
+
+
 def test_scans_of_kitti_07(data_dir: Path) -> None:
     source = CloudFolderReader().open(data_dir / "scans/kitti_07_5scans")
     sizes = [len(frame.read_points()) for frame in source.frames if frame.read_points]
     assert [frame.frame_id for frame in source.frames] == [f"{row:06d}.bin" for row in range(5)]
     assert sizes == [21562, 24703, 24573, 16911, 19872]
+    assert "the angles of 5 .bin scans are those of KITTI's HDL-64E" in source.notes[0]
 
 
 def test_a_graph_of_numbers_joins_scans_with_names(tmp_path: Path) -> None:

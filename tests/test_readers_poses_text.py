@@ -50,6 +50,18 @@ def test_stamps_too_large_for_seconds_are_read_in_their_unit(tmp_path: Path, uni
     assert [line.split()[:2] for line in lines] == [[str(stamp * per_second), "1.0"] for stamp in stamps]
 
 
+@pytest.mark.parametrize("head", ["# timestamp tx ty tz qw qx qy qz", "time,x,y,z,q_w,q_x,q_y,q_z"])
+def test_a_head_that_names_w_first_is_followed_and_written_again(tmp_path: Path, head: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(f"{head}\n5.5 1 2 3 0.6 0 0 0.8\n")
+    read = parse_tum(path)
+    np.testing.assert_allclose(se3.to_quat_xyzw(read.trajectory.world_from_cam), [[0, 0, 0.8, 0.6]], atol=1e-15)
+    assert "poses.txt: quaternions are read with w first, as its head names them" in read.notes
+    (tmp_path / "out").mkdir()
+    line = TumRewriter().rewrite(tmp_path / "out", path, read.trajectory).read_text().splitlines()[1]
+    np.testing.assert_allclose([float(word) for word in line.split()], [5.5, 1, 2, 3, 0.6, 0, 0, 0.8], atol=1e-15)
+
+
 def test_a_quarter_turn_by_hand(tmp_path: Path) -> None:
     path = tmp_path / "a.tum"
     path.write_text("# comment\r\n5.5, 1 2 3\t0 0 0.70710678118654752 0.70710678118654752\r\n\r\n")

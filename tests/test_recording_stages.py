@@ -15,9 +15,10 @@ from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import Contents
 from hodge_pipeline.recording.curl import triangle_curl_m
 from hodge_pipeline.recording.growth import first_frame
-from hodge_pipeline.recording.merge import find_parts, with_pairs
+from hodge_pipeline.recording.merge import contents_of, eyes, find_parts, with_entities
+from hodge_pipeline.recording.recorder import Recorder
 from hodge_pipeline.recording.registration import chosen_pairs, moved_m
-from hodge_pipeline.types import CloudSet, Edges, Model, PointCloud, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Frame, Model, PointCloud, ViewGraph
 from recording_data import circle, make_solution, record, rgb, ring_graph, rows
 
 
@@ -56,6 +57,10 @@ def test_registration_reads_back_with_the_clouds_of_chosen_pairs(tmp_path: Path)
     np.testing.assert_array_equal(np.float32(rows(part, columns, "rmse_m")[0]), np.float32(found.rmse_m))
     assert rows(part, columns, "iterations")[0] == found.iterations.tolist()
     assert rows(part, columns, "rejected")[0] == found.why.tolist()
+    judged = found.put(np.array([0]), why="3 of 3 cycles close")
+    record(tmp_path / "judged").registration(1, judged, guesses, seen)
+    (told,) = rows(tmp_path / "judged" / part.name, columns, "rejected")
+    assert told == found.why.tolist(), "an edge is not rejected for what the diagnosis says"
     pair = layout.pair("rejected")
     (after,) = rows(part, f"{pair}/after", "Points3D:positions")
     moved = np.asarray(seen[4].points_in_cam, float) + [0.3, 0, 0]
@@ -63,7 +68,7 @@ def test_registration_reads_back_with_the_clouds_of_chosen_pairs(tmp_path: Path)
     (before,) = rows(part, f"{pair}/before", "Points3D:positions")
     np.testing.assert_array_equal(np.float32(before), seen[4].points_in_cam)
     readers = [(path, RrdReader(path)) for path in find_parts(tmp_path)]
-    assert with_pairs(Contents(), readers).pairs == ("least_fitness", "moved_most", "rejected")
+    assert with_entities(Contents(), readers).pairs == ("least_fitness", "moved_most", "rejected")
 
 
 def test_no_pairs_at_all(tmp_path: Path) -> None:
@@ -137,6 +142,45 @@ def test_a_point_grows_with_the_frame_that_saw_it_first(tmp_path: Path) -> None:
     (first,) = rows(part, layout.growth(0), "Points3D:positions")[:1]
     np.testing.assert_array_equal(np.float32(first), points[[1, 2]])
     np.testing.assert_array_equal(rgb(rows(part, layout.growth(0), "Points3D:colors")[0]), colours[[1, 2]])
+
+
+def test_a_street_grows_as_a_room_does() -> None:
+    """Clouds on a grid of 0.5 m: a fused point lies up to half of it beside the measured ones."""
+    x = np.arange(0, 10, 0.5)
+    wall = PointCloud(np.column_stack([x, np.zeros(20), np.full(20, 5.0)]).astype(np.float32))
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = [0.0, 20.0, 40.0]
+    points = np.float32([[2.25, 0.2, 5.1], [22.25, 0.2, 5.1], [45.2, 0.2, 5.2]])
+    assert first_frame(points, CloudSet.from_clouds([wall] * 3), poses).tolist() == [0, 1, 2]
+
+
+def test_what_is_not_there_has_no_view_and_a_scanner_is_no_camera(tmp_path: Path) -> None:
+    """Scans have no images and, here, no truth: no panel stays empty, and no pose is drawn as a frustum."""
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = np.arange(4) * 10.0
+    for scanner in (False, True):
+        folder = tmp_path / str(scanner)
+        recorder = Recorder(folder, "run-1", is_scanner=scanner)
+        recorder.frames("scans", [Frame(row, float(row)) for row in range(4)])
+        recorder.poses("odometry", poses)
+        readers = [(path, RrdReader(path)) for path in find_parts(folder)]
+        contents = with_entities(contents_of(find_parts(folder)), readers)
+        assert contents.is_scanner == scanner and contents.holds(layout.CAMERA) and not contents.holds(layout.COLOUR)
+        eye = eyes(contents, readers).graph
+        assert eye is not None
+        np.testing.assert_allclose(eye.up, [0, 0, 1] if scanner else [0, -1, 0], atol=1e-9)
+        (line, *_) = rows(find_parts(folder)[1], layout.frusta("odometry"), "LineStrips3D:strips")[0]
+        size_m = 0.6 * np.array([1, 0.4, 0.5] if scanner else [1.6, 1.2, 1])  # of 30 m a fiftieth, times the shape
+        np.testing.assert_allclose(np.ptp(np.array(line), axis=0), size_m, rtol=1e-5)
+
+
+def test_points_without_a_colour_are_grey(tmp_path: Path) -> None:
+    points = np.float32([[1, 0, 1], [0, 0, 1]])
+    seen = CloudSet.from_clouds([PointCloud(points)])
+    record(tmp_path).clouds([Frame(0, 0.0)], seen)
+    record(tmp_path).model(Model("m", points), seen, np.eye(4)[None])
+    for part, path in (("001-clouds", layout.CLOUD), ("900-model", layout.MODEL), ("900-model", layout.growth(0))):
+        assert (rgb(rows(tmp_path / f"{part}.rrd", path, "Points3D:colors")[0]) == 190).all()
 
 
 def test_growth_holds_one_cloud_at_a_time() -> None:

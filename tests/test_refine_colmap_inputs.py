@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import hodge_pipeline
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.reader import ColmapReader
+from hodge_adapters.colmap.writer import ColmapWriter
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.store.edge_table import read_edges
@@ -75,6 +76,47 @@ def test_models_without_an_observation_are_refused_in_one_line(sparse: Path) -> 
     told = str(refused.value)
     assert f"{sparse / '0'}: the model has one image" in told and f"{sparse / '1'}: the model has no point" in told
     assert "\n" not in told
+
+
+def test_points_that_are_not_finite_are_left_out_and_noted(sparse: Path) -> None:
+    spoiled = pycolmap.Reconstruction(sparse / "1")
+    for key in sorted(spoiled.points3D)[:2]:
+        spoiled.points3D[key].xyz = np.array([np.nan, 0.0, np.inf])
+    count = spoiled.num_points3D()
+    spoiled.write(sparse / "1")
+    note = "2 points not finite: left out"
+    assert note in ColmapReader(edges="none").open(sparse / "1").notes
+    for given in (sparse / "1", spoiled):
+        (result,) = hodge_pipeline.refine_colmap(given, overrides=FREE).results
+        assert result.start.quality.points == count - 2 and note in result.notes
+    assert spoiled.num_points3D() == count
+
+
+def test_a_name_of_two_images_is_told(sparse: Path) -> None:
+    model = pycolmap.Reconstruction(sparse / "1")
+    first, second = sorted(model.images)[:2]
+    model.images[second].name = name = model.images[first].name
+    model.write(sparse / "1")
+    with pytest.raises(SourceError, match=f"two images have the name '{name}': rename one"):
+        ColmapReader().open(sparse / "1")
+
+
+def test_names_with_blanks_in_text_stay_whole(sparse: Path, tmp_path: Path) -> None:
+    """COLMAP writes such names as they are, and reads them up to the blank."""
+    model, text = pycolmap.Reconstruction(sparse / "1"), tmp_path / "text"
+    for image_id, image in model.images.items():
+        image.name = f"cam 1/image {image_id}.jpg"
+    text.mkdir()
+    model.write_text(text)
+    names = [f"cam 1/image {image_id}.jpg" for image_id in sorted(model.images)]
+    source = ColmapReader(edges="none").open(text)
+    assert sorted(frame.frame_id for frame in source.frames) == names
+    refined = hodge_pipeline.refine_colmap(text, out=tmp_path / "out", overrides=FREE)
+    assert sorted(image.name for image in refined.models[0].images.values()) == names
+    lines = (tmp_path / "out/sparse/0/images.txt").read_text().splitlines()
+    assert sorted(line.split(maxsplit=9)[9] for line in lines if "jpg" in line) == names
+    with pytest.raises(SourceError, match="names with blanks"):
+        ColmapWriter(form="txt").write(tmp_path / "copy", source)
 
 
 def contradict(model: Path) -> None:

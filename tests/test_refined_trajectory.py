@@ -1,5 +1,6 @@
 """Refinement from Python: arrays and Open3D objects in and out; the correction spread; the file forms."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hodge_pipeline
+from hodge_adapters.nerfstudio import NerfstudioReader
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_adapters.trajectories.rewriting import (
     EurocRewriter,
     KittiRewriter,
     LogRewriter,
+    NerfstudioRewriter,
     SevenScenesRewriter,
     TumRewriter,
 )
@@ -211,6 +214,23 @@ def test_seven_scenes_poses_become_a_folder(tmp_path: Path) -> None:
     (tmp_path / "seq").rename(tmp_path / "scene" / "seq-01")
     of_scene = SevenScenesRewriter().rewrite(tmp_path, tmp_path / "scene", moved) / "seq-01" / "frame-000004.pose.txt"
     np.testing.assert_allclose(np.loadtxt(of_scene), moved.world_from_cam[1], atol=1e-12)
+
+
+def test_transforms_json_keeps_all_but_its_poses(tmp_path: Path) -> None:
+    frames = [{"file_path": f"{row}.png", "mine": row, "transform_matrix": np.eye(4).tolist()} for row in range(3)]
+    original = {"ply_file_path": "a.ply", "applied_scale": 2.0, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(original))
+    moved = Trajectory(np.array([0.0, 2.0]), se3.exp([[0.1, 0.2, 0.3, 1.0, 2.0, 3.0], [0.3, 0.2, 0.1, 4.0, 5.0, 6.0]]))
+    out = NerfstudioRewriter().rewrite(tmp_path, tmp_path, moved)
+    found = NerfstudioReader().open(out).trajectory
+    assert out.name == "refined.json" and found is not None
+    np.testing.assert_allclose(found.world_from_cam[::2], moved.world_from_cam, atol=1e-12)
+    back = json.loads(out.read_text())
+    assert back["frames"][1] == frames[1]
+    for entry in (*back["frames"], *frames):
+        del entry["transform_matrix"]
+    assert back == original
+    assert NerfstudioRewriter().copy(tmp_path, tmp_path).read_bytes() == (tmp_path / "transforms.json").read_bytes()
 
 
 def test_every_rewriter_has_the_name_of_a_reader() -> None:

@@ -105,6 +105,17 @@ def test_information_is_symmetric_and_positive_in_a_corner(name: str) -> None:
     assert np.linalg.eigvalsh(information).min() > 0
 
 
+def test_aligned_both_ways_neither_cloud_is_preferred() -> None:
+    def differ(both_ways: bool) -> float:
+        registrar = Gicp(both_ways=both_ways)
+        i, j = (registrar.prepare(seen_from(pose, seed, 0.02)) for pose, seed in ((WORLD_FROM_I, 1), (WORLD_FROM_J, 2)))
+        forth = registrar.register(i, j, I_FROM_J @ OFF).i_from_j
+        back = registrar.register(j, i, se3.inverse(I_FROM_J @ OFF)).i_from_j
+        return float(np.abs(se3.log(forth @ back)).max())
+
+    assert differ(both_ways=True) < 0.3 * differ(both_ways=False)
+
+
 def test_a_plane_leaves_three_directions_without_information() -> None:
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(-1, 1, (2000, 2)), np.full(2000, 2.0)]).astype(np.float32)

@@ -21,10 +21,11 @@ from hodge_pipeline.report.contents import (
     Report,
     Residuals,
     SourceSummary,
+    StageRow,
 )
-from hodge_pipeline.report.run_page import document, next_commands
+from hodge_pipeline.report.run_page import document, next_commands, worst_places
 from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows
-from hodge_pipeline.report.tables import score_tables
+from hodge_pipeline.report.tables import score_tables, stages_table, worst_edges_table
 from hodge_pipeline.report.verdict import suspicions
 from hodge_pipeline.report.write import as_json, write_report
 from hodge_pipeline.types import Edges
@@ -109,6 +110,25 @@ def test_the_first_lines_say_where_it_is_worst_and_what_to_type(report: Report) 
     assert "hodge diagnose" not in document(report, "runs/a").first[1].text
 
 
+def test_what_nobody_measured_has_no_column_and_no_number(report: Report) -> None:
+    """A solved pose graph has no fitness, no verdicts, and no memory that was measured."""
+    assert worst_edges_table(report).header == ("i", "j", "source", "weight", "off by", "turned by")
+    judged = replace(report.worst_edges[0], fitness=0.5, verdict="wrong")
+    table = worst_edges_table(replace(report, worst_edges=(judged, *report.worst_edges[1:])))
+    assert {"fitness", "verdict"} <= set(table.header) and {len(row) for row in table.rows} == {8}
+    solved = replace(report, stages=(StageRow("solve", 1.0, 2.0, float("nan")),))
+    assert "nan" not in str(stages_table(solved)) and "time     1.0 s, 2.0 CPU s" in brief(solved, "x")
+
+
+def test_a_refinement_that_is_not_kept_is_not_called_the_result(report: Report) -> None:
+    names = tuple(map(str, range(20)))
+    shown = replace(report, shows_rejected=True, pictures=replace(report.pictures, names=names))
+    assert next(worst_places(shown)).startswith("In the refinement, which is not kept, frame ")
+    told = [section.title for section in document(shown, "x").sections if "which is not kept" in section.caption]
+    assert told == ["The place that changed most", "Errors and graph", "The scene from four sides"]
+    assert next(worst_places(replace(shown, shows_rejected=False))).startswith("Frame ")
+
+
 def test_a_length_has_no_unit_where_none_is_known(report: Report) -> None:
     page = document(replace(report, has_metres=False), "runs/a")
     assert page.first[0].lines[0].endswith("it is 0.5 and 0.2° off the result.") or "0.50" in page.first[0].lines[0]
@@ -176,7 +196,7 @@ def test_the_terminal_gets_ten_lines_of_80_columns(report: Report) -> None:
     for shown in (report, replace(report, notes=notes)):
         lines = brief(shown, "runs/a")
         assert len(lines) <= 10 and max(map(len, lines)) <= 80
-        assert lines[0] == "verdict  Improved against odometry" and lines[1].startswith("  - distance of clouds")
+        assert lines[0] == "verdict  Improved against odometry" and lines[1].startswith("  - ATE ")
         assert "time     3.0 s, 4.0 CPU s, at most 300 MB" in lines
         assert lines[-2:] == ["report   runs/a/report.html", "next     hodge view runs/a --web"]
     assert "  - … and 4 more measures: --verbose" in lines
@@ -186,7 +206,7 @@ def test_the_terminal_gets_ten_lines_of_80_columns(report: Report) -> None:
 
 def test_numbers_in_words() -> None:
     assert [length(value) for value in (0.0012, 0.0305, 1.303, float("nan"))] == ["1.2 mm", "3.05 cm", "1.3 m", "–"]
-    assert [percent(value) for value in (-0.406, 0.1)] == ["−41 %", "+10 %"]
+    assert [percent(value) for value in (-0.406, 0.1, -0.004, 0.0)] == ["−41 %", "+10 %", "0 %", "0 %"]
 
 
 def test_what_is_a_large_residual_and_how_many_pairs_may_see_nothing_goes_by_the_scene(report: Report) -> None:

@@ -94,6 +94,14 @@ def test_scanners_are_seen_with_their_own_z_up() -> None:
     assert up == pytest.approx(tilted[0, :3, 2]) and ahead == pytest.approx(tilted[0, :3, 0])
 
 
+def test_what_lies_at_the_lower_edge_is_not_drawn_at_the_upper_one_too() -> None:
+    size = (40, 30)
+    row = np.column_stack([np.linspace(-15, 15, 31), np.full(31, 14.0), np.zeros(31)]).astype(np.float32)
+    view = raster.View(np.eye(3), np.zeros(3), 1.0, size, culled=False, fill_px=3)
+    image = raster.picture(raster.Points.of(row), view)
+    assert (image[25:] < raster.PAPER).any() and (image[:20] == raster.PAPER).all()
+
+
 def test_frames_that_show_nothing_are_no_error() -> None:
     clouds, poses = room(3)
     assert four_sides(clouds, np.full((3, 4, 4), np.nan), poses, np.zeros(3, int)) == ()
@@ -148,16 +156,21 @@ def test_the_place_that_changed_most_is_shown_before_and_after() -> None:
 
 
 def test_the_rotation_error_of_each_frame_is_that_of_its_pose() -> None:
-    """Against the truth where there is one; a frame without a pose has none, nor has a report of an earlier version."""
-    truth = se3.exp(np.random.default_rng(0).standard_normal((5, 6)))
-    turned = truth @ se3.exp(np.radians([[0, 0, k * 40.0, 0, 0, 0] for k in range(5)]))
+    """Against the truth where there is one, after the mean turn: a straight path says nothing of the turn about it. A
+    frame without a pose has none, nor has a report of an earlier version.
+    """
+    turns, up = [20.0, 10, -10, 0, -20], [0.0, 0, 1, 0, 0, 0]
+    truth = np.tile(np.eye(4), (5, 1, 1))
+    turned = se3.exp(np.array(up) * 0.5) @ truth @ se3.exp(np.radians(np.outer(turns, up)))
     turned[3] = np.nan
     paths = (Path3D.of("truth", truth), Path3D.of("odometry", turned), Path3D.of("result", truth))
     report = Report("", SourceSummary("", "", 5), before="odometry", after="result", pictures=Pictures(paths=paths))
     found = turns_deg(report)
-    np.testing.assert_allclose(found["odometry"], [0, 40, 80, np.nan, 160], atol=1e-6)
+    np.testing.assert_allclose(found["odometry"], [20, 10, 10, np.nan, 20], atol=1e-6)
     np.testing.assert_allclose(found["result"], 0, atol=1e-6)
     without = replace(report, pictures=Pictures(paths=tuple(replace(path, rotations=None) for path in paths)))
     assert turns_deg(without) == {}
-    moved = replace(report, pictures=Pictures(paths=paths[1:]))
-    np.testing.assert_allclose(turns_deg(moved)["result"], [0, 40, 80, np.nan, 160], atol=1e-6)
+    assert turns_deg(replace(report, pictures=Pictures(paths=paths[1:]))) == {}, "nothing moved"
+    before = replace(paths[1], positions=paths[1].positions + 1.0)
+    moved = replace(report, pictures=Pictures(paths=(before, paths[2])))
+    np.testing.assert_allclose(turns_deg(moved)["result"], [20, 10, 10, np.nan, 20], atol=1e-6)

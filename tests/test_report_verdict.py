@@ -57,7 +57,7 @@ def test_errors_that_disagree_are_mixed(report: Report) -> None:
     best, bad = verdict.headline.split(", but ")
     assert best == "Mixed against odometry: RPE of the rotation 4.43° → 0.443° and 2 more better"
     assert bad.startswith("distance of clouds (near-centroid pairs) 10 mm → 20 mm, distance of clouds (overlapping")
-    assert [change.sign for change in verdict.changes] == [-1, -1, 1, 1, 1]
+    assert [change.sign for change in verdict.changes] == [1, 1, 1, -1, -1]
 
 
 def test_a_measure_that_got_worse_is_named_in_the_headline() -> None:
@@ -253,3 +253,14 @@ def test_clouds_that_fit_better_than_at_the_truth_are_explained(report: Report) 
     better = replace(report, scores=scored(0.010, 0.020, 0.009))
     assert [note.kind for note in suspicions(better)].count("above truth") == 1
     assert "above truth" not in [note.kind for note in suspicions(report)]
+
+
+def test_scans_that_fit_in_several_ways_are_told_first(report: Report) -> None:
+    drawn = report.pictures.graph
+    assert drawn is not None
+    graph = graph_summary(Edges.measured(drawn), drawn.vertex_ids, np.arange(20))
+    source = replace(report.source, unordered=True, kind="scans")
+    verdict = judge(replace(report, graph=graph, source=source, notes=(Note("ambiguous", 9, "190"),)))
+    assert verdict.headline.startswith(
+        "No two of 20 scans joined, and 9 of 190 pairs fit in several ways (take scans in"
+    )

@@ -180,6 +180,19 @@ def test_the_table_is_filtered_and_sorted(session: Session) -> None:
     assert [edge["row"] for edge in some] == [edge["row"] for edge in everything["edges"][10:15]]
 
 
+def test_where_nothing_is_wrong_every_edge_is_listed(tmp_path: Path, session: Session) -> None:
+    assert session.look.verdicts == ("wrong", "suspect")
+    poses = poses_on_a_ring(VIEWS)
+    write_g2o(tmp_path / "good.g2o", measured(poses, near_pairs(VIEWS, REACH)), poses)
+    good = Session(open_for_review(tmp_path / "good.g2o"), who="ada")
+    try:
+        good.wait()
+        found = list_edges(good, Query(verdicts=good.look.verdicts))
+        assert found["total"] == len(good.table) == VIEWS * REACH
+    finally:
+        good.close()
+
+
 def test_the_whole_scene_is_seen_from_above_when_it_is_asked_for_again(session: Session) -> None:
     session.show(mode="edge")
     session.show(mode="all")

@@ -19,6 +19,7 @@ from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.tracked_blocks import _empty_file
 from hodge_pipeline.stages import Step
 from hodge_pipeline.store import artifacts, codec
+from hodge_pipeline.store import cost as cost_module
 from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.store import Store, stored, stored_clouds
 from hodge_pipeline.types import CloudSet, Edges, Floats, PointCloud
@@ -268,6 +269,20 @@ def test_costs_are_those_of_the_run_that_computed_it_and_are_added_by_title(tmp_
     assert cost["title"] == "t" and len(parts) == 2
     assert cost["wall_s"] == pytest.approx(sum(part["wall_s"] for part in parts))
     assert cost["peak_mb"] == max(part["peak_mb"] for part in parts) > 1
+
+
+def test_short_steps_share_one_look_at_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks: list[int] = []
+    monkeypatch.setattr(cost_module, "SAMPLE_SECONDS", 1000.0)
+    monkeypatch.setattr(cost_module, "_memory_bytes", lambda process: looks.append(process.pid) or 5_000_000)
+    monitor = cost_module.Monitor()
+    peaks = []
+    for _ in range(3):
+        with monitor.measure() as spent:
+            pass
+        peaks.append(spent.peak_mb)
+    assert looks.count(os.getpid()) == 1
+    assert peaks == [5.0 * len(looks)] * 3
 
 
 VALUES: list[tuple[Any, Any]] = [

@@ -19,14 +19,14 @@ from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView
 from hodge_pipeline.stages import no_progress
 from hodge_pipeline.start.unordered.folds import Pieces, contradictions, unfolded, within_parts
-from hodge_pipeline.start.unordered.hypotheses import _ambiguous, allowed_hue_conflict, allowed_violation
+from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, _ambiguous, allowed_hue_conflict, allowed_violation
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
-from hodge_pipeline.start.unordered.start import Frames, Start, find_start
+from hodge_pipeline.start.unordered.start import Frames, Start, _ambiguous_pairs, find_start
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, ViewGraph
-from hodge_pipeline.types.edges import USED
+from hodge_pipeline.types.edges import REJECTED, USED
 from test_global_registration import furnished_corner
 
 OPTIONS = CloudOptions(voxel_m=0.05, min_range_m=0.0, max_range_m=100.0)
@@ -73,7 +73,7 @@ def test_scans_of_one_place_are_joined_and_a_stranger_and_a_wall_are_left_apart(
             @ found.world_from_cam[j]
         )
         assert np.abs(error).max() < 0.02
-    said = "\n".join(found.notes)
+    said = "\n".join(map(str, found.notes))
     assert "scan 4: cannot be registered by its shape: its surfaces leave open" in said
     assert "falls into 3 pieces" in said
 
@@ -272,3 +272,12 @@ def test_what_hues_may_differ_by_follows_the_best_pairs_of_a_run() -> None:
     assert allowed_hue_conflict(np.array([]), limits) == limits.hue_floor
     assert allowed_hue_conflict(np.array([0.0, 0.0, 0.1, np.nan]), limits) == limits.hue_floor
     assert np.isclose(allowed_hue_conflict(np.full(5, 0.01), limits), 0.12)
+
+
+def test_pairs_that_fit_in_several_ways_are_told_unless_others_join_their_scans() -> None:
+    edges = Edges.of([[0, 1], [0, 2], [1, 2]])
+    edges = edges.put(slice(None), status=REJECTED, why=np.array([AMBIGUOUS, AMBIGUOUS, "too little overlap"]))
+    assert [(note.kind, note.count, note.detail) for note in _ambiguous_pairs(edges, np.array([0, 0, 1]))] == [
+        ("ambiguous", 1, "3")
+    ]
+    assert _ambiguous_pairs(edges, np.array([0, 0, 0])) == ()

@@ -42,7 +42,7 @@ class NerfstudioReader:
     def sniff(self, path: Path) -> Sniff:
         """By the name, or by the keys near the first_text."""
         path = Path(path)
-        text = first_text(path / FILE if path.is_dir() else path)
+        text = first_text(transforms_file(path))
         if '"transform_matrix"' in text or '"frames"' in text:
             return Sniff(0.9, "frames with a transform_matrix")
         return Sniff(0.0, "no transforms.json")
@@ -50,7 +50,7 @@ class NerfstudioReader:
     def open(self, path: Path) -> Source:
         """Frames in the file's order: id is `file_path`, stamp the row. World and scale are the file's own."""
         path = Path(path)
-        file = path / FILE if path.is_dir() else path
+        file = transforms_file(path)
         content = read_json(file)
         entries = objects(content.get("frames"), f"{file}: frames")
         if not entries:
@@ -101,16 +101,20 @@ class NerfstudioWriter:
     """Writes posed frames as a `transforms.json`, with images that its cameras fit."""
 
     def write(self, path: Path, source: Source) -> tuple[str, ...]:
-        """The file, atomically, after the images: each stays where it is below the file's folder, else a copy goes to
-        `images/` beside it. Lens distortion passes through where nerfstudio knows the lens (k1 to k4, p1, p2, for all
-        images alike); else undistorted images are written there. Without an image `file_path` is the frame's id.
+        """A `.json`, or `transforms.json` in a folder of that name, atomically, after the images: each stays where it
+        is below the file's folder, else a copy goes to `images/` beside it. Lens distortion passes through where
+        nerfstudio knows the lens (k1 to k4, p1, p2, for all images alike); else undistorted images are written there.
+        Without an image `file_path` is the frame's id.
         """
-        path = Path(path)
+        path = Path(path) if Path(path).suffix == ".json" else Path(path) / FILE
         posed = [frame for frame in source.frames if frame.world_from_cam is not None]
         if not posed:
             poses = trajectory_of(source).world_from_cam
             bare = [_entry(f"{row:06d}", pose, None) for row, pose in enumerate(poses)]
-            write_json(path, {"camera_model": PERSPECTIVE, "orientation_override": "none", "frames": bare})
+            write_json(
+                _target(path.parent, path.name),
+                {"camera_model": PERSPECTIVE, "orientation_override": "none", "frames": bare},
+            )
             return written(f"{len(bare)} poses without images", source)
         lenses = [None if frame.image is None else named(frame.image) for frame in posed]
         models = {lens[0] for lens in lenses if lens}
@@ -124,13 +128,26 @@ class NerfstudioWriter:
                 name, how = _undistorted(path.parent, frame)
                 entries.append(_entry(name, frame.world_from_cam, _pinhole(frame.camera)))
             done[how] += 1
-        write_json(path, {"camera_model": model or PERSPECTIVE, "orientation_override": "none", "frames": entries})
+        write_json(
+            _target(path.parent, path.name),
+            {"camera_model": model or PERSPECTIVE, "orientation_override": "none", "frames": entries},
+        )
         how = ", ".join(f"{count} {what}" for what, count in done.items())
         return written(f"{len(entries)} frames: {how}", source, {"cameras", "names", "images"})
 
 
+def transforms_file(path: Path) -> Path:
+    """The file itself, or the one in a folder."""
+    return path / FILE if path.is_dir() else path
+
+
+def opengl_matrix(world_from_cam: Any) -> list[list[float]]:
+    """The rows of a `transform_matrix`."""
+    return (world_from_cam @ OPENGL_FROM_CAM + 0.0).tolist()  # type: ignore[no-any-return]
+
+
 def _entry(name: str, world_from_cam: Any, camera: Mapping[str, float] | None) -> dict[str, Any]:
-    return {"file_path": name, **(camera or {}), "transform_matrix": (world_from_cam @ OPENGL_FROM_CAM + 0.0).tolist()}
+    return {"file_path": name, **(camera or {}), "transform_matrix": opengl_matrix(world_from_cam)}
 
 
 def _pinhole(camera: Camera | None) -> dict[str, float]:
@@ -147,7 +164,7 @@ def _placed(folder: Path, image: Path, frame_id: int | str) -> tuple[str, str]:
     base = folder.resolve()
     if image.resolve().is_relative_to(base):
         return image.resolve().relative_to(base).as_posix(), "images where they are"
-    target = _target(folder, image.name if isinstance(frame_id, int) else _bare(frame_id) + image.suffix)
+    target = _target(folder / IMAGES, image.name if isinstance(frame_id, int) else _bare(frame_id) + image.suffix)
     write_bytes_atomically(target, read_input(image))
     return target.relative_to(folder).as_posix(), "images copied"
 
@@ -156,7 +173,7 @@ def _undistorted(folder: Path, frame: Frame) -> tuple[str, str]:
     """The `file_path` of the image that a frame's pinhole camera sees, written as PNG."""
     if frame.read_colour is None:
         return str(frame.frame_id), "without an image"
-    target = _target(folder, _bare(str(frame.frame_id)) + ".png")
+    target = _target(folder / IMAGES, _bare(str(frame.frame_id)) + ".png")
     done, contents = cv2.imencode(".png", cv2.cvtColor(frame.read_colour(), cv2.COLOR_RGB2BGR))
     assert done
     write_bytes_atomically(target, bytes(contents))
@@ -170,8 +187,8 @@ def _bare(name: str) -> str:
 
 
 def _target(folder: Path, name: str) -> Path:
-    """The path of this image in the folder of images, which is made."""
-    target = inside(folder / IMAGES, name)
+    """The path of this file in the folder, which is made."""
+    target = inside(folder, name)
     if target is None:
         raise SourceError(f"{name!r}: the name of an image leaves its folder: rename it")
     try:

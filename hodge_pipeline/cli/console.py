@@ -129,7 +129,7 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
     """A table on stdout, numbers to the right; `words` are columns of text, as the first is."""
     table = Table(title=Text(visible(title)), title_justify="left", box=box.SIMPLE_HEAD)
     for row, name in enumerate(header):
-        table.add_column(name, justify="left" if row == 0 or name in words else "right")
+        table.add_column(name, justify="left" if row == 0 or name in words else "right", overflow="fold")
     for cells in rows:
         table.add_row(*(Text(visible(cell)) for cell in cells))
     Console(highlight=False, file=unguarded(sys.stdout)).print(table)

@@ -50,11 +50,15 @@ class Loops:
         """Edges of each loop, (L,)."""
         return np.diff(self.offsets)
 
+    @property
+    def rows(self) -> Ints:
+        """The loop (N,) that each entry of `edge` belongs to."""
+        return np.repeat(np.arange(len(self)), self.lengths)
+
     def incidence(self, edge_count: int) -> csr_matrix:
         """The loops as 1-chains, (L, E): how often each passes each edge, with sign."""
-        rows = np.repeat(np.arange(len(self)), self.lengths)
         values = self.sign.astype(float)
-        matrix = csr_matrix((values, (rows, self.edge)), shape=(len(self), edge_count))
+        matrix = csr_matrix((values, (self.rows, self.edge)), shape=(len(self), edge_count))
         matrix.eliminate_zeros()
         return matrix
 
@@ -70,11 +74,13 @@ class Loops:
         return Loops(self.offsets, self.edge, np.where(turned[self.edge], -self.sign, self.sign))
 
 
-def spanning_forest(edges: Ints, vertex_count: int) -> SpanningForest:
-    """A breadth-first tree of each component from its first vertex; the first of parallel edges is in the tree."""
+def spanning_forest(edges: Ints, vertex_count: int, roots: Ints | None = None) -> SpanningForest:
+    """A breadth-first tree of each component from its first vertex, or from `roots`, one of each component; the first
+    of parallel edges is in the tree.
+    """
     edges = np.asarray(edges, np.int64).reshape(-1, 2)
-    component = connected_components(edges, vertex_count)
-    roots = np.flatnonzero(first_of_component(component))
+    if roots is None:
+        roots = np.flatnonzero(first_of_component(connected_components(edges, vertex_count)))
     parent = _breadth_first_parents(edges, roots, vertex_count)
     child = np.flatnonzero(parent >= 0)
     parent_edge = np.full(vertex_count, -1, np.int64)
@@ -197,7 +203,7 @@ def loop_products(loops: Loops, i_from_j: Floats) -> Floats:
 
 def _batch_products(loops: Loops, i_from_j: Floats) -> Floats:
     motion = _directed(i_from_j, loops.edge, loops.sign)
-    row = np.repeat(np.arange(len(loops)), loops.lengths)
+    row = loops.rows
     place = np.arange(len(row)) - loops.offsets[:-1][row]
     while len(place) and place.max() > 0:
         # neighbours (0, 1), (2, 3), … of every loop at once; a last one without a partner stays

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
-from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.diagnosis.consensus import find_consensus
@@ -24,16 +23,13 @@ from hodge_pipeline.diagnosis.result import (
     WRONG,
     Cycles,
     Diagnosis,
-    count_verdicts,
-    residuals_in_pieces,
 )
-from hodge_pipeline.diagnosis.robust_poses import Fit
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors, judge_cycles, with_cycles_of, witnesses
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
 LIKELIER_RIGHT = 0.5
@@ -84,7 +80,19 @@ def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
     verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
     world_from_cam = fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
     cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))
-    found = _report(stated, cycles, probability, verdict, undecided, fit, world_from_cam)
+    telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
+    found = Diagnosis.of(
+        stated,
+        verdict=verdict,
+        probability=probability,
+        reasons=partial(reasons, stated, cycles, verdict, telling, undecided, fit.bridge),
+        kept=(verdict == CONSISTENT) | (verdict == UNTESTABLE),
+        resistance=fit.resistance,
+        cycles=cycles,
+        witnesses=telling,
+        world_from_cam=world_from_cam,
+        tested=f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close",
+    )
     information = _of_noise(evidence.noise, point, graph.dimension == 2)
     notes = (*found.notes, *evidence.noise.doubts, *free_direction_notes(stated))
     return replace(found, information=information, notes=notes)
@@ -108,35 +116,3 @@ def _of_noise(noise: Noise, point: Floats, planar: bool) -> Floats:
     if planar:
         information[:, OUT_OF_PLANE] = information[:, :, OUT_OF_PLANE] = 0
     return np.asarray(information)
-
-
-def _report(
-    graph: ViewGraph,
-    cycles: Cycles,
-    probability: Floats,
-    verdict: NDArray[np.str_],
-    undecided: Ints,
-    fit: Fit,
-    world_from_cam: Floats,
-) -> Diagnosis:
-    kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
-    piece, *residual = residuals_in_pieces(graph, kept, world_from_cam)
-    telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
-    share = 1 - 1 / (1 + fit.resistance)
-    tested = f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close"
-    return Diagnosis(
-        verdict=verdict,
-        probability=probability,
-        reason=reasons(graph, cycles, verdict, (residual[0], residual[1]), telling, undecided, fit.bridge),
-        kept=kept,
-        residual_m=residual[0],
-        residual_deg=residual[1],
-        leverage=np.where(kept, share, 0.0),
-        information=graph.information,
-        cycles=cycles,
-        witnesses_for=telling[0],
-        witnesses_against=telling[1],
-        piece=piece,
-        world_from_cam=world_from_cam,
-        notes=(f"edges: {count_verdicts(verdict)}", tested, *describe_components(piece, graph.vertex_ids)),
-    )

@@ -137,7 +137,7 @@ class _Errors:
 
     def __init__(self, loops: Loops, relative: Floats, error: Floats) -> None:
         self.loops, self.error = loops, error
-        self.row = np.repeat(np.arange(len(loops)), loops.lengths)
+        self.row = loops.rows
         self.ratio = error / np.sqrt(np.bincount(self.row, relative[loops.edge] ** 2, len(loops)))
 
     def scale(self, gate: float, prior: Floats, fallback: float) -> float:

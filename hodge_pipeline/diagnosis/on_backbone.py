@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline import se3
-from hodge_pipeline.complex.components import describe_components
-from hodge_pipeline.complex.cycles import Loops
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.cycles import fundamental_loops, fundamental_products, spanning_forest
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.resistance import effective_resistance
@@ -19,12 +21,9 @@ from hodge_pipeline.diagnosis.result import (
     WRONG,
     Cycles,
     Diagnosis,
-    count_verdicts,
-    residuals_in_pieces,
 )
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors
 from hodge_pipeline.diagnosis.wording import distance
-from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -46,24 +45,18 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisO
     untestable = np.isnan(probability)
     wrong = ~kept & (probability < options.wrong_below) & (backbone.steps | backbone.found.confirmed)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
-    piece, residual_m, residual_deg = residuals_in_pieces(graph, kept, backbone.world_from_cam)
-    resistance = effective_resistance(graph.edges, graph.vertex_count, kept)
     cycles, cycle = _cycles(graph, backbone, in_loop)
-    return Diagnosis(
+    return Diagnosis.of(
+        graph,
         verdict=verdict,
         probability=probability,
-        reason=_reasons(backbone, verdict, (residual_m, residual_deg)),
+        reasons=partial(_reasons, backbone, verdict),
         kept=kept,
-        residual_m=residual_m,
-        residual_deg=residual_deg,
-        leverage=np.where(kept, 1 - 1 / (1 + resistance), 0.0),
-        information=graph.information,
+        resistance=effective_resistance(graph.edges, graph.vertex_count, kept),
         cycles=cycles,
-        witnesses_for=_witnesses(np.where(kept, cycle, -1)),
-        witnesses_against=_witnesses(np.where(kept, -1, cycle)),
-        piece=piece,
+        witnesses=(_witnesses(np.where(kept, cycle, -1)), _witnesses(np.where(kept, -1, cycle))),
         world_from_cam=backbone.world_from_cam,
-        notes=(f"edges: {count_verdicts(verdict)}", backbone.note, *describe_components(piece, graph.vertex_ids)),
+        tested=backbone.note,
     )
 
 
@@ -77,34 +70,18 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
     """The cycle of each loop with the steps that it spans, and the row of each edge's (E,): of the shortest loops, and
     of those whose steps confirmed loops pass over, since no step is to blame for a loop that fails alone.
     """
-    chain = backbone.chain
-    same = chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]]
-    spans = np.where(same, chain.ends[:, 1] - chain.ends[:, 0], graph.edge_count)
-    bare = np.cumsum((chain.step_edge < 0) | ~in_loop[chain.step_edge])
-    same &= bare[chain.ends[:, 1]] == bare[chain.ends[:, 0]]
-    order = np.argsort(spans, kind="stable")
-    order = order[same[order] & (np.cumsum(spans[order] + 1) <= MOST_ENTRIES)]
-    loops = _listed(graph, chain, order)
-    poses, (low, high) = chain.poses(), chain.ends[order].T
-    products = se3.inverse(poses[low]) @ poses[high] @ se3.inverse(chain.motion[order])
-    angle, displacement_m = cycle_errors(loops, graph.i_from_j, products)
-    edges = chain.loop_edge[order]
+    chain, steps = backbone.chain, np.flatnonzero(backbone.steps & in_loop)
+    forest = spanning_forest(graph.edges[steps], graph.vertex_count)
+    forest = replace(forest, edges=graph.edges, parent_edge=np.append(steps, -1)[forest.parent_edge])
+    component = connected_components(graph.edges[steps], graph.vertex_count)[graph.edges[chain.loop_edge]]
+    same, spans = component[:, 0] == component[:, 1], np.diff(chain.ends, axis=1)[:, 0]
+    order = np.flatnonzero(same)[np.argsort(spans[same], kind="stable")]
+    chords = chain.loop_edge[order[np.cumsum(spans[order] + 1) <= MOST_ENTRIES]]
+    loops = fundamental_loops(forest, chords)
+    errors = cycle_errors(loops, graph.i_from_j, fundamental_products(forest, graph.i_from_j, chords))
     row = np.full(graph.edge_count, -1, np.int64)
-    row[edges] = np.arange(len(edges))
-    return Cycles(loops, angle, displacement_m, backbone.chi2[edges], backbone.used[edges]), row
-
-
-def _listed(graph: ViewGraph, chain: Chain, rows: Ints) -> Loops:
-    low, high = chain.ends[rows].T
-    lengths = high - low + 1
-    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-    owner = np.repeat(np.arange(len(rows)), lengths)
-    place = low[owner] + 1 + np.arange(offsets[-1]) - offsets[owner]
-    is_loop = place > high[owner]
-    place = np.minimum(place, chain.size - 1)
-    edge = np.where(is_loop, chain.loop_edge[rows][owner], chain.step_edge[place])
-    begins = np.where(is_loop, chain.order[high[owner]], chain.order[place - 1])
-    return Loops(offsets, edge, np.where(graph.edges[edge, 0] == begins, 1, -1))
+    row[chords] = np.arange(len(chords))
+    return Cycles(loops, *errors, backbone.chi2[chords], backbone.used[chords]), row
 
 
 def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floats, Floats]) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.growth import Alignment, align
+from hodge_pipeline.diagnosis.growth import Alignment, Proposals, align
 from hodge_pipeline.diagnosis.placement import (
     PlacementCriteria,
     arrangement_log_evidence,
@@ -25,7 +25,6 @@ from hodge_pipeline.diagnosis.placement import (
     run_sums,
     sums_of,
 )
-from hodge_pipeline.diagnosis.proposals import Proposals
 from hodge_pipeline.diagnosis.robust_poses import ONCE, TWICE, Fit, fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.types import Bools, Floats

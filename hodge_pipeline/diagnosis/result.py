@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy import str_
 from numpy.typing import NDArray
 
-from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.components import connected_components, describe_components
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, ViewGraph
@@ -61,6 +62,33 @@ class Diagnosis:
     world_from_cam: Floats
     notes: tuple[str, ...]
 
+    @classmethod
+    def of(
+        cls,
+        graph: ViewGraph,
+        *,
+        verdict: NDArray[str_],
+        probability: Floats,
+        reasons: Callable[[tuple[Floats, Floats]], tuple[str, ...]],
+        kept: Bools,
+        resistance: Floats,
+        cycles: Cycles,
+        witnesses: tuple[Ints, Ints],
+        world_from_cam: Floats,
+        tested: str,
+    ) -> Diagnosis:
+        """The diagnosis of these verdicts: its pieces are those of the kept edges; `reasons` of the residuals (E,) in
+        metres and degrees; `resistance (E,)` as of `effective_resistance`; `tested`: a note on what tested the edges.
+        """
+        piece = connected_components(graph.edges[kept], graph.vertex_count)
+        apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
+        displacement_m, angle = edge_residuals(graph, world_from_cam)
+        residual = np.where(apart, np.nan, displacement_m), np.where(apart, np.nan, np.degrees(angle))
+        leverage = np.where(kept, 1 - 1 / (1 + resistance), 0.0)
+        notes = f"edges: {count_verdicts(verdict)}", tested, *describe_components(piece, graph.vertex_ids)
+        told = verdict, probability, reasons(residual), kept, *residual, leverage, graph.information, cycles
+        return cls(*told, *witnesses, piece, world_from_cam, notes)
+
     def __repr__(self) -> str:
         return f"Diagnosis({len(self.verdict)} edges: {count_verdicts(self.verdict)})"
 
@@ -78,13 +106,3 @@ class Diagnosis:
 def count_verdicts(verdict: NDArray[str_]) -> str:
     """How many edges have each verdict, in words."""
     return ", ".join(f"{int((verdict == name).sum())} {name}" for name in (CONSISTENT, SUSPECT, WRONG, UNTESTABLE))
-
-
-def residuals_in_pieces(graph: ViewGraph, kept: Bools, world_from_cam: Floats) -> tuple[Ints, Floats, Floats]:
-    """The piece (V,) of each vertex, by the kept edges (E,), and how far each edge is from the poses (V, 4, 4), metres
-    and degrees; NaN between two pieces.
-    """
-    piece = connected_components(graph.edges[kept], graph.vertex_count)
-    displacement_m, angle = edge_residuals(graph, world_from_cam)
-    apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
-    return piece, np.where(apart, np.nan, displacement_m), np.where(apart, np.nan, np.degrees(angle))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -14,25 +15,28 @@ from scipy.special import gammainc, gammaln
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.cycles import SpanningForest, fundamental_products, spanning_forest
+from hodge_pipeline.complex.cycles import Loops, loop_products
 from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, diagnose, lattice_backbone
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
-from hodge_pipeline.solvers.backbone.solve import solve_on_backbone
-from hodge_pipeline.solvers.backbone.trust import NONE, find_backbone
+from hodge_pipeline.diagnosis.short_cycles import tree_loops
+from hodge_pipeline.solvers.backbone.trust import NONE, Backbone, find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import held_rows
-from hodge_pipeline.solvers.stated import is_explained
 from hodge_pipeline.solvers.weights import edge_weights, is_planar
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, ViewGraph
 
 LEVEL = 0.01
 """Choices of edges that agree so well by chance, expected among all: as the gate of the edges, which 1 % miss."""
+SIGMAS = 3.0
+"""Standard deviations of χ², √(2 degrees of freedom), by which it may exceed these where stated errors explain it."""
 UNIFORM_RAD2 = (8 * math.pi**2) ** (2 / 3) / (2 * math.pi)
 """Variance of an axis at which a Gaussian is as dense at 0 as uniform rotations, which spread no wider."""
+Solver: TypeAlias = Callable[[ViewGraph, Floats], Solution]
+"""The maximum-likelihood solution of a graph, from poses (V, 4, 4)."""
 
 
 def solve_robust(
@@ -60,39 +64,73 @@ def solve_robust(
     if backbone is None:
         found = diagnose(graph, replace(diagnosis, trust=NONE))
         backbone = lattice_backbone(graph, found, diagnosis)
-    if backbone is not None:
-        return solve_on_backbone(
-            graph, backbone, start=start, objective=objective, dimension=dimension, certificate=certificate
-        )
     fixed, unheld = held_rows(graph, start)
-    known = replace(graph, information=found.information) if has_unit_information(graph) else graph
 
-    def solved(weights: Floats, poses: Floats) -> Solution:
-        rows = np.flatnonzero(weights)
-        chosen = known.select(rows)
-        held = start is not None and len(fixed) > 0
+    def solved(chosen: ViewGraph, poses: Floats) -> Solution:
         return solve(
-            replace(chosen, information=weights[rows, None, None] * chosen.information),
-            start=start if held else _placed(chosen, poses, start),
-            initial="chordal" if held or graph.priors is not None else "given",
+            chosen,
+            start=start if len(fixed) else _placed(chosen, poses, start),
+            initial="chordal" if len(fixed) or graph.priors is not None else "given",
             objective=objective,
             dimension=dimension,
             fixed=fixed,
             certificate=certificate,
         )
 
+    final = _judged(graph, found, solved) if backbone is None else _on_backbone(graph, backbone, solved)
+    metrics = {**final.metrics, "kept_edges": float((final.weights > 0).sum())}
+    return replace(final, notes=(*unheld, *final.notes), metrics=metrics)
+
+
+def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Solution:
+    """The poses of a backbone and the loops that it confirms, with the information as it is stated where it explains
+    what these leave over, else with the errors that they were found to have; `confirmed` is None where no loop is.
+    """
+    chosen = graph.select(np.flatnonzero(backbone.used))
+    final = solved(chosen, backbone.world_from_cam)
+    if not is_explained(chosen, final):
+        final = solved(backbone.weighted(graph), backbone.world_from_cam)
+    return replace(
+        final,
+        weights=backbone.used.astype(float),
+        notes=(backbone.note, *final.notes),
+        metrics={**final.metrics, "tested_edges": float(np.isfinite(backbone.chi2).sum())},
+        confirmed=True if backbone.found.confirmed else None,
+    )
+
+
+def _judged(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Solution:
+    """The poses of the edges that a diagnosis without a backbone keeps."""
+    known = replace(graph, information=found.information) if has_unit_information(graph) else graph
     kept = found.kept & graph.information.any(axis=(1, 2))
+
+    def weighed(weights: Floats, poses: Floats) -> Solution:
+        rows = np.flatnonzero(weights)
+        chosen = known.select(rows)
+        return solved(replace(chosen, information=weights[rows, None, None] * chosen.information), poses)
+
     weights = kept.astype(float)
-    final = solved(weights, found.world_from_cam)
+    final = weighed(weights, found.world_from_cam)
     if not is_explained(graph.select(np.flatnonzero(kept)), final):
-        weights, final = reweighted(known, weights, final, solved)
+        weights, final = reweighted(known, weights, final, weighed)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
     stated = edge_weights(graph, 2 if graph.dimension == 2 or is_planar(graph) else 3)
     told = (note for note in stated.notes if note not in final.notes)
-    notes = (*unheld, *told, _told(found, whole), *found.notes, *final.notes)
-    metrics = {**final.metrics, "kept_edges": float((whole > 0).sum())}
-    return _with_confirmation(graph, stated.used, replace(final, weights=whole, notes=notes, metrics=metrics))
+    notes = (*told, _told(found, whole), *found.notes, *final.notes)
+    return _with_confirmation(graph, stated.used, replace(final, weights=whole, notes=notes))
+
+
+def is_explained(graph: ViewGraph, solution: Solution) -> bool:
+    """Whether the χ² of a maximum-likelihood solution of all edges of a graph is no more than the graph's information
+    has chance make of it; False where the information is the identity that stands for unknown.
+    """
+    if has_unit_information(graph):
+        return False
+    axes = 3 if graph.dimension == 2 or is_planar(graph) else 6
+    tree = graph.vertex_count - int(solution.component.max(initial=-1)) - 1
+    freedom = axes * (graph.edge_count - tree)
+    return not freedom or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
 
 
 def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:
@@ -136,56 +174,32 @@ def confirmed(graph: ViewGraph, kept: Ints) -> bool:
     end is uniform; of C cycles, minus the sum of the logarithms is gamma distributed. Every choice of as many
     of the edges counts, whichever the solver made: so that it chose the best makes nothing look better than it is.
     """
-    forest = spanning_forest(graph.edges[kept], graph.vertex_count)
-    chords = forest.chords[forest.edges[forest.chords, 0] != forest.edges[forest.chords, 1]]
-    if not len(chords):
+    graph, every = graph.select(kept), graph.edge_count
+    loops = tree_loops(graph.edges, graph.vertex_count)
+    if not len(loops):
         return False
-    log_chance = _log_chance(graph, kept, forest, chords)
-    every, out, cycles = graph.edge_count, graph.edge_count - len(kept), len(chords)
+    log_chance = _log_chance(graph, loops)
+    out, cycles = every - len(kept), len(loops)
     log_choices = gammaln(every + 1) - gammaln(out + 1) - gammaln(len(kept) + 1) + math.log(every)
     mean = -float(log_chance.sum()) / cycles
     # Chernoff's bound of the gamma distribution's tail
     return mean > 1 and cycles * (1 + math.log(mean) - mean) + log_choices < math.log(LEVEL)
 
 
-def _log_chance(graph: ViewGraph, kept: Ints, forest: SpanningForest, chords: Ints) -> Floats:
-    """The logarithm of how likely (C,) a cycle of such edges in random directions leaves less; axes along which most
+def _log_chance(graph: ViewGraph, loops: Loops) -> Floats:
+    """The logarithm of how likely (L,) a cycle of such edges in random directions leaves less; axes along which most
     edges do not move do not count.
     """
-    left = se3.log(fundamental_products(forest, graph.i_from_j[kept], chords))
-    squares = se3.log(graph.i_from_j[kept]) ** 2
+    left = se3.log(loop_products(loops, graph.i_from_j))
+    squares = se3.log(graph.i_from_j) ** 2
     axes = np.median(squares, axis=0) > 0
     if not axes.any():
         return np.zeros(len(left))
-    spread = around_cycles(forest, chords, squares)
+    spread = np.stack([np.add.reduceat(column[loops.edge], loops.offsets[:-1]) for column in squares.T], axis=1)
     spread[:, :3] = np.minimum(spread[:, :3], UNIFORM_RAD2)
     spread = np.maximum(spread[:, axes], np.finfo(float).tiny)
     chance = gammainc(axes.sum() / 2, (left[:, axes] ** 2 / spread).sum(axis=1) / 2)
     return np.asarray(np.log(np.maximum(chance, np.finfo(float).tiny)))
-
-
-def around_cycles(forest: SpanningForest, chords: Ints, values: Floats) -> Floats:
-    """The sum (C, k) of the values (E, k) of the edges of each chord's cycle, by jumps of doubled length to where its
-    two tree paths meet.
-    """
-    is_root = forest.parent < 0
-    jumps = [np.where(is_root, np.arange(len(is_root)), forest.parent)]
-    above = np.where(is_root[:, None], 0.0, values[forest.parent_edge])
-    while (jumps[-1] != jumps[-1][jumps[-1]]).any():
-        above = above + above[jumps[-1]]
-        jumps.append(jumps[-1][jumps[-1]])
-    above = above + above[jumps[-1]]
-    ends = forest.edges[chords]
-    deep = np.take_along_axis(ends, forest.depth[ends].argmax(axis=1)[:, None], axis=1)[:, 0]
-    other = ends.sum(axis=1) - deep
-    ahead = forest.depth[deep] - forest.depth[other]
-    for power, jump in enumerate(jumps):
-        deep = np.where(ahead >> power & 1, jump[deep], deep)
-    for jump in reversed(jumps):
-        apart = jump[deep] != jump[other]
-        deep, other = np.where(apart, jump[deep], deep), np.where(apart, jump[other], other)
-    meeting = np.where(deep == other, deep, jumps[0][deep])
-    return np.asarray(np.maximum(above[ends].sum(axis=1) - 2 * above[meeting], 0.0) + values[chords])
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

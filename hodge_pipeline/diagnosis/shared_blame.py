@@ -34,7 +34,7 @@ class SharedBlame:
 def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
     """Who shares the blame, in this alignment."""
     loops, count = cycles.loops, len(evidence.graph.edges)
-    row, edge = np.repeat(np.arange(len(loops)), loops.lengths), loops.edge
+    row, edge = loops.rows, loops.edge
     untold = np.bincount(edge, cycles.closes[row], count) == 0
     untold &= ~evidence.in_no_listed_cycle
     classes = series_classes(evidence.graph.edges, evidence.graph.vertex_count)
@@ -60,7 +60,7 @@ def _undecided(cycles: Cycles, classes: Ints) -> Ints:
     out = np.full(len(classes), -1, np.int64)
     failing = np.flatnonzero(~cycles.closes)
     loops = cycles.loops.select(failing)
-    row = np.repeat(np.arange(len(loops)), loops.lengths)
+    row = loops.rows
     alone = classes[loops.edge] == classes[loops.edge[loops.offsets[row]]]
     alone = np.bincount(row, alone, len(loops)) == loops.lengths
     out[loops.edge[alone[row]]] = failing[row[alone[row]]]

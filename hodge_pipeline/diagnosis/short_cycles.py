@@ -1,5 +1,5 @@
-"""The cycles that test edges: triangles where there are any, then squares, then the shortest loops of a tree; which of
-them close, and which are evidence for or against each edge.
+"""The cycles that test edges: triangles where there are any, then the shortest loops of a tree; which of them close,
+and which are evidence for or against each edge.
 """
 
 from __future__ import annotations
@@ -13,9 +13,6 @@ from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.result import WITNESSES, Cycles
 from hodge_pipeline.types import Bools, Floats, Ints
 
-NEIGHBOURS = 8
-"""Of each end of an edge that are tried for a square."""
-EDGES_AT_ONCE = 20_000
 LONGEST_ENTRIES = 5_000_000
 GATE = 30.0
 """χ² over six dimensions of a cycle that closes."""
@@ -24,14 +21,12 @@ GATE = 30.0
 def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     """Cycles of the graph such that every edge that lies in one is in one of these, unless that would be too long.
 
-    Pairs of parallel edges, triangles (thinned evenly where there are very many), squares for edges that have none
-    of these, and for the rest the loops that their chords close in a breadth-first tree.
+    Pairs of parallel edges, triangles (thinned evenly where there are very many), and where edges have none of these
+    the loops that all chords close in a breadth-first tree.
     """
     loops = _joined([_parallel_pairs(edges, vertex_count), _triangles(edges, vertex_count, most_per_edge)])
-    if (bare := _uncovered(loops, len(edges))).any():
-        loops = _joined([loops, _squares(edges, vertex_count, np.flatnonzero(bare))])
-    if _uncovered(loops, len(edges)).any():
-        loops = _joined([loops, _tree_loops(edges, vertex_count)])
+    if len(np.unique(loops.edge)) < len(edges):
+        loops = _joined([loops, tree_loops(edges, vertex_count)])
     return _distinct(loops, len(edges))
 
 
@@ -41,7 +36,7 @@ def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, 
     Two cycles that fail over one edge make a third without it, which may be the only one that closes.
     """
     rows = np.flatnonzero(chosen)
-    more = _tree_loops(edges[rows], vertex_count)
+    more = tree_loops(edges[rows], vertex_count)
     more = Loops(more.offsets, rows[more.edge], more.sign)
     passes = np.add.reduceat(wanted[more.edge], more.offsets[:-1]) > 0 if len(more) else np.zeros(0, bool)
     return _distinct(_joined([loops, more.select(np.flatnonzero(passes))]), len(edges))
@@ -72,12 +67,6 @@ def _middles(loops: Loops, i_from_j: Floats) -> Floats:
     return total / np.maximum(np.minimum(lengths, 4), 1)[:, None]
 
 
-def _uncovered(loops: Loops, edge_count: int) -> Bools:
-    out = np.ones(edge_count, bool)
-    out[loops.edge] = False
-    return out
-
-
 def _joined(found: list[Loops]) -> Loops:
     lengths = np.concatenate([loops.lengths for loops in found])
     offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
@@ -87,7 +76,7 @@ def _joined(found: list[Loops]) -> Loops:
 
 
 def _distinct(loops: Loops, edge_count: int) -> Loops:
-    """Each cycle once: a square is found from each of its edges that lack a triangle, and again as a loop of the tree.
+    """Each cycle once: a triangle is found again as a loop of the tree.
 
     Cycles are the same where the sums of random numbers of their edges are, 64 bits each.
     """
@@ -115,54 +104,18 @@ def _parallel_pairs(edges: Ints, vertex_count: int) -> Loops:
 
 def _triangles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     """Triangles of the first of parallel edges, thinned by a stride where an edge would be in too many."""
-    complex_ = flag_complex(edges, vertex_count)
-    corners = complex_.simplices[2]
-    limit = max(most_per_edge * len(complex_.simplices[1]) // 3, 1)
-    return _along(corners[:: max(-(-len(corners) // limit), 1)], edges, vertex_count)
-
-
-def _along(corners: Ints, edges: Ints, vertex_count: int) -> Loops:
-    """The loops that pass corners (N, K) in order along the first of parallel edges, where all are joined."""
+    corners = flag_complex(edges, vertex_count).simplices[2]
     simple = orient_edges(edges, vertex_count)
+    limit = max(most_per_edge * len(simple.edges) // 3, 1)
+    corners = corners[:: max(-(-len(corners) // limit), 1)]
     real = np.flatnonzero(simple.row >= 0)
     measured = real[np.unique(simple.row[real], return_index=True)[1]]
-    keys = simple.edges @ [vertex_count, 1]
     sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=2), axis=2) @ [vertex_count, 1]
-    place = np.minimum(np.searchsorted(keys, sides), len(keys) - 1)
-    joined = (keys[place] == sides).all(axis=1)
-    edge = measured[place[joined]]
-    return _of_equal_length(edge, np.where(edges[edge, 0] == corners[joined], 1, -1))
+    edge = measured[np.searchsorted(simple.edges @ [vertex_count, 1], sides)]
+    return _of_equal_length(edge, np.where(edges[edge, 0] == corners, 1, -1))
 
 
-def _squares(edges: Ints, vertex_count: int, wanted: Ints) -> Loops:
-    """Cycles i–j–b–a–i for the wanted edges (i, j), over some neighbours a of i and b of j."""
-    neighbours = _some_neighbours(orient_edges(edges, vertex_count).edges, vertex_count)
-    found = []
-    for start in range(0, len(wanted), EDGES_AT_ONCE):
-        rows = np.repeat(wanted[start : start + EDGES_AT_ONCE], NEIGHBOURS**2)
-        i, j = edges[rows].T
-        a, b = (
-            neighbours[i, np.arange(len(rows)) // NEIGHBOURS % NEIGHBOURS],
-            neighbours[j, np.arange(len(rows)) % NEIGHBOURS],
-        )
-        possible = (a >= 0) & (b >= 0) & (a != j) & (b != i) & (a != b) & (i != j)
-        found.append(_along(np.stack([i, j, b, a], axis=1)[possible], edges, vertex_count))
-    return _joined(found)
-
-
-def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
-    """Up to NEIGHBOURS neighbours (V, NEIGHBOURS) of each vertex, −1 where there are fewer."""
-    tail, head = np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]])
-    order = np.lexsort((np.abs(head - tail), tail))
-    tail, head = tail[order], head[order]
-    rank = np.arange(len(tail)) - np.searchsorted(tail, tail)
-    out = np.full((vertex_count, NEIGHBOURS), -1, np.int64)
-    few = rank < NEIGHBOURS
-    out[tail[few], rank[few]] = head[few]
-    return out
-
-
-def _tree_loops(edges: Ints, vertex_count: int) -> Loops:
+def tree_loops(edges: Ints, vertex_count: int) -> Loops:
     """The loops of the chords of a tree, the shortest of them, as long as together they are not too long."""
     forest = spanning_forest(edges, vertex_count)
     chords = forest.chords[edges[forest.chords, 0] != edges[forest.chords, 1]]
@@ -174,7 +127,7 @@ def _tree_loops(edges: Ints, vertex_count: int) -> Loops:
 
 def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
     """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
-    row = _rows(loops)
+    row = loops.rows
     turn = np.bincount(row, noise.rotation_rad[loops.edge] ** 2, len(loops))
     shift = np.bincount(row, noise.translation_m[loops.edge] ** 2, len(loops))
     swing = turn * (reach_m * loops.lengths) ** 2 / 12
@@ -195,7 +148,7 @@ def usual_share(cycles: Cycles) -> float:
 
 def closing_support(cycles: Cycles, prior: Floats) -> Floats:
     """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
-    row, edge = _rows(cycles.loops), cycles.loops.edge
+    row, edge = cycles.loops.rows, cycles.loops.edge
     total = np.bincount(row, np.log(prior[edge]), len(cycles.loops))
     others = np.exp(total[row] - np.log(prior[edge]))
     strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)[row]
@@ -206,7 +159,7 @@ def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
     """For each edge (E, 3) the closing, or failing, cycles whose other edges are the likeliest; −1 for none."""
     wanted = np.flatnonzero(cycles.closes == closing)
     loops = cycles.loops.select(wanted)
-    row, edge = _rows(loops), loops.edge
+    row, edge = loops.rows, loops.edge
     logs = np.log(np.clip(np.nan_to_num(probability, nan=0.5), 1e-3, 1.0))
     others = np.bincount(row, logs[edge], len(loops))[row] - logs[edge]
     order = np.lexsort((row, -others, edge))
@@ -216,7 +169,3 @@ def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
     top = rank < WITNESSES
     out[ranked[top], rank[top]] = wanted[row[order[top]]]
     return out
-
-
-def _rows(loops: Loops) -> Ints:
-    return np.repeat(np.arange(len(loops)), loops.lengths)

@@ -6,8 +6,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.series import series_classes
-from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE, Cycles
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+
+ORDER = (WRONG, SUSPECT, UNTESTABLE, CONSISTENT)
+SPLITS = 1 - 1e-6
+
+
+def ranked(diagnosis: Diagnosis) -> Ints:
+    """Rows of all edges, the worst first: wrong, suspect, untestable, consistent; in each the least probable."""
+    place = np.array([ORDER.index(str(verdict)) for verdict in diagnosis.verdict], np.int64)
+    probability = np.nan_to_num(diagnosis.probability, nan=0.5)
+    return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), probability.round(1), place))
+
+
+def advice(diagnosis: Diagnosis, disabled: Bools) -> tuple[str, ...]:
+    """What to do about each edge, in a few words; `disabled (E,)` are off already."""
+    in_no_listed_cycle = np.ones(len(disabled), bool)
+    in_no_listed_cycle[diagnosis.cycles.loops.edge] = False
+    columns = zip(
+        diagnosis.verdict.tolist(), disabled.tolist(), in_no_listed_cycle.tolist(), diagnosis.leverage, strict=True
+    )
+    return tuple(_advice(*each) for each in columns)
+
+
+def _advice(verdict: str, is_disabled: bool, in_no_listed_cycle: bool, leverage: float) -> str:
+    if is_disabled:
+        return "is disabled; nothing speaks against it: enable it again" if verdict == CONSISTENT else "is disabled"
+    if verdict == WRONG:
+        return "disable it"
+    if verdict == SUSPECT:
+        return "look at it; disable it where the views do not meet"
+    if verdict == UNTESTABLE:
+        return (
+            "register another pair across it"
+            if in_no_listed_cycle
+            else "look at the loop's edges, or register a pair across it"
+        )
+    return "keep it: without it the scene falls apart" if leverage >= SPLITS else "keep it"
+
 
 LONGEST_NAMED = 12
 ROUNDING = 1e-9
@@ -31,10 +68,10 @@ def reasons(
     graph: ViewGraph,
     cycles: Cycles,
     verdict: NDArray[np.str_],
-    residual: tuple[Floats, Floats],
     witnesses: tuple[Ints, Ints],
     undecided: Ints,
     bridge: Bools,
+    residual: tuple[Floats, Floats],
 ) -> tuple[str, ...]:
     """One line for each edge: which cycles close, and how far it is from the poses.
 
@@ -77,7 +114,7 @@ def _in_loop(graph: ViewGraph, wanted: Bools) -> Bools:
 def _sound(cycles: Cycles, kept: Bools) -> Ints:
     """How many cycles (E,) close over an edge of which all other edges are kept."""
     loops = cycles.loops
-    row = np.repeat(np.arange(len(loops)), loops.lengths)
+    row = loops.rows
     left_out = np.bincount(row, ~kept[loops.edge], len(loops))
     others = left_out[row] - ~kept[loops.edge]
     return np.bincount(loops.edge, cycles.closes[row] & (others == 0), len(kept)).astype(np.int64)

@@ -23,12 +23,14 @@ NO_NEIGHBOUR_M = 0.1
 class DistanceBlock:
     """Pairs (P, 2) sorted by their first cloud, and their motions `i_from_j (S, P, 4, 4)` in S sets of poses.
 
-    `scale`: what the reach is taken times, for scenes that are no rooms.
+    `scale`: what the reach is taken times, for scenes that are no rooms. Of each second cloud at most `points`, evenly
+    strided, are measured.
     """
 
     clouds_folder: Path
     pairs: Ints
     i_from_j: Floats
+    points: int
     scale: float = 1.0
 
 
@@ -42,7 +44,8 @@ def block_distances(block: DistanceBlock) -> Floats:
     for i, columns in _columns_by_target(block.pairs):
         plane = TargetPlanes(clouds[i], block.scale)
         for column in columns:
-            points_in_j = clouds[int(block.pairs[column, 1])].points_in_cam.astype(np.float64)
+            points = clouds[int(block.pairs[column, 1])].points_in_cam
+            points_in_j = points[:: max(1, -(-len(points) // block.points))].astype(np.float64)
             out[:, column] = [plane.distance(points_in_j, motion) for motion in block.i_from_j[:, column]]
     return out
 

@@ -114,5 +114,5 @@ def angle(degrees: float, floor_deg: float = 0.0) -> str:
 
 
 def percent(share: float) -> str:
-    """A signed share in per cent, with a real minus sign."""
-    return f"{share * 100:+.0f} %".replace("-", "−")
+    """A signed share in per cent, with a real minus sign; none of what rounds to 0."""
+    return f"{share * 100:+.0f} %".replace("-", "−") if abs(share) >= 0.005 else "0 %"

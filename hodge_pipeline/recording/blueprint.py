@@ -7,18 +7,16 @@ from dataclasses import dataclass
 import rerun.blueprint as rrb
 
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.eye import Eye
+from hodge_pipeline.recording.eye import Eye, Eyes
 
 BACKGROUND = (24, 26, 32)
 COLOUR_NAMES = {"truth": "green", "odometry": "orange", "start": "violet"}
-PAIR_EYE = Eye((0.6, -1.6, -2.2), (0.0, 0.0, 1.8), (0.0, -1.0, 0.0))
-"""In the axes of a camera: behind it, above, to the right."""
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a recording holds: stages, trajectories and shown pairs by name, the best trajectory, the last rounds (0:
-    none).
+    """What a recording holds: stages and trajectories by name, the best trajectory, the last rounds (0: none), whether
+    its poses are a scanner's, and the paths of its entities.
     """
 
     stages: frozenset[str] = frozenset()
@@ -26,15 +24,22 @@ class Contents:
     trajectory: str = "truth"
     last_graph: int = 0
     last_solution: int = 0
-    pairs: tuple[str, ...] = ()
+    is_scanner: bool = False
+    entities: frozenset[str] = frozenset()
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """The names of the pairs whose clouds are shown."""
+        return tuple(sorted({path.split("/")[2] for path in self.entities if path.startswith(f"{layout.PAIRS}/")}))
+
+    def holds(self, parent: str) -> bool:
+        """Whether there is this entity, or one below it."""
+        return any(path == parent or path.startswith(f"{parent}/") for path in self.entities)
 
 
-def make_blueprint(contents: Contents, room: Eye | None, graph: Eye | None, active_tab: int = 0) -> rrb.Blueprint:
-    """The default blueprint: a tab for each part of the run that is there, the story first.
-
-    `room` sees the model, `graph` the cameras alone.
-    """
-    return without_panels(rrb.Tabs(*make_tabs(contents, room, graph), active_tab=active_tab), layout.STORY)
+def make_blueprint(contents: Contents, eyes: Eyes, active_tab: int = 0) -> rrb.Blueprint:
+    """The default blueprint: a tab for each part of the run that is there, the story first."""
+    return without_panels(rrb.Tabs(*make_tabs(contents, eyes), active_tab=active_tab), layout.STORY)
 
 
 def without_panels(root: rrb.Container, timeline: str) -> rrb.Blueprint:
@@ -48,26 +53,26 @@ def without_panels(root: rrb.Container, timeline: str) -> rrb.Blueprint:
     )
 
 
-def make_tabs(contents: Contents, room: Eye | None, graph: Eye | None) -> list[rrb.Container]:
+def make_tabs(contents: Contents, eyes: Eyes) -> list[rrb.Container]:
     """The tabs in the order of the run."""
     has_pairs = {"registration", "diagnosis"} & contents.stages
     return [
-        _story_tab(contents, room),
-        _frames_tab(contents, room),
-        *([registration_tab(contents)] if "registration" in contents.stages else []),
-        *([complex_tab(contents, graph)] if has_pairs else []),
-        _solver_tab(contents, graph),
-        *([model_tab(room)] if "model" in contents.stages else []),
-        *([evaluation_tab(contents, graph)] if "evaluation" in contents.stages else []),
+        _story_tab(contents, eyes.room),
+        *([_frames_tab(contents, eyes.room)] if contents.holds(layout.CAMERA) else []),
+        *([registration_tab(contents, eyes.pair)] if "registration" in contents.stages else []),
+        *([complex_tab(contents, eyes.graph)] if has_pairs else []),
+        _solver_tab(contents, eyes.graph),
+        *([model_tab(eyes.room)] if "model" in contents.stages else []),
+        *([evaluation_tab(contents, eyes.graph)] if "evaluation" in contents.stages else []),
         _text_tab(contents),
     ]
 
 
-def scene_view(name: str, contents: list[str], eye: Eye | None) -> rrb.Spatial3DView:
+def scene_view(name: str, contents: list[str], eye: Eye | None, origin: str = layout.WORLD) -> rrb.Spatial3DView:
     """A view of the world with these entities, seen from `eye` where one is given."""
     controls = rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up) if eye else None
     return rrb.Spatial3DView(
-        origin=layout.WORLD,
+        origin=origin,
         name=name,
         contents=contents,
         background=BACKGROUND,
@@ -95,10 +100,10 @@ def _story_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
         f"- {layout.DEPTH}",
     ]
     shown += [f"+ {layout.trajectory(name)}" for name in contents.trajectories]
-    scene = scene_view("Room, trajectories and edges", shown + _lines(contents.trajectory), eye)
+    scene = scene_view("Model, trajectories and edges", shown + _lines(contents.trajectory), eye)
     side = rrb.Vertical(
-        rrb.Spatial2DView(origin=layout.PINHOLE, name="Colour", contents=[f"+ {layout.COLOUR}"]),
-        _errors_view(),
+        *_images(contents, layout.COLOUR),
+        *_errors_views(contents),
         rrb.Tabs(
             rrb.TextDocumentView(origin=layout.LEGEND, name="Colours"),
             rrb.TextDocumentView(origin=layout.graph_text(max(contents.last_graph, 1)), name="Viewing graph"),
@@ -107,13 +112,23 @@ def _story_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
     return rrb.Horizontal(scene, side, column_shares=[3, 1], name="Story")
 
 
-def _frames_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
-    images = rrb.Vertical(
-        rrb.Spatial2DView(origin=layout.PINHOLE, name="Colour", contents=[f"+ {layout.COLOUR}"]),
-        rrb.Spatial2DView(origin=layout.PINHOLE, name="Depth", contents=[f"+ {layout.DEPTH}"]),
-    )
+def _images(contents: Contents, *paths: str) -> list[rrb.Spatial2DView]:
+    """A view of each of these images that there is."""
+    names = {layout.COLOUR: "Colour", layout.DEPTH: "Depth"}
+    return [
+        rrb.Spatial2DView(origin=layout.PINHOLE, name=names[path], contents=[f"+ {path}"])
+        for path in paths
+        if contents.holds(path)
+    ]
+
+
+def _frames_tab(contents: Contents, eye: Eye | None) -> rrb.Container:
     shown = [f"+ {layout.CAMERA}/**", f"- {layout.DEPTH}", f"+ {layout.trajectory(contents.trajectory)}"]
-    return rrb.Horizontal(scene_view("Camera and its cloud", shown, eye), images, column_shares=[2, 1], name="Frames")
+    scene = scene_view("One scan" if contents.is_scanner else "Camera and its cloud", shown, eye)
+    images = _images(contents, layout.COLOUR, layout.DEPTH)
+    if not images:
+        return rrb.Horizontal(scene, name="Frames")
+    return rrb.Horizontal(scene, rrb.Vertical(*images), column_shares=[2, 1], name="Frames")
 
 
 def _solver_tab(contents: Contents, eye: Eye | None) -> rrb.Vertical:
@@ -136,16 +151,14 @@ def _solver_tab(contents: Contents, eye: Eye | None) -> rrb.Vertical:
     return rrb.Vertical(graphs, plots, row_shares=[3, 1], name="Edges and solver")
 
 
-def registration_tab(contents: Contents) -> rrb.Vertical:
+def registration_tab(contents: Contents, eye: Eye | None) -> rrb.Vertical:
     """Chosen pairs before and after, and the numbers of all."""
     views = [
-        rrb.Spatial3DView(
-            origin=layout.pair(name),
-            name=f"{name.replace('_', ' ').capitalize()}, {when}",
-            contents=[f"+ {layout.pair(name)}/target", f"+ {layout.pair(name)}/{when}"],
-            background=BACKGROUND,
-            line_grid=rrb.LineGrid3D(visible=False),
-            eye_controls=rrb.EyeControls3D(position=PAIR_EYE.position, look_target=PAIR_EYE.target, eye_up=PAIR_EYE.up),
+        scene_view(
+            f"{name.replace('_', ' ').capitalize()}, {when}",
+            [f"+ {layout.pair(name)}/target", f"+ {layout.pair(name)}/{when}"],
+            eye,
+            layout.pair(name),
         )
         for when in ("before", "after")
         for name in contents.pairs
@@ -195,11 +208,9 @@ def evaluation_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
         eye,
     )
     plots = rrb.Vertical(
-        _errors_view(),
-        rrb.TimeSeriesView(origin=layout.FRAME_PLOTS, name="Score of a frame's pairs", contents=["+ $origin/score/**"]),
-        rrb.TimeSeriesView(
-            origin=layout.SOLVER_PLOTS, name="Deviation D of a loop", contents=["+ $origin/loop_deviation_mean"]
-        ),
+        *_errors_views(contents),
+        *_series(contents, layout.FRAME_PLOTS, "score", "Score of a frame's pairs"),
+        *_series(contents, layout.SOLVER_PLOTS, "loop_deviation_mean", "Deviation D of a loop"),
     )
     scores = rrb.TextDocumentView(origin=layout.SCORES, name="Scores")
     return rrb.Horizontal(
@@ -207,10 +218,14 @@ def evaluation_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
     )
 
 
-def _errors_view() -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        origin=layout.FRAME_PLOTS, name="Error of the position (ATE), m", contents=["+ $origin/error_m/**"]
-    )
+def _errors_views(contents: Contents) -> list[rrb.TimeSeriesView]:
+    return _series(contents, layout.FRAME_PLOTS, "error_m", "Error of the position (ATE), m")
+
+
+def _series(contents: Contents, origin: str, path: str, name: str) -> list[rrb.TimeSeriesView]:
+    """A view of these series, where there are any."""
+    view = rrb.TimeSeriesView(origin=origin, name=name, contents=[f"+ $origin/{path}/**"])
+    return [view] if contents.holds(f"{origin}/{path}") else []
 
 
 def _text_tab(contents: Contents) -> rrb.Horizontal:

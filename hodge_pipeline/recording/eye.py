@@ -1,4 +1,4 @@
-"""Initial viewpoint of the 3-D views: above and behind the cameras."""
+"""Initial viewpoint of the 3-D views: above and behind the cameras, or scanners."""
 
 from __future__ import annotations
 
@@ -32,16 +32,28 @@ class Eye:
         return Eye(_triple(target + times * (position - target)), self.target, self.up)
 
 
-def look_at(model_chunks: Iterable[Chunk], pose_chunks: Iterable[Chunk]) -> Eye | None:
-    """An eye that has the model in view, or the cameras where there is no model; None where there are no poses."""
-    poses = _poses(pose_chunks)
+@dataclass(frozen=True)
+class Eyes:
+    """Where the model, the graph alone, and the clouds of a pair in the axes of the first are looked at from."""
+
+    room: Eye | None = None
+    graph: Eye | None = None
+    pair: Eye | None = None
+
+
+def look_at(model_chunks: Iterable[Chunk], pose_chunks: Iterable[Chunk], is_scanner: bool = False) -> Eye | None:
+    """An eye that has the model in view, or the sensors where there is no model; None where there are no poses."""
+    return look_from(_poses(pose_chunks), points_of(model_chunks), is_scanner)
+
+
+def look_from(poses: Floats, points: Floats, is_scanner: bool) -> Eye | None:
+    """As `look_at`, of the poses (N, 4, 4) and the points (P, 3) themselves."""
     if not len(poses):
         return None
-    points = _points(model_chunks)
     scene = points if len(points) else poses[:, :3, 3]
     low, high = np.percentile(scene, [3, 97], axis=0)
     size = max(float(np.linalg.norm(high - low)), 0.5)
-    up, ahead = up_and_ahead(poses)
+    up, ahead = up_and_ahead(poses, is_scanner)
     target = (low + high) / 2
     position = target - DISTANCE * size * (ahead - ELEVATION * up)
     return Eye(_triple(position), _triple(target), _triple(up))
@@ -59,7 +71,8 @@ def _column(chunk: Chunk, name: str, width: int) -> Floats:
     return np.asarray(values.flatten().to_numpy(zero_copy_only=False), float).reshape(-1, width)
 
 
-def _points(chunks: Iterable[Chunk]) -> Floats:
+def points_of(chunks: Iterable[Chunk]) -> Floats:
+    """Some of the points and vertices (P, 3) in these chunks."""
     names = ("Mesh3D:vertex_positions", "Points3D:positions")
     found = [_column(chunk, name, 3) for chunk in chunks for name in names]
     points = np.concatenate([np.zeros((0, 3)), *found])

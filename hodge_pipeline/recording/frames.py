@@ -10,6 +10,7 @@ import rerun as rr
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
+from hodge_pipeline.recording.shapes import or_grey
 from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes
 from hodge_pipeline.types import Camera, CloudSet, EncodedImage, Floats, Frame, Ints
 from hodge_pipeline.types.arrays import evenly
@@ -86,7 +87,7 @@ def log_clouds(
         layout.CLOUD,
         indexes=frame_columns(frames, len(clouds), np.arange(len(clouds))),
         columns=rr.Points3D.columns(
-            positions=np.asarray(clouds.points[picked]), colors=np.asarray(clouds.colours[picked])
+            positions=np.asarray(clouds.points[picked]), colors=or_grey(np.asarray(clouds.colours[picked]), len(picked))
         ).partition([len(part) for part in parts]),
     )
     clouds.forget()

@@ -25,20 +25,25 @@ TRAJECTORY_RADIUS, FRUSTUM_RADIUS, EDGE_RADIUS, CENTRE_RADIUS = -1.6, -0.5, -0.6
 
 
 def log_poses(
-    stream: rr.RecordingStream, name: str, world_from_cam: Floats, frames: Sequence[Frame], options: RecordingOptions
+    stream: rr.RecordingStream,
+    name: str,
+    world_from_cam: Floats,
+    frames: Sequence[Frame],
+    options: RecordingOptions,
+    is_scanner: bool = False,
 ) -> tuple[str, ...]:
-    """Log a trajectory as a line, as frusta and as transforms; gives notes of what was left out."""
+    """Log a trajectory as a line, as shapes (`pose_lines`) and as transforms; gives notes of what was left out."""
     drawable = np.flatnonzero(shapes.is_drawable(world_from_cam))
     sequences = np.array([frame.sequence for frame in frames] or [""] * len(world_from_cam), dtype=np.str_)
     colour = shapes.TRAJECTORY_COLOURS.get(name, shapes.RESULT_COLOUR)
-    lines = shapes.strips(world_from_cam, sequences)
+    path = shapes.strips(world_from_cam, sequences)
     line = rr.LineStrips3D(
-        lines, colors=[colour], radii=[TRAJECTORY_RADIUS], labels=[name] * len(lines), show_labels=False
+        path, colors=[colour], radii=[TRAJECTORY_RADIUS], labels=[name] * len(path), show_labels=False
     )
     stream.log(layout.trajectory(name), line, static=True)
     picked = drawable[evenly(len(drawable), options.frusta)]
-    frusta = rr.LineStrips3D(shapes.frustum_lines(world_from_cam[picked]), colors=[colour], radii=[FRUSTUM_RADIUS])
-    stream.log(layout.frusta(name), frusta, static=True)
+    lines = shapes.pose_lines(world_from_cam[picked], is_scanner)
+    stream.log(layout.frusta(name), rr.LineStrips3D(lines, colors=[colour], radii=[FRUSTUM_RADIUS]), static=True)
     stream.send_columns(
         layout.poses(name),
         indexes=frame_columns(frames, len(world_from_cam), drawable),

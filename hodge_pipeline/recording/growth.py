@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import rerun as rr
+from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
 from hodge_pipeline.recipe.recording_options import RecordingOptions
@@ -15,8 +16,10 @@ from hodge_pipeline.types.arrays import evenly
 STEPS = 24
 MOST_POINTS = 120_000
 POINT_BYTES = 16
-CELL_M = 0.06
-"""Twice the usual cloud's grid: a fused point and the measured one beside it are in the same or the next cell."""
+USUAL_GRID_M = 0.03
+"""Of a recipe for rooms."""
+GRIDS = 2.0
+"""A cell in grids of the clouds: a fused point and the measured one beside it are in the same or the next cell."""
 POINT_RADIUS = -1.2
 
 
@@ -34,15 +37,14 @@ def log_growth(
     if not options.has_images or not len(rows) or not len(clouds):
         return
     points = model.points_in_world[rows]
-    colours = None if model.colours is None else model.colours[rows]
+    colours = shapes.or_grey(model.colours, len(model.points_in_world))[rows]
     first = first_frame(points, clouds, world_from_cam)
     cuts = np.unique(np.linspace(0, len(clouds), STEPS + 1).astype(np.int64))
     for step, (start, end) in enumerate(zip(cuts, cuts[1:], strict=False)):
         lot = np.flatnonzero((first >= start) & (first < end))
         if not len(lot):
             continue
-        coloured = None if colours is None else colours[lot]
-        columns = rr.Points3D.columns(positions=points[lot], colors=coloured).partition([len(lot)])
+        columns = rr.Points3D.columns(positions=points[lot], colors=colours[lot]).partition([len(lot)])
         share = np.array([step / STEPS])
         times = [rr.TimeColumn(layout.FRAME, sequence=np.array([start])), *story_columns(slot, share)]
         stream.send_columns(layout.growth(step), times, columns)
@@ -58,22 +60,25 @@ def first_frame(points: Floats32, clouds: CloudSet, world_from_cam: Floats) -> I
     known = np.flatnonzero(shapes.is_drawable(world_from_cam) & (clouds.sizes > 0))
     if not len(points) or not len(known):
         return found
-    cells = np.floor(points.astype(float) / CELL_M).astype(np.int64)
+    cell_m = GRIDS * grid_m(np.asarray(clouds[int(known[len(known) // 2])].points_in_cam, float))
+    cells = np.floor(points.astype(float) / cell_m).astype(np.int64)
     low = cells.min(axis=0) - 1
     size = cells.max(axis=0) + 2 - low
     around = (cells[:, None] + [[0, 0, 0], *np.eye(3, dtype=int), *-np.eye(3, dtype=int)]).reshape(-1, 3)
-    keys, cell_of = np.unique(_keys(around - low, size), return_inverse=True)
+    keys, cell_of = np.unique(shapes.numbered(around - low, size), return_inverse=True)
     first = np.full(len(keys), len(clouds) - 1)
     for row in known[::-1].tolist():
         seen = se3.transform(world_from_cam[row], np.asarray(clouds[row].points_in_cam, float))
-        own = np.floor(seen / CELL_M).astype(np.int64) - low
-        own = _keys(own[((own >= 0) & (own < size)).all(axis=1)], size)
+        own = np.floor(seen / cell_m).astype(np.int64) - low
+        own = shapes.numbered(own[((own >= 0) & (own < size)).all(axis=1)], size)
         place = np.minimum(np.searchsorted(keys, own), len(keys) - 1)
         first[place[keys[place] == own]] = row
     clouds.forget()
     return np.asarray(first[cell_of.reshape(len(points), -1)].min(axis=1))
 
 
-def _keys(cells: Ints, size: Ints) -> Ints:
-    """A number (N,) for each cell (N, 3) of a grid."""
-    return np.asarray((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2])
+def grid_m(points: Floats) -> float:
+    """The distance between neighbours in a cloud (P, 3): that of the median point; the usual one of a single point."""
+    if len(points) < 2:
+        return USUAL_GRID_M
+    return max(float(np.median(cKDTree(points).query(points, k=2)[0][:, 1])), float(np.finfo(np.float32).eps))

@@ -45,6 +45,8 @@ DIAGNOSIS = "/text/diagnosis"
 PAIRS_TEXT = "/text/pairs"
 LEGEND = "/text/legend"
 
+SCANNER = "scanner"
+"""Detail of the frames' part where they are those of a scanner, x ahead and z up."""
 PART_SUFFIX = ".rrd"
 PARTIAL_SUFFIX = ".partial.rrd"
 

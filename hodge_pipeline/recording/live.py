@@ -19,8 +19,7 @@ from rerun.chunk import RrdReader
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import binary, layout
 from hodge_pipeline.recording.blueprint import legend, make_blueprint
-from hodge_pipeline.recording.eye import look_at
-from hodge_pipeline.recording.merge import contents_of, send, with_pairs
+from hodge_pipeline.recording.merge import contents_of, eyes, send, with_entities
 from hodge_pipeline.recording.stream import log_markdown, open_stream
 
 HOST = "127.0.0.1"
@@ -40,21 +39,14 @@ class Live:
     def show(self, parts: Sequence[Path]) -> None:
         """Send the parts that were not sent yet; the views follow what there is."""
         readers = [(part, RrdReader(part)) for part in parts]
-        contents = with_pairs(contents_of(parts), readers)
+        contents = with_entities(contents_of(parts), readers)
         poses = layout.poses(contents.trajectory)
         for part, reader in readers:
             if part not in self._sent:
                 send(self._stream, reader, poses)
                 self._sent.add(part)
-        room, graph = (
-            look_at(
-                (chunk for _, reader in readers for chunk in reader.stream().filter(content=model)),
-                (chunk for _, reader in readers for chunk in reader.stream().filter(content=poses)),
-            )
-            for model in (layout.MODEL, layout.LEGEND)
-        )
         log_markdown(self._stream, layout.LEGEND, legend(contents))
-        self._stream.send_blueprint(make_blueprint(contents, room, graph))
+        self._stream.send_blueprint(make_blueprint(contents, eyes(contents, readers)))
         self._stream.flush()
 
     def close(self) -> None:

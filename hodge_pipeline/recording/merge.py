@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from subprocess import SubprocessError
 
+import numpy as np
 import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
 from hodge_pipeline.recording import binary, layout
 from hodge_pipeline.recording.blueprint import Contents, legend, make_blueprint
-from hodge_pipeline.recording.eye import look_at
+from hodge_pipeline.recording.eye import Eyes, look_at, look_from, points_of
 from hodge_pipeline.recording.stream import log_markdown, log_notes, partial_path, writing
 
 
@@ -37,11 +38,10 @@ def merge(parts: Iterable[Path], out: Path, recording_id: str, *, active_tab: in
     notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="hodge-recording-") as scratch:
         readers = [(part, reader) for part in parts if (reader := _open(part, Path(scratch), notes)) is not None]
-        contents = with_pairs(contents, readers)
+        contents = with_entities(contents, readers)
         poses = layout.poses(contents.trajectory)
-        room = look_at(_chunks(readers, layout.MODEL), _chunks(readers, poses))
-        graph = look_at((), _chunks(readers, poses))
-        with writing(out, recording_id, make_blueprint(contents, room, graph, active_tab)) as stream:
+        blueprint = make_blueprint(contents, eyes(contents, readers), active_tab)
+        with writing(out, recording_id, blueprint) as stream:
             for _, reader in readers:
                 send(stream, reader, poses)
             log_notes(stream, 0, notes, level="WARN")
@@ -75,14 +75,24 @@ def contents_of(parts: Iterable[Path]) -> Contents:
         trajectory=best,
         last_graph=max(rounds, default=0),
         last_solution=max(solved, default=0),
+        is_scanner=("frames", layout.SCANNER) in stages,
     )
 
 
-def with_pairs(contents: Contents, readers: Iterable[tuple[Path, RrdReader]]) -> Contents:
-    """The contents with the names of the pairs whose clouds are shown."""
-    paths = {chunk.entity_path for chunk in _chunks(readers, f"{layout.PAIRS}/**")}
-    names = dict.fromkeys(path.split("/")[2] for path in sorted(paths))
-    return replace(contents, pairs=tuple(names))
+def with_entities(contents: Contents, readers: Sequence[tuple[Path, RrdReader]]) -> Contents:
+    """The contents with the paths of all entities."""
+    return replace(contents, entities=frozenset(c.entity_path for _, reader in readers for c in reader.stream()))
+
+
+def eyes(contents: Contents, readers: Sequence[tuple[Path, RrdReader]]) -> Eyes:
+    """Where the views of these parts are looked at from."""
+    poses, is_scanner = layout.poses(contents.trajectory), contents.is_scanner
+    pairs = points_of(_chunks(readers, f"{layout.PAIRS}/**"))
+    return Eyes(
+        room=look_at(_chunks(readers, layout.MODEL), _chunks(readers, poses), is_scanner),
+        graph=look_at((), _chunks(readers, poses), is_scanner),
+        pair=look_from(np.eye(4)[None], pairs, is_scanner) if len(pairs) else None,
+    )
 
 
 def _open(part: Path, scratch: Path, notes: list[str]) -> RrdReader | None:

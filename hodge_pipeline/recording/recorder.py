@@ -28,6 +28,7 @@ class Recorder:
     A part depends on its arguments and the options alone, and is replaced as a whole: a resumed run records only what
     it computes again. Outer rounds count from 1; `rounds` says how many there will be, since they share the solver's
     bytes. Each method gives notes of what was thinned or left out. With level `off` nothing is written.
+    `is_scanner`: the poses are those of scanners or robots, x ahead and z up.
     """
 
     def __init__(
@@ -36,14 +37,17 @@ class Recorder:
         recording_id: str,
         options: RecordingOptions | None = None,
         rounds: int = 1,
+        *,
+        is_scanner: bool = False,
     ) -> None:
-        self.folder, self.recording_id = folder, recording_id
+        self.folder, self.recording_id, self.is_scanner = folder, recording_id, is_scanner
         self.options = options or RecordingOptions()
         self.rounds = max(rounds, 1)
 
     def frames(self, name: str, frames: Sequence[Frame], notes: Sequence[str] = ()) -> Notes:
         """The frames' images as their files hold them, their cameras and names; `notes` are the reader's."""
-        return self._part(0, "frames", "", lambda s: frame_log.log_frames(s, name, frames, notes, self.options))
+        sensor = layout.SCANNER if self.is_scanner else ""
+        return self._part(0, "frames", sensor, lambda s: frame_log.log_frames(s, name, frames, notes, self.options))
 
     def clouds(self, frames: Sequence[Frame], clouds: CloudSet) -> Notes:
         """Each frame's down-sampled cloud, in its camera's axes."""
@@ -52,7 +56,10 @@ class Recorder:
     def poses(self, name: str, world_from_cam: Floats, frames: Sequence[Frame] = ()) -> Notes:
         """A trajectory (N, 4, 4) by its name, such as truth or odometry; NaN where a pose is unknown."""
         return self._part(
-            2, "poses", name, lambda s: graph_log.log_poses(s, name, world_from_cam, frames, self.options)
+            2,
+            "poses",
+            name,
+            lambda s: graph_log.log_poses(s, name, world_from_cam, frames, self.options, self.is_scanner),
         )
 
     def registration(self, outer: int, registered: Edges, guesses: Floats, clouds: CloudSet) -> Notes:
@@ -61,7 +68,7 @@ class Recorder:
             layout.outer_number(outer, 2),
             "registration",
             str(outer),
-            lambda s: log_registration(s, outer, registered, guesses, clouds, self.options),
+            lambda s: log_registration(s, outer, registered, guesses, clouds, self.options, self.is_scanner),
         )
 
     def edges(
@@ -100,7 +107,8 @@ class Recorder:
             )
             notes += log_complex(stream, outer, graph, start, solution, self.options, self._round_bytes / 4)
             name = layout.round_name(outer)
-            return notes + graph_log.log_poses(stream, name, solution.world_from_cam, frames, self.options)
+            poses = solution.world_from_cam
+            return notes + graph_log.log_poses(stream, name, poses, frames, self.options, self.is_scanner)
 
         return self._part(layout.outer_number(outer, 1), "solution", str(outer), log)
 

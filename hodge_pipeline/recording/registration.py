@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.recipe.recording_options import RecordingOptions
@@ -13,6 +14,7 @@ from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.stream import log_markdown
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32
 from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.edges import REJECTED
 
 POINTS_SHOWN = 6_000
 TARGET_COLOUR, BEFORE_COLOUR, AFTER_COLOUR = (86, 180, 233), (230, 130, 0), (240, 228, 66)
@@ -28,6 +30,7 @@ def log_registration(
     guesses: Floats,
     clouds: CloudSet,
     options: RecordingOptions,
+    is_scanner: bool = False,
 ) -> tuple[str, ...]:
     """Log histograms and columns of all pairs (P,), and the clouds of chosen ones in i's axes; nothing is left out.
 
@@ -40,6 +43,8 @@ def log_registration(
         chosen = chosen_pairs(registered, guesses)
         for name, row in chosen.items():
             _log_pair(stream, name, registered, row, guesses, clouds)
+            axes = rr.ViewCoordinates.FLU if is_scanner else rr.ViewCoordinates.RDF
+            stream.log(layout.pair(name), axes, static=True)
         log_markdown(stream, layout.PAIRS_TEXT, _text(registered, guesses, chosen))
     return ()
 
@@ -57,10 +62,15 @@ def log_columns(stream: rr.RecordingStream, outer: int, registered: Edges) -> No
             rmse_m=registered.rmse_m.astype(np.float32),
             iterations=registered.iterations,
             correspondences=registered.correspondences,
-            rejected=registered.why.tolist(),
+            rejected=_reasons(registered).tolist(),
         ),
         static=True,
     )
+
+
+def _reasons(registered: Edges) -> NDArray[np.str_]:
+    """Why each pair (P,) was rejected; empty for an edge, where `why` is what the diagnosis says."""
+    return np.where(registered.status == REJECTED, registered.why, "")
 
 
 def chosen_pairs(registered: Edges, guesses: Floats) -> Mapping[str, int]:
@@ -93,7 +103,6 @@ def _log_pair(
     ):
         shown = rr.Points3D(points, colors=[colour], radii=[POINT_RADIUS])
         stream.log(f"{layout.pair(name)}/{part}", shown, static=True)
-    stream.log(layout.pair(name), rr.ViewCoordinates.RDF, static=True)
 
 
 def _thinned(clouds: CloudSet, row: int) -> Floats32:
@@ -111,7 +120,7 @@ def _log_histogram(stream: rr.RecordingStream, path: str, values: Floats) -> Non
 
 def _text(registered: Edges, guesses: Floats, chosen: Mapping[str, int]) -> str:
     moved = moved_m(registered, guesses)
-    reasons, counts = np.unique(registered.why, return_counts=True)
+    reasons, counts = np.unique(_reasons(registered), return_counts=True)
     lines = ["# Registration", "", "| outcome | pairs |", "|---|---|"]
     lines += [f"| {reason or 'edge'} | {count} |" for reason, count in zip(reasons, counts, strict=True)]
     lines += ["", "Blue: frame i. Orange: frame j as guessed. Yellow: frame j as registered.", ""]

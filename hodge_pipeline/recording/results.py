@@ -28,7 +28,8 @@ def log_model(
     kept = options.count(options.model_points, available, bytes_each, options.max_bytes("model"))
     thin = shapes.thin_model(model, max(kept, 1))
     if thin.triangles is None or not len(thin.triangles):
-        cloud = rr.Points3D(thin.points_in_world, colors=thin.colours, radii=[POINT_RADIUS])
+        colours = shapes.or_grey(thin.colours, len(thin.points_in_world))
+        cloud = rr.Points3D(thin.points_in_world, colors=colours, radii=[POINT_RADIUS])
         stream.log(path, cloud, static=True)
     else:
         # Only the side that was seen is drawn, so that a room can be looked into from outside.

@@ -18,6 +18,7 @@ from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge
 from hodge_pipeline.recording.recorder import Recorder
+from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.scene import FIRST, START, Round, given_poses, has_given, has_truth, pose_sets, true_poses
 from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.start.clouds import clouds as clouds_step
@@ -135,7 +136,8 @@ class Recording:
 
     def _recorder(self, folder: Path) -> Recorder:
         rounds = self._recipe.outer_iterations + self._recipe.suggestions.rounds
-        return Recorder(folder, self._identity, options=self._recipe.recording, rounds=rounds)
+        seen = self._clouds is not None and is_scanner(self._clouds)
+        return Recorder(folder, self._identity, options=self._recipe.recording, rounds=rounds, is_scanner=seen)
 
     def _finish(self) -> None:
         merged = self._steps.step(

@@ -6,7 +6,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.types import Bytes, Floats, Floats32, Ints, Model, ViewGraph
+from hodge_pipeline.types import Bytes, CloudSet, Floats, Floats32, Ints, Model, ViewGraph
 from hodge_pipeline.types.arrays import evenly
 
 RESIDUAL_COLOURS = np.array([[60, 115, 225], [130, 145, 170], [190, 180, 120], [255, 225, 50]], float)
@@ -14,12 +14,32 @@ RESIDUAL_COLOURS = np.array([[60, 115, 225], [130, 145, 170], [190, 180, 120], [
 IGNORED_COLOUR = (230, 60, 160)
 REJECTED_COLOUR = (110, 110, 110)
 RESULT_COLOUR = (255, 255, 255)
+GREY = 190
+"""Of points without a colour."""
 TRAJECTORY_COLOURS = {"truth": (0, 200, 140), "odometry": (230, 130, 0), "start": (185, 130, 235)}
 """Bluish green, orange and purple of Okabe and Ito's colour-blind safe set, brightened for the dark background."""
 
-FRUSTUM_DEPTH_M = 0.06
-_CORNERS = np.array([[-0.8, -0.6, 1.0], [0.8, -0.6, 1.0], [0.8, 0.6, 1.0], [-0.8, 0.6, 1.0]]) * FRUSTUM_DEPTH_M
+LEAST_POSE_M, POSE_SHARE = 0.06, 0.02
+"""How large a pose is drawn: in a room, and of the extent of its trajectory where that is more."""
+_CORNERS = np.array([[-0.8, -0.6, 1.0], [0.8, -0.6, 1.0], [0.8, 0.6, 1.0], [-0.8, 0.6, 1.0]])
 _FRUSTUM = np.vstack([_CORNERS, np.zeros((1, 3))])[[0, 4, 1, 2, 4, 3, 0, 1, 2, 3]]
+_ARROW = np.array([[0, 0, 0.5], [0, 0, 0], [1, 0, 0], [0.7, 0.2, 0], [0.7, -0.2, 0], [1, 0, 0]])
+SCANNER_AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+"""Right, down and ahead of a scanner, or a robot, in its own axes: x ahead and z up; a camera's are the unit matrix."""
+LOOKED_AT = 9
+"""Clouds that tell whether they are a scanner's: all are of one sensor."""
+SEEN_BEHIND = 0.01
+"""Share of points behind the image plane, which no camera has: of those of a scanner, whose z is up, it is the ground.
+"""
+
+
+def is_scanner(clouds: CloudSet, rows: Ints | None = None) -> bool:
+    """Whether these rows, or a few of them, hold points behind an image plane."""
+    rows = np.flatnonzero(clouds.sizes > 0) if rows is None else rows
+    looked_at = rows[evenly(len(rows), LOOKED_AT)].tolist()
+    return len(rows) > 0 and bool(
+        np.mean([(clouds[row].points_in_cam[:, 2] < 0).mean() for row in looked_at]) > SEEN_BEHIND
+    )
 
 
 def residuals_m(graph: ViewGraph, world_from_cam: Floats) -> Floats:
@@ -41,6 +61,11 @@ def segments(world_from_cam: Floats, pairs: Ints) -> Floats32:
     return np.asarray(world_from_cam[pairs, :3, 3], np.float32)
 
 
+def or_grey(colours: Bytes | None, count: int) -> Bytes:
+    """Colours (count, 3); grey where none is known."""
+    return colours if colours is not None and colours.any() else np.full((count, 3), GREY, np.uint8)
+
+
 def is_drawable(world_from_cam: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """Where (...,) a pose is finite."""
     return np.asarray(np.isfinite(world_from_cam).all(axis=(-1, -2)))
@@ -54,20 +79,20 @@ def strips(world_from_cam: Floats, sequences: np.ndarray[tuple[int, ...], np.dty
     return [np.asarray(world_from_cam[run, :3, 3], np.float32) for run in runs if len(run) and drawable[run[0]]]
 
 
-def frustum_lines(world_from_cam: Floats) -> Floats32:
-    """One line (N, 10, 3) for each pose, that draws its frustum, x right and z forward."""
-    return np.asarray(se3.transform(world_from_cam, _FRUSTUM), np.float32)
+def pose_lines(world_from_cam: Floats, is_scanner: bool = False) -> Floats32:
+    """One line (N, K, 3) for each pose: the frustum of a camera, x right and z forward; of a scanner an arrow along its
+    x, under a mast along its z.
+    """
+    extent_m = np.linalg.norm(np.ptp(world_from_cam[:, :3, 3], axis=0)) if len(world_from_cam) else 0.0
+    shape = max(LEAST_POSE_M, POSE_SHARE * float(extent_m)) * (_ARROW if is_scanner else _FRUSTUM)
+    return np.asarray(se3.transform(world_from_cam, shape), np.float32)
 
 
 def up_and_ahead(world_from_cam: Floats, is_scanner: bool = False) -> tuple[Floats, Floats]:
-    """Unit vectors (3,): the cameras' mean up direction, and their mean view direction across it; of scanners, whose z
-    is up and whose x is ahead, likewise.
-    """
-    right, down, forth = world_from_cam[:, :3, :3].mean(axis=0).T
-    if is_scanner:
-        up, ahead = unit(forth, np.array([0.0, 0.0, 1.0])), right
-    else:
-        up, ahead = unit(-down, np.array([0.0, -1.0, 0.0])), forth
+    """Unit vectors (3,): the mean up direction of cameras, or scanners, and their mean view direction across it."""
+    axes = SCANNER_AXES if is_scanner else np.eye(3)
+    _, down, ahead = axes @ world_from_cam[:, :3, :3].mean(axis=0).T
+    up = unit(-down, -axes[1])
     return up, unit(ahead - (ahead @ up) * up, unit(np.cross(up, [1.0, 0.3, 0.2]), up))
 
 
@@ -92,7 +117,7 @@ def _clustered(model: Model, kept: int) -> Model:
     low = points.min(axis=0)
     voxel_m = max(float(np.ptp(points, axis=0).max()) / 2000, 1e-9)
     while True:
-        _, first, cluster = np.unique(_keys(points - low, voxel_m), return_index=True, return_inverse=True)
+        _, first, cluster = np.unique(_voxels(points - low, voxel_m), return_index=True, return_inverse=True)
         if len(first) <= kept:
             break
         voxel_m *= max(1.05, float(np.sqrt(len(first) / kept)))
@@ -101,9 +126,13 @@ def _clustered(model: Model, kept: int) -> Model:
     return _replace(model, first, triangles[(a != b) & (b != c) & (a != c)].astype(np.int32))
 
 
-def _keys(offsets: Floats, voxel_m: float) -> Ints:
+def _voxels(offsets: Floats, voxel_m: float) -> Ints:
     cells = np.floor(offsets / voxel_m).astype(np.int64)
-    size = cells.max(axis=0) + 1
+    return numbered(cells, cells.max(axis=0) + 1)
+
+
+def numbered(cells: Ints, size: Ints) -> Ints:
+    """A number (N,) for each cell (N, 3) of a grid of this size (3,)."""
     return np.asarray((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2])
 
 

@@ -22,15 +22,17 @@ def record_graph(
     solution: Solution | None,
     sets: Mapping[str, Floats],
     notes: Sequence[str] = (),
+    *,
+    is_scanner: bool = False,
 ) -> tuple[str, ...]:
     """Write `recording.rrd`: the graph as it was, the film of the solve, the edges under its result, further poses.
 
-    The sets of poses alone where nothing was solved. What was left out of it, in words.
+    The sets of poses alone where nothing was solved; `is_scanner` as of a `Recorder`. What was left out, in words.
     """
     result = start if solution is None else solution.world_from_cam
     identity = hashlib.sha256(np.ascontiguousarray(result).tobytes()).hexdigest()[:32]
     with tempfile.TemporaryDirectory(dir=folder, prefix=".recording-") as parts:
-        recorder = Recorder(Path(parts), identity)
+        recorder = Recorder(Path(parts), identity, is_scanner=is_scanner)
         left_out = [*recorder.frames(name, (), tuple(notes))]
         left_out += [note for label, poses in sets.items() for note in recorder.poses(label, poses)]
         if graph is not None and solution is not None:

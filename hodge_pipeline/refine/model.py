@@ -11,7 +11,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.executors.dask import open_workers
-from hodge_pipeline.refine.candidates import Found, weigh
+from hodge_pipeline.refine.candidates import GIVEN, Found, weigh
 from hodge_pipeline.refine.choice import Choice, choose, held_out_score
 from hodge_pipeline.refine.guard import Change, Decision, Measure
 from hodge_pipeline.refine.judge import SAME_COST, Cost
@@ -146,7 +146,7 @@ def _placed_decision(start: TrackedModel, found: Found, choice: Choice) -> Decis
         return None
     off, name = found.positions_off, found.candidates[choice.row].name
     fit = f", {off[0]:.3g} -> {off[choice.row]:.3g} m off in the median" if np.isfinite(off[0]) else ""
-    told = f"mean error {found.costs[0].px:.4g} -> {found.costs[choice.row].px:.4g} px by {name}"
+    told = f"mean error {found.costs[0].px:.4g} -> {found.costs[choice.row].px:.4g} px{_by(name)}"
     return Decision("refined", f"{start.placing}{fit}; {told}")
 
 
@@ -156,7 +156,7 @@ def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool
     name = found.candidates[choice.row].name
     if len(scales) > 1:
         return _join_decision(found.inputs, after, name, force)
-    told = f"mean error {before.px:.4g} -> {after.px:.4g} px by {name}"
+    told = f"mean error {before.px:.4g} -> {after.px:.4g} px{_by(name)}"
     if scales[0].is_observable and not scales[0].is_one:
         return Decision("refined", f"in metres now; {told}")
     if not choice.row:
@@ -165,10 +165,14 @@ def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool
 
 
 def _join_decision(apart: Cost, joined: Cost, name: str, force: bool) -> Decision:
-    told = f"mean error {apart.px:.4g} px apart, {joined.px:.4g} px as one, by {name}"
+    told = f"mean error {apart.px:.4g} px apart, {joined.px:.4g} px as one{_by(name)}"
     if joined.px <= (1 + JOIN_LOSS) * apart.px and len(joined.images_off) <= len(apart.images_off):
         return Decision("refined", f"the models are one; {told}")
     return Decision("forced" if force else "worse", f"the models do not fit as one: {told}")
+
+
+def _by(candidate: str) -> str:
+    return ", with the poses as given" if candidate == GIVEN else f" by {candidate}"
 
 
 def _in_the_scale_of(start: TrackedModel, model: TrackedModel) -> TrackedModel:

@@ -21,6 +21,8 @@ FRAMES_IN_BLOCK = 16
 MIN_POINTS_FOR_NORMALS = 5
 MANY_POINTS = 5_000_000
 LISTED_NOTES = 5
+MAP_AWAY = 10.0
+"""Times the spread of a cloud's points: from there on they are not seen from the origin, but counted from it."""
 MAX_VOXELS_ALONG_AXIS = 2_000_000  # its cube still fits the 64-bit voxel key
 BLANK_LEVELS = 6
 """Of 255, by which nearly all pixels of a blank image differ at most: a covered camera's do by 5 where its noise is 2
@@ -260,13 +262,23 @@ def in_range(cloud: PointCloud, options: CloudOptions) -> PointCloud:
 
 
 def out_of_range(cloud: PointCloud, options: CloudOptions) -> str:
-    """What to do about points none of which is in range: scanners store millimetres as often as metres."""
+    """What to do about points none of which is in range: scanners store millimetres as often as metres, and maps count
+    from far away.
+    """
     ranges = _ranges(cloud)
     finite = ranges[np.isfinite(ranges) & (ranges > 0)]
     if not len(finite):
         return "there is no point in it"
     usual = float(np.median(finite))
     limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
+    points = cloud.points_in_cam[np.isfinite(ranges) & (ranges > 0)]
+    spread_m = float(np.ptp(np.quantile(points, (0.05, 0.95), axis=0), axis=0).max())
+    if usual > max(options.max_range_m, MAP_AWAY * spread_m):
+        rounding_m = float(np.spacing(np.float32(usual)))
+        return (
+            f"its points lie {usual:.3g} m away, all near each other: map coordinates? Subtract one corner from all "
+            f"scans, in double precision, and write them again: float32 rounds them to {rounding_m:.2g} m there"
+        )
     unit = " (millimetres? then source.reader.units_per_metre=1000)" if usual > options.max_range_m else ""
     return f"its points lie {usual:.3g} m away, in range are {limits}{unit}"
 

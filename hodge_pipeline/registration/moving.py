@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,21 +47,38 @@ class Rival:
     contradicting: float
 
 
-def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floats) -> tuple[float, Rival | None]:
-    """The share of the tested pixels that contradict the motion found, and the motion of corners where that has none;
-    None where little contradicts it, or no other motion agrees.
+class Agreement(NamedTuple):
+    """Shares of the tested pixels: `contradicting`, whose depth or grey value contradicts a motion; `misplaced`, whose
+    depth in the view is off what the motion predicts, by `OFF_M` and `OFF_SIGMAS`: few where both see one rigid scene,
+    most of a bare room where the motion is an object's.
+    """
+
+    contradicting: float
+    misplaced: float
+
+
+def agreement(key: FlowImage, view: FlowImage, key_from_view: Floats) -> Agreement:
+    """How much of the view contradicts a motion."""
+    compared = _compared(key, view, key_from_view)
+    return Agreement(_contradicting(_misfit(key, view, *compared)), _misplaced(view, *compared))
+
+
+def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floats) -> tuple[Agreement, Rival | None]:
+    """How much contradicts the motion found, and the motion of corners where that has none; None where little
+    contradicts it, or no other motion agrees.
     """
     key = corners.image
-    misfit = _misfit(key, view, found.key_from_view)
-    share = _contradicting(misfit)
-    if share <= MUCH:
+    compared = _compared(key, view, found.key_from_view)
+    misfit = _misfit(key, view, *compared)
+    share = Agreement(_contradicting(misfit), _misplaced(view, *compared))
+    if share.contradicting <= MUCH:
         return share, None
     own = _tiles_with(key, corners.pixels[found.rows])
     others = find_corners(key, 1 - own)
     other = follow(others, view, guess)
     if other is None:
         return share, None
-    others_misfit = _misfit(key, view, other.key_from_view)
+    others_misfit = _misfit(key, view, *_compared(key, view, other.key_from_view))
     won, lost = _votes(key, misfit - others_misfit)
     if won == lost == 0:  # the same motion
         return share, None
@@ -69,16 +87,7 @@ def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floa
     return share, Rival(others, other, fits_better, moving, _contradicting(others_misfit))
 
 
-def contradicting(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
-    """The share of the tested pixels whose depth or grey value contradicts a motion."""
-    return _contradicting(_misfit(key, view, key_from_view))
-
-
-def misplaced(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
-    """The share of the tested pixels whose depth in the view is off what the motion predicts, by `OFF_M` and
-    `OFF_SIGMAS`: few where both see one rigid scene, most of a bare room where the motion is an object's.
-    """
-    expected, actual = _compared(key, view, key_from_view)
+def _misplaced(view: FlowImage, expected: Floats, actual: Floats) -> float:
     off = np.abs(actual - expected[:, 2])
     off = off[np.isfinite(off)] / view.unit_m
     sigma = depth_sigma(expected[np.isfinite(actual), 2] / view.unit_m)
@@ -114,12 +123,11 @@ def tested_pixels(shape: tuple[int, ...]) -> Floats:
     return np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
 
 
-def _misfit(key: FlowImage, view: FlowImage, key_from_view: Floats) -> Floats:
-    """Of the tested pixels (n,) of the key frame: how far depth and grey value in the view are off what the motion
-    predicts, 1: by as much as may be or more; NaN where not both frames have a depth.
+def _misfit(key: FlowImage, view: FlowImage, expected: Floats, actual: Floats) -> Floats:
+    """Of the tested pixels (n,) of the key frame, `_compared`: how far depth and grey value in the view are off what
+    the motion predicts, 1: by as much as may be or more; NaN where not both frames have a depth.
     """
     pixels = tested_pixels(key.depth.shape)
-    expected, actual = _compared(key, view, key_from_view)
     sigma = DEPTH_SIGMAS * view.unit_m * depth_sigma(expected[:, 2] / view.unit_m)
     off = (actual - expected[:, 2]) / (GATE_PX / PIXEL_SIGMA * sigma)
     change = _grey(view, expected[:, :2]) - _grey(key, pixels)

@@ -17,7 +17,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, is_blank
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
-from hodge_pipeline.registration.moving import contradicting, misplaced, rival_motion
+from hodge_pipeline.registration.moving import Agreement, agreement, rival_motion
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registration.tracked_blocks import TrackedBlock
@@ -248,27 +248,26 @@ class _Tracker:
         if key.corners is None or key.image is None or view.image is None:
             return None
         found = follow(key.corners, view.image, guess)
-        against = 0.0
-        if found is not None:
-            found, against = self._of_most_area(key, view, found, guess)
-        if found is None or len(found.rows) < FEWEST_FOLLOWED or found.share < self._limits.min_fitness:
+        if found is None:
             return None
-        off = misplaced(key.image, view.image, found.key_from_view)
-        if off > MISPLACED:
+        found, against = self._of_most_area(key, view, found, guess)
+        if len(found.rows) < FEWEST_FOLLOWED or found.share < self._limits.min_fitness:
+            return None
+        if against.misplaced > MISPLACED:
             by_clouds = self._registrar.register(key.prepared, view.prepared, guess)
-            left = misplaced(key.image, view.image, by_clouds.i_from_j)
-            if self._good(by_clouds) and 2 * left < off:
-                self._doubt(view, max(contradicting(key.image, view.image, by_clouds.i_from_j), key.left_out))
+            left = agreement(key.image, view.image, by_clouds.i_from_j)
+            if self._good(by_clouds) and 2 * left.misplaced < against.misplaced:
+                self._doubt(view, max(left.contradicting, key.left_out))
                 return by_clouds
-        self._doubt(view, max(against, key.left_out))
+        self._doubt(view, max(against.contradicting, key.left_out))
         self._corner_points[key.place] = key.corners.points
         self._sightings[key.place, view.place] = found
         information = found.information / CORNERS_A_SAMPLE
         return Registration(found.key_from_view, information, found.share, found.rmse_m, len(found.rows), 0, True)
 
-    def _of_most_area(self, key: _View, view: _View, found: Followed, guess: Floats) -> tuple[Followed, float]:
-        """The motion found, or another one that more of the image follows, and the share of the image that contradicts
-        it; what moves leaves the key frame's cloud.
+    def _of_most_area(self, key: _View, view: _View, found: Followed, guess: Floats) -> tuple[Followed, Agreement]:
+        """The motion found, or another one that more of the image follows, and what contradicts it; what moves leaves
+        the key frame's cloud.
         """
         assert key.image is not None and key.corners is not None and view.image is not None
         share, rival = rival_motion(key.corners, view.image, found, guess)
@@ -276,10 +275,11 @@ class _Tracker:
             return found, share
         self._moving.add(view.place)
         key.leave_out(rival.moving, rival.corners if rival.fits_better else key.corners)
-        if not rival.fits_better:
-            return found, share
-        self._sightings = {pair: one for pair, one in self._sightings.items() if pair[0] != key.place}
-        return rival.followed, rival.contradicting
+        if rival.fits_better:
+            self._sightings = {pair: one for pair, one in self._sightings.items() if pair[0] != key.place}
+            found, share = rival.followed, Agreement(rival.contradicting, 0.0)
+        left = agreement(key.image, view.image, found.key_from_view)
+        return found, Agreement(share.contradicting, left.misplaced)
 
     def _doubt(self, view: _View, share: float) -> None:
         if share > DOUBTFUL:

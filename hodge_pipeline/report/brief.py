@@ -6,8 +6,7 @@ import textwrap
 from collections.abc import Iterator
 
 from hodge_pipeline.report.contents import Report
-from hodge_pipeline.report.run_page import duration, next_commands, worst_places
-from hodge_pipeline.report.tables import peak_mb
+from hodge_pipeline.report.run_page import duration, next_commands, peak, worst_places
 from hodge_pipeline.report.verdict import judge, suspicions
 from hodge_pipeline.types.notes import Rank
 
@@ -40,7 +39,7 @@ def all_notes(report: Report) -> list[str]:
 def _end(report: Report, folder: str) -> Iterator[str]:
     if report.stages:
         wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
-        yield from labelled("time", f"{duration(wall)}, {cpu:.1f} CPU s, at most {peak_mb(report):.0f} MB")
+        yield from labelled("time", f"{duration(wall)}, {cpu:.1f} CPU s{peak(report)}")
     yield f"{'report':<{LABEL}}{folder}/report.html"
     command = next(line for line in next_commands(report, folder) if not line.startswith("#"))
     yield f"{'next':<{LABEL}}{command}"

@@ -32,7 +32,8 @@ def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
         raise not_written(html, error) from error
     names = comparison.a.name, comparison.b.name
     poses = comparison.a_poses, comparison.b_poses
-    record_comparison(recording, names, poses, models, comparison.apart_m, markdown(tables(comparison)))
+    told = markdown(tables(comparison))
+    record_comparison(recording, names, poses, models, comparison.apart_m, told, is_scanner=_is_scanner(comparison))
     return html, recording
 
 
@@ -48,6 +49,10 @@ def _model(run: RunFacts, world_from_run: Floats) -> Model | None:
     points = np.asarray(se3.transform(world_from_run, model.points_in_world.astype(float)), np.float32)
     normals = None if model.normals_in_world is None else model.normals_in_world @ turn.T
     return Model(model.name, points, normals, model.colours, model.triangles, model.notes)
+
+
+def _is_scanner(comparison: Comparison) -> bool:
+    return bool(comparison.a.report["source"].get("is_scanner"))
 
 
 def _page(comparison: Comparison, models: tuple[Model | None, Model | None]) -> Document:
@@ -87,5 +92,5 @@ def _sides(comparison: Comparison, models: tuple[Model | None, Model | None]) ->
     if first is None or second is None or not len(comparison.a_poses) or not len(first.points_in_world):
         return ()
     scenes = [raster.Points.of(one.points_in_world, one.normals_in_world, one.colours) for one in (first, second)]
-    views = raster.around(scenes[0], comparison.a_poses)
+    views = raster.around(scenes[0], comparison.a_poses, _is_scanner(comparison))
     return sides(scenes, views, f"{comparison.a.name} | {comparison.b.name}")

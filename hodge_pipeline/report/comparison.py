@@ -15,6 +15,7 @@ from hodge_pipeline.evaluation.difference import floor_of, length, percent, sign
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.report.document import Table
 from hodge_pipeline.report.verdict import GRAPH_NAMES
+from hodge_pipeline.scene import is_clock
 from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.store.workspace import RECIPE_FILE, is_run_folder
 from hodge_pipeline.types import Floats
@@ -88,7 +89,7 @@ def compare(first: Path, second: Path) -> Comparison:
     """The runs of two folders, the second laid onto the first. Raises `WorkspaceError`."""
     same = first.resolve().name == second.resolve().name
     a, b = read_facts(first, str(first) if same else ""), read_facts(second, str(second) if same else "")
-    row_in_b = {key: row for row, key in enumerate(b.keys)}
+    row_in_b = {key: row for row, key in enumerate(b.keys)} if _may_share(a, b) else {}
     rows = np.array([(row, row_in_b[key]) for row, key in enumerate(a.keys) if key in row_in_b], int).reshape(-1, 2)
     a_poses, b_poses = a.world_from_cam[rows[:, 0]], b.world_from_cam[rows[:, 1]]
     if len(rows) < FEWEST_SHARED:
@@ -96,6 +97,13 @@ def compare(first: Path, second: Path) -> Comparison:
     laid = absolute_error(b_poses, a_poses)
     a_from_b = laid.aligned[0] @ se3.inverse(b_poses[0])
     return Comparison(a, b, a_poses, laid.aligned, a_from_b, laid.per_frame_m)
+
+
+def _may_share(a: RunFacts, b: RunFacts) -> bool:
+    """Whether equal stamps mean equal frames: a clock's do; numbers of frames in sources alike in name or length."""
+    if all(is_clock(np.array([stamp for _, stamp in run.keys])) for run in (a, b)):
+        return True
+    return any(a.report["source"].get(what) == b.report["source"].get(what) for what in ("name", "frames"))
 
 
 def tables(comparison: Comparison) -> tuple[Table, ...]:
@@ -180,8 +188,19 @@ def _change(a: float | None, b: float | None, floor: float) -> str:
 
 
 def _changed_options(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
-    if isinstance(a, Mapping) and isinstance(b, Mapping):
+    """Options that differ; of two stages, which have options of their own, the names."""
+    if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        a, b = ({str(number): each for number, each in enumerate(one, start=1)} for one in (a, b))
+    if isinstance(a, Mapping) and isinstance(b, Mapping) and a.get("stage") == b.get("stage"):
         for name in dict.fromkeys((*a, *b)):
-            yield from _changed_options(a.get(name), b.get(name), f"{key}.{name}" if key else str(name))
+            if f"{key}{name}" != "description":
+                yield from _changed_options(a.get(name), b.get(name), f"{key}.{name}" if key else str(name))
     elif a != b:
-        yield key, str(a), str(b)
+        yield key, _named(a), _named(b)
+
+
+def _named(value: Any) -> str:
+    """An option's value in a cell: of a stage its name."""
+    if isinstance(value, Mapping) and "stage" in value:
+        return str(value["stage"])
+    return ", ".join(map(_named, value)) if isinstance(value, list) else "–" if value is None else str(value)

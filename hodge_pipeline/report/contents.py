@@ -24,7 +24,8 @@ class SourceSummary:
     """What was read: how many frames, how many of them with a true pose, and what the reader remarked.
 
     `key_frames` is None where every frame is a vertex of the graph. `format` is the reader's name, `kind`
-    says what a frame is, `unordered` that all were joined from nothing.
+    says what a frame is, `unordered` that all were joined from nothing; `is_scanner`: x is ahead and z up, where a
+    camera has z ahead and y down.
     """
 
     name: str
@@ -37,6 +38,7 @@ class SourceSummary:
     format: str = ""
     kind: Literal["frames", "scans", "images", "poses"] = "frames"
     unordered: bool = False
+    is_scanner: bool = False
 
     @property
     def counted(self) -> str:
@@ -48,6 +50,11 @@ class SourceSummary:
     def vertex_name(self) -> str:
         """What the vertices of the viewing graph are."""
         return self.kind if self.key_frames is None else "key frames"
+
+    @property
+    def vertex(self) -> str:
+        """What one of them is."""
+        return self.vertex_name.removesuffix("s")
 
 
 @dataclass(frozen=True)
@@ -256,7 +263,8 @@ class Report:
     `before` and `after` name the sets of poses that the verdict compares, as in `scores` and `trajectories`.
     `last_shift_m` is how far the last round moved the positions (root mean square), None where it had none before it.
     `wrong_edges` is None where nobody judged; `unmeasured` says why no measure was taken; without `has_metres` lengths
-    are in the source's own unit. `position_fit` is None without known positions.
+    are in the source's own unit. `position_fit` is None without known positions. `shows_rejected`: the pictures and
+    scores are of a refinement that is not kept.
     """
 
     title: str
@@ -279,6 +287,7 @@ class Report:
     unmeasured: str = ""
     position_fit: PositionFit | None = None
     has_metres: bool = True
+    shows_rejected: bool = False
     pictures: Pictures = field(default_factory=Pictures)
 
     @property

@@ -11,11 +11,12 @@ from matplotlib.figure import Figure
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.evaluation.difference import length
+from hodge_pipeline.recording.shapes import SCANNER_AXES, is_scanner
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import EdgePictures
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.matches import side_by_side
-from hodge_pipeline.report.painting import painted
+from hodge_pipeline.report.painting import UNKNOWN_UNIT, painted
 from hodge_pipeline.report.photographs import images_of
 from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, PointCloud, ViewGraph
 
@@ -41,9 +42,9 @@ def edge_pictures(
 ) -> tuple[EdgePictures, ...]:
     """The pictures of these edges; nothing for a graph without frames or clouds. `has_metres`: as of a `Report`."""
     said = length if has_metres else "{:.3g} units".format
-    found = []
+    scans, found = clouds is not None and is_scanner(clouds), []
     for row in map(int, rows):
-        plots = tuple(_plots(graph, diagnosis, row, frames, clouds, said))
+        plots = tuple(_plots(graph, diagnosis, row, frames, clouds, said, scans=scans))
         if plots:
             found.append(EdgePictures(row, plots))
     return tuple(found)
@@ -56,18 +57,22 @@ def _plots(
     frames: Sequence[Frame],
     clouds: CloudSet | None,
     said: Callable[[float], str],
+    *,
+    scans: bool,
 ) -> Iterator[Picture]:
     i, j = graph.edges[row].tolist()
     names = graph.vertex_ids[i], graph.vertex_ids[j]
     if clouds is not None and len(clouds[i]) and len(clouds[j]):
         measured, known = graph.i_from_j[row], [("As the edge says", graph.i_from_j[row])]
-        up = _up(diagnosis, i)
+        axes = SCANNER_AXES if scans else np.eye(3)
+        up = _up(diagnosis, i, axes[1])
         if diagnosis.piece[i] == diagnosis.piece[j]:
             robust = se3.inverse(diagnosis.world_from_cam[i]) @ diagnosis.world_from_cam[j]
             known.append(("As the robust poses say", robust))
             yield _cut(clouds[i], clouds[j], measured, robust, up, names[1], said)
-        views = _views(clouds[i], clouds[j], [motion for _, motion in known], up)
-        shown = f"Frame {names[0]} blue, frame {names[1]} orange; left as camera {names[0]} looks, right from above."
+        views = _views(clouds[i], clouds[j], [motion for _, motion in known], up, axes)
+        left = f"along x of {names[0]}" if scans else f"as camera {names[0]} looks"
+        shown = f"Frame {names[0]} blue, frame {names[1]} orange; left {left}, right from above."
         for title, motion in known:
             both = raster.two(clouds[i], clouds[j], motion, (BLUE, ORANGE))
             yield Picture(title, shown, raster.jpeg(raster.beside([raster.picture(both, view) for view in views])))
@@ -75,24 +80,24 @@ def _plots(
         yield from _images(frames[i], frames[j])
 
 
-def _up(diagnosis: Diagnosis, i: int) -> Floats:
-    """Where up is, in camera i's axes: the mean of what the cameras of its piece have as up."""
-    poses = diagnosis.world_from_cam
-    up = -poses[diagnosis.piece == diagnosis.piece[i], :3, 1].mean(axis=0)
+def _up(diagnosis: Diagnosis, i: int, down: Floats) -> Floats:
+    """Where up is, in frame i's axes, where `down` (3,) is down in each: the mean of its piece."""
+    turns = diagnosis.world_from_cam[:, :3, :3]
+    up = -(turns[diagnosis.piece == diagnosis.piece[i]] @ down).mean(axis=0)
     size = float(np.linalg.norm(up))
-    return np.asarray(poses[i, :3, :3].T @ (up / size) if size > LEAST_UP else np.array([0.0, -1.0, 0.0]))
+    return np.asarray(turns[i].T @ (up / size) if size > LEAST_UP else -down)
 
 
 def _views(
-    first: PointCloud, second: PointCloud, motions: Sequence[Floats], up_in_i: Floats
+    first: PointCloud, second: PointCloud, motions: Sequence[Floats], up_in_i: Floats, axes: Floats
 ) -> tuple[raster.View, raster.View]:
-    """As camera i looks, and from above: the same for every motion, so that the pictures compare."""
+    """Along `axes` (3, 3), and from above: the same for every motion, so that the pictures compare."""
     moved = [se3.transform(motion, np.asarray(second.points_in_cam, float)) for motion in motions]
     points = np.concatenate([np.asarray(first.points_in_cam, float), *moved])
-    across = np.cross(-up_in_i, np.eye(3)[2])
+    across = np.cross(-up_in_i, axes[2])
     across /= max(float(np.linalg.norm(across)), 1e-9)
     above = np.stack([across, np.cross(-up_in_i, across), -up_in_i])
-    ahead, down = (raster.holding(axes, points, SIZE, STRAY_PERCENT) for axes in (np.eye(3), above))
+    ahead, down = (raster.holding(axes, points, SIZE, STRAY_PERCENT) for axes in (axes, above))
     return replace(ahead, culled=False), replace(down, culled=False)
 
 
@@ -127,6 +132,7 @@ def _cut(
                 axes.scatter(x, y, s=2, color=np.array(colour) / 255, marker=marker, linewidths=0)
             axes.set_aspect("equal", adjustable="datalim")
             axes.set_title(title, fontsize=9)
+            axes.set_xlabel("m" if said is length else UNKNOWN_UNIT, fontsize=8)
             axes.tick_params(labelsize=7)
 
     told = f", here {times} times as large" if times > 1 else ""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hodge_pipeline import se3
+from hodge_pipeline.evaluation.difference import floor_of
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Floats
@@ -18,6 +20,8 @@ DOTS_PER_INCH = 150
 SIZE = 5.0, 3.9
 """Inches."""
 TRUTH = "truth"
+UNKNOWN_UNIT = "units"
+"""Of lengths that nothing relates to metres."""
 LINES = (":", "#D55E00"), ("-", "#0072B2")
 """Before and after, as in every plot."""
 
@@ -46,7 +50,7 @@ def error_plots(report: Report) -> Iterator[Picture]:
     title = "Error" if has_truth(report) else "Movement"
     yield painted(
         f"{title} over time, per axis",
-        f"How far each frame lies {against}; below, by how much it is turned.",
+        f"How far each frame lies {against}; below, by how much it is turned, but for the mean turn.",
         lambda figure: _over_time(figure, report),
     )
     last = report.after if report.after in errors else next(iter(errors))
@@ -62,36 +66,48 @@ def has_truth(report: Report) -> bool:
 
 
 def offsets(report: Report) -> dict[str, Floats]:
-    """How far (N, 3) each set of positions lies from the truth, without one the result from the poses before it."""
+    """How far (N, 3) each set of positions lies from the truth, without one the result from those before; nothing
+    where it did not move.
+    """
     paths = {path.name: path.positions for path in report.pictures.paths}
     if not paths.keys() >= {report.before, report.after}:
         return {}
     shown = {name: paths[name] for name in (report.before, report.after)}
     if TRUTH not in paths:
         shown = {report.after: shown[report.after]}
+        moved_m = np.linalg.norm(paths[report.after] - paths[report.before], axis=1)
+        if not (moved_m > floor_of(*paths.values())).any():
+            return {}
     found = {name: positions - paths.get(TRUTH, paths[report.before]) for name, positions in shown.items()}
     return found if all(np.isfinite(each).any() for each in found.values()) else {}
 
 
 def turns_deg(report: Report) -> dict[str, Floats]:
-    """By how many degrees (N,) each set of poses is turned against what `offsets` compares it with."""
+    """By how many degrees (N,) each set of poses is turned against what `offsets` compares it with, after the mean turn
+    of each component: positions along a line say little of it.
+    """
     rotations = {path.name: path.rotations for path in report.pictures.paths}
     reference = rotations.get(TRUTH if has_truth(report) else report.before)
     found = {}
     for name in offsets(report):
         own = rotations[name]
-        if own is not None and reference is not None:
-            known = np.isfinite(own).all(axis=(1, 2)) & np.isfinite(reference).all(axis=(1, 2))
-            found[name] = np.full(len(own), np.nan)
-            apart = np.swapaxes(reference[known], 1, 2) @ own[known]
-            found[name][known] = np.degrees(np.linalg.norm(se3.so3_log(apart), axis=-1))
+        if own is None or reference is None:
+            continue
+        component = report.pictures.component if len(report.pictures.component) == len(own) else np.zeros(len(own), int)
+        known = np.isfinite(own).all(axis=(1, 2)) & np.isfinite(reference).all(axis=(1, 2))
+        found[name] = np.full(len(own), np.nan)
+        for part in np.unique(component[known]):
+            rows = np.flatnonzero(known & (component == part))
+            turn = se3.project_to_so3((reference[rows] @ np.swapaxes(own[rows], 1, 2)).mean(axis=0))
+            apart = np.swapaxes(reference[rows], 1, 2) @ turn @ own[rows]
+            found[name][rows] = np.degrees(np.linalg.norm(se3.so3_log(apart), axis=-1))
     return found
 
 
 def _unit(report: Report, offsets: Sequence[Floats]) -> tuple[str, float]:
     """The unit that suits these offsets, and how many of them a metre has."""
     if not report.has_metres:
-        return "units", 1.0
+        return UNKNOWN_UNIT, 1.0
     largest = max(float(np.nanmax(np.abs(each), initial=0.0)) for each in offsets)
     return ("mm", 1000.0) if largest < 0.02 else ("cm", 100.0) if largest < 1 else ("m", 1.0)
 
@@ -120,7 +136,7 @@ def _times(report: Report, count: int) -> tuple[Floats, str]:
     stamps = report.pictures.stamps_s
     if len(stamps) == count and count > 1 and (np.diff(stamps) > 0).all():
         return stamps - stamps[0], "s"
-    return np.arange(count, dtype=float), "frame"
+    return np.arange(count, dtype=float), f"{report.source.vertex} (row)"
 
 
 def _coloured_path(figure: Figure, report: Report, name: str) -> None:
@@ -136,9 +152,14 @@ def _coloured_path(figure: Figure, report: Report, name: str) -> None:
         along[worst_last], across[worst_last], c=size[worst_last] * factor, s=14, cmap="viridis_r", linewidths=0
     )
     figure.colorbar(dots, ax=axes, label=unit, shrink=0.8)
+    map_axes(axes, report)
+
+
+def map_axes(axes: Any, report: Report) -> None:
+    """Axes of a map: a metre is as long along both."""
     axes.set_aspect("equal", adjustable="datalim")
-    for label in (axes.set_xlabel, axes.set_ylabel):
-        label("m" if report.has_metres else "the source's unit")
+    unit = "m" if report.has_metres else UNKNOWN_UNIT
+    axes.set(xlabel=unit, ylabel=unit)
 
 
 def flattest_plane(positions: Floats) -> tuple[Floats, Floats]:

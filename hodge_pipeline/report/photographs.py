@@ -13,6 +13,7 @@ from scipy.ndimage import uniform_filter
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import length
+from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow
 from hodge_pipeline.report.document import Picture
@@ -30,11 +31,6 @@ CLOSER = 2
 """How many times the place that changed most is enlarged."""
 DOWN = np.diag([1.0, -1.0, -1.0])
 """Right, down and look of a view from above, in the axes of a scanner."""
-LOOKED_AT = 9
-"""Clouds that tell whether they are a scanner's: all are of one sensor."""
-SEEN_BEHIND = 0.01
-"""Share of points behind the image plane, which no camera has: of those of a scanner, whose z is up, it is the ground.
-"""
 VIEWED_PERCENT = 3.0
 """Of a frame's points, which may lie outside its own picture."""
 
@@ -83,7 +79,7 @@ def _as_seen_by(clouds: CloudSet, world_from_cam: Floats, row: int) -> raster.Vi
     """The view of one camera, orthographic, which its own points fill; of a scanner, from above."""
     pose = world_from_cam[row]
     points = np.asarray(clouds[row].points_in_cam, float)
-    axes = DOWN if _is_scanner(clouds, np.array([row])) else np.eye(3)
+    axes = DOWN if is_scanner(clouds, np.array([row])) else np.eye(3)
     held = raster.holding(axes, points, LARGE, VIEWED_PERCENT)
     depth_m = points @ axes[2]
     near_m = float(axes[2] @ held.centre - max(np.percentile(depth_m, 1) / 2, 0.0))
@@ -122,7 +118,7 @@ def four_sides(clouds: CloudSet, before: Floats, after: Floats, component: Ints)
         return ()
     aligned = _laid_on(before, after, rows)
     scenes = [raster.merged(clouds, poses, rows) for poses in (aligned, after)]
-    return sides(scenes, raster.around(scenes[1], after[rows], _is_scanner(clouds, rows)), "Before | after")
+    return sides(scenes, raster.around(scenes[1], after[rows], is_scanner(clouds, rows)), "Before | after")
 
 
 def _laid_on(before: Floats, after: Floats, rows: Ints) -> Floats:
@@ -130,12 +126,6 @@ def _laid_on(before: Floats, after: Floats, rows: Ints) -> Floats:
     turn = se3.project_to_so3((after[rows, :3, :3] @ np.swapaxes(before[rows, :3, :3], 1, 2)).mean(axis=0))
     shift = (after[rows, :3, 3] - before[rows, :3, 3] @ turn.T).mean(axis=0)
     return np.asarray(se3.from_parts(turn, shift) @ before)
-
-
-def _is_scanner(clouds: CloudSet, rows: Ints) -> bool:
-    """Whether these rows, or a few of them, hold points behind an image plane."""
-    looked_at = rows[evenly(len(rows), LOOKED_AT)].tolist()
-    return bool(np.mean([np.mean(clouds[row].points_in_cam[:, 2] < 0) for row in looked_at]) > SEEN_BEHIND)
 
 
 def sides(scenes: Sequence[raster.Points], views: Mapping[str, raster.View], caption: str) -> tuple[Picture, ...]:

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.report.painting import error_plots, flattest_plane, has_truth, painted
-from hodge_pipeline.report.verdict import GRAPH_NAMES
+from hodge_pipeline.report.painting import UNKNOWN_UNIT, error_plots, flattest_plane, has_truth, map_axes, painted
+from hodge_pipeline.report.tables import counted_pairs
 from hodge_pipeline.types import Floats, Ints
 
 STYLES: tuple[dict[str, Any], ...] = (
@@ -42,7 +43,8 @@ def draw_convergence(report: Report) -> tuple[Picture, ...]:
     """How the solver came to its result."""
     if not any(report.pictures.convergence.values()) and not report.loops:
         return ()
-    caption = "Objective of the solver, and mean deviation of a loop, by iteration."
+    loops = ", and mean deviation of a loop" if report.loops else ""
+    caption = f"Objective of the solver{loops}, by iteration. It may rise where a solver weighs edges anew."
     return (painted("Convergence", caption, lambda figure: _convergence(figure, report)),)
 
 
@@ -55,7 +57,8 @@ def _plots(report: Report) -> Iterator[Picture]:
     if report.scores is not None and any(len(graph.pairs) for graph in report.scores.graphs):
         yield painted("Score of each pair", "Further right is better.", lambda figure: _score_histogram(figure, report))
     if any(len(residuals.translation_m) for residuals in pictures.residuals):
-        caption = "Measured motions against the poses: further left is better."
+        least = f"what is below {SMALLEST_RESIDUAL} is drawn as that"
+        caption = f"Measured motions against the poses: further left is better; {least}."
         yield painted("Residual of each edge", caption, lambda figure: _residuals(figure, report))
     if pictures.graph is not None and pictures.graph.edge_count:
         caption = "Above the diagonal: where each edge comes from. Below: how far it is off the result."
@@ -84,9 +87,7 @@ def _paths(figure: Figure, report: Report) -> None:
     for path in paths:
         along, across = plane @ (_broken(path.positions, component) - origin).T
         axes.plot(along, across, label=path.name, **_style(report, path.name))
-    axes.set_aspect("equal", adjustable="datalim")
-    for label in (axes.set_xlabel, axes.set_ylabel):
-        label("m" if report.has_metres else "the source's unit")
+    map_axes(axes, report)
     axes.legend(frameon=False, fontsize=9)
 
 
@@ -108,8 +109,8 @@ def _score_histogram(figure: Figure, report: Report) -> None:
         scores = graph.scores[row][np.isfinite(graph.scores[row])]
         mean = f", mean {scores.mean():.3f}" if len(scores) else ", not scored"
         axes.hist(scores, bins=bins, histtype="step", label=f"{name}{mean}", **_style(report, name))
-    axes.set_xlabel(f"score, {len(graph.pairs)} {GRAPH_NAMES[graph.kind]}")
-    axes.set_ylabel("pairs")
+    axes.set_xlabel(f"score, {counted_pairs(graph)}")
+    _count(axes, "pairs")
     axes.legend(frameon=False, fontsize=9, loc="best")
 
 
@@ -126,23 +127,32 @@ def _residuals(figure: Figure, report: Report) -> None:
     ):
         _log_histogram(axes, report, columns)
         axes.set_xlabel(name)
-        axes.set_ylabel("edges")
+        _count(axes, "edges")
         axes.legend(frameon=False, fontsize=8)
 
 
 def _small_unit(report: Report) -> tuple[str, float]:
     """The unit of residuals, and how many of them a metre has."""
-    return ("cm", 100.0) if report.has_metres else ("the source's unit", 1.0)
+    return ("cm", 100.0) if report.has_metres else (UNKNOWN_UNIT, 1.0)
 
 
 def _log_histogram(axes: Any, report: Report, columns: list[tuple[str, Floats]]) -> None:
-    known = [(name, np.maximum(values[np.isfinite(values)], SMALLEST_RESIDUAL)) for name, values in columns]
-    every = np.concatenate([values for _, values in known if len(values)] or [np.array([SMALLEST_RESIDUAL])])
-    bins = np.geomspace(every.min(), max(every.max(), 2 * every.min()) * 1.001, HISTOGRAM_BINS)
+    known = [(name, values[np.isfinite(values)]) for name, values in columns]
+    every = np.concatenate([values for _, values in known if len(values)] or [np.zeros(1)]).clip(SMALLEST_RESIDUAL)
+    low, high = np.floor(np.log10(every.min())), np.ceil(np.log10(1.001 * every.max()))
+    bins = np.geomspace(10**low, 10**high, HISTOGRAM_BINS)
     for name, values in known:
         median = f", median {np.median(values):.2g}" if len(values) else ""
-        axes.hist(values, bins=bins, histtype="step", label=f"{name}{median}", **_style(report, name))
+        shown = values.clip(SMALLEST_RESIDUAL)
+        axes.hist(shown, bins=bins, histtype="step", label=f"{name}{median}", **_style(report, name))
     axes.set_xscale("log")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _count(axes: Any, what: str) -> None:
+    """How many, in whole numbers, upwards."""
+    axes.set_ylabel(what)
+    axes.yaxis.get_major_locator().set_params(integer=True)
 
 
 def _matrix(figure: Figure, report: Report) -> None:
@@ -160,7 +170,7 @@ def _matrix(figure: Figure, report: Report) -> None:
     axes.set_xlim(-0.5, graph.vertex_count - 0.5)
     axes.set_ylim(graph.vertex_count - 0.5, -0.5)
     axes.set_aspect("equal")
-    axes.set_xlabel("frame (row)")
+    axes.set_xlabel(f"{report.source.vertex} (row)")
     axes.legend(
         frameon=False,
         fontsize=8,

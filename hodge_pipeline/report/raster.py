@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from hodge_pipeline import se3
-from hodge_pipeline.recording.shapes import unit, up_and_ahead
+from hodge_pipeline.recording.shapes import or_grey, unit, up_and_ahead
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Floats32, Ints, PointCloud
 
 WIDTH, HEIGHT = 560, 400
@@ -29,7 +29,6 @@ STRAY_PERCENT = 0.5
 MARGIN = 1.06
 NEAR_M = 0.1
 """Before the eye of a picture in perspective."""
-GREY = 190
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,8 @@ class Points:
     @classmethod
     def of(cls, points: Floats32, normals: Floats32 | None = None, colours: Bytes | None = None) -> Points:
         """These points; without colours they are grey."""
-        if colours is None or not colours.any():
-            colours = np.full((len(points), 3), GREY, np.uint8)
-        return cls(points, np.zeros((len(points), 3), np.float32) if normals is None else normals, colours)
+        normals = np.zeros((len(points), 3), np.float32) if normals is None else normals
+        return cls(points, normals, or_grey(colours, len(points)))
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
@@ -171,13 +169,19 @@ def _shades(colours: Bytes, facing: Floats32) -> Floats32:
 
 def _filled(image: Bytes, depth: Floats32, passes: int) -> Bytes:
     """The picture with the gaps between points closed by their nearest neighbours."""
+    height, width = depth.shape
     for _ in range(passes):
-        best, colour = depth.copy(), image.copy()
-        for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-            moved = np.roll(depth, (down, right), axis=(0, 1))
-            nearer = np.isinf(depth) & (moved < best)
-            best[nearer], colour[nearer] = moved[nearer], np.roll(image, (down, right), axis=(0, 1))[nearer]
-        depth, image = best, colour
+        # beyond the border there is nothing
+        best, near, colours = (
+            depth.copy(),
+            np.pad(depth, 1, constant_values=np.inf),
+            np.pad(image, ((1, 1), (1, 1), (0, 0))),
+        )
+        for row, column in ((1, 0), (0, 1), (1, 2), (2, 1)):
+            window = np.s_[row : row + height, column : column + width]
+            nearer = np.isinf(depth) & (near[window] < best)
+            best[nearer], image[nearer] = near[window][nearer], colours[window][nearer]
+        depth = best
     return image
 
 

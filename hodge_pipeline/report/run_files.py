@@ -15,6 +15,7 @@ from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.schema import Recipe
+from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import (
@@ -40,6 +41,7 @@ from hodge_pipeline.scene import (
     Scene,
     given_poses,
     has_given,
+    has_real_stamps,
     has_truth,
     pose_sets,
     sequences_of,
@@ -122,6 +124,7 @@ def make_report(
             format="" if recipe.source.reader is None else registry.name_of(recipe.source.reader),
             kind="scans" if scans else "frames",
             unordered=not scene.in_order,
+            is_scanner=is_scanner(scene.clouds),
         ),
         scores=scores,
         trajectories=_trajectories(recipe, scene, sets, world_from_cam, component, kept=kept),
@@ -144,6 +147,7 @@ def make_report(
             worst_pairs=worst_pairs(source, worst),
         ),
         refinement=None if refined is None else summary(refined.decision),
+        shows_rejected=kept,
     )
 
 
@@ -250,8 +254,8 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
         for number, one in enumerate(rounds)
         if one.solution is not None
     }
-    names = tuple(str(frame.frame_id) for frame in source.frames)
-    stamps = np.array([frame.stamp_s for frame in source.frames])
+    names, is_clocked = tuple(str(frame.frame_id) for frame in source.frames), has_real_stamps(source.frames)
+    stamps = np.array([frame.stamp_s for frame in source.frames if is_clocked])
     return Pictures(tuple(paths), component, residuals, last.graph, convergence, names, stamps)
 
 

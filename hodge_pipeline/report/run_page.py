@@ -18,7 +18,7 @@ from hodge_pipeline.report.tables import (
     stages_table,
     worst_edges_table,
 )
-from hodge_pipeline.report.verdict import Outcome, judge, suspicions
+from hodge_pipeline.report.verdict import Outcome, capital, judge, suspicions
 from hodge_pipeline.types.notes import Rank
 from hodge_pipeline.types.text import command
 
@@ -32,9 +32,11 @@ FIRST = 4
 def document(report: Report, folder: str) -> Document:
     """The page of a report that lies in this folder, which the commands to type name."""
     verdict = judge(report)
-    worrying = [str(note) for note in suspicions(report) if note.rank < Rank.FACT]
-    facts = tuple(str(note) for note in suspicions(report) if note.rank == Rank.FACT)
+    told = suspicions(report)
+    worrying = [capital(str(note)) for note in told if note.rank < Rank.FACT]
+    facts = tuple(capital(str(note)) for note in told if note.rank == Rank.FACT)
     pictures = report.pictures
+    of = "Result is the refinement here, which is not kept." if report.shows_rejected else ""
     return Document(
         report.title,
         _subtitle(report),
@@ -44,14 +46,14 @@ def document(report: Report, folder: str) -> Document:
             Section("What now", text="\n".join(next_commands(report, folder))),
         ),
         (
-            Section("The place that changed most", pictures=pictures.changed_most, is_large=True),
+            Section("The place that changed most", of, pictures=pictures.changed_most, is_large=True),
             Section("What else to look at", lines=tuple(worrying[FIRST:])),
-            Section("Errors and graph", pictures=draw(report)),
+            Section("Errors and graph", of, pictures=draw(report)),
             *(Section.of(table) for table in score_tables(report)),
             Section(
                 "The scene from four sides",
                 f"The frames' clouds laid together by their poses: {report.before} on the left, {report.after} on "
-                "the right.",
+                f"the right. {of}".rstrip(),
                 pictures=pictures.sides,
             ),
             *([Section.of(worst_edges_table(report))] if report.worst_edges else []),
@@ -77,10 +79,14 @@ def _subtitle(report: Report) -> str:
         parts = len(graph.components)
         told.append(f"{graph.edges} edges, {parts} connected part{'s' * (parts != 1)}")
     if report.stages:
-        peak = peak_mb(report)
-        memory = f", at most {peak:.0f} MB" if np.isfinite(peak) else ""
-        told.append(f"{duration(sum(stage.wall_s for stage in report.stages))}{memory}")
+        told.append(f"{duration(sum(stage.wall_s for stage in report.stages))}{peak(report)}")
     return f"{'; '.join(told)}."
+
+
+def peak(report: Report) -> str:
+    """`, at most 800 MB`; nothing where memory was not measured."""
+    memory = peak_mb(report)
+    return f", at most {memory:.0f} MB" if np.isfinite(memory) else ""
 
 
 def worst_places(report: Report) -> Iterator[str]:
@@ -89,12 +95,10 @@ def worst_places(report: Report) -> Iterator[str]:
     if errors is not None and len(report.pictures.names) == len(errors):
         size = np.linalg.norm(errors, axis=1)
         row = int(np.nanargmax(size))
-        what = (
-            "lies {} off the truth, more than any other"
-            if has_truth(report)
-            else "was moved by {}, more than any other"
-        )
-        yield f"Frame {report.pictures.names[row]} {what.format(report.length(float(size[row])))}."
+        name, off = f"{report.source.vertex} {report.pictures.names[row]}", report.length(float(size[row]))
+        what = f"lies {off} off the truth" if has_truth(report) else f"was moved by {off}"
+        where = "in the refinement, which is not kept, " if report.shows_rejected else ""
+        yield capital(f"{where}{name} {what}, more than any other.")
     used = [edge for edge in report.worst_edges if edge.weight > 0]
     if used:
         off = f"{report.length(used[0].residual_m)} and {used[0].residual_deg:.2g}°"

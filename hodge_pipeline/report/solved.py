@@ -38,7 +38,8 @@ def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
     solution = solved.solution
     start = solution.world_from_cam if solved.start is None else solved.start
     notes = solved.source.notes
-    return record_graph(folder, solved.source.name, solved.graph, start, solution, _before(solved), notes)
+    name, before = solved.source.name, _before(solved)
+    return record_graph(folder, name, solved.graph, start, solution, before, notes, is_scanner=True)
 
 
 def _edges(solved: SolvedFile) -> Edges:

@@ -15,7 +15,7 @@ from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m
 
 
 def peak_mb(report: Report) -> float:
-    """The most memory that a stage took."""
+    """The most memory that a stage took, NaN where none was measured."""
     return max(stage.peak_mb for stage in report.stages)
 
 
@@ -54,10 +54,15 @@ def _of_key_frames(report: Report) -> str:
 
 def _measures(refinement: RefinementSummary, of: str) -> Table:
     rows = tuple(
-        (row.name, f"{row.before:.4g}", f"{row.after:.4g}", row.unit, row.better, "worse" if row.is_worse else "ok")
+        (
+            row.name,
+            *(f"{value:.4g} {row.unit}".strip() for value in (row.before, row.after)),
+            row.better,
+            "worse" if row.is_worse else "ok",
+        )
         for row in refinement.measures
     )
-    header = ("measure", "before", "after", "unit", "better", "judgement")
+    header = ("measure", "before", "after", "better", "judgement")
     caption = f"{of}Where one is worse by more than its own noise the input is kept. "
     caption += " ".join(filter(None, (refinement.change, refinement.scale)))
     return Table("Measures", header, rows, caption)
@@ -80,7 +85,7 @@ def _candidates(refinement: RefinementSummary) -> Table:
 def _scores(report: Report) -> Table:
     table = report.scores
     assert table is not None
-    counts = ", ".join(f"{len(graph.pairs)} {GRAPH_NAMES[graph.kind]}" for graph in table.graphs)
+    counts = ", ".join(counted_pairs(graph) for graph in table.graphs)
     columns = [(f"score, {GRAPH_NAMES[graph.kind]}", "d", "pairs") for graph in table.graphs]
     rows = [
         (name, *(cell for graph in table.graphs for cell in _score_cells(graph, row)))
@@ -98,6 +103,12 @@ def _scores(report: Report) -> Table:
         caption,
         highlighted=report.after,
     )
+
+
+def counted_pairs(graph: GraphScores) -> str:
+    """`355 overlapping pairs`."""
+    name = GRAPH_NAMES[graph.kind]
+    return f"{len(graph.pairs)} {name if len(graph.pairs) != 1 else name.removesuffix('s')}"
 
 
 def _score_cells(graph: GraphScores, row: int) -> tuple[str, str, str]:
@@ -186,34 +197,34 @@ def source_table(report: Report) -> Table:
 
 
 def worst_edges_table(report: Report) -> Table:
-    """The edges furthest from the result."""
-    rows = tuple(
-        (
-            edge.i,
-            edge.j,
-            edge.source,
-            number(edge.fitness, ".2f"),
-            number(edge.weight, ".2g"),
-            report.length(edge.residual_m, report.worst_edges[0].residual_m),
-            number(edge.residual_deg, ".2f", "°"),
-            edge.verdict or "–",
-        )
-        for edge in report.worst_edges
-    )
-    caption = (
-        "Measured motions that disagree most with the result, worst first: a wrong edge, or a wrong result there. "
-        "Fitness: share of the cloud that found a partner. Weight: 0 where the solver ignored the edge. "
-        "Verdict: what the cycles through the edge say."
-    )
-    header = ("i", "j", "source", "fitness", "weight", "off by", "turned by", "verdict")
-    return Table("Worst edges", header, rows, caption, 3)
+    """The edges furthest from the result; without the columns of what nobody measured."""
+    edges = report.worst_edges
+    columns = {
+        "i": [edge.i for edge in edges],
+        "j": [edge.j for edge in edges],
+        "source": [edge.source for edge in edges],
+        "fitness": [number(edge.fitness, ".2f") for edge in edges],
+        "weight": [number(edge.weight, ".2g") for edge in edges],
+        "off by": [report.length(edge.residual_m, edges[0].residual_m) for edge in edges],
+        "turned by": [number(edge.residual_deg, ".2f", "°") for edge in edges],
+        "verdict": [edge.verdict or "–" for edge in edges],
+    }
+    told = {
+        "fitness": " Fitness: share of the cloud that found a partner.",
+        "weight": " Weight: 0 where the solver ignored the edge.",
+        "verdict": " Verdict: what the cycles through the edge say.",
+    }
+    header = tuple(name for name, cells in columns.items() if set(cells) != {"–"})
+    rows = tuple(zip(*(columns[name] for name in header), strict=True))
+    caption = "Measured motions that disagree most with the result, worst first: a wrong edge, or a wrong result there."
+    return Table("Worst edges", header, rows, caption + "".join(told.get(name, "") for name in header), 3)
 
 
 def stages_table(report: Report) -> Table:
     """What each stage cost, with the total."""
-    rows = [(s.name, f"{s.wall_s:.1f} s", f"{s.cpu_s:.1f} s", f"{s.peak_mb:.0f} MB") for s in report.stages]
+    rows = [(s.name, f"{s.wall_s:.1f} s", f"{s.cpu_s:.1f} s", number(s.peak_mb, ".0f", " MB")) for s in report.stages]
     wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
-    rows.append(("all", f"{wall:.1f} s", f"{cpu:.1f} s", f"{peak_mb(report):.0f} MB"))
+    rows.append(("all", f"{wall:.1f} s", f"{cpu:.1f} s", number(peak_mb(report), ".0f", " MB")))
     caption = "CPU time and peak memory are summed over all processes; a stage that was resumed cost nothing."
     return Table("Time", ("stage", "wall", "CPU", "peak memory"), tuple(rows), caption)
 

@@ -67,14 +67,14 @@ class Verdict:
     @property
     def sentence(self) -> str:
         """Headline and details in one."""
-        return f"{self.headline}. {_capital(self.details)}"
+        return f"{self.headline}. {capital(self.details)}"
 
     @property
     def points(self) -> tuple[str, ...]:
         """What the headline rests on, a short line each."""
         if not self.changes and not self.reason:
-            return (_capital(self.details),)
-        return (*filter(None, [_capital(self.reason)]), *(change.line for change in self.changes))
+            return (capital(self.details),)
+        return (*filter(None, [capital(self.reason)]), *(change.line for change in self.changes))
 
     @property
     def mark(self) -> Outcome:
@@ -89,7 +89,7 @@ def judge(report: Report) -> Verdict:
 
     A refinement has been judged already, by its guard; an error against the truth that got worse is named all the same.
     """
-    changes = (*_score_changes(report), *_trajectory_changes(report))
+    changes = (*_trajectory_changes(report), *_score_changes(report))
     outcome, headline, details = _judged(report, changes)
     pieces, reason = _pieces(report), report.refinement.reason if report.refinement else ""
     if pieces:
@@ -97,7 +97,7 @@ def judge(report: Report) -> Verdict:
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
     told = (*_unsettled(report), *_other_scale(report), *report.notes)
     doubts = [DOUBTS[note.kind] for note in told if note.kind in DOUBTS]
-    headline = _capital(": ".join(f"{text[:1].lower()}{text[1:]}" for text in (*doubts, headline)))
+    headline = capital(": ".join(f"{text[:1].lower()}{text[1:]}" for text in (*doubts, headline)))
     return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason, bool(doubts))
 
 
@@ -121,7 +121,8 @@ def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, 
     return outcome, f"{outcome.capitalize()} against {report.before}", told
 
 
-def _capital(text: str) -> str:
+def capital(text: str) -> str:
+    """The text with its first letter large."""
     return text[:1].upper() + text[1:]
 
 
@@ -132,7 +133,9 @@ def _pieces(report: Report) -> str:
         return ""
     of_all = f"of {graph.vertices} {report.source.vertex_name}"
     if not sizes:
-        return f"No two {of_all} joined"
+        pairs = next((f"{note.count} of {note.detail}" for note in report.notes if note.kind == "ambiguous"), "")
+        todo = "take scans in between, with furniture or targets in sight"
+        return f"No two {of_all} joined" + (f", and {pairs} pairs fit in several ways ({todo})" if pairs else "")
     if len(sizes) > 1:
         listed = [str(size) for size in sizes[:MOST_SIZES]] + ["…"] * (len(sizes) > MOST_SIZES)
         return f"In {len(sizes)} pieces ({', '.join(listed)} {of_all})"

@@ -10,6 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG
+from hodge_pipeline.recording.shapes import is_scanner, or_grey, up_and_ahead
 from hodge_pipeline.report.diagnosis_plots import COLOURS as REPORTED
 from hodge_pipeline.review.closeup import Closeup, placed, quat_wxyz
 from hodge_pipeline.review.listing import witnesses
@@ -101,12 +102,10 @@ class Scene:
         known = poses[np.isfinite(poses).all(axis=(1, 2))]
         _, radius = _ball(known[:, :3, 3])
         self._size = max(radius, 0.5) if self._subject.unit == "m" else radius
-        up = -known[:, :3, 1].mean(axis=0) if len(known) and self._subject.clouds is not None else np.array([0, 0, 1.0])
-        self._up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0, 0, 1.0])
-        side = np.cross(self._up, [1.0, 0.3, 0.2])
-        side /= np.linalg.norm(side)
-        centre, radius = _ball(np.concatenate([known[:, :3, 3], _sampled(self._subject.clouds, poses)]))
-        return centre + max(radius, self._size) * (1.8 * self._up + 1.3 * side), centre
+        clouds = self._subject.clouds
+        self._up, ahead = up_and_ahead(known if len(known) else np.eye(4)[None], clouds is None or is_scanner(clouds))
+        centre, radius = _ball(np.concatenate([known[:, :3, 3], _sampled(clouds, poses)]))
+        return centre + max(radius, self._size) * (1.8 * self._up - 1.3 * ahead), centre
 
     def draw(self, flip: bool = False) -> None:
         """Bring the scene up to date with the session; what has not changed is not sent again."""
@@ -249,7 +248,7 @@ def thinned(clouds: CloudSet, row: int, step: int) -> tuple[Floats32, np.ndarray
     """Points and colours of a frame, each `step`th; grey where there is no colour."""
     entry = slice(int(clouds.offsets[row]), int(clouds.offsets[row + 1]), step)
     points, colours = np.asarray(clouds.points[entry]), np.asarray(clouds.colours[entry])
-    return points, colours if colours.any() else np.full_like(colours, 150)
+    return points, or_grey(colours, len(points))
 
 
 def _ball(points: Floats) -> tuple[Floats, float]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, Edit, pair_names, vertex_rows
 from hodge_pipeline.review.adding import Candidate, assessed, guess_from_poses, register_candidate
@@ -32,6 +32,8 @@ _EDITS: dict[str, Callable[[tuple[str, ...]], Edit]] = {
 }
 _SWITCHES = {"disable": DISABLED, "enable": ENABLED, "right": RIGHT}
 VERBS = tuple(_EDITS)
+ALL_VERDICTS = (WRONG, SUSPECT, UNTESTABLE, CONSISTENT)
+"""Shown where nothing is wrong or suspect: an empty page says nothing."""
 MODES = ("all", "edge", "solution", "blink", "between", "apart", "place")
 """What is shown; the last two are of a candidate alone."""
 
@@ -214,6 +216,8 @@ class Session:
         judged = judge(table, history, DiagnosisOptions() if recipe is None else recipe.diagnosis)
         with self.changed:
             if table is self.table:
+                if self.judged is None and not np.isin(judged.edges.verdict, self.look.verdicts).any():
+                    self.look = replace(self.look, verdicts=ALL_VERDICTS)
                 self.judged = judged
                 self.table = replace(table, edges=judged.edges)
             self.bump()

@@ -1,7 +1,7 @@
-"""Poses in the world of known positions, such as satellite fixes: aligned to them, then solved with them as priors.
+"""Poses in the world of known positions, such as satellite fixes: aligned to them, then bent to them along the path.
 
 Neither how far edges drift nor how far positions scatter is as their information states: both factors are estimated
-(variance components, Förstner 1979), and a position that the others and the edges contradict is rejected.
+(solvers/bending.py), and a position that the others and the edges contradict is rejected.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import by_size, connected_components
 from hodge_pipeline.complex.judging import chi2_by_information
-from hodge_pipeline.solvers.covariance import marginal_covariances
+from hodge_pipeline.solvers.bending import Bending, Bent
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.setup import NO_ROWS
-from hodge_pipeline.types import Bools, Floats, Ints, Priors, ViewGraph, Words
-from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph, Words
 from hodge_pipeline.types.positions import PositionFit
 
 FEWEST = 3
@@ -32,22 +31,16 @@ REJECTED_SIGMA = 5.0
 """A position so far from what all others say is rejected: of right ones one in 65,000 is (three dimensions)."""
 SPREAD_SIGMA = 5.0
 """Nine in ten positions nearer together say nothing of the heading: of a robot at rest they span 3.3 sigma."""
-MOST_ROUNDS, SETTLED = 30, 0.05
-"""Of factors and rejections, until both factors change by less than 5 %."""
-LOOSE = 100.0
-"""The factor on the edges' sigma to begin with: from the loose side, drift is not taken for scatter of positions."""
+MOST_ROUNDS = 30
+"""Of rejections."""
 TORN, CALM, MOST_STRETCHES = 25.0, 5.0, 6
 """Times the median chi-squared of edges. Of six numbers, whose median is 5.35, one edge in 6,000 has more than 5 times
 that, and none (2e-26) more than 25 times: edges below the former hold a stretch together, those above the latter tear.
 """
 FEWEST_SPARE = 30
 """Numbers measured beyond those sought, below which nothing tells how far edges drift: then positions bend nothing."""
-INERTIA, MOST_FACTOR = 6.0, 1e3
-"""Degrees of freedom, one pose's, that the factor of the round before counts; and how large or small one may become."""
-MOST_COVARIANCES = 60
-"""Poses whose covariance is computed; the others have that of the nearest one."""
 NEAR_CERTAIN = 0.95
-"""Largest share of a position's variance that its own pose is taken to have, for what those covariances approximate."""
+"""Largest share of a position's variance that its own pose is taken to have, since to first order it may have all."""
 
 
 @dataclass(frozen=True)
@@ -78,19 +71,6 @@ class Fixes:
         """Where (P, 3) poses put them."""
         poses = world_from_cam[self.vertices]
         return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], self.arms) + poses[:, :3, 3])
-
-    def lever(self, world_from_cam: Floats) -> Floats:
-        """The derivative (P, 3, 6) of where poses put them by ξ = (rotation, translation) in `T · exp(ξ)`."""
-        turned = world_from_cam[self.vertices, :3, :3]
-        return np.concatenate([-turned @ se3.hat(self.arms), turned], axis=2)
-
-    def priors(self, world_from_cam: Floats, factor: float) -> Priors:
-        """What they say of their poses near these, their sigma multiplied by a factor."""
-        poses = world_from_cam[self.vertices].copy()
-        poses[:, :3, 3] += self.points - self.found(world_from_cam)
-        lever = self.lever(world_from_cam)
-        weight = np.linalg.inv(self.covariances) / factor**2
-        return Priors(self.vertices, poses, np.swapaxes(lever, 1, 2) @ weight @ lever)
 
 
 @dataclass(frozen=True)
@@ -126,9 +106,10 @@ def place(
     settled = _Settled(poses, used, np.linalg.norm(_whitened(fixes, left), axis=1), 1.0, 1.0)
     joined = placed[graph.edges[:, 0]] & (weights > 0)
     if 6 * int(joined.sum()) + 3 * int(used.sum()) > 6 * int(placed.sum()) + FEWEST_SPARE:
-        gauges = 6 * len(np.unique(component[placed]))
-        settle = partial(_settled, graph, poses, weights, fixes, reached=reached, gauges=gauges)
-        settled = _untorn(graph, weights, fixes, settle(used), settle)
+        weighed = replace(graph, information=graph.information * weights[:, None, None], priors=None, fixed=NO_ROWS)
+        rest = solve(weighed, start=poses, initial="given", fixed=NO_ROWS).world_from_cam
+        pieces = [np.flatnonzero(placed & (component == label)) for label in np.unique(component[placed])]
+        settled = _untorn(weighed, fixes, used, reached, partial(_settled, Bending(weighed, rest, pieces), fixes))
     solved = np.where(placed[:, None, None], settled.world_from_cam, world_from_cam)
     fit = PositionFit(
         fixes.labels,
@@ -206,14 +187,15 @@ class _Settled:
 
 
 def _untorn(
-    graph: ViewGraph, weights: Floats, fixes: Fixes, settled: _Settled, settle: Callable[[Bools], _Settled]
+    graph: ViewGraph, fixes: Fixes, used: Bools, reached: Bools, settle: Callable[[Bools, Bools, bool], _Settled]
 ) -> _Settled:
-    """The same without the positions of a stretch whose two ends tear edges, where those before and after it then
+    """Poses settled without the positions of a stretch whose two ends tear edges, where those before and after it then
     agree along the edges: a receiver that is off by the same for a while agrees with itself. Edges torn in one place
-    alone may be at fault themselves: then all positions stay.
+    alone may be at fault themselves: then all positions stay, as do those that the rest does not contradict.
     """
+    allowed, settled = reached, settle(used, reached, True)
     for _ in range(MOST_STRETCHES):
-        torn = _torn(graph, weights, settled.world_from_cam)
+        torn = _torn(graph, settled.world_from_cam)
         if torn.max(initial=0.0) <= TORN:
             break
         part = connected_components(graph.edges[torn <= CALM], len(settled.world_from_cam))[fixes.vertices]
@@ -221,78 +203,49 @@ def _untorn(
         labels = labels[counts >= FEWEST]
         if len(labels) < FEWEST:
             break
-        tried = [settle(settled.used & (part != label)) for label in labels[np.argsort(counts[counts >= FEWEST])]]
-        left = [float(_torn(graph, weights, each.world_from_cam).max()) for each in tried[:MOST_STRETCHES]]
+        others = [part != label for label in labels[np.argsort(counts[counts >= FEWEST])][:MOST_STRETCHES]]
+        tried = [settle(settled.used & own, allowed & own, True) for own in others]
+        left = [float(_torn(graph, each.world_from_cam).max()) for each in tried]
         if min(left) > torn.max() / 2:
             break
-        settled = tried[int(np.argmin(left))]
-    return settled
+        best = int(np.argmin(left))
+        settled, allowed = tried[best], allowed & others[best]
+    final, without = settle(settled.used, allowed, False), reached & ~allowed
+    if without.any() and np.median(final.distance[without]) <= REJECTED_SIGMA:
+        return settle(settled.used | without, reached, False)
+    return final
 
 
-def _torn(graph: ViewGraph, weights: Floats, poses: Floats) -> Floats:
+def _torn(graph: ViewGraph, poses: Floats) -> Floats:
     """Chi-squared (E,) of each edge over the median; 0 of an edge without weight."""
-    chi2 = chi2_by_information(graph, poses) * (weights > 0)
-    return np.asarray(chi2 / max(float(np.median(chi2[weights > 0])), 1e-12))
+    chi2 = chi2_by_information(graph, poses)
+    return np.asarray(chi2 / max(float(np.median(chi2[chi2 > 0])), 1e-12))
 
 
-def _settled(
-    graph: ViewGraph, poses: Floats, weights: Floats, fixes: Fixes, used: Bools, *, reached: Bools, gauges: int
-) -> _Settled:
-    """The poses once neither the factors nor the rejections change any more.
-
-    How far edges drift is told by how far positions bend them, for each number that these tell beyond the `gauges`; not
-    by how well edges close among themselves, which share their errors.
-    """
-    information = graph.information * weights[:, None, None]
-    alone = replace(graph, information=information, priors=None, fixed=NO_ROWS)
-    at_rest = chi2_by_information(alone, solve(alone, start=poses, initial="given", fixed=NO_ROWS).world_from_cam)
-    edge_factor, fix_factor = LOOSE, 1.0
+def _settled(bending: Bending, fixes: Fixes, used: Bools, allowed: Bools, finest: bool) -> _Settled:
+    """The poses once the rejections among those `allowed (P,)` do not change any more; bent as finely as can be?"""
+    least = 1.0 if fixes.stated.all() else 0.0
     for _ in range(MOST_ROUNDS):
-        priors = fixes.select(used).priors(poses, fix_factor)
-        whole = replace(graph, information=information / edge_factor**2, priors=priors, fixed=NO_ROWS)
-        poses = solve(whole, start=poses, initial="given", fixed=NO_ROWS).world_from_cam
-        share, distance = _tested(whole, poses, fixes, used, reached, fix_factor)
-        found = _Settled(poses, used, distance, edge_factor, fix_factor)
-        told = float(share[used].sum())
-        chi2 = chi2_by_information(alone, poses)
-        most = GROSS**2 * np.median(chi2[weights > 0])  # a jump tears a few edges far
-        bent = np.minimum(chi2, most).sum() - np.minimum(at_rest, most).sum()
-        edge_factor = _factor(edge_factor, max(bent, 0.0), told - gauges)
-        chi2 = (_whitened(fixes, fixes.points - fixes.found(poses))[used] ** 2).sum()
-        fix_factor = _factor(fix_factor, chi2, 3 * int(used.sum()) - told)
-        fix_factor = max(fix_factor, 1.0) if fixes.stated.all() else fix_factor
-        used = reached & (distance <= REJECTED_SIGMA)
-        changes = np.log([edge_factor / found.edge_factor, fix_factor / found.fix_factor])
-        if np.array_equal(used, found.used) and np.abs(changes).max() < SETTLED:
+        own = fixes.select(used)
+        bent = bending.towards(own.vertices, own.arms, own.points, own.covariances, least, finest)
+        distance = _distance(bent, fixes, used)
+        found = _Settled(bent.poses, used, distance, bent.edge_factor, bent.point_factor)
+        used = allowed & (distance <= REJECTED_SIGMA)
+        if np.array_equal(used, found.used) or used.sum() < FEWEST:
             break
     return found
-
-
-def _factor(before: float, chi2: float, freedom: float) -> float:
-    """The factor on sigma with which chi2 is as large as its degrees of freedom; that of before counts as some."""
-    factor = np.sqrt((chi2 + INERTIA * before**2) / (max(freedom, 0.0) + INERTIA))
-    return float(np.clip(factor, 1 / MOST_FACTOR, MOST_FACTOR))
 
 
 def _whitened(fixes: Fixes, vectors: Floats) -> Floats:
     return np.asarray(np.einsum("nij,nj->ni", np.linalg.inv(np.linalg.cholesky(fixes.covariances)), vectors))
 
 
-def _tested(
-    graph: ViewGraph, poses: Floats, fixes: Fixes, used: Bools, reached: Bools, factor: float
-) -> tuple[Floats, Floats]:
-    """Of each position: how many of its three numbers (P,) its own pose takes from it, and its distance (P,) in sigmas
-    from what all others say, NaN where its piece is not placed.
-    """
-    vertices = np.unique(fixes.vertices[reached])
-    sampled = vertices[evenly(len(vertices), MOST_COVARIANCES)]
-    covariances = marginal_covariances(graph, poses, sampled)
-    nearest = np.abs(fixes.vertices[:, None] - sampled).argmin(axis=1)
-    lever = fixes.lever(poses)
-    half = np.linalg.inv(np.linalg.cholesky(fixes.covariances * factor**2))
-    known = half @ lever @ covariances[nearest] @ np.swapaxes(lever, 1, 2) @ np.swapaxes(half, 1, 2)
+def _distance(bent: Bent, fixes: Fixes, used: Bools) -> Floats:
+    """How far each position (P,) is from what all others say, in sigmas."""
+    found = fixes.found(bent.poses)
+    half = np.linalg.inv(np.linalg.cholesky(fixes.covariances * bent.point_factor**2))
+    known = half @ bent.covariances(fixes.vertices, found) @ np.swapaxes(half, 1, 2)
     values, axes = np.linalg.eigh(known)
     values = np.where(used[:, None], np.clip(values, 0, NEAR_CERTAIN), values)
-    left = np.einsum("nij,ni->nj", axes, np.einsum("nij,nj->ni", half, fixes.points - fixes.found(poses)))
-    variance = np.where(used[:, None], 1 - values, 1 + values)
-    return values.sum(axis=1), np.where(reached, np.sqrt((left**2 / variance).sum(axis=1)), np.nan)
+    left = np.einsum("nij,ni->nj", axes, _whitened(fixes, fixes.points - found) / bent.point_factor)
+    return np.asarray(np.sqrt((left**2 / np.where(used[:, None], 1 - values, 1 + values)).sum(axis=1)))

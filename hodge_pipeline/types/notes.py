@@ -36,6 +36,11 @@ WORDING: dict[str, tuple[Rank, str]] = {
         "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
     ),
     "option unknown": (Rank.LOOK, "{detail}; made by another version: it is left out of what is shown"),
+    "ambiguous": (
+        Rank.DOUBT,
+        "{count} of {detail} pairs fit in several ways, as in a bare room, and join nothing: take scans in between, "
+        "with furniture or targets in sight.",
+    ),
     "scale": (Rank.LOOK, "{detail}"),
     "given poses": (Rank.FACT, "{count} of {detail} poses given"),
     "given file": (Rank.FACT, "{detail}"),

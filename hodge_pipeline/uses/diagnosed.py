@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import registry
-from hodge_pipeline.diagnosis.advice import advice, ranked
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.energy import EnergyRow, energy_rows
 from hodge_pipeline.diagnosis.options import DiagnosisOptions, SuggestionOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
+from hodge_pipeline.diagnosis.wording import advice, ranked
 from hodge_pipeline.pairs.edits import joining, pair_names, read_history
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
 from hodge_pipeline.report.diagnosis_page import PageContents, document

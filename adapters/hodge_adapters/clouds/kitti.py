@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,11 @@ MAX_REFLECTANCE = 255
 MAX_BEAM = 255
 WIDTHS = (3, 4, 5)
 """Columns: x, y, z; with a reflectance; with the number of the beam as well."""
+KITTI_RAISE_DEG = 0.205
+"""KITTI's calibration of its HDL-64E has the beams too low (Deschaud, IMLS-SLAM, ICRA 2018); KISS-ICP's value."""
+SCANS_LOOKED_AT = 9
+NEAREST_M = 5.0
+"""Nearer points tell less of a beam's angle: lasers lie up to 20 cm from the origin that angles are taken at."""
 _NUMBERED = re.compile(r"\d(\.pcd)?\.bin$")
 
 
@@ -79,6 +85,39 @@ def _has_reflectance(table: Floats32) -> bool:
 
 def _median_step(points: Floats32) -> float:
     return float(np.median(np.linalg.norm(np.diff(points.astype(float), axis=0), axis=1))) if len(points) > 1 else 0.0
+
+
+def raised(cloud: PointCloud, angle_deg: float) -> PointCloud:
+    """The cloud with the elevation of each point larger by the angle, at the same range and azimuth."""
+    points = cloud.points_in_cam.astype(float)
+    ground = np.hypot(points[:, 0], points[:, 1])
+    cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    points[:, :2] *= (cos - sin * points[:, 2] / np.maximum(ground, 1e-9))[:, None]
+    points[:, 2] = cos * points[:, 2] + sin * ground
+    return replace(cloud, points_in_cam=points.astype(np.float32))
+
+
+def are_of_hdl64(files: Sequence[Path]) -> bool:
+    """Whether the points of some of these scans together lie all round, between 24.8 degrees below the horizon and 2
+    above it, where they end at once: the fan of an HDL-64E, KITTI's scanner, and of no other common one.
+    """
+    clouds: list[Floats32] = []
+    for file in files[:: max(1, len(files) // SCANS_LOOKED_AT)]:
+        try:
+            clouds.append(read_bin(file).points_in_cam)
+        except SourceError:  # said where the scan is read
+            continue
+    points = np.concatenate([np.zeros((0, 3)), *clouds])
+    points = points[np.linalg.norm(points, axis=1) > NEAREST_M]
+    up = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    round_deg = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    if len(np.unique(round_deg // 10)) < 36:
+        return False
+    beyond, low, at_0, at_1, at_3 = (
+        float(((up >= least) & (up < most)).mean()) for least, most in ((4, 91), (-27, -20), (0, 1), (1, 2), (3, 4))
+    )
+    below = float((up < -27).mean())
+    return max(beyond, below) < 0.005 and low > 0.001 and at_1 > 0.7 * at_0 and at_1 > 3 * at_3
 
 
 def scan_poses(

@@ -9,19 +9,20 @@ from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.clouds.kitti import is_scan, read_bin, scan_poses
+from hodge_adapters.clouds.kitti import KITTI_RAISE_DEG, are_of_hdl64, is_scan, raised, read_bin, scan_poses
 from hodge_adapters.clouds.pcd import read_pcd
 from hodge_adapters.clouds.ply import read_ply, write_ply
 from hodge_adapters.clouds.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
 from hodge_adapters.posed import posed_frames, written
 from hodge_adapters.text_rows import listed, natural
 from hodge_adapters.trajectories.log import read_log_file
+from hodge_adapters.trajectories.text import unit_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -31,8 +32,6 @@ OTHER_SCANS = frozenset((".xyz", ".pts", ".ptx", ".asc", ".obj", ".stl", ".off",
 _NUMBER = re.compile(r"(\d{1,19})\D*$")
 _CLOCK = re.compile(r"(?<!\d)(\d{9,10})([._])(\d{1,9})$")
 """Seconds since 1970 with a fraction, as bag_to_pcd names its files, or with nanoseconds of their own."""
-A_SECOND = ((10**17, 10**9), (10**14, 10**6), (10**11, 10**3))
-"""From the first number on, a whole number is a time since 1973, counted in so many a second."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -47,6 +46,11 @@ class CloudFolderReader:
     )
     units_per_metre: float = Field(1.0, gt=0, description="stored units per metre; 1000 for millimetres")
     every: int = Field(1, ge=1, description="take every n-th fragment")
+    raise_deg: float | Literal["auto"] = Field(
+        "auto",
+        description="degrees by which the points of `.bin` scans are raised; auto: 0.205, the error of KITTI's "
+        "calibration, where the angles of the points are those of its scanner, an HDL-64E; 0: not",
+    )
 
     def sniff(self, path: Path) -> Sniff:
         """By the endings of the files."""
@@ -84,6 +88,7 @@ class CloudFolderReader:
         beside = tuple(filter(None, [log]))
         if not poses and is_scan(fragments[0].path.name):
             poses, beside = scan_poses(fragments[0].path.parent, numbers, notes)
+        raise_deg = self._raise_deg([fragment.path for fragment in fragments], notes)
         names = {number: fragment.name for number, fragment in zip(numbers, fragments, strict=True)}
         without = [name for number, name in names.items() if number not in poses]
         if poses and without:
@@ -92,7 +97,7 @@ class CloudFolderReader:
             Frame(
                 frame_id=fragment.name,
                 stamp_s=number,
-                read_points=partial(read_fragment, fragment, units_per_metre=self.units_per_metre),
+                read_points=partial(read_fragment, fragment, units_per_metre=self.units_per_metre, raise_deg=raise_deg),
                 world_from_cam=poses.get(number, fragment.in_metres(self.units_per_metre)),
                 sequence=scanner,
             )
@@ -117,6 +122,19 @@ class CloudFolderReader:
         if others:
             notes.append(f"{len(others)} files are scans of another format, left out: {listed(others)}: convert to PLY")
         return sorted(found, key=lambda file: natural(file.name))
+
+    def _raise_deg(self, files: list[Path], notes: list[str]) -> float:
+        """By how much the points of `.bin` scans are raised; told where the scans themselves decide it."""
+        if self.raise_deg != "auto":
+            return self.raise_deg
+        scans = [file for file in files if file.suffix.lower() == ".bin"]
+        if not scans or not are_of_hdl64(scans):
+            return 0.0
+        notes.append(
+            f"the angles of {len(scans)} .bin scans are those of KITTI's HDL-64E: their points are raised by "
+            f"{KITTI_RAISE_DEG:g} degrees, the known error of its calibration (source.reader.raise_deg=0: not)"
+        )
+        return KITTI_RAISE_DEG
 
     def _log(self, folder: Path) -> Path | None:
         if not self.log:
@@ -177,14 +195,16 @@ class Fragment:
         return pose
 
 
-def read_fragment(fragment: Fragment, *, units_per_metre: float) -> PointCloud:
-    """The points of a fragment in metres, by the ending of its file."""
+def read_fragment(fragment: Fragment, *, units_per_metre: float, raise_deg: float = 0.0) -> PointCloud:
+    """The points of a fragment in metres, by the ending of its file; those of a `.bin` raised by an angle."""
     if fragment.row is not None:
         cloud = read_e57(fragment.path, fragment.row)
     elif fragment.corner is not None:
         cloud = read_las(fragment.path, fragment.corner)
     else:
         cloud = READERS[fragment.path.suffix.lower()](fragment.path)
+    if raise_deg and fragment.path.suffix.lower() == ".bin":
+        cloud = raised(cloud, raise_deg)
     if units_per_metre == 1.0:
         return cloud
     return replace(cloud, points_in_cam=cloud.points_in_cam / np.float32(units_per_metre))
@@ -267,8 +287,7 @@ def _number(stem: str) -> _Number | None:
     if not number:
         return None
     count = int(number[1])
-    a_second = next((per for least, per in A_SECOND if count >= least), 1)
-    return _Number(count / a_second, number.start(1), number.end(1))
+    return _Number(count / int(unit_of(np.array([count], float))[1]), number.start(1), number.end(1))
 
 
 def _graph(names: Mapping[float, str], pairs: Any, i_from_j: Any, notes: list[str]) -> ViewGraph:

@@ -54,6 +54,12 @@ def image_count(path: Path) -> int:
         return int(_U64.unpack(file.read(8))[0])
 
 
+def names_with_blanks(path: Path) -> dict[int, str]:
+    """The whole names of images in `images.txt` by their ids: COLMAP itself reads each up to its first blank."""
+    poses = (text.split(maxsplit=9) for _, text, _ in _image_lines(path))
+    return {int(float(words[0])): words[9] for words in poses if len(words[9].split()) > 1}
+
+
 def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Each line with its number, without comments and empty ones."""
     for line, raw in enumerate(read_text(path).split("\n"), 1):
@@ -187,14 +193,6 @@ def _is_pose(text: str) -> bool:
     return len(words) == 10 and to_floats(words[:9]) is not None
 
 
-def _is_camera(words: list[str]) -> bool:
-    return len(words) > 4
-
-
-def _is_point(words: list[str]) -> bool:
-    return len(words) >= 8 and len(words) % 2 == 0
-
-
 def _is_rig(words: list[str]) -> bool:
     at, sensors = 4, 1
     while at < len(words):
@@ -210,8 +208,11 @@ def _is_frame(words: list[str]) -> bool:
 
 
 _LINES: Mapping[str, tuple[Callable[[list[str]], bool], str]] = {
-    "cameras": (_is_camera, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"),
-    "points3D": (_is_point, "POINT3D_ID X Y Z R G B ERROR and pairs of IMAGE_ID POINT2D_IDX"),
+    "cameras": (lambda words: len(words) > 4, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"),
+    "points3D": (
+        lambda words: len(words) >= 8 and len(words) % 2 == 0,
+        "POINT3D_ID X Y Z R G B ERROR and pairs of IMAGE_ID POINT2D_IDX",
+    ),
     "rigs": (
         _is_rig,
         "RIG_ID NUM_SENSORS and so many sensors: SENSOR_TYPE (CAMERA, IMU) SENSOR_ID, after the first "

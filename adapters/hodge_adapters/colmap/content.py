@@ -7,15 +7,16 @@ import struct
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.colmap.check import REMEDY, check_files, check_words
+from hodge_adapters.colmap.check import REMEDY, check_files, check_words, names_with_blanks
 from hodge_adapters.colmap.files import MODEL_FILES, model_ending
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, Points, matrix_of
-from hodge_adapters.text_rows import natural
+from hodge_adapters.text_rows import counted, natural
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
@@ -64,16 +65,19 @@ def read_model(folder: Path, tracks: bool = True) -> tuple[pycolmap.Reconstructi
         raise
     content = checked_content(model, folder, has_points)
     several = sum(rig.num_sensors() > 1 for rig in model.rigs.values())
-    notes = [f"{several} of {len(model.rigs)} rigs have more than one sensor: {len(model.frames)} frames of rigs"]
-    return model, replace(content, files=files, notes=tuple(notes[:several]))
+    told = f"{several} of {len(model.rigs)} rigs have more than one sensor: {len(model.frames)} frames of rigs"
+    return model, replace(content, files=files, notes=(*([told] if several else []), *content.notes))
 
 
 def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
     """The model of a folder whose files have the right sizes. Raises `SourceError` with a reason."""
     try:
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
     except Exception as error:  # pycolmap raises what its C++ checks raise: RuntimeError, ValueError, IndexError
         raise SourceError(f"{folder}: {_reason(str(error) or type(error).__name__)}: {REMEDY}") from error
+    for image_id, name in names_with_blanks(folder / "images.txt").items() if model_ending(folder) == ".txt" else ():
+        model.images[image_id].name = name
+    return model
 
 
 def content_of(reconstruction: pycolmap.Reconstruction, tracks: bool = True) -> Model:
@@ -88,8 +92,14 @@ def content_of(reconstruction: pycolmap.Reconstruction, tracks: bool = True) -> 
 
 
 def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks: bool = True) -> Model:
-    """The content, if its numbers can be a model's. Raises `SourceError`."""
+    """The content, if its numbers can be a model's; points that are not finite are taken out of the model and noted.
+
+    Raises `SourceError`.
+    """
     try:
+        lost = [key for key, point in reconstruction.points3D.items() if not np.isfinite(point.xyz).all()]
+        for key in lost:
+            reconstruction.delete_point3D(key)
         content = content_of(reconstruction, tracks)
     except UnicodeDecodeError as error:
         raise SourceError(f"{where}: the name of an image is no UTF-8: {REMEDY}") from error
@@ -104,7 +114,7 @@ def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks
         turn = reconstruction.images[image.image_id].cam_from_world().rotation.quat
         if not abs(float(np.linalg.norm(turn)) - 1.0) < OFF_UNIT or not np.isfinite(image.world_from_cam).all():
             raise SourceError(f"{where}: image {image.name!r}: its pose is not finite, or its quaternion is zero")
-    return content
+    return replace(content, notes=(f"{counted(len(lost), 'point')} not finite: left out",)) if lost else content
 
 
 def refreshed(model: Model, reconstruction: pycolmap.Reconstruction) -> Model:
@@ -162,18 +172,17 @@ def _check(model: Model, where: Path) -> None:
             raise SourceError(
                 f"{where}: camera {camera.camera_id} of {camera.width}x{camera.height} has no sound numbers: mend it"
             )
-    if len({image.name for image in model.images}) < len(model.images):
-        raise SourceError(f"{where}: two images have the same name: {REMEDY}")
+    names = [image.name for image in model.images]
+    twice = [name for name, after in pairwise(names) if name == after]
+    if twice:
+        raise SourceError(f"{where}: two images have the name {twice[0]!r}: rename one, or leave it out")
     known = np.append(model.points.ids, NO_POINT)
     for image in model.images:
         if not np.isfinite(image.pixels).all():
-            raise SourceError(f"{where}: image {image.name!r}: an observation is not finite: {REMEDY}")
+            raise SourceError(f"{where}: image {image.name!r}: an observation is not finite: reconstruct it again")
         lost = image.point_ids[~np.isin(image.point_ids, known)]
         if lost.size:
             raise SourceError(f"{where}: image {image.name!r} observes point {lost[0]}, which is not there: {REMEDY}")
-    wrong = ~np.isfinite(model.points.xyz).all(axis=1)
-    if wrong.any():
-        raise SourceError(f"{where}: point {model.points.ids[wrong][0]} is not finite: {REMEDY}")
 
 
 def _pose(image: pycolmap.Image) -> Floats:

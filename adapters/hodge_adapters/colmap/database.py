@@ -32,7 +32,7 @@ MAX_VALUE_BYTES = 1 << 26
 
 
 @contextmanager
-def _opened(path: Path, instead: str = "leave it out") -> Iterator[sqlite3.Connection]:
+def _opened(path: Path, instead: str = "give --database none") -> Iterator[sqlite3.Connection]:
     """The database. Raises `SourceError` for a file that is none, or one that is damaged."""
     try:
         with opened_database(path, TABLES, MAX_VALUE_BYTES) as database:
@@ -46,8 +46,26 @@ def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) 
 
     Raises `SourceError` for a file that is no database of COLMAP, or one that is damaged.
     """
+    row_of_name = {image.name: row for row, image in enumerate(model.images)}
+    cameras = camera_table(model)
+    outside = 0
     with _opened(path, "set edges=covisibility") as database:
-        yield from _pairs(database, path, model, min_shared, notes)
+        row_of_id = _rows_by_id(database, row_of_name)
+        rows = database.execute(
+            "SELECT pair_id, rows, config, data, F, E, H FROM two_view_geometries WHERE rows >= ? ORDER BY pair_id",
+            (min_shared,),
+        )
+        for pair_id, count, config, data, *matrices in rows:
+            ids = divmod(int(pair_id), MAX_IMAGE_ID)[::-1]
+            i, j = (row_of_id.get(image_id) for image_id in ids)
+            if i is None or j is None:
+                outside += 1
+            elif config in USABLE:
+                matches = _blob(path, f"pair {pair_id}", data, np.dtype("<u4"), count, 2)
+                keys = _keypoints(database, path, ids[0]), _keypoints(database, path, ids[1])
+                yield Pair(i, j, _sighting(path, model, cameras, (i, j), keys, matches, config, matrices), "database")
+    if outside:
+        notes.append(f"{path.name}: {outside} pairs are of images that the model does not have")
 
 
 def database_names(path: Path) -> set[str]:
@@ -61,9 +79,12 @@ def has_verified_pairs(path: Path) -> bool:
 
     Raises `SourceError` where it is no database.
     """
-    query = "SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'two_view_geometries'"
     with _opened(path) as database:
-        return bool(database.execute(query).fetchone()[0])
+        return _has_table(database, "two_view_geometries")
+
+
+def _has_table(database: sqlite3.Connection, name: str) -> bool:
+    return bool(database.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone())
 
 
 class PriorRow(NamedTuple):
@@ -82,8 +103,7 @@ class PriorRow(NamedTuple):
 def prior_rows(path: Path) -> Sequence[PriorRow]:
     """The pose priors of a database, empty where it has none. Raises `SourceError` where it is none."""
     with _opened(path) as database:
-        there = database.execute("SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name = 'pose_priors'")
-        if not there.fetchone()[0]:
+        if not _has_table(database, "pose_priors"):
             return ()
         names = dict(database.execute("SELECT image_id, name FROM images"))
         table = database.execute("SELECT * FROM pose_priors")
@@ -126,30 +146,6 @@ def database_matches(path: Path, row_of_name: Mapping[str, int]) -> Iterator[tup
 def _rows_by_id(database: sqlite3.Connection, row_of_name: Mapping[str, int]) -> dict[int, int]:
     names = database.execute("SELECT image_id, name FROM images")
     return {int(image_id): row_of_name[name] for image_id, name in names if name in row_of_name}
-
-
-def _pairs(database: sqlite3.Connection, path: Path, model: Model, min_shared: int, notes: list[str]) -> Iterator[Pair]:
-    row_of_name = {image.name: row for row, image in enumerate(model.images)}
-    row_of_id = _rows_by_id(database, row_of_name)
-    cameras = camera_table(model)
-    outside = 0
-    rows = database.execute(
-        "SELECT pair_id, rows, config, data, F, E, H FROM two_view_geometries WHERE rows >= ? ORDER BY pair_id",
-        (min_shared,),
-    )
-    for pair_id, count, config, data, *matrices in rows:
-        j, i = (row_of_id.get(image_id) for image_id in divmod(int(pair_id), MAX_IMAGE_ID))
-        if i is None or j is None:
-            outside += 1
-        elif config in USABLE:
-            ids = int(pair_id) % MAX_IMAGE_ID, int(pair_id) // MAX_IMAGE_ID
-            matches = _blob(path, f"pair {pair_id}", data, np.dtype("<u4"), count, 2)
-            keys_i, keys_j = (_keypoints(database, path, image_id) for image_id in ids)
-            yield Pair(
-                i, j, _sighting(path, model, cameras, (i, j), (keys_i, keys_j), matches, config, matrices), "database"
-            )
-    if outside:
-        notes.append(f"{path.name}: {outside} pairs are of images that the model does not have")
 
 
 def _sighting(

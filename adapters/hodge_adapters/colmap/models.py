@@ -81,7 +81,8 @@ class ColmapModels:
         nowhere = Path(f"model {number}")
         images, database = ("none" if option == "auto" else option for option in (self.images, self.database))
         alone = replace(self, images=images, database=database)
-        return alone._open(nowhere, pycolmap.Reconstruction(model), checked_content(model, nowhere))
+        copy = pycolmap.Reconstruction(model)
+        return alone._open(nowhere, copy, checked_content(copy, nowhere))
 
     def join(self, models: Sequence[ColmapModel]) -> Sequence[ColmapModel]:
         """The largest model takes in, one by one, those that enough tied points place in it."""

@@ -50,20 +50,16 @@ class ColmapWriter:
             raise SourceError(
                 f"{source.path}: fy is negative (y points up), which COLMAP has not: turn the images over"
             )
-        whole = _whole_model(source, frames)
-        if whole is not None:
-            _write_folder(Path(path), _files_of(whole, self.form))
-            points = counted(whole.num_points3D(), "point")
-            return written(f"{_sizes(whole)}, {points}", source, {"cameras", "names", "images"})
-        names = _names(frames)
-        blank = [name for name in names if len(name.split()) != 1]
+        model = _whole_model(source, frames)
+        points = "no points" if model is None else counted(model.num_points3D(), "point")
+        model = model or _made_model(frames)
+        blank = [image.name for image in model.images.values() if len(image.name.split()) != 1]
         if blank and self.form == "txt":
             raise SourceError(
                 f"{source.path}: COLMAP's text cannot hold names with blanks ({listed(blank)}): write form=bin"
             )
-        made = _made_model(frames, names)
-        _write_folder(Path(path), _files_of(made, self.form))
-        return written(f"{_sizes(made)}, no points", source, {"cameras", "names", "images"})
+        _write_folder(Path(path), _files_of(model, self.form))
+        return written(f"{_sizes(model)}, {points}", source, {"cameras", "names", "images"})
 
 
 def _sizes(model: pycolmap.Reconstruction) -> str:
@@ -99,10 +95,10 @@ def _whole_model(source: Source, frames: list[Frame]) -> pycolmap.Reconstruction
     return model
 
 
-def _made_model(frames: list[Frame], names: list[str]) -> pycolmap.Reconstruction:
+def _made_model(frames: list[Frame]) -> pycolmap.Reconstruction:
     """A model of these frames without points: a rig for each camera, a frame for each image."""
     model, numbers = pycolmap.Reconstruction(), dict[Lens, int]()
-    for row, (frame, name) in enumerate(zip(frames, names, strict=True), 1):
+    for row, (frame, name) in enumerate(zip(frames, _names(frames), strict=True), 1):
         lens = _lens(frame)
         if lens not in numbers:
             numbers[lens] = len(numbers) + 1

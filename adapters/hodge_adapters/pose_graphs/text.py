@@ -70,8 +70,8 @@ def read_records(
     rests: dict[str, list[str]] = {tag: [] for tag in keys}
     other: Counter[str] = Counter()
     for number, line in enumerate(lines, 1):
-        parts = line.split(None, 1)
-        if not parts or parts[0].startswith("#"):
+        parts = line.partition("#")[0].split(None, 1)
+        if not parts:
             continue
         tag = other_names.get(parts[0], parts[0])
         if tag in numbers:
@@ -84,10 +84,10 @@ def read_records(
 
 
 def _text(contents: bytes) -> str:
-    """The text, whatever the encoding of its comments; raises `ValueError` for what is none."""
+    """The text, whatever its comments are encoded in and its lines end in; raises `ValueError` for what is none."""
     if b"\0" in contents:
         raise ValueError("it has zero bytes")
-    return contents.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
+    return contents.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n").decode("latin-1")
 
 
 def _parse(
@@ -117,19 +117,18 @@ def _integers(path: Path, tag: str, numbers: Sequence[int], keys: list[list[str]
     try:
         flat = np.fromiter((int(key) for row in keys for key in row), np.int64, count=width * len(keys))
     except (ValueError, OverflowError):
-        for number, row in zip(numbers, keys, strict=True):
-            for key in row:
-                if not _is_int64(key):
-                    raise SourceError(f"{path}:{number}: {key!r} is no 64-bit integer id of a {tag}") from None
-        raise
+        words = ((number, key) for number, row in zip(numbers, keys, strict=True) for key in row)
+        number, key = next(word for word in words if not _is(np.int64, word[1]))
+        raise SourceError(f"{path}:{number}: {key!r} is no 64-bit integer id of a {tag}") from None
     return flat.reshape(-1, width)
 
 
-def _is_int64(key: str) -> bool:
+def _is(kind: type[np.int64] | type[float], word: str) -> bool:
     try:
-        return -(2**63) <= int(key) < 2**63
-    except ValueError:
+        kind(word)
+    except (ValueError, OverflowError):
         return False
+    return True
 
 
 def _numbers(path: Path, tag: str, numbers: list[int], rests: list[str], columns: tuple[int, ...]) -> Floats:
@@ -154,17 +153,9 @@ def _first_malformed(
         if len(words) != wanted:
             return SourceError(f"{path}:{number}: {tag} needs {wanted} numbers after its ids, has {len(words)}")
         for word in words:
-            if not _is_float(word):
+            if not _is(float, word):
                 return SourceError(f"{path}:{number}: {word!r} is no number")
     return SourceError(f"{path}: the {tag} lines cannot be parsed")
-
-
-def _is_float(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def write_lines(lines: list[str], tag: str, keys: Ints, values: Floats) -> None:

@@ -12,12 +12,14 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
+from hodge_adapters.json_files import read_json, write_json
+from hodge_adapters.nerfstudio import opengl_matrix, transforms_file
 from hodge_adapters.open3d_json import Open3dReader, Open3dTrajectoryWriter
 from hodge_adapters.seven_scenes.files import FRAME_FILE, sequence_folders
 from hodge_adapters.text_rows import read_text, to_floats, write_text_atomically
 from hodge_adapters.trajectories.euroc import NANO
 from hodge_adapters.trajectories.euroc import file_of as euroc_file
-from hodge_adapters.trajectories.text import COLUMNS, tum_stamps, unit_of
+from hodge_adapters.trajectories.text import COLUMNS, has_w_first, tum_stamps, unit_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Trajectory
@@ -39,11 +41,14 @@ class _Poses:
 
 
 class _OneFile:
-    """A format of one file."""
+    """A format of one file, which EuRoC has in folders of its own."""
 
     def copy(self, folder: Path, original: Path) -> Path:
         """See `PoseRewriter`."""
-        return _copied(folder, original)
+        original = euroc_file(original)
+        out = folder / f"refined{original.suffix}"
+        shutil.copyfile(original, out)
+        return out
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
@@ -53,11 +58,12 @@ class TumRewriter(_OneFile):
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
         """See `PoseRewriter`; lines that hold no pose stay as they are."""
         poses, per_second = _Poses(trajectory), unit_of(tum_stamps(original))[1]
+        shift = int(has_w_first(original))
 
         def numbers(fields: list[str]) -> list[float] | None:
             values = to_floats(fields)
             pose = poses.at(values[0] / per_second) if values and len(values) in COLUMNS else None
-            return None if pose is None else [*pose[:3, 3], *se3.to_quat_xyzw(pose)]
+            return None if pose is None else [*pose[:3, 3], *np.roll(se3.to_quat_xyzw(pose), shift)]
 
         return _rewritten(folder, original, numbers, first=1)
 
@@ -77,7 +83,7 @@ class KittiRewriter(_OneFile):
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
-class EurocRewriter:
+class EurocRewriter(_OneFile):
     """Lines of `nanoseconds,x,y,z,qw,qx,qy,qz,…`: further columns (velocities, biases) stay as they are."""
 
     def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
@@ -90,10 +96,6 @@ class EurocRewriter:
             return None if pose is None else [*pose[:3, 3], *np.roll(se3.to_quat_xyzw(pose), 1)]
 
         return _rewritten(folder, euroc_file(original), numbers, first=1)
-
-    def copy(self, folder: Path, original: Path) -> Path:
-        """See `PoseRewriter`."""
-        return _copied(folder, euroc_file(original))
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
@@ -135,10 +137,7 @@ class SevenScenesRewriter:
 
     def copy(self, folder: Path, original: Path) -> Path:
         """See `PoseRewriter`."""
-        out = _emptied(folder / "refined")
-        for file in _pose_files(original):
-            shutil.copyfile(file, _beside(out, original, file))
-        return out
+        return self.rewrite(folder, original, Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
 
 
 @dataclass(frozen=True, config=NO_OPTIONS)
@@ -156,6 +155,25 @@ class Open3dRewriter(_OneFile):
         return out
 
 
+@dataclass(frozen=True, config=NO_OPTIONS)
+class NerfstudioRewriter:
+    """nerfstudio's `transforms.json`: the poses of its frames; cameras, paths and all else stay."""
+
+    def rewrite(self, folder: Path, original: Path, trajectory: Trajectory) -> Path:
+        """See `PoseRewriter`."""
+        content, poses, out = read_json(transforms_file(original)), _Poses(trajectory), folder / "refined.json"
+        for row, entry in enumerate(content["frames"]):
+            pose = poses.at(float(row))
+            if pose is not None:
+                entry["transform_matrix"] = opengl_matrix(pose)
+        write_json(out, content)
+        return out
+
+    def copy(self, folder: Path, original: Path) -> Path:
+        """See `PoseRewriter`."""
+        return Path(shutil.copyfile(transforms_file(original), folder / "refined.json"))
+
+
 def _rewritten(folder: Path, original: Path, numbers: Callable[[list[str]], list[float] | None], *, first: int) -> Path:
     """The text with the fields of each line from `first` on replaced by what `numbers` gives for the line, if any."""
     lines = []
@@ -169,12 +187,6 @@ def _rewritten(folder: Path, original: Path, numbers: Callable[[list[str]], list
         lines.append(line)
     out = folder / f"refined{original.suffix}"
     write_text_atomically(out, "".join(lines))
-    return out
-
-
-def _copied(folder: Path, original: Path) -> Path:
-    out = folder / f"refined{original.suffix}"
-    shutil.copyfile(original, out)
     return out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
@@ -12,14 +13,14 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.posed import length_notes, trajectory_of, written
-from hodge_adapters.text_rows import Row, listed, read_rows, to_floats, write_text_atomically
+from hodge_adapters.text_rows import Row, first_text, listed, read_rows, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Source, Trajectory
 
 COLUMNS = (8, 9)
 """Of a line of TUM's: RTAB-Map adds the number of the node."""
-
+_QUATERNION = re.compile(r"\bq_?([wx])\b", re.IGNORECASE)
 
 UNITS = (("nanoseconds", 1e17, 1e9), ("microseconds", 1e14, 1e6), ("milliseconds", 1e11, 1e3))
 """What all stamps from so much on count, and how many make a second: as seconds 1e11 is the year 5138."""
@@ -52,13 +53,24 @@ def parse_tum(path: Path) -> ParsedTrajectory:
         raise _unreadable(path, bad, "stamp tx ty tz qx qy qz qw")
     unit, per_second = unit_of(table[:, 0])
     table[:, 0] /= per_second
+    w_first = has_w_first(path)
+    if w_first:
+        table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
     parsed = ordered(table)
     notes = [f"{path.name}: {note}" for note in parsed.notes]
+    if w_first:
+        notes.append(f"{path.name}: quaternions are read with w first, as its head names them")
     if per_second > 1:
         notes.append(f"{path.name}: stamps are read as {unit}, too large for seconds")
     if bad:
         notes.append(f"{path.name}: {len(bad)} lines that are no pose left out: {listed([r.line for r in bad])}")
     return ParsedTrajectory(parsed.trajectory, tuple(notes))
+
+
+def has_w_first(path: Path) -> bool:
+    """Whether the head of a TUM file names qw before qx, unlike TUM."""
+    named = _QUATERNION.search(first_text(path))
+    return named is not None and named[1].lower() == "w"
 
 
 def tum_stamps(path: Path) -> Floats:

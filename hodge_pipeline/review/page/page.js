@@ -47,10 +47,10 @@ function element(tag, text, className) {
 
 function show(found) {
   if (found.version < state.version) return;
-  if (state.version < 0) shown = new Set(found.look.verdicts);
+  shown = new Set(found.look.verdicts);
   state = found;
   document.title = `${state.name} – hodge review`;
-  $("name").textContent = `${state.name}: ${state.poses} poses, ${state.counting} of ${state.edges} edges count`;
+  $("name").textContent = `${state.name}: ${state.poses} ${state.poses === 1 ? "pose" : "poses"}, ${state.counting} of ${state.edges} edges count`;
   const error = state.error_m === null ? "" : `; error ${metres(state.first_error_m)} at first, ${metres(state.error_m)} now`;
   $("facts").textContent = `${state.disabled} disabled, ${state.pieces} ${state.pieces === 1 ? "piece" : "pieces"}${error}` + (state.to_register.length ? `; hodge solve will register ${state.to_register.join(", ")}` : "");
   const behind = state.settled_revision !== state.revision;
@@ -65,6 +65,7 @@ function show(found) {
   for (const name of ["disable", "enable", "right"]) $(name).disabled = Boolean(state.locked) || state.look.selected < 0;
   $("undo").disabled = !state.can_undo; $("undo").title = state.latest;
   $("redo").disabled = !state.can_redo;
+  $("wrong").disabled = Boolean(state.locked) || !state.verdicts.wrong;
   $("finishes").textContent = state.finish; $("unit").textContent = state.unit; $("adding").hidden = !state.is_run;
   $("view").hidden = !state.has_clouds;
   for (const button of $("view").querySelectorAll("button")) button.classList.toggle("on", button.dataset.mode === state.look.mode);
@@ -91,14 +92,14 @@ function showFilters() {
 async function list(always) {
   const query = new URLSearchParams({ verdicts: [...shown].join(","), frame: $("frame").value, min_gap: $("gap").value, min_residual_m: $("residual").value, sort, descending, first, count: COUNT });
   const version = state.version, key = `${query} ${version}`;
-  if (!shown.size || (key === listed && !always)) return;
+  if (key === listed && !always) return;
   listed = key;
   try {
     const found = await ask(`edges?${query}`);
     if (key !== listed) return;
     rows = found.edges; total = found.total;
     fill($("table").tBodies[0]);
-    $("place").textContent = `${total ? first + 1 : 0}–${first + rows.length} of ${total}`;
+    $("place").textContent = total ? `${first + 1}–${first + rows.length} of ${total}` : state.edges ? "no such edge: choose other verdicts, or empty the fields above" : "no edges";
     $("before").disabled = first === 0; $("after").disabled = first + rows.length >= total;
     for (const head of $("table").tHead.rows[0].cells) head.classList.toggle("sorted", head.dataset.sort === sort);
     document.body.dataset.listed = version;

@@ -8,10 +8,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, places_along
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, root, shifted, without_run
-from hodge_pipeline.solvers.backbone.places import places_along
 from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS, SEEDS = 8, 16
@@ -62,14 +61,9 @@ class Testimony:
         """At the poses of the bare chain."""
         return cls(chain, linear, explained, away, used, places_along(chain))
 
-    def places(self, rows: Ints) -> Floats:
-        """How many of these loops (K,), each itself included, are of one place."""
-        near = cKDTree(self.ends[rows]).query_ball_point(self.ends[rows], 1.0, p=np.inf, return_length=True)
-        return np.asarray(near, float)
-
     def testimonies(self) -> float:
         """How many there are, of which the best is taken: a place makes one."""
-        return float((1 / self.places(np.arange(len(self.ends)))).sum()) if len(self.ends) else 0.0
+        return float((1 / loops_at_place(self.ends)).sum())
 
     def displaced(self, loop: Ints) -> Floats:
         """The motion (K, 4, 4) of the world beyond a break that each of these loops asks for."""
@@ -97,15 +91,11 @@ class Testimony:
         def local(frame: Floats, covariance: Floats) -> Floats:
             turned, origin = frame.copy(), np.broadcast_to(np.eye(4), frame.shape).copy()
             turned[:, :3, 3], origin[:, :3, 3] = 0.0, -frame[:, :3, 3]
-            return carried(se3.inverse(turned), shifted(covariance, chain.adjoint(origin)))
-
-        def carried(frame: Floats, covariance: Floats) -> Floats:
-            into = chain.adjoint(frame)
-            return np.asarray(into @ covariance @ np.swapaxes(into, 1, 2))
+            return chain.carried(se3.inverse(turned), shifted(covariance, chain.adjoint(origin)))
 
         before = local(end, total[np.maximum(a, low)] - total[np.minimum(a, low)])
         after = local(poses[high], total[np.maximum(b, high)] - total[np.minimum(b, high)])
-        return end, before + after + carried(se3.inverse(poses[high]) @ poses[b], chain.covariance[loop])
+        return end, before + after + chain.carried(se3.inverse(poses[high]) @ poses[b], chain.covariance[loop])
 
     def seeds(self, rows: Ints) -> list[int]:
         """Loops of these with which others near them agree most, those of their own place together as one: each differs
@@ -142,7 +132,7 @@ class Testimony:
         gain = np.logaddexp(np.log(share) + factor, np.log1p(-share)) - self.explained[rows]
         for alike in (agrees, ~agrees):
             if alike.any():
-                gain[alike] /= self.places(rows[alike])
+                gain[alike] /= loops_at_place(self.ends[rows[alike]])
         gain[np.abs(self.ends[rows] - self.ends[seed]).max(axis=1) < 1.0] = 0.0
         return np.asarray(np.where(self.used[rows], np.minimum(gain, 0.0), gain))
 
@@ -287,14 +277,14 @@ def strained_break(fit: Fit, usual: Usual) -> Break | None:
         return None
     poses, turned = chain.poses(), linear.poses[high].copy()
     turned[:, :3, 3] = 0.0
-    into = chain.adjoint(se3.inverse(turned))
-    motion = se3.inverse(poses[low]) @ poses[high] @ chain.exp((into @ residual[..., None])[..., 0])
+    ahead = chain.exp((chain.adjoint(se3.inverse(turned)) @ residual[..., None])[..., 0])
+    motion = se3.inverse(poses[low]) @ poses[high] @ ahead
     others = replace(
         chain,
         loop_edge=np.full(len(low), -1),
         ends=used.ends[used.runs],
         motion=motion,
-        covariance=into @ prior @ np.swapaxes(into, 1, 2),
+        covariance=chain.carried(se3.inverse(turned), prior),
     )
     told = Testimony.of(others, linearise(others, poses), log_density, np.zeros(len(low)), np.zeros(len(low), bool))
     owner = np.repeat(strained, (high - low)[strained])

@@ -18,7 +18,7 @@ from hodge_pipeline.solvers.backbone.breaks import (
     unusual_breaks,
 )
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
-from hodge_pipeline.solvers.backbone.evidence import Wrong
+from hodge_pipeline.solvers.backbone.evidence import Scales, Wrong, learn_scales, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, linearise, settled
 from hodge_pipeline.solvers.backbone.inference import (
     BY_CHANCE,
@@ -30,7 +30,6 @@ from hodge_pipeline.solvers.backbone.inference import (
     refused,
     thinned,
 )
-from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales, mixture
 from hodge_pipeline.types import Bools
 
 MOST_BREAKS, MOST_TRIED = 10, 2

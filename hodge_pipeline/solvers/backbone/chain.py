@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.cycles import spanning_forest
 from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.solvers.weights import PLANAR_AXES
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -62,6 +65,11 @@ class Chain:
         whole = se3.adjoint(poses)
         return whole if len(self.axes) == 6 else np.asarray(whole[..., self.axes[:, None], self.axes])
 
+    def carried(self, poses: Floats, covariance: Floats) -> Floats:
+        """Covariances (..., p, p) of twists, in the axes that the poses lead to: `Ad Σ Adᵀ`."""
+        into = self.adjoint(poses)
+        return np.asarray(into @ covariance @ np.swapaxes(into, -1, -2))
+
     def log(self, motions: Floats) -> Floats:
         """Twists (..., p) of the free axes."""
         return np.asarray(se3.log(motions)[..., self.axes])
@@ -75,17 +83,14 @@ class Chain:
 
 def sequential_edges(graph: ViewGraph) -> Bools:
     """Edges (E,) between vertices that follow each other in the order of their ids; the first of parallel ones."""
-    rank = np.argsort(np.argsort(graph.vertex_ids, kind="stable"), kind="stable") if _numbered(graph) else None
-    ranks = graph.edges if rank is None else rank[graph.edges]
+    ranks = graph.edges
+    if graph.vertex_ids.dtype.kind in "iu":
+        ranks = np.argsort(np.argsort(graph.vertex_ids, kind="stable"), kind="stable")[ranks]
     low = ranks.min(axis=1, initial=len(graph.vertex_ids))
     out = np.zeros(graph.edge_count, bool)
     consecutive = np.flatnonzero(np.abs(ranks[:, 0] - ranks[:, 1]) == 1)
     out[consecutive[np.unique(low[consecutive], return_index=True)[1]]] = True
     return out
-
-
-def _numbered(graph: ViewGraph) -> bool:
-    return bool(graph.vertex_ids.dtype.kind in "iu")
 
 
 def linear_forest(edges: Ints, count: int, trusted: Bools) -> Bools:
@@ -186,22 +191,43 @@ def _directed(motion: Floats, covariance: Floats, reverse: Bools, axes: Ints) ->
 
 def _walk(edges: Ints, count: int, rows: Ints) -> tuple[Ints, Ints, Ints]:
     """Vertices (V,) path by path, the edge that leads to each (−1 at a beginning), and its path."""
-    near: list[list[tuple[int, int]]] = [[] for _ in range(count)]
-    for row, (i, j) in zip(rows.tolist(), edges[rows].tolist(), strict=True):
-        near[i].append((j, row))
-        near[j].append((i, row))
-    seen = [False] * count
-    order, via, path, number = [], [], [], 0
-    for start in range(count):
-        if seen[start] or len(near[start]) > 1:
-            continue
-        vertex, edge = start, -1
-        while vertex >= 0:
-            seen[vertex] = True
-            order.append(vertex)
-            via.append(edge)
-            path.append(number)
-            following = [(other, row) for other, row in near[vertex] if not seen[other]]
-            vertex, edge = following[0] if following else (-1, -1)
-        number += 1
-    return np.array(order, np.int64), np.array(via, np.int64), np.array(path, np.int64)
+    ends = np.flatnonzero(np.bincount(edges[rows].ravel(), minlength=count) < 2)
+    component = connected_components(edges[rows], count)
+    begins = ends[np.unique(component[ends], return_index=True)[1]]
+    forest = spanning_forest(edges[rows], count, begins)
+    path = np.argsort(np.argsort(begins))[component]
+    order = np.lexsort((forest.depth, path))
+    return order, np.append(rows, -1)[forest.parent_edge[order]], path[order]
+
+
+PLACE = 4.0
+"""Loops of which the steps between their ends vary less than so many loops do are of one place."""
+STEPS_OF_PLACE, FEWEST_PLACES = 20, 50
+"""Steps that a place has at the least, however large the errors of steps are; places that a path has, however small."""
+
+
+def places_along(chain: Chain) -> Floats:
+    """Where the ends of each loop (M, 2) lie along the chain, in places: of one place are loops both ends of which lie
+    within 1. These are one testimony, however many agree, since a place may be mistaken for another.
+    """
+    own = np.median(np.einsum("mii->mi", chain.covariance), axis=0)
+    steps = np.where(chain.bridged[:, None], 0.0, np.einsum("nii->ni", chain.step_covariance))
+    longest = max(STEPS_OF_PLACE, chain.size / FEWEST_PLACES)
+    along = np.clip((steps / own).mean(axis=1) / PLACE, 1 / longest, 1 / STEPS_OF_PLACE)
+    return np.asarray(np.cumsum(along)[chain.ends])
+
+
+def loops_at_place(ends: Floats) -> Floats:
+    """How many loops (M,), each itself included, are of the place of each; `ends (M, 2)` are given in places."""
+    near = cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True) if len(ends) else []
+    return np.asarray(near, float)
+
+
+def one_of_each_place(ends: Floats) -> Ints:
+    """Rows of loops, ascending, whose `ends (M, 2)` are given in places: first those that have the most others near."""
+    tree, free, out = cKDTree(ends), np.ones(len(ends), bool), []
+    for row in np.argsort(-loops_at_place(ends), kind="stable").tolist():
+        if free[row]:
+            out.append(row)
+            free[tree.query_ball_point(ends[row], 1.0, p=np.inf)] = False
+    return np.sort(np.array(out, np.int64))

@@ -1,15 +1,18 @@
-"""What speaks for a loop: the density of its residual if it is right, against that if it joins places at random."""
+"""What speaks for a loop: the density of its residual if it is right, against that if it joins places at random; and
+how large errors are, as factors on what the information of steps and loops states.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaln
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.fit import root
+from hodge_pipeline.solvers.backbone.fit import linearise, root
 from hodge_pipeline.types import Floats
 
 PAIRS = 4000
@@ -91,3 +94,166 @@ def student(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     size = residual.shape[1]
     norm = gammaln((FREEDOM + size) / 2) - gammaln(FREEDOM / 2) - 0.5 * size * np.log(FREEDOM / 2)
     return log_density + 0.5 * chi2 + norm - 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM), chi2
+
+
+FOLD = np.log(4.0)
+"""Standard deviation of a scale's logarithm beforehand: stated information is seldom wrong by more."""
+FIRST, FINEST = np.log(4.0), np.log(2.0) / 3
+"""Steps of the search, in the logarithm of a scale."""
+MOST_RATIO = np.log(2.0)
+"""Between the scales of rotation and of translation, where information is stated."""
+UNITS, TRIED = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8]), 3
+"""Logarithms of scales at which the search begins too where the information is the identity that stands for unknown,
+and how many of them, the likeliest: rotation and translation have each a unit of their own then.
+"""
+BY_CHANCE = float(np.log(100.0))
+"""Nats by which loops must be likelier there."""
+LEAST_SHARE = 1e-3
+EVEN = np.full(2, 0.5)
+DECOYS = 4
+"""To a loop: with one, scales of loops differed up to eightfold from one draw to the next."""
+MOST_LOOPS = 3000
+"""That scales are learned from: more tell hardly more."""
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Factors on stated standard deviations: of steps and of loops, each of rotation and of translation."""
+
+    step_turn: float = 1.0
+    step_shift: float = 1.0
+    loop_turn: float = 1.0
+    loop_shift: float = 1.0
+
+    def applied(self, chain: Chain) -> Chain:
+        """The chain with the covariances that follow."""
+        step, loop = self.units(chain)
+        return replace(
+            chain,
+            step_covariance=np.where(
+                chain.bridged[:, None, None], chain.step_covariance, chain.step_covariance * np.outer(step, step)
+            ),
+            covariance=chain.covariance * np.outer(loop, loop),
+        )
+
+    def units(self, chain: Chain) -> tuple[Floats, Floats]:
+        """The factor on each free axis (p,), of steps and of loops."""
+        split, size = turns(chain), len(chain.axes)
+        pairs = (self.step_turn, self.step_shift), (self.loop_turn, self.loop_shift)
+        step, loop = (np.repeat(pair, (split, size - split)) for pair in pairs)
+        return step, loop
+
+
+def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Floats]:
+    """The scales at which the loops' residuals against the bare chain are likeliest, and the shares of right and wrong
+    loops.
+
+    Each loop counts by itself: that loops at one place err alike, and steps too, would else be taken for small errors.
+    Decoys, motions of loops between other places, tell what as many would explain by chance at each scale.
+    """
+    own, decoys = _Model.of(chain, poses, wrong), _Model.of(decoyed(chain), poses, wrong)
+    share = len(own.residual) / max(len(decoys.residual), 1)
+
+    def value(logs: Floats, unit: float) -> float:
+        ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
+        if not unit and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
+            return -np.inf
+        prior = -0.5 * float((logs - unit) @ (logs - unit)) / FOLD**2
+        return float(own.value(logs)[0] - share * max(decoys.value(logs)[0], 0.0) + prior)
+
+    found = _likeliest(value, 0.0)
+    if not chain.stated:
+        values = np.array([value(np.full(4, unit), unit) for unit in UNITS])
+        others = [_likeliest(value, unit) for unit in UNITS[np.argsort(-values, kind="stable")[:TRIED]].tolist()]
+        other = max(others, key=lambda each: each[1])
+        found = other if other[1] > found[1] + BY_CHANCE else found
+    return Scales(*map(float, np.exp(found[0]))), own.value(found[0])[1]
+
+
+def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Floats, float]:
+    """The logarithms (4,) of scales about that of a unit that have the largest value, and this."""
+    best, width = np.full(4, unit), FIRST
+    top = value(best, unit)
+    while width >= FINEST:
+        improved = False
+        for axis in range(4):
+            for sign in (-1, 1):
+                tried = best.copy()
+                tried[axis] += sign * width
+                if (found := value(tried, unit)) > top:
+                    best, top, improved = tried, found, True
+        width = width if improved else width / 2
+    return best, top
+
+
+def decoyed(chain: Chain) -> Chain:
+    """The chain with each loop's motion, `DECOYS` times, between two other places of one path, at random."""
+    rng = np.random.default_rng(1)
+    loop = np.repeat(np.arange(len(chain.loop_edge)), DECOYS)
+    count = len(loop)
+    first = rng.integers(0, chain.size, count)
+    begin = np.searchsorted(chain.path, chain.path[first])
+    length = np.searchsorted(chain.path, chain.path[first], side="right") - begin
+    second = begin + np.minimum((rng.random(count) * length).astype(np.int64), length - 1)
+    ends = np.sort(np.stack([first, second], axis=1), axis=1)
+    return replace(
+        chain, loop_edge=chain.loop_edge[loop], ends=ends, motion=chain.motion[loop], covariance=chain.covariance[loop]
+    )
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Residuals (M, p) of loops, with the covariances of their paths and their own as parts (3, M, p, p): of rotation,
+    of translation, and of both together; `away (M,)`: the log-density of wrong loops.
+    """
+
+    residual: Floats
+    fixed: Floats
+    path: Floats
+    own: Floats
+    away: Floats
+
+    @classmethod
+    def of(cls, chain: Chain, poses: Floats, wrong: Wrong) -> _Model:
+        a, b = chain.ends.T
+        rows = np.flatnonzero(chain.path[a] == chain.path[b])
+        if len(rows) > MOST_LOOPS:
+            rows = np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
+        bridges = replace(chain, step_covariance=chain.step_covariance * chain.bridged[:, None, None])
+        fixed = linearise(bridges, poses).path(a[rows], b[rows])
+        chain = replace(chain, step_covariance=chain.step_covariance * ~chain.bridged[:, None, None])
+        parts = []
+        for step in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
+            part = Scales(*step, *step).applied(chain)
+            linear = linearise(part, poses)
+            parts.append((linear.path(a[rows], b[rows]), linear.loops[1][rows]))
+        path, own = (np.stack(each) for each in zip(*parts, strict=True))
+        for parted in (path, own):
+            parted[2] -= parted[0] + parted[1]
+        return cls(linear.loops[0][rows], fixed, path, own, wrong.log_density(chain, poses)[rows])
+
+    def value(self, logs: Floats) -> tuple[float, Floats]:
+        """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
+        if not len(self.residual):
+            return 0.0, EVEN
+        turn, shift, own_turn, own_shift = np.exp(logs)
+        covariance = self.fixed + _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
+        factor = student(self.residual, covariance)[0] - self.away
+        shares, likelihood = mixture(np.stack([factor, np.zeros_like(factor)]))
+        return likelihood, shares
+
+
+def _weighed(parts: Floats, turn: float, shift: float) -> Floats:
+    return np.asarray(turn**2 * parts[0] + shift**2 * parts[1] + turn * shift * parts[2])
+
+
+def mixture(log_densities: Floats) -> tuple[Floats, float]:
+    """The shares (k,) of classes with these log-densities (k, M) that are likeliest, and the log-likelihood."""
+    shares = np.full(len(log_densities), 1 / len(log_densities))
+    for _ in range(30):
+        joint = log_densities + np.log(shares)[:, None]
+        total = np.logaddexp.reduce(joint, axis=0)
+        weight = np.exp(joint - total).sum(axis=1) + 0.5
+        shares = np.maximum(weight / weight.sum(), LEAST_SHARE)
+        shares /= shares.sum()
+    return shares, float(total.sum())

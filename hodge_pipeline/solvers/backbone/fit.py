@@ -33,8 +33,7 @@ class Linear:
     @cached_property
     def covariance(self) -> Floats:
         """The steps' covariances summed over positions (n, p, p), about the world's origin: in extended precision."""
-        frame = self.chain.adjoint(self.poses)
-        each = frame @ self.chain.step_covariance @ np.swapaxes(frame, 1, 2)
+        each = self.chain.carried(self.poses, self.chain.step_covariance)
         by_entry = np.ascontiguousarray(each.reshape(len(each), -1).T)
         return np.asarray(np.cumsum(by_entry, axis=1, dtype=np.longdouble).T.reshape(each.shape))
 
@@ -87,8 +86,7 @@ def loops_at(chain: Chain, poses: Floats, rows: Ints) -> tuple[Floats, Floats]:
     turned = poses[b].copy()
     turned[:, :3, 3] = 0.0
     left = chain.log(se3.inverse(chain.motion[rows]) @ se3.inverse(poses[a]) @ poses[b])
-    turned = chain.adjoint(turned)
-    return np.einsum("nij,nj->ni", turned, left), turned @ chain.covariance[rows] @ np.swapaxes(turned, 1, 2)
+    return np.einsum("nij,nj->ni", chain.adjoint(turned), left), chain.carried(turned, chain.covariance[rows])
 
 
 ROUNDING = 1e-12
@@ -185,8 +183,7 @@ class Fit:
         chain, (at, run) = self.linear.chain, self.reduced.inside
         frame = self.linear.poses[at]
         frame[:, :3, 3] -= self.linear.poses[self.reduced.ends[self.reduced.runs[:, 1]][run], :3, 3]
-        into = chain.adjoint(frame)
-        return np.asarray(into @ chain.step_covariance[at] @ np.swapaxes(into, 1, 2))
+        return chain.carried(frame, chain.step_covariance[at])
 
     @cached_property
     def runs(self) -> Floats:

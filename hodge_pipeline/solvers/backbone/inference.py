@@ -6,14 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import Wrong, student
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, inverse, linearise, root, settled, without
-from hodge_pipeline.solvers.backbone.places import one_of_each_place, places_along
-from hodge_pipeline.solvers.backbone.polish import LOCAL, polished
-from hodge_pipeline.solvers.backbone.scales import EVEN, Scales, learn_scales, mixture
-from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.solvers.backbone.chain import Chain, one_of_each_place, places_along
+from hodge_pipeline.solvers.backbone.evidence import EVEN, Scales, Wrong, learn_scales, mixture, student
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, linearise, root, settled, without
+from hodge_pipeline.solvers.backbone.polish import polished
+from hodge_pipeline.types import Bools, Floats, Ints
 
 ROUNDS = 6
 SAMPLES = 64
@@ -37,7 +34,7 @@ class Judged:
 @dataclass(frozen=True)
 class Inferred:
     """The result: loops that are `used (M,)`, how all were judged, the poses of the used ones, and what their errors
-    were found to be: scales, and `step_width`, `loop_width (M,)`, factors on standard deviations for the last solve.
+    were found to be: scales, and `loop_width (M,)`, factors on standard deviations for the last solve.
 
     `log_evidence`: of the loops as judged, against all being wrong. `confirmed`: whether they say more than chance; if
     not, none should be used: see `refused`.
@@ -47,7 +44,6 @@ class Inferred:
     judged: Judged
     poses: Floats
     scales: Scales
-    step_width: float
     loop_width: Floats
     log_evidence: float
     confirmed: bool
@@ -73,7 +69,7 @@ def infer(
         reduced = thinned(chain, np.flatnonzero(used))
         if not thin and len(reduced.active) < used.sum():
             return None
-        fit = settled_globally(Fit(reduced, linear))
+        fit = settled(Fit(reduced, linear), MOST_STEPS, TOLERANCE)
         linear = fit.linear
         judged = _judge(linear, fit, shares, wrong)
         shares, likelihood = mixture(judged.log_density)
@@ -91,7 +87,7 @@ def infer(
     used |= always
     rows = thinned(chain, np.flatnonzero(used)).active
     linear, width = polished(rows, linear if used.any() else start)
-    return Inferred(used, judged, linear.poses, scales, LOCAL, width, top, confirmed)
+    return Inferred(used, judged, linear.poses, scales, width, top, confirmed)
 
 
 def refused(found: Inferred, chain: Chain, always: Bools) -> Inferred:
@@ -146,7 +142,7 @@ def _confirmed(linear: Linear, judged: Judged, used: Bools, wrong: Wrong) -> boo
     chain, ends, rows = linear.chain, places_along(linear.chain), np.flatnonzero(used)
     count, chosen = len(one_of_each_place(ends)), rows[one_of_each_place(ends[rows])]
     reduced = thinned(chain, chosen)
-    fit = settled_globally(Fit(reduced, linear))
+    fit = settled(Fit(reduced, linear), MOST_STEPS, TOLERANCE)
     factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[reduced.active]
     return float(np.maximum(factor - np.log(count), 0.0).sum()) > MISTAKEN
 
@@ -160,33 +156,6 @@ twenty. More would refuse the loops of a path that closes once: these can say no
 def by_chance(count: int) -> float:
     """The log-evidence that chance may reach among so many loops."""
     return BY_CHANCE + BY_CHANCE_EACH_FOLD * float(np.log(max(count, 1)))
-
-
-def settled_globally(fit: Fit) -> Fit:
-    """The fit at the poses of least cost: from its own, and from chordal rotations where that ends too high."""
-    fit, chain, reduced = settled(fit, MOST_STEPS, TOLERANCE), fit.linear.chain, fit.reduced
-    if not len(reduced.active) or fit.cost <= TOO_HIGH * len(chain.axes) * len(reduced.active):
-        return fit
-    rows = np.flatnonzero(chain.inner)
-    edges = np.concatenate([np.stack([rows - 1, rows], axis=1), chain.ends[reduced.active]])
-    axes = np.ix_(np.arange(len(edges)), chain.axes, chain.axes)
-    information = np.zeros((len(edges), 6, 6))
-    information[axes] = inverse(np.concatenate([chain.step_covariance[rows], chain.covariance[reduced.active]]))
-    graph = ViewGraph.from_edges(
-        np.arange(chain.size),
-        edges,
-        np.concatenate([chain.step[rows], chain.motion[reduced.active]]),
-        information,
-        dimension=2 if len(chain.axes) == 3 else 3,
-    )
-    start = solve(graph, start=fit.linear.poses, objective="isotropic", max_iterations=CHORDAL_STEPS).world_from_cam
-    other = settled(Fit(reduced, linearise(chain, start)), MOST_STEPS, TOLERANCE)
-    return other if other.cost < fit.cost else fit
-
-
-TOO_HIGH = 2.0
-"""χ² to a degree of freedom."""
-CHORDAL_STEPS = 10
 
 
 def _judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong, tense: bool = False) -> Judged:

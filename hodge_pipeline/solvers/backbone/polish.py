@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, turns
+from hodge_pipeline.solvers.backbone.chain import loops_at_place, places_along
+from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, settled
 from hodge_pipeline.types import Floats, Ints
 
@@ -34,7 +33,7 @@ def polished(rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
     reduced = Reduced.of(chain, rows)
     chain = replace(chain, step_covariance=LOCAL**2 * chain.step_covariance)
     wide = np.ones(count)
-    wide[rows] = crowding(chain, rows) ** CROWDED_POWER
+    wide[rows] = loops_at_place(places_along(chain)[rows]) ** CROWDED_POWER
     chain = replace(chain, covariance=chain.covariance * wide[:, None, None])
     weights = np.ones(count)
     for _ in range(ROUNDS):
@@ -47,21 +46,3 @@ def polished(rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
         if np.abs(weights[rows] - before).max() < SAME_WEIGHT:
             break
     return linear, np.sqrt(wide / weights)
-
-
-def crowding(chain: Chain, rows: Ints) -> Floats:
-    """How many of these loops, each itself included, join the same two places: so near along the paths that the steps
-    between them err less than a loop.
-    """
-    own = np.median(_variances(chain, chain.covariance[rows]), axis=0)
-    along = np.cumsum((_variances(chain, chain.step_covariance) / own).sum(axis=1))
-    places = along[chain.ends[rows]]
-    near = cKDTree(places).query_ball_point(places, 1.0, p=np.inf, return_length=True)
-    return np.asarray(near, float)
-
-
-def _variances(chain: Chain, covariance: Floats) -> Floats:
-    split = turns(chain)
-    return np.stack(
-        [np.einsum("eii->e", covariance[:, part, part]) for part in (slice(0, split), slice(split, None))], axis=1
-    )

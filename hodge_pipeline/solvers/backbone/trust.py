@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import infer_bridged
 from hodge_pipeline.solvers.backbone.chain import Chain, linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.backbone.inference import Inferred
-from hodge_pipeline.solvers.backbone.tested import tested_by_pairs, tested_steps
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.solvers.backbone.polish import LOCAL
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
 FEWEST_STEPS = 100
@@ -51,23 +50,11 @@ class Backbone:
     chi2: Floats
     world_from_cam: Floats
 
-    def placed(self, start: Floats | None) -> Floats:
-        """The poses (V, 4, 4), the first vertex of each component where it starts."""
-        poses = self.world_from_cam
-        if start is None:
-            return poses
-        ends = self.chain.order[self.chain.ends[self.found.used]]
-        steps = np.flatnonzero((self.chain.step_edge >= 0) & ~self.chain.bridged)
-        joined = np.concatenate([np.stack([self.chain.order[steps - 1], self.chain.order[steps]], axis=1), ends])
-        component = connected_components(joined, len(poses))
-        first = np.unique(component, return_index=True)[1]
-        return np.asarray((start[first] @ se3.inverse(poses[first]))[component] @ poses)
-
     def weighted(self, graph: ViewGraph) -> ViewGraph:
         """The graph of the edges that count, with the information that their errors were found to have."""
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
-        width[self.chain.step_edge[self.chain.step_edge >= 0]] = step * self.found.step_width
+        width[self.chain.step_edge[self.chain.step_edge >= 0]] = step * LOCAL
         width[self.chain.loop_edge] = loop * self.found.loop_width[:, None]
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
@@ -108,7 +95,8 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, lattice: bool = False)
         return None
     if trust == AUTO and tested_steps(chain, chain.poses()).sum() > TESTED * steps.sum():
         return None
-    many_loops = _many_loops(chain, steps)
+    loops = len(chain.loop_edge)
+    many_loops = loops > LOOPS_AT_A_STEP * steps.sum()
     if lattice and not many_loops:
         return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
@@ -116,21 +104,10 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, lattice: bool = False)
     if inferred is None:
         return None
     chain, found = inferred
-    if trust == AUTO and not found.confirmed and _loops_agree(chain, steps):
-        return None
+    doubted = trust == AUTO and not found.confirmed and loops > steps.sum()
+    if doubted and tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum():
+        return None  # many loops agree with each other, and none with the backbone: it is what is wrong
     return _backbone(graph, chain, found, steps)
-
-
-def _loops_agree(chain: Chain, steps: Bools) -> bool:
-    """Whether many loops agree with each other, though none with the backbone: it is what is wrong then."""
-    return len(chain.loop_edge) > steps.sum() and bool(
-        tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum()
-    )
-
-
-def _many_loops(chain: Chain, steps: Bools) -> bool:
-    """As in a lattice, in which no edge needs to be trusted."""
-    return bool(len(chain.loop_edge) > LOOPS_AT_A_STEP * steps.sum())
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
@@ -155,3 +132,70 @@ def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools) -> 
 
 UNUSED = 0.49
 """The most probable that a loop which does not count is: too little speaks for it."""
+
+
+LONGEST = 3
+"""Steps of a cycle with one loop: cycles of several loops close too where these agree on a place that is wrong."""
+OF_STEPS = 3.0
+"""Of the usual displacement and angle of steps: a cycle of right edges closes to less, and one of places at random
+seldom does.
+"""
+
+
+def tested_steps(chain: Chain, poses: Floats) -> Bools:
+    """Steps (n,) that lie in a cycle with one loop that closes to less than a step."""
+    out = np.zeros(chain.size, bool)
+    if not len(chain.ends):
+        return out
+    same = chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]]
+    low, high = chain.ends.T
+    short = np.flatnonzero(same & (high - low <= LONGEST))
+    good = short[_closes(chain.motion[short], _between(poses, low[short], high[short]), _gate(chain))]
+    for ahead in range(1, LONGEST + 1):
+        rows = good[high[good] - low[good] >= ahead]
+        out[low[rows] + ahead] = True
+    return out
+
+
+def tested_by_pairs(chain: Chain, poses: Floats) -> Bools:
+    """Steps (n,) in cycles of two loops and the steps between neighbouring ends of them that close."""
+    out = np.zeros(chain.size, bool)
+    low, high = chain.ends.T
+    keys = low * chain.size + high
+    order, path, gate = np.argsort(keys, kind="stable"), chain.path, _gate(chain)
+    for down, up in ((0, 1), (1, 0), (1, 1), (1, -1)) if len(keys) else ():
+        moved = low + down, high + up
+        at = np.minimum(np.searchsorted(keys, moved[0] * chain.size + moved[1], sorter=order), len(keys) - 1)
+        other = order[at]
+        fits = (low[other] == moved[0]) & (high[other] == moved[1])
+        first = np.flatnonzero(fits & (path[low] == path[low[other]]) & (path[high] == path[high[other]]))
+        second = other[first]
+        before, after = _between(poses, low[first], low[second]), _between(poses, high[second], high[first])
+        good = first[_closes(chain.motion[first], before @ chain.motion[second] @ after, gate)]
+        if down:
+            out[low[good] + 1] = True
+        if up:
+            out[high[good] + (1 if up > 0 else 0)] = True
+    return out
+
+
+def _gate(chain: Chain) -> tuple[float, float]:
+    """Metres and radians to which cycles of right edges close."""
+    inner = np.flatnonzero(chain.step_edge >= 0)
+    shift = np.linalg.norm(chain.step[inner, :3, 3], axis=1)
+    turn = np.linalg.norm(se3.so3_log(chain.step[inner, :3, :3]), axis=1)
+    return float(np.median(shift)) / OF_STEPS, max(float(np.median(turn)), TURN_RAD) / OF_STEPS
+
+
+TURN_RAD = 0.1
+"""Where a backbone goes straight on, the angle that counts as a usual one."""
+
+
+def _between(poses: Floats, a: Ints, b: Ints) -> Floats:
+    return np.asarray(se3.inverse(poses[a]) @ poses[b])
+
+
+def _closes(motion: Floats, other: Floats, gate: tuple[float, float]) -> Bools:
+    left = se3.inverse(motion) @ other
+    near = np.linalg.norm(left[:, :3, 3], axis=1) < gate[0]
+    return np.asarray(near & (np.linalg.norm(se3.so3_log(left[:, :3, :3]), axis=1) < gate[1]))

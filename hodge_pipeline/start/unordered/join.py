@@ -18,7 +18,7 @@ from hodge_pipeline.start.clouds import landmarks_for, make_clouds
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.start import Frames, Start, find_start
 from hodge_pipeline.types import CloudSet, Edges, Source
-from hodge_pipeline.types.notes import Note, notes_of
+from hodge_pipeline.types.notes import Note
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
@@ -77,7 +77,7 @@ def start_without_guess(
     scratch = step.folder / "scratch"
     found = find_start(frames, options, scratch, workers, step.advance)
     shutil.rmtree(scratch, ignore_errors=True)
-    step.note(*notes_of("start", found.notes))
+    step.note(*found.notes)
     if edges is not None and drift is not None and _stays(source, edges, found):
         step.note(Note("left apart"))
         return replace(found, edges=edges, world_from_cam=drift.world_from_cam)

@@ -19,7 +19,7 @@ from hodge_pipeline.scene import Drift
 from hodge_pipeline.solvers.backbone.trust import SEQUENTIAL
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
-from hodge_pipeline.start.unordered.hypotheses import weigh
+from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, weigh
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans
@@ -27,6 +27,7 @@ from hodge_pipeline.start.unordered.similarity import LocalDescriptors, all_pair
 from hodge_pipeline.start.unordered.views import Views
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
+from hodge_pipeline.types.notes import Note, notes_of
 
 DESCRIBED, VIEWS = "described", "views"
 
@@ -38,7 +39,7 @@ class Start:
     world_from_cam: Floats
     edges: Edges
     piece: Ints
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,15 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
     poses = laid_apart(pieces.piece, pieces.poses, clouds)
-    return Start(poses, Edges.measured(pieces.graph), pieces.piece, tuple(notes))
+    said = (*_ambiguous_pairs(hypotheses, pieces.piece), *notes_of("start", notes))
+    return Start(poses, Edges.measured(pieces.graph), pieces.piece, said)
+
+
+def _ambiguous_pairs(hypotheses: Edges, piece: Ints) -> tuple[Note, ...]:
+    """A note where pairs that fit in several ways would join pieces (N,)."""
+    first, second = hypotheses.pairs[hypotheses.why == AMBIGUOUS].T
+    count = int((piece[first] != piece[second]).sum())
+    return (Note("ambiguous", count, str(len(hypotheses))),) if count else ()
 
 
 def weighed_matches(
