@@ -290,9 +290,9 @@ def pcd(kind: str) -> Callable[[Path], Path]:
 TARGETS: dict[str, Target] = {
     "seven_scenes": Target(SevenScenesReader(), lambda folder: seven_scenes_sequence(folder / "seq-01", 2)),
     "tum": Target(TumReader(), tum_folder),
-    "icl_lists": Target(IclNuimReader(intrinsics=(10.0, -10.0, 4.0, 3.0)), icl),
-    "icl_pov": Target(IclNuimReader(intrinsics=(10.0, -10.0, 4.0, 3.0)), pov),
-    "icl_redwood": Target(IclNuimReader(intrinsics=(10.0, 10.0, 4.0, 3.0)), redwood),
+    "icl_lists": Target(IclNuimReader(camera=(10.0, -10.0, 4.0, 3.0)), icl),
+    "icl_pov": Target(IclNuimReader(camera=(10.0, -10.0, 4.0, 3.0)), pov),
+    "icl_redwood": Target(IclNuimReader(camera=(10.0, 10.0, 4.0, 3.0)), redwood),
     "seven_scenes_split": Target(SevenScenesReader(split="train", colour_camera="kinect"), scene),
     "mcap_ros": Target(McapReader(), mcap_of(CDR)),
     "mcap_protobuf": Target(McapReader(depth_topic="/rvl"), mcap_of(PROTOBUF)),

@@ -67,12 +67,12 @@ def test_inliers_are_those_that_one_motion_explains() -> None:
     first, second = (p[:, :2] / p[:, 2:] for p in (points, moved))
     second[80:] = rng.uniform(-0.4, 0.4, (40, 2))
     cameras = (CAMERA, CAMERA)
-    found = count_inliers(first.astype(np.float32), second.astype(np.float32), cameras, 1.0)
+    found = count_inliers(first.astype(np.float32), second.astype(np.float32), cameras)
     assert 80 <= found <= 90
-    assert found == count_inliers(first.astype(np.float32), second.astype(np.float32), cameras, 1.0)
+    assert found == count_inliers(first.astype(np.float32), second.astype(np.float32), cameras)
     pixels = [(p * 180 + [99.5, 74.5]).astype(np.float32) for p in (first, second)]
-    assert 75 <= count_inliers(*pixels, (None, None), 1.0) <= 95
-    assert count_inliers(pixels[0][:5], pixels[1][:5], (None, None), 1.0) == 0
+    assert 75 <= count_inliers(*pixels, (None, None)) <= 95
+    assert count_inliers(pixels[0][:5], pixels[1][:5], (None, None)) == 0
 
 
 def test_similar_frames_are_spread_over_the_sequence() -> None:

@@ -58,6 +58,9 @@ def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
     assert next_command(Path("my data"), {"frames": 0}, None).split(" --")[0] == "hodge refine trajectory 'my data'"
     command = next_command(Path("in"), {"frames": 3, "frames with depth": 0, "formats": []}, "mine")
     assert command == "hodge run clouds --source in --set source.reader=mine --out runs/in"
+    facts = {"frames": 3, "frames with depth": 3, "formats": []}
+    command = next_command(Path("in"), facts, "tum", ["depth_scale=1000"])
+    assert command == "hodge run tum --source in --set source.reader.depth_scale=1000 --out runs/in"
 
 
 def test_a_sound_sequence_has_no_oddities() -> None:
@@ -92,6 +95,8 @@ def test_an_oddity_is_named(row: int, change: dict[str, Any], expected: str) -> 
 def test_a_wrong_depth_scale_is_suspected() -> None:
     frames = [replace(frame, read_depth=partial(constant_depth, 2000.0)) for frame in walk(3)]
     assert oddities_of(frames) == ["the median depth is 2e+03 m: is the depth scale right?"]
+    near = [replace(frame, read_depth=partial(constant_depth, 0.4)) for frame in frames]
+    assert oddities_of(near) == ["all depth lies within 0.4 m: is this a close-up, or is the depth scale wrong?"]
 
 
 def test_frames_that_cannot_be_read_are_told() -> None:

@@ -68,6 +68,18 @@ def test_odometry_of_a_body_that_nothing_links_to_the_camera(tmp_path: Path) -> 
     np.testing.assert_allclose(told.frames[1].world_from_cam, some_poses(2)[1], atol=1e-9)
 
 
+def test_of_two_robots_the_one_that_carries_the_camera_gives_the_poses(tmp_path: Path) -> None:
+    log, poses = depth_log(some_images(2)), some_poses(4)
+    log.add("/tf_static", "tf2_msgs/msg/TFMessage", transforms((0.0, "b/base_link", OPTICAL, np.eye(4))), CDR)
+    for row, pose in enumerate(poses):
+        name, at = ("b", row - 2) if row >= 2 else ("a", row)
+        message = odometry(100 + at / 10, pose, child=f"{name}/base_link")
+        log.add(f"/{name}/odom", "nav_msgs/msg/Odometry", message, CDR)
+    source = McapReader().open(log.write(tmp_path / "log.mcap"))
+    np.testing.assert_allclose([frame.world_from_cam for frame in source.frames], poses[2:], atol=1e-9)
+    assert "poses of /b/odom taken, not of /a/odom: see option pose_topic" in source.notes
+
+
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_bare_poses_are_of_the_camera(tmp_path: Path, encoding: str) -> None:
     log, poses = depth_log(some_images(3), encoding=encoding), some_poses(3)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hodge_adapters.association import interpolated_poses, nearest_pairs
+from hodge_adapters.images.camera_files import resized
 from hodge_adapters.tum import reader
 from hodge_adapters.tum.image_lists import StampedImages, read_pairs
 from hodge_adapters.tum.reader import TumReader
@@ -81,12 +82,13 @@ def test_the_camera_by_the_folder_name(folder: Path, name: str, expected: float)
     (folder / "intrinsics.txt").unlink()
     renamed = folder.rename(folder.with_name(name))
     source = TumReader().open(renamed)
-    assert source.frames[0].camera.fx == expected
+    assert source.frames[0].camera.fx == pytest.approx(expected * WIDTH / 640)
     assert any("intrinsics " in note and " taken" in note for note in source.notes)
 
 
 def test_the_camera_by_option(folder: Path) -> None:
-    assert TumReader(camera="fr2").open(folder).frames[0].camera == Camera(640, 480, 520.9, 521.0, 325.1, 249.7)
+    fr2 = resized(Camera(640, 480, 520.9, 521.0, 325.1, 249.7), (WIDTH, HEIGHT))
+    assert TumReader(camera="fr2").open(folder).frames[0].camera == fr2
     assert TumReader(camera=(9, 8, 4, 3)).open(folder).frames[0].camera == Camera(WIDTH, HEIGHT, 9, 8, 4, 3)
     (folder / "mine.yaml").write_text(
         "Camera.fx: 7.5\nCamera.fy: 7.5\nCamera.cx: 4\nCamera.cy: 3\nDepthMapFactor: 1000.0\n"
@@ -182,7 +184,10 @@ def test_colour_that_is_absent_or_too_late(folder: Path) -> None:
     assert "1 colour images listed but not there: 10.510000.png" in source.notes
     source = TumReader(max_difference_s=0.005).open(folder)
     assert colour_names(source) == [None] * 3
-    assert "3 depth images have no colour image within 0.005 s" in source.notes
+    assert (
+        "3 of 3 depth images have no colour image within 0.005 s, the nearest is 0.01 s away: set max_difference_s, or "
+        "are they of two clocks?"
+    ) in source.notes
     (folder / "rgb.txt").unlink()
     (folder / "rgb").rename(folder / "elsewhere")
     assert "no rgb.txt: frames have no colour" in TumReader().open(folder).notes
@@ -325,3 +330,20 @@ def test_a_camera_without_distortion_is_not_taken_for_another(tmp_path: Path) ->
     source = TumReader().open(folder)
     assert source.frames[0].camera.fx == 525.0
     assert any("whose cameras fit no better" in note for note in source.notes)
+
+
+@pytest.mark.parametrize("listed", ["lists", "association"])
+def test_stamps_in_nanoseconds(tmp_path: Path, listed: str) -> None:
+    folder = tum_folder(tmp_path / "sequence")
+    rows = {}
+    for name in ("depth", "rgb"):
+        lines = [line.split() for line in (folder / f"{name}.txt").read_text().splitlines() if line[0] != "#"]
+        rows[name] = [f"{1_700_000_000_000_000_000 + round(float(stamp) * 1e9)} {file}" for stamp, file in lines]
+        (folder / f"{name}.txt").write_text("\n".join(rows[name]) + "\n")
+    if listed == "association":
+        lines = [" ".join(pair) for pair in zip(rows["depth"], rows["rgb"], strict=True)]
+        (folder / "associations.txt").write_text("\n".join(lines) + "\n")
+    source = TumReader().open(folder)
+    np.testing.assert_allclose([frame.stamp_s - 1.7e9 for frame in source.frames], [10.0, 10.5, 11.25], atol=1e-6)
+    assert [frame.colour_delay_s for frame in source.frames] == pytest.approx([0.01] * 3, abs=1e-6)
+    assert any("read as nanoseconds" in note for note in source.notes)

@@ -12,7 +12,7 @@ from PIL import Image
 from rerun.chunk import RrdReader
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording import binary, layout, shapes
+from hodge_pipeline.recording import binary, layout, shapes, stream
 from hodge_pipeline.recording.eye import look_at
 from hodge_pipeline.recording.merge import contents_of, find_parts, merge
 from hodge_pipeline.types import CloudSet
@@ -153,3 +153,11 @@ def test_it_opens_on_trajectories_and_edges(tmp_path: Path) -> None:
     pixels = np.asarray(Image.open(tmp_path / "opened.png").convert("RGB"), int)
     for colour in (shapes.TRAJECTORY_COLOURS["odometry"], shapes.RESULT_COLOUR, shapes.IGNORED_COLOUR):
         assert np.count_nonzero(np.abs(pixels - colour).max(axis=-1) < 40) > 20, colour
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_note_that_names_a_file_in_another_encoding_stays(tmp_path: Path) -> None:
+    with stream.writing(tmp_path / "notes.rrd", "run-1") as begun:
+        stream.log_notes(begun, 0, ["depth/\udcff.png: cannot be read"])
+        stream.log_markdown(begun, "/text", "source \udcff")
+    assert RrdReader(tmp_path / "notes.rrd").recordings()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import threading
@@ -167,6 +168,23 @@ def test_the_command_line_or_the_environment_names_the_cluster(
         said = one_line_of(*command, *option, "--out", tmp_path / way, environment=environment)
         assert said.startswith(f"no Dask scheduler answers at '{stranger.address}'")
         assert stranger.calls
+
+
+def test_workers_that_start_elsewhere_find_source_and_run(
+    tiny_sequence: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from distributed import Client, LocalCluster
+
+    monkeypatch.chdir(tiny_sequence.parent)
+    out = os.path.relpath(tmp_path / "run")
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        with Client(cluster) as client:
+            client.run(os.chdir, "/")
+        recipe = load_recipe("demo", SMALL)
+        run = hodge_pipeline.run(recipe, out, source=tiny_sequence.name, dask=cluster.scheduler_address)
+    assert np.isfinite(run.poses).all()
 
 
 def test_a_run_goes_on_with_or_without_the_cluster(run_folder: Path, made: Run) -> None:

@@ -1,5 +1,6 @@
 """The run folder: whose it is, refusal, and the files in it."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,12 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("a file")
     with pytest.raises(WorkspaceError, match="cannot be written"):
         Workspace.open(tmp_path / "run", RECIPE)
+
+
+def test_a_name_that_is_not_utf_8_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="not a name in UTF-8"):
+        Workspace.open(tmp_path / os.fsdecode(b"run\xff"), RECIPE)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:

@@ -24,25 +24,26 @@ def inspect(path: Path, *, reader: str | None, settings: Sequence[str], as_json:
 
         print_json(facts)
         return
-    for name, value in (*facts.items(), ("next", next_command(path, facts, reader))):
+    for name, value in (*facts.items(), ("next", next_command(path, facts, reader, settings))):
         for row, text in enumerate(_rows(value)):
             print(f"{name if row == 0 else '':<30}{text}")
 
 
-def next_command(path: Path, facts: dict[str, Any], reader: str | None) -> str:
-    """What to type next with such a path."""
+def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings: Sequence[str] = ()) -> str:
+    """What to type next with such a path, opened with such `settings` of its reader."""
     if not facts["frames"]:
         if facts.get("graph", {}).get("edges"):
             return command("hodge", "solve", path, "--out", "solved.g2o")
         return command("hodge", "refine", "trajectory", path, "--frames", "DIR", "--out", f"runs/{path.stem}")
     from hodge_pipeline.recipe.recipe_file import recipe_names
 
+    options = [word for setting in settings for word in ("--set", f"source.reader.{setting}")]
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
     recipe = "lidar" if facts.get("scanner") and not reader else {"clouds": "scans"}.get(name, name)
     if recipe in recipe_names():
-        return command("hodge", "run", recipe, "--source", path, "--out", f"runs/{path.stem}")
+        return command("hodge", "run", recipe, "--source", path, *options, "--out", f"runs/{path.stem}")
     recipe = "seven_scenes" if facts["frames with depth"] else "clouds"
-    named = ("--set", f"source.reader={name}", "--out", f"runs/{path.stem}")
+    named = ("--set", f"source.reader={name}", *options, "--out", f"runs/{path.stem}")
     return command("hodge", "run", recipe, "--source", path, *named)
 
 

@@ -15,7 +15,7 @@ from hodge_pipeline.diagnosis.consensus import find_consensus
 from hodge_pipeline.diagnosis.evidence import Evidence, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
-from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.options import CONSISTENT_FROM, WRONG_BELOW, DiagnosisOptions
 from hodge_pipeline.diagnosis.result import (
     CONSISTENT,
     SUSPECT,
@@ -45,10 +45,10 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     check_graph(graph)
     graph = replace(graph, dimension=2) if is_planar(graph) else graph
     if (backbone := find_backbone(graph, options.trust)) is not None:
-        return judged_on_backbone(graph, backbone, options)
+        return judged_on_backbone(graph, backbone)
     found = _by_cycles(graph, options)
     backbone = lattice_backbone(graph, found, options)
-    return found if backbone is None else judged_on_backbone(graph, backbone, options)
+    return found if backbone is None else judged_on_backbone(graph, backbone)
 
 
 def lattice_backbone(graph: ViewGraph, found: Diagnosis, options: DiagnosisOptions) -> Backbone | None:
@@ -75,8 +75,8 @@ def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
     probability = np.where(untestable, np.nan, np.maximum(agreeing, blame.probability))
     undecided = np.where(unvouched | (blame.probability > 0), blame.cycle, -1)
     undecided = np.where(blame.undecided >= 0, blame.undecided, undecided)
-    right = (probability >= options.consistent_from) & fit.used
-    wrong = probability < options.wrong_below
+    right = (probability >= CONSISTENT_FROM) & fit.used
+    wrong = probability < WRONG_BELOW
     verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
     world_from_cam = fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
     cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))

@@ -24,6 +24,8 @@ FEW = 20
 """Edges of a gap at which the usual share of right edges weighs as much as their own."""
 TRIED_FROM = 0.1
 """Share of the far pairs that are joined."""
+CYCLES_PER_EDGE = 64
+"""Triangles kept to an edge, so that memory is bounded."""
 LEAST_DEGREE = 4
 """Mean number of edges at a view."""
 
@@ -141,7 +143,7 @@ class Evidence:
     - `graph`: with the noise as information; `noise` of each edge; `reach_m`: how far overlapping views lie apart.
     - `prior (E,)`: probability of being right by the order of the views; `support (E,)`: how many cycles close over
       the edge, whose edges are likely right; `in_no_listed_cycle (E,)`.
-    - `weight (E,)` of an edge's vote; `cluster_gain` nats for each e-fold of those that agree.
+    - `weight (E,)` of an edge's vote.
     - `exhaustive`: whether registration seems to have been tried on all pairs.
     """
 
@@ -152,7 +154,6 @@ class Evidence:
     support: Floats
     in_no_listed_cycle: Bools
     weight: Floats
-    cluster_gain: float
     exhaustive: bool
 
     def select(self, rows: Ints) -> Evidence:
@@ -167,7 +168,7 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
     prior = order_prior(edges, count) if options.order_prior else np.full(len(edges), 0.5)
     point, reach_m = working_point(graph.i_from_j, prior)
     motions = recentred(graph.i_from_j, point)
-    loops = short_cycles(edges, count, options.max_cycles_per_edge)
+    loops = short_cycles(edges, count, CYCLES_PER_EDGE)
     errors = cycle_errors(loops, motions)
     noise = edge_noise(graph, loops, *errors, prior, reach_m)
     cycles = judge_cycles(loops, *errors, noise, reach_m)
@@ -186,7 +187,7 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
     weight = prior / (1 - prior) * (0.5 + support) / (1 + support)
     weight *= 1 + TIE_BREAK * np.random.default_rng(options.seed).random(len(weight))
     known = replace(graph, i_from_j=motions, information=noise.information)
-    found = Evidence(known, noise, reach_m, prior, support, unlisted, weight, options.cluster_gain, exhaustive)
+    found = Evidence(known, noise, reach_m, prior, support, unlisted, weight, exhaustive)
     return found, cycles, point
 
 

@@ -26,6 +26,9 @@ VOTES_AGREE = 30.0
 HYPOTHESES = 24
 """Votes of a pair of pieces, the weightiest, that are tried as the answer."""
 MOST_PAIRS_TO_A_VOTE = 400
+CLUSTER_GAIN = 2.0
+"""Nats that agreeing edges between two pieces add per e-fold of their number: they are one event, since places that
+look alike give many wrong edges that agree."""
 DRIFT = 0.25
 """Of an edge's variance, for each usual edge length between two votes: pieces are not solved while they grow."""
 
@@ -69,7 +72,7 @@ def _gains(evidence: Evidence, votes: Votes) -> Floats:
     strength = votes.agreement * weight[votes.edge[votes.vote]]
     counted = votes.agreement * np.minimum(1.0, 0.5 + weight[votes.edge[votes.vote]])
     gain: Floats = np.bincount(votes.hypothesis, strength, size).astype(np.float64)
-    gain += evidence.cluster_gain * np.log1p(np.bincount(votes.hypothesis, counted, size))
+    gain += CLUSTER_GAIN * np.log1p(np.bincount(votes.hypothesis, counted, size))
     agreeing = np.bincount(votes.hypothesis, votes.agreement > 0, size)
     suffices: Bools = evidence.in_no_listed_cycle[votes.edge] | (weight[votes.edge] > SINGLE_VOTE_FROM)
     return np.where((agreeing >= 2) | ((agreeing == 1) & suffices), gain, 0.0)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import fundamental_loops, fundamental_products, spanning_forest
 from hodge_pipeline.complex.series import series_classes
-from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.options import WRONG_BELOW
 from hodge_pipeline.diagnosis.resistance import effective_resistance
 from hodge_pipeline.diagnosis.result import (
     CONSISTENT,
@@ -35,7 +35,7 @@ other probability is that of a step which they call wrong.
 """
 
 
-def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisOptions) -> Diagnosis:
+def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
     """The verdicts that follow from a backbone; its own edges are kept, but for steps that are broken."""
     kept = backbone.used
     in_loop = np.zeros(graph.edge_count, bool)
@@ -43,7 +43,7 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone, options: DiagnosisO
     probability = np.where(backbone.steps, np.where(in_loop, RIGHT_STEP, np.nan), backbone.right)
     probability[backbone.steps & ~kept] = 1 - RIGHT_STEP
     untestable = np.isnan(probability)
-    wrong = ~kept & (probability < options.wrong_below) & (backbone.steps | backbone.found.confirmed)
+    wrong = ~kept & (probability < WRONG_BELOW) & (backbone.steps | backbone.found.confirmed)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
     cycles, cycle = _cycles(graph, backbone, in_loop)
     return Diagnosis.of(

@@ -15,6 +15,12 @@ SolveWith: TypeAlias = Literal["all", "kept"]
 """The edges that a round is solved with: all that were accepted, or of these what the diagnosis keeps."""
 
 
+CONSISTENT_FROM = 0.7
+"""Probability from which an edge is consistent: a wrong one kept costs as much as two or three right ones lost."""
+WRONG_BELOW = 0.2
+"""Probability below which an edge is wrong, not suspect."""
+
+
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class DiagnosisOptions:
     """How edges are weighed against each other."""
@@ -25,29 +31,10 @@ class DiagnosisOptions:
         description="edges that are trusted as a backbone: auto learns from the graph whether consecutive edges are "
         "one; sequential trusts these, none no edge; any other word the edges that come from it (`proposed_by`)",
     )
-    cluster_gain: float = Field(
-        default=2.0,
-        ge=0,
-        description="nats that agreeing edges between two pieces add per e-fold of their number: they are one event, "
-        "since places that look alike give many wrong edges that agree",
-    )
     order_prior: bool = Field(
         default=True,
         description="learn from the graph whether vertices that are near in order are more often joined, and expect "
         "such edges to be right more often; none is trusted",
-    )
-    max_cycles_per_edge: int = Field(
-        default=64, gt=0, description="triangles kept to an edge, so that memory is bounded"
-    )
-    consistent_from: float = Field(
-        default=0.7,
-        gt=0,
-        lt=1,
-        description="probability from which an edge is consistent: with 0.7 a wrong edge that is kept costs as much as "
-        "two or three right ones that are lost",
-    )
-    wrong_below: float = Field(
-        default=0.2, gt=0, lt=1, description="probability below which an edge is wrong, not suspect"
     )
     seed: int = Field(default=0, ge=0, description="of the order in which edges that weigh the same are tried")
 

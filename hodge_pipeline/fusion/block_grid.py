@@ -32,6 +32,10 @@ def blocks_within(memory_limit_mb: float) -> int:
     return max(1, int(memory_limit_mb * 1e6 / (BLOCK_SIDE**3 * BYTES_A_VOXEL * GROWTH_COPIES)))
 
 
+TRUNCATION_VOXELS = 4.0
+"""How far from the surface a distance is kept; must exceed depth noise and drift."""
+
+
 class BlockGrid:
     """Integrates depth images; `max_blocks` bounds it, `GridFull` is raised before it is passed.
 
@@ -42,13 +46,12 @@ class BlockGrid:
     def __init__(
         self,
         voxel_m: float,
-        truncation_voxels: float,
         max_depth_m: float,
         max_blocks: int,
         colour: bool,
         box: Box | None = None,
     ) -> None:
-        self.truncation_voxels, self.max_depth_m, self.max_blocks = truncation_voxels, max_depth_m, max_blocks
+        self.max_depth_m, self.max_blocks = max_depth_m, max_blocks
         self.voxel_m, self.box = voxel_m, box
         self.colour, self.views, self.coloured = colour, 0, 0
         float32 = o3d.core.float32
@@ -72,7 +75,7 @@ class BlockGrid:
         if not self._reaches(depth_m):
             return False
         depth = o3d.t.geometry.Image(_tensor(depth_m, np.float32))
-        pose, reach = _tensor(se3.inverse(world_from_cam), np.float64), (self.max_depth_m, self.truncation_voxels)
+        pose, reach = _tensor(se3.inverse(world_from_cam), np.float64), (self.max_depth_m, TRUNCATION_VOXELS)
         blocks = self._touched(depth, camera, pose)
         if self.box is not None:
             blocks = blocks[_tensor(self.box.around.holds(blocks.numpy()), bool)]
@@ -105,7 +108,7 @@ class BlockGrid:
             cam_from_world,
             depth_scale=1.0,
             depth_max=self.max_depth_m,
-            trunc_voxel_multiplier=self.truncation_voxels,
+            trunc_voxel_multiplier=TRUNCATION_VOXELS,
         )
 
     def _reaches(self, depth_m: Floats32) -> bool:

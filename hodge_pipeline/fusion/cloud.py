@@ -27,9 +27,6 @@ class CloudFuser:
     stride: int = Field(2, ge=1, description="pixels: only each such row and column of a depth image is taken")
     min_depth_m: float = Field(0.2, ge=0, description="metres: measurements nearer than this are ignored")
     max_depth_m: float = Field(6.0, gt=0, description="metres: depth measurements beyond are ignored as too noisy")
-    min_points: int = Field(
-        1, ge=1, description="points: a cube with fewer is left out; 3 removes most flying pixels of a depth camera"
-    )
     every: int = Field(1, ge=1, description="frames: only each such frame is fused; a long sequence needs fewer")
     max_points: int = Field(
         3_000_000,
@@ -52,7 +49,7 @@ class CloudFuser:
                 far += self._add(cloud, frame, pose, skipped)
             advance(1)
         advance(len(frames) - len(views))
-        points, normals, colours = cloud.points(self.min_points)
+        points, normals, colours = cloud.points()
         return Model(
             name="cloud",
             points_in_world=points,

@@ -44,9 +44,6 @@ class TsdfFuser:
     voxel_m: float = Field(
         0.02, gt=0, description="metres: side of a voxel; 0.02 is near the noise of a depth camera in a room"
     )
-    truncation_voxels: float = Field(
-        4.0, ge=1, description="voxels: how far from the surface a distance is kept; must exceed depth noise and drift"
-    )
     max_depth_m: float = Field(6.0, gt=0, description="metres: measurements beyond are ignored as too noisy")
     min_weight: float = Field(
         3.0,
@@ -130,7 +127,7 @@ class TsdfFuser:
     def _grid(self, voxel_m: float, views: Views, box: Box | None) -> BlockGrid:
         colour = self.colour and any(frame.read_colour for frame, _ in views)
         limit = blocks_within(self.memory_limit_mb)
-        return BlockGrid(voxel_m, self.truncation_voxels, self.max_depth_m, limit, colour, box)
+        return BlockGrid(voxel_m, self.max_depth_m, limit, colour, box)
 
     def _touched(self, grid: BlockGrid, views: Views, skipped: Skipped, progress: _Progress) -> tuple[Ints, Ints]:
         """All blocks (M, 3), and each view's least and largest one (V, 2, 3), of one that has none the other way."""

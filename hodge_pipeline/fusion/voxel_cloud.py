@@ -45,10 +45,10 @@ class VoxelCloud:
             self._merge()
         return int((~near).sum())
 
-    def points(self, min_count: int) -> tuple[Floats32, Floats32, Bytes]:
-        """The mean position, unit normal (0 where none was given) and colour of each voxel of `min_count` points."""
+    def points(self) -> tuple[Floats32, Floats32, Bytes]:
+        """The mean position, unit normal (0 where none was given) and colour of each voxel."""
         self._merge()
-        sums = self._sums[self._sums[:, COUNT] >= min_count]
+        sums = self._sums
         count = sums[:, COUNT, None]
         origin = np.zeros(3) if self.origin is None else self.origin
         length = np.linalg.norm(sums[:, NORMAL], axis=1, keepdims=True)

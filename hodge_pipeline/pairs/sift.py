@@ -48,7 +48,6 @@ class SiftEdges:
     ratio: float = Field(
         0.8, gt=0, le=1, description="a match is this much nearer than the second nearest (Lowe 2004: 0.8)"
     )
-    max_error_px: float = Field(1.5, gt=0, description="pixels from the epipolar line, for a match to be an inlier")
     seed: int = Field(0, ge=0, description="of the vocabulary's sample; the same seed gives the same pairs")
 
     def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
@@ -110,7 +109,7 @@ def _matched(options: SiftEdges, same: _Same, features: Features) -> Edges:
         if len(matches) > options.min_inliers:
             points_i, points_j = features.points(i)[matches[:, 0]], features.points(j)[matches[:, 1]]
             cameras = same.frames[i].camera, same.frames[j].camera
-            inliers = count_inliers(points_i, points_j, cameras, options.max_error_px)
+            inliers = count_inliers(points_i, points_j, cameras)
         accepted = inliers > options.min_inliers
         name_i, name_j = same.frames[i].frame_id, same.frames[j].frame_id
         log.log(

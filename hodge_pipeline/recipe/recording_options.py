@@ -34,9 +34,6 @@ class RecordingOptions:
         ge=0,
         description="points of all frames' clouds together; more says little beside the fused model",
     )
-    model_points: int = Field(
-        default=250_000, ge=1, description="points or mesh vertices of the fused model; a laptop's viewer stays fluid"
-    )
     edge_lines: int = Field(
         default=20_000, ge=1, description="lines in one picture of the graph; more is a solid block"
     )

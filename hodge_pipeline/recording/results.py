@@ -15,6 +15,8 @@ from hodge_pipeline.types import Floats, Frame, Model
 VERTEX_BYTES = 28
 """A vertex with normal and colour; a triangle has `TRIANGLE_BYTES`, and there are about two for each vertex."""
 TRIANGLE_BYTES = 12
+MODEL_POINTS = 250_000
+"""Points or vertices of the fused model; a laptop's viewer stays fluid."""
 POINT_RADIUS = -1.2
 """Negative: points on the screen."""
 
@@ -25,7 +27,7 @@ def log_model(
     """Log the fused scene as a static mesh or point cloud; gives notes of what was thinned."""
     available = len(model.points_in_world)
     bytes_each = VERTEX_BYTES + (0 if model.triangles is None else 2 * TRIANGLE_BYTES)
-    kept = options.count(options.model_points, available, bytes_each, options.max_bytes("model"))
+    kept = options.count(MODEL_POINTS, available, bytes_each, options.max_bytes("model"))
     thin = shapes.thin_model(model, max(kept, 1))
     if thin.triangles is None or not len(thin.triangles):
         colours = shapes.or_grey(thin.colours, len(thin.points_in_world))

@@ -114,10 +114,15 @@ def log_notes(stream: rr.RecordingStream, slot: int, notes: Iterable[str], level
     for note in notes:
         stream.set_time(layout.STORY, duration=layout.SLOT_S * slot)
         stream.set_time(layout.STAGE, sequence=slot)
-        stream.log(layout.LOG, rr.TextLog(note, level=level))
+        stream.log(layout.LOG, rr.TextLog(_utf8(note), level=level))
     stream.reset_time()
+
+
+def _utf8(text: str) -> str:
+    """The text with what is not UTF-8, as in names of other systems, written out."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def log_markdown(stream: rr.RecordingStream, path: str, text: str) -> None:
     """A text that is there at every time."""
-    stream.log(path, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+    stream.log(path, rr.TextDocument(_utf8(text), media_type=rr.MediaType.MARKDOWN), static=True)

@@ -236,7 +236,8 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
             colours, blank = image[v, u], is_blank(image)
         except (SourceError, OSError) as error:
             odd = Oddity(frame.frame_id, "its cloud has no colours", str(error))
-    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd, blank=blank)
+    why_none = "" if len(rows) else _out_of_range(z, "depth_scale", options)
+    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd, why_none, blank)
 
 
 def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
@@ -266,20 +267,25 @@ def out_of_range(cloud: PointCloud, options: CloudOptions) -> str:
     from far away.
     """
     ranges = _ranges(cloud)
-    finite = ranges[np.isfinite(ranges) & (ranges > 0)]
-    if not len(finite):
-        return "there is no point in it"
-    usual = float(np.median(finite))
-    limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
-    points = cloud.points_in_cam[np.isfinite(ranges) & (ranges > 0)]
-    spread_m = float(np.ptp(np.quantile(points, (0.05, 0.95), axis=0), axis=0).max())
+    finite = np.isfinite(ranges) & (ranges > 0)
+    points, usual = cloud.points_in_cam[finite], float(np.median(ranges[finite])) if finite.any() else 0.0
+    spread_m = float(np.ptp(np.quantile(points, (0.05, 0.95), axis=0), axis=0).max()) if finite.any() else 0.0
     if usual > max(options.max_range_m, MAP_AWAY * spread_m):
         rounding_m = float(np.spacing(np.float32(usual)))
         return (
             f"its points lie {usual:.3g} m away, all near each other: map coordinates? Subtract one corner from all "
             f"scans, in double precision, and write them again: float32 rounds them to {rounding_m:.2g} m there"
         )
-    unit = " (millimetres? then source.reader.units_per_metre=1000)" if usual > options.max_range_m else ""
+    return _out_of_range(ranges, "units_per_metre", options)
+
+
+def _out_of_range(ranges: Floats32, option: str, options: CloudOptions) -> str:
+    finite = ranges[np.isfinite(ranges) & (ranges > 0)]
+    if not len(finite):
+        return "there is no point in it"
+    usual = float(np.median(finite))
+    limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
+    unit = f" (millimetres? then source.reader.{option}=1000)" if usual > options.max_range_m else ""
     return f"its points lie {usual:.3g} m away, in range are {limits}{unit}"
 
 

@@ -71,7 +71,6 @@ class FpfhRansac:
     """open3d's RANSAC over FPFH matches, at its default settings."""
 
     voxel_m: float = Field(default=0.05, gt=0, description=_VOXEL)
-    mutual: bool = Field(default=False, description="whether matches are each other's nearest; open3d's default is not")
     max_iterations: int = Field(default=100_000, ge=1, description="draws at most; open3d's default")
     seed: int = Field(default=0, ge=0, description="of the draws")
 
@@ -85,7 +84,7 @@ class FpfhRansac:
         def register(methods: Any, *clouds: Any) -> Any:
             within_m = TOLERANCE_VOXELS * self.voxel_m
             return methods.registration_ransac_based_on_feature_matching(
-                *clouds, self.mutual, within_m, methods.TransformationEstimationPointToPoint(False), 3,
+                *clouds, False, within_m, methods.TransformationEstimationPointToPoint(False), 3,
                 [
                     methods.CorrespondenceCheckerBasedOnEdgeLength(0.9),
                     methods.CorrespondenceCheckerBasedOnDistance(within_m),

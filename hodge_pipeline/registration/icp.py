@@ -58,13 +58,14 @@ class PointToPlaneIcp:
         )
 
 
+GEOMETRIC_SHARE = 0.968
+"""Weight of geometry against colour; open3d's and the authors' own value."""
+
+
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class ColouredIcp(PointToPlaneIcp):
     """Coloured ICP: holds on to texture where the surfaces alone would slide; geometry alone without colours."""
 
-    geometric_share: float = Field(
-        default=0.968, ge=0, le=1, description="Weight of geometry against colour; open3d's and the authors' own value."
-    )
     min_distance_m: float = Field(
         default=0.1,
         gt=0,
@@ -80,6 +81,6 @@ class ColouredIcp(PointToPlaneIcp):
             target.geometry,
             max(distance_m, self.min_distance_m),
             guess,
-            o3d_registration.TransformationEstimationForColoredICP(lambda_geometric=self.geometric_share),
+            o3d_registration.TransformationEstimationForColoredICP(lambda_geometric=GEOMETRIC_SHARE),
             o3d_registration.ICPConvergenceCriteria(max_iteration=self.max_iterations),
         )

@@ -24,6 +24,9 @@ from hodge_pipeline.registration.visual import VisualMotion, visual_motion
 from hodge_pipeline.types import Floats, Ints, Landmarks, PointCloud, Registration
 
 ASSESSED_POINTS = 1000
+MATCHES_PER_SAMPLE = 75.0
+"""Matches that count as one independent measurement: they share the errors of lens, shutter and the delay between depth
+and colour. Calibrated on real pairs, as `points_per_sample`."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -65,12 +68,6 @@ class Rgbd:
     assessed_within_m: float = Field(
         default=0.05, gt=0, description="metres: points of j this near to one of i count in the fitness of landmarks"
     )
-    matches_per_sample: float = Field(
-        default=75.0,
-        gt=0,
-        description="matches that count as one independent measurement: they share the errors of lens, shutter and "
-        "the delay between depth and colour. Calibrated on real pairs, as points_per_sample",
-    )
     seed: int = Field(default=0, ge=0, description="of the consensus; the recipe's seed, where none is given")
 
     def prepare(self, cloud: PointCloud) -> PreparedFrame:
@@ -95,7 +92,7 @@ class Rgbd:
         i, j = pairs.T
         pixels_rad = target.pixel_rad[i], source.pixel_rad[j]
         found = visual_motion(target.landmarks[i], source.landmarks[j], pixels_rad, self.seed)
-        return found and replace(found, information=found.information / self.matches_per_sample)
+        return found and replace(found, information=found.information / MATCHES_PER_SAMPLE)
 
     def _suffices(self, visual: VisualMotion | None) -> bool:
         return visual is not None and visual.inliers >= self.min_inliers

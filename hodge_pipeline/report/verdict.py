@@ -224,7 +224,7 @@ def _other_scale(report: Report) -> Iterator[Note]:
     scale = float(np.sum(x * y) / max(np.sum(x * x), np.finfo(float).tiny))
     explained = np.sum((scale * x - y) ** 2) < EXPLAINED**2 * np.sum((x - y) ** 2)
     if explained and (scale > OTHER_SCALE or 0 < scale < 1 / OTHER_SCALE):
-        yield Note("other scale", detail=f"{scale:.2g}")
+        yield Note("other scale", detail=f"{float(f'{scale:.2g}'):g}")
 
 
 def _path_m(positions: Floats) -> float:

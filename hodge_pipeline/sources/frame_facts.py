@@ -25,6 +25,8 @@ SECTORS, ALL_ROUND = 36, 0.9
 MOSTLY_EMPTY = 0.9
 PLAUSIBLE_DEPTH_M = (0.1, 30.0)
 """The median depth of a scene; outside, the scale is probably wrong."""
+NEAR_M = 1.3
+"""Where the depth of a room, in millimetres but read as TUM's 5000 to the metre, ends: 6.5 m."""
 
 
 def frame_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
@@ -160,6 +162,8 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
     median = float(np.median(valid)) if len(valid) else None
     if median is not None and not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
         oddities.append(f"the median depth is {median:.3g} m: is the depth scale right?")
+    elif median is not None and valid.max() < NEAR_M and with_depth[0].read_depth is not None:
+        oddities.append(f"all depth lies within {valid.max():.2g} m: is this a close-up, or is the depth scale wrong?")
     return {
         "frames looked into": len(depths),
         "depth range in metres": [float(valid.min()), float(valid.max())] if len(valid) else None,

@@ -32,7 +32,7 @@ def remembered(source: Source, reader: FrameReader | None, steps: Steps, prints:
 
     A source that no reader opened is in memory and cannot be told from its like: no other run has its key.
     """
-    files = [(str(path), *found) for path, found in prints.items()]
+    files = [(str(path.absolute()), *found) for path, found in prints.items()]
     steps.remember(source, uuid.uuid4().hex if reader is None else steps.key([files, reader]))
     return source
 

@@ -69,8 +69,11 @@ class Workspace:
         if os.path.lexists(folder / RECIPE_FILE):
             _refuse_irregular(folder)
         try:
+            str(folder.absolute()).encode()
             folder.mkdir(parents=True, exist_ok=True)
             lock = _open_lock(folder)
+        except UnicodeEncodeError as error:
+            raise WorkspaceError(f"{folder}: not a name in UTF-8, which recordings need: give another --out") from error
         except OSError as error:
             raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): give another --out") from error
         try:

@@ -75,7 +75,8 @@ WORDING: dict[str, tuple[Rank, str]] = {
     "other scale": (
         Rank.DOUBT,
         "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
-        "source.reader.depth_scale), or with another camera's focal length.",
+        "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not of "
+        "the camera.",
     ),
     "clock": (
         Rank.LOOK,

@@ -51,7 +51,7 @@ def run(
     opened = source if isinstance(source, Source) else None
     if source is not None:
         recipe = with_source(recipe, Path(source.path if isinstance(source, Source) else source))
-    folder = Path(out)
+    folder = _for_workers(Path(out), dask)
     with (
         Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace,
         disk_errors(folder),
@@ -61,6 +61,11 @@ def run(
         return _Run(recipe, workspace.folder, store, live, dask, opened, strict=strict).finished()
 
 
+def _for_workers(path: Path, dask: str | None) -> Path:
+    """The path as the workers of a cluster must be told it, which start from folders of their own."""
+    return path.absolute() if dask else path
+
+
 @plugin_errors()
 def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str | None = None) -> Run:
     """Solve and fuse a finished run once more, with the edits in its folder, and bring all that it left up to date.
@@ -68,7 +73,7 @@ def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str
     Nothing is registered and no score is measured again: `run` with the same recipe does that. `dask` is as of `run`.
     Raises `HodgeError`.
     """
-    folder = Path(folder)
+    folder = _for_workers(Path(folder), dask)
     listed_edges(folder)
     check_layout(folder)
     recipe = load_recipe(str(folder / RECIPE_FILE))
@@ -108,6 +113,7 @@ class _Run:
         path = self.recipe.source.path
         if path is None:
             raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
+        path = _for_workers(path, self.dask)
         source, reader = (
             (self.opened, None) if self.opened else open_with_reader(path, self.recipe.source.reader, recipe_names())
         )

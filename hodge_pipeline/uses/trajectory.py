@@ -105,7 +105,7 @@ def refine_trajectory(
 
 
 def _source(frames: Path | str | Sequence[Frame], poses: Floats) -> Source:
-    opened = guess_reader(Path(frames)).open(Path(frames)) if isinstance(frames, (str, Path)) else None
+    opened = guess_reader(Path(frames)).open(Path(frames).absolute()) if isinstance(frames, (str, Path)) else None
     listed = (
         tuple(frames) if opened is None and not isinstance(frames, (str, Path)) else opened.frames if opened else ()
     )

@@ -62,7 +62,7 @@ def pov_frames(
         frame for frame in frames if frame.world_from_cam is not None and abs(frame.world_from_cam[:3, 3]).max() > 50
     ]
     if far:
-        notes.append("positions beyond 50 m: are the files in centimetres? then set units_per_metre to 100")
+        notes.append("positions beyond 50 m: are the files in centimetres? then set depth_scale to 100")
     return frames, tuple(files)
 
 

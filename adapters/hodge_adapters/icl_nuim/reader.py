@@ -15,9 +15,10 @@ from hodge_adapters.association import interpolated_poses
 from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
 from hodge_adapters.icl_nuim.redwood import find_log, is_redwood, list_images
 from hodge_adapters.images import pixels
-from hodge_adapters.images.camera_files import Intrinsics, checked
+from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.frames import image_frame
 from hodge_adapters.posed import posed_frames
+from hodge_adapters.seven_scenes.files import FrameFiles, read_poses
 from hodge_adapters.text_rows import first_text
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_adapters.trajectories.text import parse_tum
@@ -38,11 +39,12 @@ SNIFFED_BYTES = 1 << 16
 class IclNuimReader:
     """Reads a folder of any of the three layouts, or a `.gt.freiburg` file alone."""
 
-    intrinsics: tuple[float, float, float, float] | None = Field(
+    camera: tuple[float, float, float, float] | None = Field(
         None,
-        description="fx fy cx cy in pixels; none: 481.2 -480 319.5 239.5, for Redwood's layout 525 525 319.5 239.5",
+        description="fx fy cx cy in pixels; none: 481.2 -480 319.5 239.5; for Redwood's layout those of "
+        "a camera file in the folder, else 525 525 319.5 239.5",
     )
-    units_per_metre: float | None = Field(
+    depth_scale: float | None = Field(
         None,
         gt=0,
         description="stored units per metre; none: 5000 (TUM-like), 1 (POV-Ray, positions too), 1000 (Redwood)",
@@ -97,7 +99,7 @@ class IclNuimReader:
         )
 
     def _camera(self, default: Intrinsics) -> Intrinsics:
-        return checked(Intrinsics(*self.intrinsics), "option intrinsics") if self.intrinsics else default
+        return checked(Intrinsics(*self.camera), "option camera") if self.camera else default
 
     def _open_lists(self, path: Path) -> Source:
         notes: list[str] = []
@@ -120,14 +122,22 @@ class IclNuimReader:
         without = int(np.isnan(poses[:, 0, 0]).sum())
         if without:
             notes.append(f"{without} of {len(poses)} frames have no truth")
-        frames = self._frames(listing, ICL, poses, 5000.0, is_true=True)
+        frames = self._frames(listing, ICL, poses, 5000.0, notes, is_true=True)
         files = (*listing.files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour))
         return Source(path.resolve().name, path, frames, trajectory, notes=tuple(notes), files=files)
 
     def _frames(
-        self, listing: StampedImages, default: Intrinsics, poses: Floats, units_per_metre: float, *, is_true: bool
+        self,
+        listing: StampedImages,
+        default: Intrinsics,
+        poses: Floats,
+        units_per_metre: float,
+        notes: list[str],
+        *,
+        is_true: bool,
     ) -> tuple[Frame, ...]:
-        camera = self._camera(default).camera(pixels.common_size(listing.depth))
+        camera = self._camera(default).camera_of(listing.depth, notes)
+        colour_size = pixels.colour_size(listing.colour, (camera.width, camera.height), notes)
         ids = frame_ids(listing.stamps_s)
         return tuple(
             image_frame(
@@ -136,9 +146,10 @@ class IclNuimReader:
                 camera,
                 listing.depth[row],
                 listing.colour[row],
-                units_per_metre=self.units_per_metre or units_per_metre,
+                units_per_metre=self.depth_scale or units_per_metre,
                 world_from_cam=poses[row],
                 is_true=is_true,
+                colour_size=colour_size,
             )
             for row in range(0, len(ids), self.every)
         )
@@ -146,26 +157,42 @@ class IclNuimReader:
     def _open_pov(self, path: Path, pov: dict[int, Path]) -> Source:
         notes: list[str] = []
         colours = [file for file in (depth.with_suffix(".png") for depth in pov.values()) if file.is_file()]
-        camera = self._camera(ICL).camera(pixels.common_size(colours) if colours else (640, 480))
-        frames, files = pov_frames(pov, camera, self.units_per_metre or 1.0, notes)
+        own = self._camera(ICL)
+        camera = own.camera_of(colours, notes) if colours else own.camera((640, 480))
+        frames, files = pov_frames(pov, camera, self.depth_scale or 1.0, notes)
         every = tuple(frames[:: self.every])
         return Source(path.resolve().name, path, every, posed_frames(frames), notes=tuple(notes), files=files)
 
     def _open_redwood(self, path: Path) -> Source:
         notes: list[str] = []
         listing = list_images(path, notes)
-        log = find_log(path)
-        estimates = read_log_file(log).poses if log else {}
-        if log:
-            notes.append(f"poses from {log.relative_to(path)}: an estimate of another program, not the truth")
-        none = np.full((4, 4), np.nan)
-        poses = np.array([estimates.get(number, none) for number in frame_ids(listing.stamps_s)])
-        without = int(np.isnan(poses[:, 0, 0]).sum())
-        if log and without:
-            notes.append(f"{without} of {len(poses)} frames have no pose in it")
-        frames = self._frames(listing, REDWOOD, poses, 1000.0, is_true=False)
-        files = (*filter(None, [log]), *listing.depth, *filter(None, listing.colour))
+        poses, log = _estimated(path, frame_ids(listing.stamps_s), notes)
+        own = None if self.camera else find_camera_file(path)
+        if own:
+            notes.append(f"intrinsics from {own.relative_to(path)}")
+        default = read_intrinsics(own) if own else REDWOOD
+        frames = self._frames(listing, default, poses, 1000.0, notes, is_true=False)
+        files = (*filter(None, [log, own]), *listing.depth, *filter(None, listing.colour))
         return Source(path.resolve().name, path, frames, notes=tuple(notes), files=files)
+
+
+def _estimated(path: Path, numbers: list[int], notes: list[str]) -> tuple[Floats, Path | None]:
+    """Poses (N, 4, 4) of these frames by `trajectory.log`, or by `pose/0.txt`, … as ScanNet has them; NaN where there
+    is none. The log, where there is one.
+    """
+    log, folder = find_log(path), path / "pose"
+    if log is None and not folder.is_dir():
+        return np.full((len(numbers), 4, 4), np.nan), None
+    notes.append(f"poses from {(log or folder).relative_to(path)}: an estimate of another program, not the truth")
+    if log is None:
+        files = [FrameFiles(folder.name, number, 0, {"pose": folder / f"{number}.txt"}) for number in numbers]
+        return read_poses(files, notes), None
+    estimates = read_log_file(log).poses
+    poses = np.array([estimates.get(number, np.full((4, 4), np.nan)) for number in numbers])
+    without = int(np.isnan(poses[:, 0, 0]).sum())
+    if without:
+        notes.append(f"{without} of {len(poses)} frames have no pose in it")
+    return poses, log
 
 
 def _find_truth(folder: Path) -> Path | None:

@@ -5,15 +5,32 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from hodge_adapters.images.pixels import common_size, same_shape
 from hodge_adapters.text_rows import read_rows, read_text, to_floats
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera
 
 _ENTRY = re.compile(r"^\s*\"?(?:Camera\d?\.)?(\w+)\"?\s*[:=]\s*([-+0-9.eE]+)\s*[,;]?\s*(?:#.*)?$", re.MULTILINE)
 _DISTORTION = ("k1", "k2", "k3", "p1", "p2")
+CAMERA_FILES = (
+    "intrinsics.txt",
+    "camera-intrinsics.txt",
+    "camera.yaml",
+    "camera.txt",
+    "calibration.yaml",
+    "calibration.txt",
+    "camera_intrinsic.json",
+    "intrinsic/intrinsic_depth.txt",
+    "info.txt",
+    "TUM1.yaml",
+    "TUM2.yaml",
+    "TUM3.yaml",
+)
+"""The last but three as ScanNet exports it, then BundleFusion's."""
 LONGEST_READOUT_S = 1.0
 """Of a rolling shutter: slower cameras give no video."""
 _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"
@@ -42,15 +59,53 @@ class Intrinsics:
         width, height = self.size or size
         return Camera(width, height, self.fx, self.fy, self.cx, self.cy, self.readout_s)
 
+    def camera_of(self, images: Sequence[Path], notes: list[str]) -> Camera:
+        """The camera of these images: intrinsics of another size are scaled, which is noted, where the shape is the
+        same. Raises `SourceError` where it is not.
+        """
+        size = common_size(images)
+        told = self.camera(size)
+        if not same_shape((told.width, told.height), size):
+            raise SourceError(
+                f"{images[0].parent}: images of {size[0]}x{size[1]}, but intrinsics of {told.width}x{told.height}: "
+                "give those of your camera with --set source.reader.camera=[fx,fy,cx,cy]"
+            )
+        if (told.width, told.height) != size:
+            notes.append(f"intrinsics of {told.width}x{told.height} are scaled to the images' {size[0]}x{size[1]}")
+        camera = resized(told, size)
+        notes.extend(filter(None, [fit_note(camera)]))
+        return camera
+
+
+def find_camera_file(folder: Path) -> Path | None:
+    """The camera file of a folder, by its usual names."""
+    return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+
+
+def resized(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The camera of the same view in images of this (width, height)."""
+    across, down = size[0] / camera.width, size[1] / camera.height
+    return replace(
+        camera,
+        width=size[0],
+        height=size[1],
+        fx=camera.fx * across,
+        fy=camera.fy * down,
+        cx=(camera.cx + 0.5) * across - 0.5,
+        cy=(camera.cy + 0.5) * down - 0.5,
+    )
+
 
 def read_intrinsics(path: Path) -> Intrinsics:
     """The intrinsics in a file: one line `fx fy cx cy [width height]`, a 3x3 or 4x4 matrix K, `fx: …` lines as in
-    ORB-SLAM's YAML (with `readout_s: …` for a rolling shutter), or Open3D's JSON.
+    ORB-SLAM's YAML (with `readout_s: …` for a rolling shutter), Open3D's JSON, or BundleFusion's `info.txt`.
 
     Raises `SourceError` for anything else, and for numbers that are no camera.
     """
     text = read_text(path)
-    found = _from_json(text) if path.suffix == ".json" else _from_entries(text) or _from_numbers(path)
+    found = (
+        _from_json(text) if path.suffix == ".json" else _from_info(text) or _from_entries(text) or _from_numbers(path)
+    )
     if found is None:
         raise SourceError(f"{path}: no intrinsics found: write {_SUPPORTED}")
     return checked(found, str(path))
@@ -89,6 +144,15 @@ def _from_numbers(path: Path) -> Intrinsics | None:
         k = [row for row in rows if row]
         return Intrinsics(k[0][0], k[1][1], k[0][2], k[1][2])
     return None
+
+
+def _from_info(text: str) -> Intrinsics | None:
+    """BundleFusion's `m_name = values`: of depth, whose matrix is 4x4 by rows."""
+    values = {name: to_floats(rest.split()) or [] for name, rest in re.findall(r"m_(\w+) = (.*)", text)}
+    k, size = values.get("calibrationDepthIntrinsic", []), (values.get("depthWidth"), values.get("depthHeight"))
+    if len(k) != 16 or not size[0] or not size[1]:
+        return None
+    return Intrinsics(k[0], k[5], k[2], k[6], (int(size[0][0]), int(size[1][0])))
 
 
 def _from_entries(text: str) -> Intrinsics | None:

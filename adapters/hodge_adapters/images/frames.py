@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.images import pixels
+from hodge_adapters.images.camera_files import resized
 from hodge_adapters.images.lens import (
     Lens,
+    encoded_colour,
     encoded_straight_colour,
     encoded_straight_depth,
     straight_colour,
@@ -34,10 +36,12 @@ def image_frame(
     sequence: str = "",
     lens: Lens | None = None,
     colour_delay_s: float = 0.0,
+    colour_size: tuple[int, int] | None = None,
 ) -> Frame:
     """A frame that reads its images when asked, and then refuses those of another size than the camera.
 
-    With a lens they are bent straight first. A pose (4, 4) that is not finite means none; `is_true` says that it is
+    With a lens they are bent straight first. Colour files of another size (`colour_size`) but the camera's shape are
+    brought to its size. A pose (4, 4) that is not finite means none; `is_true` says that it is
     a benchmark's.
     """
     pose = world_from_cam if np.isfinite(world_from_cam).all() else None
@@ -49,8 +53,8 @@ def image_frame(
         read_depth=partial(pixels.read_depth, depth, units_per_metre=units_per_metre, no_depth=no_depth, size=size),
         read_colour=partial(pixels.read_colour, colour, size=size) if colour else None,
         encoded_depth=partial(pixels.encoded, depth, units_per_metre=units_per_metre),
-        encoded_colour=partial(pixels.encoded, colour) if colour else None,
-        image=None if colour is None else _image_file(colour, camera, lens),
+        encoded_colour=partial(encoded_colour, colour, size) if colour else None,
+        image=None if colour is None else _image_file(colour, resized(camera, colour_size or size), lens),
         world_from_cam=pose,
         true_world_from_cam=pose if is_true else None,
         sequence=sequence,

@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 
+from hodge_adapters.images import pixels
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, Camera, EncodedImage, Floats32
 
@@ -60,8 +62,18 @@ def encoded_straight_depth(read: Callable[[], Floats32], lens: Lens, units_per_m
 
 def encoded_straight_colour(read: Callable[[], Bytes], lens: Lens) -> EncodedImage:
     """The straight colour image as JPEG."""
-    image = cv2.cvtColor(straight_colour(read, lens), cv2.COLOR_RGB2BGR)
-    return EncodedImage(_encoded(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]), "image/jpeg")
+    return _jpeg(straight_colour(read, lens))
+
+
+def encoded_colour(path: Path, size: tuple[int, int]) -> EncodedImage:
+    """The file's bytes untouched where it has the camera's (width, height), else the image of that size as JPEG."""
+    fits = pixels.image_size(path) == size
+    return pixels.encoded(path) if fits else _jpeg(pixels.read_colour(path, size=size))
+
+
+def _jpeg(image: Bytes) -> EncodedImage:
+    contents = _encoded(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return EncodedImage(contents, "image/jpeg")
 
 
 def _encoded(kind: str, image: Any, options: list[int]) -> bytes:

@@ -21,6 +21,8 @@ from hodge_pipeline.types.input_files import open_input, read_input
 
 HEADER_BYTES = 1 << 16
 """Where an image's size is looked for: room for the thumbnail that may precede it."""
+SAME_SHAPE = 0.01
+"""By which the ratio of the sides may differ: ScanNet's colour, 1296x968, and depth, 640x480, differ by 0.4 %."""
 MAX_IMAGE_BYTES = 1 << 29
 """Twice what 64 megapixels of 16-bit depth and their rows' heads take uncompressed."""
 
@@ -50,12 +52,18 @@ def read_depth(
 
 
 def read_colour(path: Path, *, size: tuple[int, int] | None = None) -> Bytes:
-    """Colour (H, W, 3) uint8 RGB. Raises `SourceError` as `read_depth` does."""
-    return np.asarray(cv2.cvtColor(_decoded(path, size, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
+    """Colour (H, W, 3) uint8 RGB; where it has the camera's shape in another size, brought to the camera's.
+
+    Raises `SourceError` as `read_depth` does.
+    """
+    stored = _decoded(path, size, cv2.IMREAD_COLOR, any_scale=True)
+    if size is not None and stored.shape[1::-1] != size:
+        stored = cv2.resize(stored, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.cvtColor(stored, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _decoded(path: Path, size: tuple[int, int] | None, how: int) -> Any:
-    stored = cv2.imdecode(np.frombuffer(read_whole_image(path, size), np.uint8), how)
+def _decoded(path: Path, size: tuple[int, int] | None, how: int, any_scale: bool = False) -> Any:
+    stored = cv2.imdecode(np.frombuffer(read_whole_image(path, size, any_scale), np.uint8), how)
     if stored is None:
         raise SourceError(f"{path}: the image cannot be decoded: copy it again from its source")
     return stored
@@ -67,12 +75,15 @@ def encoded(path: Path, *, units_per_metre: float | None = None) -> EncodedImage
     return EncodedImage(contents, parse_header(contents, path).media_type, units_per_metre)
 
 
-def read_whole_image(path: Path, size: tuple[int, int] | None = None) -> bytes:
-    """The bytes of a PNG or JPEG file that is complete, of this (width, height) and not absurdly large."""
+def read_whole_image(path: Path, size: tuple[int, int] | None = None, any_scale: bool = False) -> bytes:
+    """The bytes of a PNG or JPEG file that is complete, of this (width, height), or of its shape with `any_scale`, and
+    not absurdly large.
+    """
     with reading(path):
         contents = read_input(path, MAX_IMAGE_BYTES)
     header = parse_header(contents, path)
-    if size is not None and (header.width, header.height) != size:
+    found = header.width, header.height
+    if size is not None and found != size and not (any_scale and same_shape(found, size)):
         raise SourceError(
             f"{path}: the image is {header.width}x{header.height}, the camera {size[0]}x{size[1]}: "
             "give the intrinsics of this image, or leave the frame out"
@@ -82,6 +93,11 @@ def read_whole_image(path: Path, size: tuple[int, int] | None = None) -> bytes:
     return contents
 
 
+def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether images of these (width, height) show the same view at most in another size."""
+    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= SAME_SHAPE
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the header alone; raises `SourceError` where there is none."""
     with reading(path), open_input(path) as file:
@@ -89,11 +105,25 @@ def image_size(path: Path) -> tuple[int, int]:
     return header.width, header.height
 
 
+def colour_size(paths: Sequence[Path | None], size: tuple[int, int], notes: list[str]) -> tuple[int, int]:
+    """The common (width, height) of those colour images that are there, noted where it is not that of depth; that of
+    depth where none can be read.
+    """
+    try:
+        found = common_size([path for path in paths if path])
+    except SourceError:
+        return size
+    if found != size and same_shape(found, size):
+        told = f"{found[0]}x{found[1]} are brought to the {size[0]}x{size[1]} of depth"
+        notes.append(f"colour images of {told}, as if registered to it")
+    return found
+
+
 def common_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int]:
     """The (width, height) that most of a few evenly spaced images have, so that one odd image does not set it."""
     sizes: Counter[tuple[int, int]] = Counter()
     problem: SourceError | None = None
-    for row in np.unique(np.linspace(0, len(paths) - 1, samples).round().astype(int)):
+    for row in np.unique(np.linspace(0, len(paths) - 1, samples if paths else 0).round().astype(int)):
         try:
             sizes[image_size(paths[row])] += 1
         except SourceError as error:

@@ -37,7 +37,7 @@ def find_poses(
 ) -> Poses:
     """Poses of the camera at the stamps, from what the recording has; `camera_frame` is empty where it is unknown."""
     if options.topic or (recording.poses and not options.world_frame):
-        topic = _choose(recording, options.topic, notes)
+        topic = _choose(recording, options.topic, camera_frame, stamps_s, notes)
         poses = _from_topic(recording, topic, camera_frame, stamps_s, options, notes)
     else:
         poses = _from_transforms(recording, camera_frame, stamps_s, options, notes)
@@ -47,12 +47,18 @@ def find_poses(
     return poses
 
 
-def _choose(recording: Recording, name: str, notes: list[str]) -> str:
+def _choose(recording: Recording, name: str, camera_frame: str, stamps_s: Floats, notes: list[str]) -> str:
     topics = recording.poses
     if name:
         return named_topic(topics, name, "pose_topic")[0]
-    # Odometry says what moves; of a bare pose it has to be assumed.
-    ranked = sorted(topics, key=lambda topic: (not topics[topic].child, -len(topics[topic].poses), topic))
+
+    def rank(topic: str) -> tuple[bool, bool, int, str]:
+        # Odometry says what moves; of a bare pose it has to be assumed. Of several robots only one carries the camera.
+        body = topics[topic].child
+        apart = body != camera_frame and recording.transforms.lookup(body, camera_frame, stamps_s) is None
+        return not body, apart, -len(topics[topic].poses), topic
+
+    ranked = sorted(topics, key=rank)
     if len(ranked) > 1:
         notes.append(f"poses of {ranked[0]} taken, not of {listed(ranked[1:])}: see option pose_topic")
     return ranked[0]

@@ -137,7 +137,7 @@ class McapReader:
         camera = self._camera(recording, topic, images[0], notes)
         if camera is None:
             why = "".join(f"; {note}" for note in recording.complaints.counted(A_MESSAGE_WITH + NO_PINHOLE))
-            raise SourceError(f"{path}: no calibration for {topic}{why}: give option camera (fx fy cx cy)")
+            raise SourceError(f"{path}: no calibration for {topic}{why}: give --set source.reader.camera=[fx,fy,cx,cy]")
         if self.colour_topic:
             colour = dict([named_topic(colour, self.colour_topic, "colour_topic")])
         colour_topic = best_colour(colour, topic, images[0], notes)

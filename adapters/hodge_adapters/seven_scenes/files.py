@@ -112,7 +112,7 @@ def _list_numbers(folder: Path) -> dict[int, dict[str, Path]]:
 
 def read_poses(usable: Sequence[FrameFiles], notes: list[str]) -> Floats:
     """Poses (N, 4, 4) with rotations projected to SO(3), NaN where there is none that can be used."""
-    poses = np.array([_read_pose(files.paths.get("pose")) for files in usable])
+    poses = np.array([read_pose(files.paths.get("pose")) for files in usable])
     good = se3.is_motion(poses)
     poses[~good] = np.nan
     poses[good, :3, :3] = se3.project_to_so3(poses[good, :3, :3])
@@ -122,7 +122,7 @@ def read_poses(usable: Sequence[FrameFiles], notes: list[str]) -> Floats:
     return poses
 
 
-def _read_pose(path: Path | None) -> Floats:
+def read_pose(path: Path | None) -> Floats:
     """The sixteen numbers of a pose file as (4, 4), NaN where they are not."""
     try:
         numbers = to_floats(read_text(path).split()) if path else None

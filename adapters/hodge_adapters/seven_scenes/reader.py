@@ -18,7 +18,7 @@ from pydantic import ConfigDict, Field, field_validator
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.images import pixels
-from hodge_adapters.images.camera_files import Intrinsics, checked, fit_note, read_intrinsics
+from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.frames import image_frame
 from hodge_adapters.seven_scenes.colour_camera import KINECT_FOCAL, LIRIS, NOMINAL, ColourCamera, read_registered_colour
 from hodge_adapters.seven_scenes.files import (
@@ -37,9 +37,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, Floats, Frame, Source, Trajectory
 
-UNITS_PER_METRE = 1000.0
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0, (640, 480))
-CAMERA_FILE = "camera-intrinsics.txt"
 IDENTITY = tuple(np.eye(4).ravel().tolist())
 
 
@@ -52,11 +50,12 @@ class SevenScenesReader:
     )
     sequences: tuple[str, ...] = Field((), description="names such as seq-01; empty: every sequence of the split")
     every: int = Field(1, ge=1, description="take every n-th frame of each sequence")
-    intrinsics: tuple[float, float, float, float] | None = Field(
+    camera: tuple[float, float, float, float] | None = Field(
         None,
-        description="fx fy cx cy in pixels; none: camera-intrinsics.txt in the folder or the one above it, "
-        "else 585 585 320 240, which the authors give for the depth camera",
+        description="fx fy cx cy in pixels; none: camera-intrinsics.txt or another camera file in the folder "
+        "or the one above it, else 585 585 320 240, which the authors give for the depth camera",
     )
+    depth_scale: float = Field(1000.0, gt=0, description="stored units per metre; 7-Scenes and BundleFusion: mm")
     no_depth: tuple[int, ...] = Field(
         (0, 65535), description="stored values that mean no depth; 7-Scenes has 65535, its re-exports have 0 as well"
     )
@@ -105,13 +104,15 @@ class SevenScenesReader:
         notes: list[str] = []
         usable = with_depth(path, self._chosen(path, notes), notes)
         camera, camera_files = self._camera(path, usable, notes)
+        colours = [files.paths.get("color") for files in usable]
+        colour_size = pixels.colour_size(colours, (camera.width, camera.height), notes)
         poses = read_poses(usable, notes)
         several = len({files.sequence for files in usable}) > 1
         taken = [row for row, files in enumerate(usable) if files.rank % self.every == 0]
         return Source(
             name=path.resolve().name,
             path=path,
-            frames=tuple(self._frame(usable[row], camera, poses[row], several) for row in taken),
+            frames=tuple(self._frame(usable[row], camera, poses[row], several, colour_size) for row in taken),
             trajectory=None if several else _trajectory(usable, poses),
             notes=tuple(notes),
             files=(*camera_files, *(file for files in usable for file in sorted(files.paths.values()))),
@@ -143,30 +144,33 @@ class SevenScenesReader:
         return folders
 
     def _camera(self, path: Path, usable: Sequence[FrameFiles], notes: list[str]) -> tuple[Camera, tuple[Path, ...]]:
-        beside = [folder / CAMERA_FILE for folder in (path, path.resolve().parent) if (folder / CAMERA_FILE).is_file()]
-        if self.intrinsics:
-            beside, found = [], checked(Intrinsics(*self.intrinsics), "option intrinsics")
+        beside = [file for folder in (path, path.resolve().parent) if (file := find_camera_file(folder))]
+        if self.camera:
+            beside, found = [], checked(Intrinsics(*self.camera), "option camera")
         elif beside:
             found = read_intrinsics(beside[0])
         else:
             found = KINECT
-            notes.append(f"no {CAMERA_FILE}: the depth camera's published 585 585 320 240 is used")
-        camera = found.camera(found.size or pixels.common_size([files.paths["depth"] for files in usable]))
-        notes.extend(filter(None, [fit_note(camera)]))
+            notes.append("no camera-intrinsics.txt: the depth camera's published 585 585 320 240 is used")
+        depth = [files.paths["depth"] for files in usable]
+        camera = found.camera_of(depth, notes)
         return camera, tuple(beside[:1])
 
-    def _frame(self, files: FrameFiles, camera: Camera, pose: Floats, several: bool) -> Frame:
+    def _frame(
+        self, files: FrameFiles, camera: Camera, pose: Floats, several: bool, colour_size: tuple[int, int]
+    ) -> Frame:
         frame = image_frame(
             f"{files.sequence}/{files.number:06d}" if several else files.number,
             files.number,
             camera,
             files.paths["depth"],
             files.paths.get("color"),
-            units_per_metre=UNITS_PER_METRE,
+            units_per_metre=self.depth_scale,
             no_depth=self.no_depth,
             world_from_cam=pose,
             is_true=True,
             sequence=files.sequence,
+            colour_size=colour_size,
         )
         colour = self._colour(camera)
         if colour is None or "color" not in files.paths:
@@ -177,7 +181,7 @@ class SevenScenesReader:
             colour=colour,
             depth_path=files.paths["depth"],
             camera=camera,
-            units_per_metre=UNITS_PER_METRE,
+            units_per_metre=self.depth_scale,
             no_depth=self.no_depth,
         )
         return replace(frame, read_colour=read, encoded_colour=None, image=None)

@@ -35,6 +35,14 @@ def unit_of(stamps: Floats) -> tuple[str, float]:
     return next(known, ("seconds", 1.0))
 
 
+def in_seconds(stamps: Floats, name: str, notes: list[str]) -> Floats:
+    """The stamps of one file in seconds; where it counts another unit, that is noted."""
+    unit, per_second = unit_of(stamps)
+    if per_second > 1:
+        notes.append(f"{name}: stamps are read as {unit}, too large for seconds")
+    return stamps / per_second
+
+
 @plain_dataclass(frozen=True)
 class ParsedTrajectory:
     """A trajectory, and what had to be left out or put in order to read it, one line each."""
@@ -51,17 +59,15 @@ def parse_tum(path: Path) -> ParsedTrajectory:
     table, bad = _tum_table(read_rows(path))
     if not len(table):
         raise _unreadable(path, bad, "stamp tx ty tz qx qy qz qw")
-    unit, per_second = unit_of(table[:, 0])
-    table[:, 0] /= per_second
+    notes: list[str] = []
+    table[:, 0] = in_seconds(table[:, 0], path.name, notes)
     w_first = has_w_first(path)
     if w_first:
         table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
     parsed = ordered(table)
-    notes = [f"{path.name}: {note}" for note in parsed.notes]
+    notes += [f"{path.name}: {note}" for note in parsed.notes]
     if w_first:
         notes.append(f"{path.name}: quaternions are read with w first, as its head names them")
-    if per_second > 1:
-        notes.append(f"{path.name}: stamps are read as {unit}, too large for seconds")
     if bad:
         notes.append(f"{path.name}: {len(bad)} lines that are no pose left out: {listed([r.line for r in bad])}")
     return ParsedTrajectory(parsed.trajectory, tuple(notes))

@@ -11,6 +11,7 @@ import numpy as np
 
 from hodge_adapters.association import nearest_pairs
 from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
+from hodge_adapters.trajectories.text import in_seconds
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Ints
 
@@ -92,7 +93,10 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
         columns[own] = np.where(found >= 0, np.append(other, -1)[found], -1)
     alone = int((columns < 0).sum())
     if alone:
-        notes.append(f"{alone} depth images have no colour image within {max_difference_s:g} s")
+        notes.append(f"{alone} of {len(depth)} depth images have no colour image within {max_difference_s:g} s")
+    if alone == len(depth) and colour:
+        nearest_s = np.abs(colour_stamps_s - depth_stamps_s[alone // 2]).min()
+        notes[-1] += f", the nearest is {nearest_s:.3g} s away: set max_difference_s, or are they of two clocks?"
     paired = [colour[column] if column >= 0 else None for column in columns.tolist()]
     delays_s = np.where(columns >= 0, np.append(colour_stamps_s, 0.0)[columns] - depth_stamps_s, 0.0)
     return StampedImages(depth_stamps_s, depth, paired, delays_s, lists, runs)
@@ -152,13 +156,13 @@ def _from_association(path: Path, notes: list[str]) -> StampedImages:
         if stamp_s is None or colour_stamp_s is None or depth is None or colour is None:
             outside.append(row.line)
         else:
-            delay_s = colour_stamp_s - stamp_s
-            found.append((stamp_s, depth, colour, delay_s if abs(delay_s) <= LONGEST_DELAY_S else 0.0))
+            found.append((stamp_s, depth, colour, colour_stamp_s))
     notes += _left_out(path.name, "`stamp file stamp file`", unreadable, outside)
     if not found:
         raise SourceError(f"{path}: no line `stamp file stamp file` that can be used in it: mend or remove the file")
     stamps_s, order, runs = _in_order(np.array([stamp for stamp, *_ in found]), path.name, notes)
-    delays_s = np.array([found[row][3] for row in order])
+    colour_stamps_s = in_seconds(np.array([found[row][3] for row in order]), path.name, [])
+    delays_s = np.where(abs(colour_stamps_s - stamps_s) <= LONGEST_DELAY_S, colour_stamps_s - stamps_s, 0.0)
     return StampedImages(
         stamps_s, [found[row][1] for row in order], [found[row][2] for row in order], delays_s, (path,), runs
     )
@@ -186,8 +190,9 @@ def _stamp(row: Row, column: int) -> float | None:
     return values[0] if values and math.isfinite(values[0]) else None
 
 
-def _in_order(stamps_s: Floats, name: str, notes: list[str]) -> tuple[Floats, list[int], Ints]:
-    """Stamps, ascending and unique in each run, their rows and runs; of equal ones the first is kept."""
+def _in_order(stamps: Floats, name: str, notes: list[str]) -> tuple[Floats, list[int], Ints]:
+    """Stamps in seconds, ascending and unique in each run, their rows and runs; of equal ones the first is kept."""
+    stamps_s = in_seconds(stamps, name, notes)
     runs = _runs(stamps_s)
     order = np.lexsort((stamps_s, runs))
     again = np.flatnonzero((np.diff(stamps_s[order]) == 0) & (np.diff(runs[order]) == 0)) + 1

@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.association import interpolated_poses
 from hodge_adapters.images import pixels
-from hodge_adapters.images.camera_files import Intrinsics, checked, fit_note, read_intrinsics
+from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.frames import image_frame
 from hodge_adapters.images.lens import Lens
 from hodge_adapters.trajectories.text import parse_tum
@@ -44,18 +44,6 @@ CAMERAS = {
 }
 RECORDED_ON = {"fr1": {"2011-05-10"}, "fr2": {"2011-07-28"}, "fr3": {"2012-07-08", "2012-07-09"}}
 """The days, UTC, of the benchmark's sequences: what tells fr1 from fr2, whose lenses bend images nearly alike."""
-CAMERA_FILES = (
-    "intrinsics.txt",
-    "camera-intrinsics.txt",
-    "camera.yaml",
-    "camera.txt",
-    "calibration.yaml",
-    "calibration.txt",
-    "camera_intrinsic.json",
-    "TUM1.yaml",
-    "TUM2.yaml",
-    "TUM3.yaml",
-)
 TRUTH_FILE = "groundtruth.txt"
 
 _FREIBURG = re.compile(r"(?:freiburg|fr)([123])(?![0-9a-z])|freiburg([123])", re.IGNORECASE)
@@ -123,8 +111,8 @@ class TumReader:
         notes: list[str] = []
         listing = read_pairs(path, self.max_difference_s, notes)
         found, camera_file = self._intrinsics(path, listing, notes)
-        camera = found.camera(found.size or pixels.common_size(listing.depth))
-        notes.extend(filter(None, [fit_note(camera)]))
+        camera = found.camera_of(listing.depth, notes)
+        colour_size = pixels.colour_size(listing.colour, (camera.width, camera.height), notes)
         lens = Lens(camera, found.distortion) if found.distortion and self.undistort else None
         if found.distortion:
             notes.append(
@@ -151,6 +139,7 @@ class TumReader:
                     is_true=True,
                     lens=lens,
                     colour_delay_s=float(listing.colour_delays_s[row]),
+                    colour_size=colour_size,
                 )
                 for row in rows
             ),
@@ -164,10 +153,7 @@ class TumReader:
             return checked(Intrinsics(*self.camera), "option camera"), ()
         if self.camera in CAMERAS:
             return CAMERAS[self.camera], ()
-        if self.camera == "auto":
-            file = next((path / name for name in CAMERA_FILES if (path / name).is_file()), None)
-        else:
-            file = path / self.camera
+        file = find_camera_file(path) if self.camera == "auto" else path / self.camera
         if file:
             return self._from_file(file, notes)
         match = _FREIBURG.search(path.resolve().name)
