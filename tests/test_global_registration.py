@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hodge_pipeline import se3
+from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.registration.consensus import rigid_consensus
 from hodge_pipeline.registration.global_evidence import (
     depth_view,
@@ -20,11 +21,12 @@ from hodge_pipeline.registration.global_evidence import (
     violation,
 )
 from hodge_pipeline.registration.global_features import describe, mutual_matches, viewpoint
+from hodge_pipeline.registration.global_pairs import describe_clouds, load_description
 from hodge_pipeline.registration.global_registrars import FpfhConsensus, FpfhFgr, FpfhRansac, KissMatcher
 from hodge_pipeline.stages import GlobalRegistrar
 from hodge_pipeline.start.unordered.hypotheses import LEAD_SIGMAS
 from hodge_pipeline.start.unordered.options import HypothesisLimits
-from hodge_pipeline.types import Camera, Floats, PointCloud
+from hodge_pipeline.types import Camera, CloudSet, Floats, PointCloud
 
 KISS = importlib.util.find_spec("kiss_matcher") is not None
 CAMERA = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
@@ -278,3 +280,13 @@ def test_real_fragments_are_registered_with_no_guess(data_dir: Path) -> None:
     found = registrar.match(*described)
     metres, degrees = off_by(found.i_from_j, wanted)
     assert metres < 0.1 and degrees < 4 and found.inliers > 50
+
+
+def test_clouds_that_are_described_anew_are_not_matched_as_they_were(tmp_path: Path) -> None:
+    for count in (3000, 6000):  # two runs of one process, into the same folder
+        folder = tmp_path / "clouds"
+        folder.mkdir(exist_ok=True)
+        cloud = PointCloud(furnished_corner(0, count).astype(np.float32))
+        CloudSet.from_clouds([cloud]).save(folder)
+        describe_clouds(folder, FpfhFgr(), np.zeros(1, np.int64), tmp_path / "described", InProcess())
+        assert len(load_description(tmp_path / "described", 0)) == len(describe(cloud, FpfhFgr().voxel_m))

@@ -219,16 +219,20 @@ def test_a_robot_at_rest_has_no_heading_by_its_fixes() -> None:
     assert "tells no heading" in found.fit.problems[0] and np.array_equal(found.world_from_cam, odometry)
 
 
-def test_positions_on_a_line_leave_the_scanner_upright() -> None:
+@pytest.mark.parametrize(("heading", "exact"), [(3.1, False), (0.0, False), (0.0, True)])
+def test_positions_on_a_line_leave_the_scanner_upright(heading: float, exact: bool) -> None:
     frames = 40
-    true = se3.from_parts(np.tile(se3.so3_exp(np.array([0, 0, 3.1])), (frames, 1, 1)), np.zeros((frames, 3)))
+    true = se3.from_parts(np.tile(se3.so3_exp(np.array([0, 0, heading])), (frames, 1, 1)), np.zeros((frames, 3)))
     true[:, :3, 3] = np.arange(frames)[:, None] * 3.0 * true[0, :3, 0]
     edges = np.stack([np.arange(frames - 1), np.arange(1, frames)], axis=1)
     graph = ViewGraph.from_edges(
         np.arange(frames), edges, se3.inverse(true[:-1]) @ true[1:], 1e4 * np.tile(np.eye(6), (39, 1, 1))
     )
     odometry = se3.inverse(true[0]) @ true
-    found = place(graph, odometry, np.zeros(frames, np.int64), np.ones(39), fixes_at(true, np.arange(frames)), UP)
+    fixes = fixes_at(true, np.arange(frames))
+    if exact:
+        fixes = replace(fixes, points=true[:, :3, 3], stated=np.zeros(frames, bool))
+    found = place(graph, odometry, np.zeros(frames, np.int64), np.ones(39), fixes, UP)
     assert found.world_from_cam[:, 2, 2].min() > np.cos(np.radians(15))
 
 
@@ -252,6 +256,21 @@ def test_positions_that_are_off_by_the_same_for_long_are_rejected(bias_m: float)
     found = place(graph, odometry, np.zeros(150, np.int64), np.ones(graph.edge_count), fixes, UP)
     assert np.array_equal(~found.fit.used, off)
     assert np.linalg.norm((found.world_from_cam - true)[:, :3, 3], axis=1).max() < 3 * SIGMA_M
+
+
+def test_positions_off_for_long_are_rejected_where_a_loop_joins_what_is_around_them() -> None:
+    graph, _, true = drifting_loop(frames=150)
+    straight = se3.inverse(true[graph.edges[:, 0]]) @ true[graph.edges[:, 1]]
+    loops = np.stack([np.arange(9), np.arange(141, 150)], axis=1)
+    motions = np.concatenate([straight, se3.inverse(true[loops[:, 0]]) @ true[loops[:, 1]]])
+    motions = motions @ se3.exp(np.random.default_rng(6).normal(0, 1, (len(motions), 6)) * ([1e-4] * 3 + [0.01] * 3))
+    edges, information = np.concatenate([graph.edges, loops]), np.tile(graph.information[0], (len(motions), 1, 1))
+    closed = ViewGraph.from_edges(np.arange(150), edges, motions, information)
+    fixes = fixes_at(true, np.arange(150))
+    off = (np.arange(150) >= 50) & (np.arange(150) < 80)
+    fixes.points[off] += [6.0, 3.0, 0]
+    found = place(closed, true, np.zeros(150, np.int64), np.ones(len(edges)), fixes, UP)
+    assert np.array_equal(~found.fit.used, off)
 
 
 def test_positions_stay_where_odometry_slipped() -> None:

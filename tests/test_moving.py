@@ -14,8 +14,10 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.flow import find_corners, flow_image, follow
 from hodge_pipeline.registration.moving import agreement, rival_motion
+from hodge_pipeline.registration.tracking import FrameBlock, _Tracker, _View
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, track
 from hodge_pipeline.types import Frame, Source
@@ -140,3 +142,23 @@ def test_the_vote_is_by_area_whichever_motion_is_found_first(still: Source) -> N
     assert rival.moving[~board].mean() < 0.2
     _, back = rival_motion(rival.corners, later, rival.followed, np.eye(4))
     assert back is not None and not back.fits_better
+
+
+def test_what_was_left_out_of_a_key_frame_is_not_misplaced(still: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = with_block(still, 0.2)
+    recipe = load_recipe("demo", [], source.path)
+    assert isinstance(recipe.start, KeyFrameStart)
+    options = recipe.start._tracking(recipe.clouds)
+    key, view = (_View(options, source.frames[place], place) for place in (0, 4))
+    side, board = int(np.sqrt(0.2 * WIDTH * HEIGHT)), np.zeros((HEIGHT, WIDTH), np.uint8)
+    board[20 : 20 + side, 20 : 20 + side] = 1
+    assert key.image is not None and view.image is not None
+    whole, corners = key.image, find_corners(key.image, 1 - board)
+    key.leave_out(board, corners)
+    found = follow(corners, view.image, np.eye(4))
+    assert found is not None
+    with_board = agreement(whole, view.image, found.key_from_view)
+    monkeypatch.setattr(tracking, "rival_motion", lambda *_: (with_board, None))
+    tracker = _Tracker(options, FrameBlock(np.arange(5), source.frames[:5], np.arange(5.0), warm_up=False))
+    _, against = tracker._of_most_area(key, view, found, np.eye(4))
+    assert 0.1 < against.misplaced < 0.7 * with_board.misplaced

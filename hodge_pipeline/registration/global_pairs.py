@@ -89,7 +89,8 @@ def match_pairs(
 
 def load_description(described: Path, row: int) -> Any:
     """What the registrar made of one cloud."""
-    return _load(described / f"{row}.pickle")
+    path = described / f"{row}.pickle"
+    return _load(path, path.stat().st_mtime_ns)
 
 
 @plugin_errors()
@@ -108,6 +109,7 @@ def _match_block(described: Path, registrar: GlobalRegistrar, pairs: Ints) -> Ma
 
 
 @lru_cache(maxsize=DESCRIPTIONS_KEPT)
-def _load(path: Path) -> Any:
+def _load(path: Path, written_ns: int) -> Any:
+    """Another run in this process may have written the file anew."""
     with open_input(path) as file:
         return pickle.load(file)

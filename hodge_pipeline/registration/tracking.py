@@ -270,16 +270,17 @@ class _Tracker:
         the key frame's cloud.
         """
         assert key.image is not None and key.corners is not None and view.image is not None
-        share, rival = rival_motion(key.corners, view.image, found, guess)
-        if rival is None or len(rival.followed.rows) < FEWEST_FOLLOWED:
-            return found, share
-        self._moving.add(view.place)
-        key.leave_out(rival.moving, rival.corners if rival.fits_better else key.corners)
-        if rival.fits_better:
-            self._sightings = {pair: one for pair, one in self._sightings.items() if pair[0] != key.place}
-            found, share = rival.followed, Agreement(rival.contradicting, 0.0)
-        left = agreement(key.image, view.image, found.key_from_view)
-        return found, Agreement(share.contradicting, left.misplaced)
+        against, rival = rival_motion(key.corners, view.image, found, guess)
+        if rival is not None and len(rival.followed.rows) >= FEWEST_FOLLOWED:
+            self._moving.add(view.place)
+            key.leave_out(rival.moving, rival.corners if rival.fits_better else key.corners)
+            if rival.fits_better:
+                self._sightings = {pair: one for pair, one in self._sightings.items() if pair[0] != key.place}
+                found, against = rival.followed, against._replace(contradicting=rival.contradicting)
+        if key.left_out:  # the corners' image still has what moves
+            left = agreement(key.image, view.image, found.key_from_view)
+            against = against._replace(misplaced=left.misplaced)
+        return found, against
 
     def _doubt(self, view: _View, share: float) -> None:
         if share > DOUBTFUL:

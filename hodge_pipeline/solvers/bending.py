@@ -27,7 +27,7 @@ SOFTNESS = np.logspace(0, 8, 33)
 MOST_STEPS, SETTLED = 20, 1e-5
 """Of Gauss-Newton; and a last one in radians, or metres to the scene's size."""
 DAMPING = 1e-9
-"""Share of the diagonal that keeps what points do not tell, such as how a line of them turns about itself."""
+"""Share of the largest of three axes that holds what points do not tell: how a line of them turns about itself."""
 
 
 @dataclass(frozen=True)
@@ -133,14 +133,13 @@ class Bending:
         for _ in range(MOST_STEPS):
             stiff, force = self._stiffness(poses)
             wanted, pull = points(poses).model(len(poses))
-            hessian = (matrix.T @ (stiff / soft + wanted) @ matrix).toarray()
-            hessian[np.diag_indices_from(hessian)] *= 1 + DAMPING
+            hessian = _damped((matrix.T @ (stiff / soft + wanted) @ matrix).toarray())
             twist = np.linalg.solve(hessian, matrix.T @ (pull - force / soft))
             step = (matrix @ twist).reshape(-1, 6)
             poses = se3.exp(step) @ poses
             if np.abs(step / ([1.0] * 3 + [self._size_m] * 3)).max() < SETTLED:
                 break
-        spread = np.linalg.inv(hessian).reshape(way.count, 6, way.count, 6) * point_factor**2
+        spread = np.asarray(np.linalg.inv(hessian) * point_factor**2).reshape(way.count, 6, way.count, 6)
         edge_factor = float(np.sqrt(soft)) * point_factor
         return Bent(_shifted(poses, self._centre), edge_factor, point_factor, spread, self._centre, way)
 
@@ -181,8 +180,7 @@ def _spectrum(wanted: Floats, pull: Floats, stiff: Floats, free: int) -> tuple[f
     """By how much the first `free` unknowns, which edges do not hold, lower the misfit; then, of each way to bend, what
     points tell of it against edges, and by how much it could lower the misfit times that.
     """
-    first = wanted[:free, :free] + DAMPING * np.diag(np.diag(wanted)[:free])
-    solved = np.linalg.solve(first, np.column_stack([wanted[:free, free:], pull[:free]]))
+    solved = np.linalg.solve(_damped(wanted[:free, :free]), np.column_stack([wanted[:free, free:], pull[:free]]))
     others = wanted[free:, free:] - wanted[free:, :free] @ solved[:, :-1]
     force = pull[free:] - wanted[free:, :free] @ solved[:, -1]
     gained = float(pull[:free] @ solved[:, -1])
@@ -192,6 +190,12 @@ def _spectrum(wanted: Floats, pull: Floats, stiff: Floats, free: int) -> tuple[f
     held = stiff / np.outer(size, size) + DAMPING**1.5 * np.eye(len(size))
     values, vectors = eigh(others / np.outer(size, size), held)
     return gained, np.maximum(values, 0.0), (vectors.T @ (force / size)) ** 2
+
+
+def _damped(matrix: Floats) -> Floats:
+    """The matrix with a little of the largest of each three axes added to all three."""
+    most = np.diag(matrix).reshape(-1, 3).max(axis=1)
+    return np.asarray(matrix + DAMPING * np.diag(np.repeat(most, 3)))
 
 
 def _blocks(ends: tuple[Ints, Ints], blocks: Floats, count: int) -> csr_matrix:

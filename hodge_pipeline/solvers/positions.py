@@ -33,6 +33,8 @@ SPREAD_SIGMA = 5.0
 """Nine in ten positions nearer together say nothing of the heading: of a robot at rest they span 3.3 sigma."""
 MOST_ROUNDS = 30
 """Of rejections."""
+LEAST_FACTOR = 1e-3
+"""On the sigma of positions that state none: exact ones would have none at all."""
 TORN, CALM, MOST_STRETCHES = 25.0, 5.0, 6
 """Times the median chi-squared of edges. Of six numbers, whose median is 5.35, one edge in 6,000 has more than 5 times
 that, and none (2e-26) more than 25 times: edges below the former hold a stretch together, those above the latter tear.
@@ -200,10 +202,12 @@ def _untorn(
             break
         part = connected_components(graph.edges[torn <= CALM], len(settled.world_from_cam))[fixes.vertices]
         labels, counts = np.unique(part[settled.used], return_counts=True)
-        labels = labels[counts >= FEWEST]
-        if len(labels) < FEWEST:
+        labels = labels[np.argsort(counts)][np.sort(counts) >= FEWEST]
+        others = [part != label for label in labels[:MOST_STRETCHES]]
+        if len(labels) < FEWEST:  # where a loop joins what is before and after, these are one
+            others = [own for own in others if _encloses(fixes.vertices, settled.used & own, settled.used & ~own)]
+        if not others:
             break
-        others = [part != label for label in labels[np.argsort(counts[counts >= FEWEST])][:MOST_STRETCHES]]
         tried = [settle(settled.used & own, allowed & own, True) for own in others]
         left = [float(_torn(graph, each.world_from_cam).max()) for each in tried]
         if min(left) > torn.max() / 2:
@@ -216,15 +220,23 @@ def _untorn(
     return final
 
 
+def _encloses(vertices: Ints, others: Bools, stretch: Bools) -> bool:
+    """Whether others are both before and after a stretch."""
+    if not others.any() or not stretch.any():
+        return False
+    low, high = vertices[stretch].min(), vertices[stretch].max()
+    return bool(vertices[others].min() < low and high < vertices[others].max())
+
+
 def _torn(graph: ViewGraph, poses: Floats) -> Floats:
     """Chi-squared (E,) of each edge over the median; 0 of an edge without weight."""
     chi2 = chi2_by_information(graph, poses)
-    return np.asarray(chi2 / max(float(np.median(chi2[chi2 > 0])), 1e-12))
+    return np.asarray(chi2 / max(float(np.median(chi2[graph.information.any(axis=(1, 2))])), 1e-12))
 
 
 def _settled(bending: Bending, fixes: Fixes, used: Bools, allowed: Bools, finest: bool) -> _Settled:
     """The poses once the rejections among those `allowed (P,)` do not change any more; bent as finely as can be?"""
-    least = 1.0 if fixes.stated.all() else 0.0
+    least = 1.0 if fixes.stated.all() else LEAST_FACTOR
     for _ in range(MOST_ROUNDS):
         own = fixes.select(used)
         bent = bending.towards(own.vertices, own.arms, own.points, own.covariances, least, finest)
