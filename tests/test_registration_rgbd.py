@@ -173,6 +173,29 @@ def test_guided_matches_lie_near_the_guess_and_are_mutual():
     assert guided_match(bare, source, np.eye(4), 0.15).shape == (0, 2)
 
 
+def no_icp(*_: object) -> None:
+    raise AssertionError("ICP is run")
+
+
+def test_landmarks_that_the_guess_tells_apart_need_no_icp(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Rgbd, "_by_surfaces", no_icp)
+    registrar = Rgbd()
+    target, source = (registrar.prepare(twins(cloud)) for cloud in frames_of(60))
+    found = registrar.register(target, source, np.eye(4))
+    np.testing.assert_allclose(found.i_from_j[:3, 3], [0.1, 0, 0], atol=2e-3)
+
+
+def test_a_pair_of_which_too_little_lies_within_reach_is_not_registered(monkeypatch: pytest.MonkeyPatch):
+    registrar, away = Rgbd(), np.eye(4)
+    away[0, 3] = 1.5
+    target, source = (registrar.prepare(cloud) for cloud in frames_of(0))
+    assert registrar.register(target, source, np.eye(4)).fitness > 0.9
+    monkeypatch.setattr(Rgbd, "_by_surfaces", no_icp)
+    found = registrar.register(target, source, away)
+    assert found.fitness == 0 and not found.converged
+    np.testing.assert_array_equal(found.i_from_j, away)
+
+
 def test_unlike_landmarks_near_a_guess_agree_on_nothing():
     target, source = frames_of(400)
     assert source.landmarks is not None

@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.assessment import SAME_FITNESS, Assessment, assess, unregistered
+from hodge_pipeline.registration.assessment import MIN_POINTS, SAME_FITNESS, Assessment, assess, unregistered
 from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.gicp import Gicp, PreparedCloud
 from hodge_pipeline.registration.guided import guided_match
@@ -63,7 +63,7 @@ class Rgbd:
         default=0.15,
         ge=0,
         description="metres: where too few matches agree, landmarks are matched again with those alone that lie this "
-        "near where the surfaces' motion puts them, which tells the handles of a cabinet apart; 0: they are not",
+        "near where the guess puts them, else surfaces do, which tells the handles of a cabinet apart; 0: they are not",
     )
     assessed_within_m: float = Field(
         default=0.05, gt=0, description="metres: points of j this near to one of i count in the fitness of landmarks"
@@ -79,10 +79,14 @@ class Rgbd:
         pairs = match(target.descriptors, source.descriptors, self.ratio)
         visual = self._visual(target, source, pairs)
         if not self._suffices(visual):
-            found = self._by_surfaces(target, source, i_from_j, visual)
-            visual = self._guided(target, source, [found, visual])
+            hint, visual = visual, self._guided(target, source, [i_from_j, *([visual.i_from_j] if visual else [])])
+            if visual is None and not self._in_reach(target, source, i_from_j):
+                return unregistered(i_from_j)
             if visual is None:
-                return found if found.fitness >= self.min_fitness else unregistered(found.i_from_j)
+                found = self._by_surfaces(target, source, i_from_j, hint)
+                visual = self._guided(target, source, [found.i_from_j])
+                if visual is None:
+                    return found if found.fitness >= self.min_fitness else unregistered(found.i_from_j)
         assert visual is not None
         if self.measure == "surfaces":
             return self.near.register(target, source, visual.i_from_j)
@@ -97,19 +101,23 @@ class Rgbd:
     def _suffices(self, visual: VisualMotion | None) -> bool:
         return visual is not None and visual.inliers >= self.min_inliers
 
-    def _guided(
-        self, target: PreparedFrame, source: PreparedFrame, starts: Sequence[Registration | VisualMotion | None]
-    ) -> VisualMotion | None:
+    def _guided(self, target: PreparedFrame, source: PreparedFrame, starts: Sequence[Floats]) -> VisualMotion | None:
         """The motion that most landmarks agree on near a start, None where too few do or surfaces disagree."""
         found = [
-            self._visual(target, source, guided_match(target, source, start.i_from_j, self.guided_m))
+            self._visual(target, source, guided_match(target, source, start, self.guided_m))
             for start in starts
-            if start is not None and self.guided_m > 0
+            if self.guided_m > 0
         ]
         best = max(filter(self._suffices, found), key=lambda one: one.inliers if one else 0, default=None)
         if best is None or self._by_landmarks(target, source, best).fitness < self.min_fitness:
             return None
         return best
+
+    def _in_reach(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats) -> bool:
+        """Whether ICP can fit as many points as it must: from the guess they lie within its first distance of i."""
+        if min(len(target), len(source)) < MIN_POINTS:
+            return False
+        return self._within(target, source, i_from_j, max(self.geometry.distances_m)).fitness >= self.min_fitness
 
     def _by_landmarks(self, target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
         """Their motion. Its fitness, where it is low, is the other way round if this is larger: a frame that shows what
@@ -118,7 +126,7 @@ class Rgbd:
         found = self._assessed(target, source, visual)
         if found.fitness >= self.min_fitness:
             return found
-        back = self._within(source, target, se3.inverse(found.i_from_j))
+        back = self._within(source, target, se3.inverse(found.i_from_j), self.assessed_within_m)
         return replace(found, fitness=max(found.fitness, back.fitness))
 
     def _by_surfaces(
@@ -133,20 +141,20 @@ class Rgbd:
         mean = self._assessed(target, source, _mean_motion(found, hint))
         return mean if mean.fitness >= found.fitness - SAME_FITNESS else found
 
-    def _within(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats) -> Assessment:
+    def _within(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats, distance_m: float) -> Assessment:
         return assess(
             source_points=source.sample_points(ASSESSED_POINTS),
             target_points=target.points,
             target_normals=target.normals,
             find_nearest=target.find_nearest,
             i_from_j=i_from_j,
-            max_distance_m=self.assessed_within_m,
+            max_distance_m=distance_m,
             points_per_sample=1.0,
         )
 
     def _assessed(self, target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
         """The landmarks' motion with what the clouds say of it: a false one shows in the fitness."""
-        seen = self._within(target, source, visual.i_from_j)
+        seen = self._within(target, source, visual.i_from_j, self.assessed_within_m)
         return Registration(
             i_from_j=visual.i_from_j,
             information=visual.information,
