@@ -16,8 +16,8 @@ class Measure:
     """One quality of the poses, before and after.
 
     `better` says which way is good; a change the other way by more than `tolerance`, in the measure's own unit, is a
-    change for the worse: what the measure's own noise could do is none. `is_held_out`: of measurements that took no part
-    in the solve.
+    change for the worse: what the measure's own noise could do is none. `is_held_out`: of measurements that took no
+    part in the solve.
     """
 
     name: str
