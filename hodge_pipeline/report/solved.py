@@ -18,6 +18,7 @@ from hodge_pipeline.report.contents import (
     SourceSummary,
     StageRow,
 )
+from hodge_pipeline.report.diagnosis_page import LISTED
 from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.store import artifacts
@@ -27,7 +28,7 @@ from hodge_pipeline.store.workspace import make_folder
 from hodge_pipeline.types import Edges, Floats
 from hodge_pipeline.types.notes import notes_of
 
-SOLVED, LISTED = "solved.json", 20
+SOLVED = "solved.json"
 
 
 def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
@@ -38,13 +39,10 @@ def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
     write_edges(folder / "edges.csv", edges, solved.graph.vertex_ids)
     artifacts.write_json(folder / SOLVED, solved.summary())
     write_report(folder, _report(solved, edges))
-    solution = solved.solution
+    source, solution = solved.source, solved.solution
     start = solution.world_from_cam if solved.start is None else solved.start
-    notes = solved.source.notes
-    name, before = solved.source.name, _before(solved)
-    return record_graph(
-        folder, name, solved.graph, start, solution, before, notes, is_scanner=not solved.source.of_cameras
-    )
+    sets, is_scanner = _before(solved), not source.of_cameras
+    return record_graph(folder, source.name, solved.graph, start, solution, sets, source.notes, is_scanner=is_scanner)
 
 
 def _edges(solved: SolvedFile) -> Edges:

@@ -218,7 +218,7 @@ def worst_edges_table(report: Report) -> Table:
     header = tuple(name for name, cells in columns.items() if set(cells) != {"–"})
     rows = tuple(zip(*(columns[name] for name in header), strict=True))
     caption = "Measured motions that disagree most with the result, worst first: a wrong edge, or a wrong result there."
-    caption += "".join(told.get(name, "") for name in header)
+    caption += " edges.csv has all." + "".join(told.get(name, "") for name in header)
     return Table("Worst edges", header, rows, caption, 3, wide=(len(header) - 1,) if "why" in header else ())
 
 
