@@ -96,6 +96,7 @@ class PointCloud:
 
     `landmarks` are other points, of the frame's image; None where nobody asked for them. `times_s (N,)` is when each
     point was measured, seconds after the first, by a scanner that turns while it moves; None where nobody says.
+    `no_numbers` is how many more points the reader left out, whose coordinates are no numbers.
     """
 
     points_in_cam: Floats32
@@ -103,6 +104,7 @@ class PointCloud:
     colours: Bytes | None = None
     landmarks: Landmarks | None = None
     times_s: Floats32 | None = None
+    no_numbers: int = 0
 
     def __len__(self) -> int:
         return len(self.points_in_cam)
