@@ -210,10 +210,26 @@ def test_corridors_that_are_mistaken_neither_break_the_backbone_nor_make_a_latti
         assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
 
 
+def test_many_loops_of_one_mistaken_place_do_not_outvote_few_of_several_places() -> None:
+    made = drive(seed=8203, count=800, loops=80, wrong=0.9, in_groups=True, misstated=(10.0, 10.0))
+    np.testing.assert_array_equal(diagnose(made.graph).kept, made.right)
+
+
 def test_edges_written_the_other_way_round_change_nothing() -> None:
     one, other = (diagnose(drive(turned=turned).graph) for turned in (False, True))
     np.testing.assert_array_equal(one.verdict, other.verdict)
     np.testing.assert_allclose(one.world_from_cam, other.world_from_cam, atol=1e-6)
+
+
+def test_the_order_of_edges_in_the_file_changes_nothing(data_dir: Path) -> None:
+    graph = read_graph(data_dir / "pose_graphs/slam_loops/bicocca/B25b_0.250.g2o").graph
+    assert graph is not None
+    order = np.random.default_rng(3).permutation(graph.edge_count)
+    one, other = find_backbone(graph), find_backbone(graph.select(order))
+    assert one is not None and other is not None
+    np.testing.assert_array_equal(other.used, one.used[order])
+    np.testing.assert_allclose(other.right, one.right[order], atol=1e-6)
+    np.testing.assert_allclose(other.world_from_cam, one.world_from_cam, atol=1e-6)
 
 
 def test_solvers_and_the_diagnosis_agree() -> None:

@@ -222,7 +222,7 @@ def test_an_uncalibrated_camera_is_said_to_be_one(tmp_path: Path) -> None:
     zero = {**foxglove_header(100, OPTICAL), **calibration(WIDTH, HEIGHT, 0, 0, 0, 0)}
     log.messages = [message for message in log.messages if message[0] != INFO]
     log.add(INFO, CALIBRATION, zero, CDR)
-    with pytest.raises(SourceError, match=r"/cam/depth/camera_info: 1 left out: .*matrix K.*: give option camera"):
+    with pytest.raises(SourceError, match=r"/cam/depth/camera_info: 1 left out: .*matrix K.*: give --set .*camera="):
         McapReader().open(log.write(tmp_path / "zero.mcap"))
 
 
@@ -230,7 +230,7 @@ def test_calibrations_that_do_not_fit(tmp_path: Path) -> None:
     log = Log()
     for row in range(2):
         log.add(DEPTH, RAW, {**foxglove_header(100 + row, OPTICAL), **some_images(1)[0]}, CDR)
-    with pytest.raises(SourceError, match=r"no calibration for /cam/depth/image: give option camera"):
+    with pytest.raises(SourceError, match=r"no calibration for /cam/depth/image: give --set .*camera="):
         McapReader().open(log.write(tmp_path / "none.mcap"))
     by_option = check_reader(McapReader(camera=(9, 9, 4, 3)), tmp_path / "none.mcap")
     assert by_option.frames[0].camera == Camera(WIDTH, HEIGHT, 9, 9, 4, 3)

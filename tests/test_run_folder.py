@@ -199,7 +199,7 @@ def test_the_layout_of_an_earlier_version_is_refused_and_made_again(recipe: Reci
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ("seed: 0", "seed: 0\npace: 2", "pace: unknown option"),
+        ("\nseed: 0", "\nseed: 0\npace: 2", "pace: unknown option"),
         ("whole_up_to: 10", "hole_up_to: 10", "did you mean 'whole_up_to'"),
         ("stage: maximum_likelihood", "stage: poison\n  strength: 3", "no stage 'poison'"),
         ("stage: local", "stage: dask\n  address: tcp://127.0.0.1:1", "no stage 'dask'"),

@@ -121,6 +121,8 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     axes = PLANAR_AXES if graph.dimension == 2 else np.arange(6)
     covariance = se3.covariances(graph.information[:, axes[:, None], axes])
     rows = np.flatnonzero(~backbone & (graph.edges[:, 0] != graph.edges[:, 1]))
+    low, high = np.sort(place[graph.edges[rows]], axis=1).T
+    rows = rows[np.lexsort((high, low))]  # samples of the loops must not depend on the order of the file
     step, step_covariance = np.tile(np.eye(4), (len(order), 1, 1)), np.zeros((len(order), len(axes), len(axes)))
     at = np.flatnonzero(step_edge >= 0)
     step[at], step_covariance[at] = _directed(

@@ -110,6 +110,8 @@ BY_CHANCE = float(np.log(100.0))
 """Nats by which loops must be likelier there."""
 LEAST_SHARE = 1e-3
 EVEN = np.full(2, 0.5)
+DECOYS = 4
+"""To a loop: with one, scales of loops differed up to eightfold from one draw to the next."""
 MOST_LOOPS = 3000
 """That scales are learned from: more tell hardly more."""
 
@@ -147,16 +149,17 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     loops.
 
     Each loop counts by itself: that loops at one place err alike, and steps too, would else be taken for small errors.
-    As many decoys, motions of loops between other places, tell what chance explains at each scale.
+    Decoys, motions of loops between other places, tell what as many would explain by chance at each scale.
     """
     own, decoys = _Model.of(chain, poses, wrong), _Model.of(decoyed(chain), poses, wrong)
+    share = len(own.residual) / max(len(decoys.residual), 1)
 
     def value(logs: Floats, unit: float) -> float:
         ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
         if not unit and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
             return -np.inf
         prior = -0.5 * float((logs - unit) @ (logs - unit)) / FOLD**2
-        return float(own.value(logs)[0] - max(decoys.value(logs)[0], 0.0) + prior)
+        return float(own.value(logs)[0] - share * max(decoys.value(logs)[0], 0.0) + prior)
 
     found = _likeliest(value, 0.0)
     if not chain.stated:
@@ -184,15 +187,18 @@ def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Fl
 
 
 def decoyed(chain: Chain) -> Chain:
-    """The chain with each loop's motion between two other places of one path, at random."""
+    """The chain with each loop's motion, `DECOYS` times, between two other places of one path, at random."""
     rng = np.random.default_rng(1)
-    count = len(chain.loop_edge)
+    loop = np.repeat(np.arange(len(chain.loop_edge)), DECOYS)
+    count = len(loop)
     first = rng.integers(0, chain.size, count)
     begin = np.searchsorted(chain.path, chain.path[first])
     length = np.searchsorted(chain.path, chain.path[first], side="right") - begin
     second = begin + np.minimum((rng.random(count) * length).astype(np.int64), length - 1)
     ends = np.sort(np.stack([first, second], axis=1), axis=1)
-    return replace(chain, ends=ends)
+    return replace(
+        chain, loop_edge=chain.loop_edge[loop], ends=ends, motion=chain.motion[loop], covariance=chain.covariance[loop]
+    )
 
 
 @dataclass(frozen=True)
