@@ -167,6 +167,7 @@ class Source:
     - `positions` of its frames that are known from elsewhere, such as satellite fixes; None where it has none.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
     - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
+    - `of_cameras`: its format says that poses are cameras', z ahead and y down; a graph of others is a robot's, z up.
     """
 
     name: str
@@ -178,6 +179,7 @@ class Source:
     files: tuple[Path, ...] = ()
     contents: tuple[str, ...] = ()
     positions: Positions | None = None
+    of_cameras: bool = False
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]
