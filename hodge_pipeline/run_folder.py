@@ -170,17 +170,25 @@ class Run:
         return self.result.edges
 
     def posed_source(self) -> Source:
-        """All frames with their final poses, the key frames with their clouds, the edges between these."""
+        """All frames with their final poses, the key frames with their clouds, the edges between these.
+
+        Frames have their colour images where the source is still what it was; else a note says why not.
+        """
         row_of = {int(row): number for number, row in enumerate(self.key_frames.rows)}
+        opened, complaint = self._frames_with_images()
+        own = self.source.frames
         frames = tuple(
             replace(
                 frame,
                 world_from_cam=_known(pose),
+                image=seen.image,
+                read_colour=seen.read_colour,
                 read_points=partial(self.clouds.__getitem__, row_of[row]) if row in row_of else None,
             )
-            for row, (frame, pose) in enumerate(zip(self.source.frames, self.poses, strict=True))
+            for row, (frame, seen, pose) in enumerate(zip(own, opened or own, self.poses, strict=True))
         )
-        return replace(self.source, frames=frames, path=self.folder, graph=self.result.graph)
+        notes = (*self.source.notes, *complaint)
+        return replace(self.source, frames=frames, path=self.folder, graph=self.result.graph, notes=notes)
 
     @property
     def recipe(self) -> Recipe:
@@ -201,6 +209,10 @@ class Run:
 
     def key_frames_with_images(self) -> tuple[Sequence[Frame], tuple[str, ...]]:
         """The key frames as their source has them, none where it has gone or has others by now, and a line why."""
+        frames, complaint = self._frames_with_images()
+        return tuple(frames[row] for row in self.key_frames.rows) if frames else (), complaint
+
+    def _frames_with_images(self) -> tuple[Sequence[Frame], tuple[str, ...]]:
         path, reader = self.recipe.source.path, self.recipe.source.reader
         if path is None:
             return (), ()
@@ -208,9 +220,9 @@ class Run:
             frames = (reader or guess_reader(path)).open(path).frames
         except (HodgeError, OSError) as error:
             return (), (f"without colour images: {error}",)
-        if len(frames) != len(self.source.frames):
+        if [frame.frame_id for frame in frames] != [frame.frame_id for frame in self.source.frames]:
             return (), (f"without colour images: {path} has other frames by now",)
-        return tuple(frames[row] for row in self.key_frames.rows), ()
+        return frames, ()
 
     def show(self, width: int = 960, height: int = 540) -> Any:
         """The recording in a Rerun viewer in a notebook's cell, in pixels (extra `notebook`); elsewhere `hodge view`.

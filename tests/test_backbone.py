@@ -210,6 +210,11 @@ def test_corridors_that_are_mistaken_neither_break_the_backbone_nor_make_a_latti
         assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
 
 
+def test_many_loops_of_one_mistaken_place_do_not_outvote_few_of_several_places() -> None:
+    made = drive(seed=8203, count=800, loops=80, wrong=0.9, in_groups=True, misstated=(10.0, 10.0))
+    np.testing.assert_array_equal(diagnose(made.graph).kept, made.right)
+
+
 def test_edges_written_the_other_way_round_change_nothing() -> None:
     one, other = (diagnose(drive(turned=turned).graph) for turned in (False, True))
     np.testing.assert_array_equal(one.verdict, other.verdict)

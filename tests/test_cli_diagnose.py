@@ -30,7 +30,7 @@ from hodge_pipeline.report.diagnosis_plots import side_by_side as pieces_apart
 from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views
 from hodge_pipeline.report.matches import side_by_side
 from hodge_pipeline.types import PointCloud, ViewGraph
-from hodge_pipeline.uses.diagnosed import open_subject
+from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 
@@ -78,6 +78,40 @@ def test_the_wrong_edge_is_printed_first_with_what_to_do(wrong_edge: tuple[Path,
     rows = hodge(folder / "ring.g2o", "--verbose").split("verdict  1 of 36")[0]
     assert re.search(rf"{i}-{j} +wrong +0\.\d\d +0 of \d+ cycles close.*disable it", rows)
     assert "note     cycles: " in rows and "energy   rotation " in rows
+
+
+def test_many_wrong_edges_are_left_out_by_one_short_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, poses = ring(20, reach=3)
+    turned = se3.exp(np.random.default_rng(1).normal(size=(20, 6)))  # motions in all directions
+    motions = se3.inverse(turned[graph.edges[:, 0]]) @ graph.i_from_j @ turned[graph.edges[:, 1]]
+    graph, poses = replace(graph, i_from_j=motions), poses @ turned
+    for row in (3, 17, 30, 41):
+        spoil(graph, row)
+    write_g2o(tmp_path / "ring.g2o", graph, poses)
+    monkeypatch.chdir(tmp_path)
+    told = hodge("ring.g2o").splitlines()[-1]
+    assert told == "next     hodge solve ring.g2o --out solved.g2o --robust"
+    done = CliRunner().invoke(app, [*told.split()[2:], "--json"], catch_exceptions=False)
+    assert json.loads(done.stdout)["edges_ignored"] == 4
+
+
+def test_the_wrong_edges_of_a_run_are_disabled_by_one_word_or_not_at_all(
+    wrong_edge: tuple[Path, str, ViewGraph],
+) -> None:
+    folder, _, graph = wrong_edge
+    file = open_subject(folder / "ring.g2o")
+    judged = replace(file, is_run=True, edges=diagnose(graph).put_into(file.edges))
+    found = diagnose_subject(judged)
+    assert found.commands == tuple(
+        f"hodge {rest}" for rest in (f"edit {file.path} --disable wrong", f"solve {file.path}")
+    )
+    assert found.advice[17] == "disable it"
+    otherwise = diagnose_subject(replace(judged, edges=file.edges))  # the table says nothing of the edge
+    i, j = graph.vertex_ids[graph.edges[17]]
+    assert otherwise.commands[0].endswith(f"--disable {i}-{j}")
+    as_good = diagnose_subject(replace(judged, harmless="No pose moves: nothing to do."))
+    assert not any("disable" in command for command in as_good.commands)
+    assert as_good.advice[17] == "nothing: no pose hangs on it" and as_good.notes[0] == "No pose moves: nothing to do."
 
 
 def test_the_files_say_the_same(wrong_edge: tuple[Path, str, ViewGraph]) -> None:
@@ -234,7 +268,7 @@ def test_two_clouds_are_drawn_where_they_are() -> None:
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)), axis=-1).reshape(-1, 2)
     left = PointCloud(np.column_stack([grid, np.full(len(grid), 2.0)]).astype(np.float32))
     i_from_j = se3.from_parts(np.eye(3), np.array([3.0, 0, 0]))
-    ahead, above = _views(left, left, [i_from_j], np.array([0.0, -1.0, 0.0]))
+    ahead, above = _views(left, left, [i_from_j], np.array([0.0, -1.0, 0.0]), np.eye(3))
     both = raster.two(left, left, i_from_j, (BLUE, ORANGE))
     image = raster.picture(both, ahead).astype(int)
     blue, orange = (

@@ -115,6 +115,22 @@ def test_a_scanners_range_is_a_distance_and_lost_points_are_dropped() -> None:
     assert (counts.looked_at, counts.valid) == (5, 1)
 
 
+def test_no_returns_of_scans_are_counted_in_one_note(tmp_path: Path) -> None:
+    """Zeros and NaN, whether the reader leaves them out or not; depth images have holes, and no note."""
+    from hodge_adapters.clouds.columns import points_of_columns
+
+    table = np.random.default_rng(0).uniform(1, 2, (40, 3)).astype(np.float32)
+    table[:5], table[5:7] = 0, np.nan
+    cloud = points_of_columns(tmp_path, dict(zip("xyz", table.T, strict=True)))
+    assert (len(cloud), cloud.no_numbers) == (38, 2)
+    scans = [Frame(k, float(k), read_points=lambda: cloud) for k in range(2)]
+    _, notes = prepare_clouds(scans, CloudOptions(), InProcess())
+    assert notes == ("14 of 80 points (17.5%) are no returns (zero, or no number): left out",)
+    holes = wall(WALL_M)
+    holes[:9] = 0
+    assert prepare_clouds([frame(holes)], CloudOptions(), InProcess())[1] == ()
+
+
 def test_clouds_come_in_the_order_of_the_frames_and_bad_frames_are_said() -> None:
     frames = [frame(wall(0.5 + 0.1 * k), k) for k in range(40)]
     frames[7] = Frame(7, 7.0, CAMERA, read_depth=unreadable)

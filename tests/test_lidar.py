@@ -79,6 +79,18 @@ def test_a_deskewed_sweep_is_what_a_scanner_at_rest_would_see() -> None:
     assert before.max() > 0.9 and after.max() < 0.03
 
 
+def test_no_returns_of_a_sweep_are_none_after_it_is_deskewed() -> None:
+    """Drivers write them as zeros: moved along they would stand as a row of points on the scanner's way."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(5, 9, (100, 3)).astype(np.float32)
+    points[::2] = 0
+    cloud = PointCloud(points, times_s=np.linspace(0, 0.1, 100).astype(np.float32))
+    moved = deskewed(cloud, np.array([0.0, 0, 0, 10, 0, 0]))
+    assert np.array_equal(moved.points_in_cam.any(axis=1), points.any(axis=1))
+    _, counts = make_cloud(Frame(0, 0.0, read_points=lambda: moved), CloudOptions(min_range_m=0, max_range_m=90))
+    assert (counts.valid, counts.no_returns) == (50, 50)
+
+
 def test_without_times_nothing_is_deskewed() -> None:
     cloud = PointCloud(np.ones((3, 3), np.float32))
     assert deskewed(cloud, np.ones(6)) is cloud

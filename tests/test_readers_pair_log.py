@@ -9,6 +9,7 @@ from hodge_adapters.pose_graphs.pair_log import PairLogReader, read_information
 from hodge_adapters.trajectories.log import LogWriter
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Source
@@ -20,6 +21,11 @@ def information(diagonal: list[float], corner: float = 0.0) -> str:
     matrix = np.diag(diagonal)
     matrix[0, 5] = matrix[5, 0] = corner
     return "".join(" ".join(map(str, line)) + "\n" for line in matrix)
+
+
+def graph_of_a_robot(folder: Path) -> Path:
+    (folder / "a.g2o").write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    return folder / "a.g2o"
 
 
 def test_pairs_by_hand(tmp_path: Path) -> None:
@@ -35,6 +41,8 @@ def test_pairs_by_hand(tmp_path: Path) -> None:
     np.testing.assert_array_equal(graph.i_from_j[0] @ [0, 0, 0, 1], [5, 6, 7, 1])
     np.testing.assert_array_equal(graph.information, np.tile(np.eye(6), (2, 1, 1)))
     assert source.notes == ("1 of 4 vertices are in no pair: 3",)
+    assert not open_for_review(path).is_scanner, "such a file is of cameras, that of a robot's graph is not"
+    assert open_for_review(graph_of_a_robot(tmp_path)).is_scanner
 
 
 def test_the_first_head_tells_pairs_from_a_trajectory(tmp_path: Path) -> None:

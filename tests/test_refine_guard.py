@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 from typer.testing import CliRunner
 
@@ -29,8 +30,15 @@ def test_force_writes_a_worse_result():
 
 
 def test_a_change_below_its_uncertainty_gives_the_input_back_without_complaint():
-    decision = decide([WORSE], STILL)
+    decision = decide([BETTER], STILL)
     assert decision.outcome == "optimal" and decision.keeps_input and decision.exit_code == 0
+
+
+def test_what_was_held_out_counts_before_a_large_uncertainty():
+    held_out = replace(WORSE, before=0.72, after=0.83, tolerance=0.02, is_held_out=True)
+    assert decide([held_out], STILL).outcome == "refined"
+    assert decide([replace(held_out, after=0.73)], STILL).outcome == "optimal"
+    assert decide([WORSE], STILL).outcome == "worse"
 
 
 def test_a_measure_within_its_tolerance_is_not_worse_and_a_lost_one_is():

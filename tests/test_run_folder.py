@@ -103,6 +103,14 @@ def test_every_reader_works_where_the_source_is_gone(run: Run, alone: Path, tmp_
     assert {path: path.stat().st_mtime_ns for path in (alone / "stages").rglob("*")} == steps
 
 
+def test_a_run_is_converted_with_the_images_of_its_source(run: Run, alone: Path, tmp_path: Path) -> None:
+    told = hodge("convert", run.folder, tmp_path / "scene", "--to", "nerfstudio")
+    entries = json.loads((tmp_path / "scene/transforms.json").read_text())["frames"]
+    assert len(entries) == FRAMES and all((tmp_path / "scene" / entry["file_path"]).is_file() for entry in entries)
+    assert f"{FRAMES} images copied" in told
+    assert "without colour images" in hodge("convert", alone, tmp_path / "bare", "--to", "nerfstudio")
+
+
 def poses_of(run: Run) -> Path:
     return run.folder / "poses.tum"
 
@@ -191,7 +199,7 @@ def test_the_layout_of_an_earlier_version_is_refused_and_made_again(recipe: Reci
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ("seed: 0", "seed: 0\npace: 2", "pace: unknown option"),
+        ("\nseed: 0", "\nseed: 0\npace: 2", "pace: unknown option"),
         ("whole_up_to: 10", "hole_up_to: 10", "did you mean 'whole_up_to'"),
         ("stage: maximum_likelihood", "stage: poison\n  strength: 3", "no stage 'poison'"),
         ("stage: local", "stage: dask\n  address: tcp://127.0.0.1:1", "no stage 'dask'"),

@@ -119,6 +119,12 @@ def test_wrong_edges_are_left_out(tmp_path):
     answer = json.loads(hodge(tmp_path / "bad.g2o", "--robust", "--json"))
     assert answer["edges_ignored"] >= 1
     assert any("edges kept" in note for note in answer["notes"])
+    hodge(tmp_path / "bad.g2o", "--robust", "--run", tmp_path / "run")
+    report = json.loads((tmp_path / "run/report.json").read_text())
+    worst = report["worst_edges"][0]
+    assert (worst["i"], worst["j"], worst["verdict"], worst["weight"]) == ("-2", str(10**15), "wrong", 0.0)
+    assert "fails by" in worst["why"] and f'word wide">{worst["why"]}<' in (tmp_path / "run/report.html").read_text()
+    assert report["graph"]["verdicts"]["wrong"] == 1 and report["source"]["is_scanner"]
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def _open_graph(path: Path, content: dict[str, Any]) -> Source:
     graph = ViewGraph.from_edges(np.arange(len(nodes)), rows, i_from_j, ours)
     graph = replace(graph, source=np.array(names, np.str_).reshape(-1))
     trajectory = Trajectory(np.arange(len(nodes), dtype=float), poses)
-    return Source(path.stem, path, trajectory=trajectory, graph=graph, files=(path,))
+    return Source(path.stem, path, trajectory=trajectory, graph=graph, files=(path,), of_cameras=True)
 
 
 def _open_trajectory(path: Path, content: dict[str, Any]) -> Source:

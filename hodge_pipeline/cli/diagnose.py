@@ -70,7 +70,7 @@ def _lines(found: Diagnosed, out: Path | None, top: int | None, bad: int) -> lis
 
     head = labelled("verdict", sentence(found.subject.graph, found.diagnosis))
     worrying = [note for note in found.notes if note not in found.diagnosis.notes]
-    tail = [line for note in worrying[:1] for line in at_most(labelled("look", note), 1)]
+    tail = [line for note in worrying[:1] for line in at_most(labelled("look", note), 2)]
     tail += [line for one in _to_register(found)[:1] if bad for line in at_most(labelled("register", one), 1)]
     tail += [] if out is None else [f"{'report':<{LABEL}}{out / 'diagnosis.html'}"]
     tail += [f"{'next':<{LABEL}}{command}" for command in found.commands]

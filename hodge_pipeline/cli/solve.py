@@ -132,7 +132,7 @@ def _lines(
     lines.append(f"{'time':<{LABEL}}{time}")
     lines += [f"{'written':<{LABEL}}{out}"] if out is not None else []
     lines += [f"{'report':<{LABEL}}{run_folder / 'report.html'}"] if run_folder is not None else []
-    return [*lines, f"{'next':<{LABEL}}{command('hodge', 'diagnose', solved.source.path)}"]
+    return [*lines, f"{'next':<{LABEL}}{command('hodge', 'diagnose', run_folder or solved.source.path)}"]
 
 
 def _check(summary: dict[str, Any]) -> None:

@@ -31,10 +31,12 @@ def free_direction_notes(graph: ViewGraph) -> tuple[str, ...]:
     """
     if graph.dimension == 2 or not graph.edge_count or has_unit_information(graph):
         return ()
-    lengths = np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1)
-    arm_m = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
-    scale = np.repeat([1 / arm_m, 1.0], 3)
-    held = scale[:, None] * _held(graph) * scale
+    held = _held(graph)
+    turns, slides = (np.einsum("vii->v", held[:, part, part]) for part in (slice(3), slice(3, 6)))
+    both = (turns > 0) & (slides > 0)
+    arm_m = float(np.sqrt(np.median(turns[both] / slides[both]))) if both.any() else 1.0
+    scale = np.repeat([1 / arm_m, 1.0], 3)  # a turn then counts as the slide that is known as well
+    held = scale[:, None] * held * scale
     values, vectors = np.linalg.eigh(held)
     free = (values < UNMEASURED * values[:, -1:]) & (values[:, -1:] > 0)
     frames = np.flatnonzero(free.any(axis=1))

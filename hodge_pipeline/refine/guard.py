@@ -16,7 +16,8 @@ class Measure:
     """One quality of the poses, before and after.
 
     `better` says which way is good; a change the other way by more than `tolerance`, in the measure's own unit, is a
-    change for the worse: what the measure's own noise could do is none.
+    change for the worse: what the measure's own noise could do is none. `is_held_out`: of measurements that took no
+    part in the solve.
     """
 
     name: str
@@ -25,6 +26,7 @@ class Measure:
     better: Better = "lower"
     tolerance: float = 0.0
     unit: str = ""
+    is_held_out: bool = False
 
     @property
     def is_worse(self) -> bool:
@@ -74,7 +76,8 @@ class Decision:
     """What becomes of a refinement, why, and the measures behind it.
 
     - `refined`: the result is written;
-    - `optimal`: it differs from the input by less than its own uncertainty: the input is given back;
+    - `optimal`: it differs from the input by less than its own uncertainty, and what was held out is no better: the
+      input is given back;
     - `worse`: a measure got worse: the input is given back, and the exit code is 3;
     - `forced`: as `worse`, but the result is written all the same;
     - `nothing`: no measurement related the poses: nothing is written but the report, and the exit code is 3.
@@ -97,12 +100,16 @@ class Decision:
 
 
 def decide(measures: Sequence[Measure], change: Change | None = None, *, force: bool = False) -> Decision:
-    """The decision on a refinement. With `force` a worse result is written; an optimal input is still given back."""
+    """The decision on a refinement. With `force` a worse result is written; an optimal input is still given back.
+
+    Measures come before the uncertainty, which is that of edges which hardly fix the poses, or state too little.
+    """
     measures = tuple(measures)
-    if change is not None and not change.is_significant:
-        return Decision("optimal", f"already optimal: {change}", measures, change)
     worse = [measure for measure in measures if measure.is_worse]
     if worse:
         reason = "worse by its own measures: " + "; ".join(str(measure) for measure in worse)
         return Decision("forced" if force else "worse", reason, measures, change)
+    better = any(measure.is_held_out and measure.is_better for measure in measures)
+    if change is not None and not change.is_significant and not better:
+        return Decision("optimal", f"already optimal: {change}", measures, change)
     return Decision("refined", "; ".join(str(measure) for measure in measures) or "nothing measured", measures, change)

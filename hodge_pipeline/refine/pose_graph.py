@@ -47,11 +47,12 @@ class Choices:
 
 @dataclass(frozen=True)
 class SolvedFile:
-    """What was read, its solution with a weight for every edge of the file, and the seconds it took."""
+    """What was read, its solution with a weight for every edge of the file, how it was solved and in what time."""
 
     source: Source
     graph: ViewGraph
     solution: Solution
+    choices: Choices
     cpu_s: float
     wall_s: float
 
@@ -153,7 +154,7 @@ def solve_file(path: Path, choices: Choices) -> SolvedFile:
     weights = np.zeros(len(off))
     weights[~off] = solution.weights
     notes = (f"{int(off.sum())} edges are disabled", *solution.notes) if off.any() else solution.notes
-    return SolvedFile(source, source.graph, replace(solution, weights=weights, notes=notes), cpu_s, wall_s)
+    return SolvedFile(source, source.graph, replace(solution, weights=weights, notes=notes), choices, cpu_s, wall_s)
 
 
 def _solved(graph: ViewGraph, start: Floats | None, choices: Choices) -> Solution:

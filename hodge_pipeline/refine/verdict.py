@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -71,10 +71,7 @@ def _decision(work: Work, rounds: Sequence[Round], before: Floats) -> Decision:
     measures = [*_held_out(work, rounds, before)]
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
     measures.append(chi2_measure(*chi2))
-    moved = change(last.graph, last.solution, before)
-    # Where edges hardly fix the poses any change is below its uncertainty; what the measures see counts first then.
-    judged = None if any(measure.is_worse for measure in measures) else moved
-    return replace(decide(measures, judged, force=work.recipe.guard.force), change=moved)
+    return decide(measures, change(last.graph, last.solution, before), force=work.recipe.guard.force)
 
 
 def chi2_measure(before: float, after: float) -> Measure:
@@ -99,7 +96,7 @@ def _held_out(work: Work, rounds: Sequence[Round], before: Floats) -> list[Measu
     mean_mm, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_mm[0]:.3g} mm apart before, {mean_mm[1]:.3g} mm after"
     work.steps.note(Note("held out", len(pairs), apart))
-    return [Measure("score of held-out edges", float(mean[0]), float(mean[1]), "higher", tolerance)]
+    return [Measure("score of held-out edges", float(mean[0]), float(mean[1]), "higher", tolerance, is_held_out=True)]
 
 
 def held_out_distances_m(

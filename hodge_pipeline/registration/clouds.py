@@ -94,8 +94,8 @@ class Oddity(NamedTuple):
 
 
 class CloudCounts(NamedTuple):
-    """What became of a frame: measurements looked at, those valid and in range, points kept; what is odd, and whether
-    its colour image is `blank`.
+    """What became of a frame: measurements looked at, those valid and in range, points kept; what is odd, whether its
+    colour image is `blank`, and how many points of a scan are no returns.
     """
 
     looked_at: int
@@ -103,6 +103,7 @@ class CloudCounts(NamedTuple):
     points: int
     odd: Oddity | None = None
     blank: bool = False
+    no_returns: int = 0
 
 
 class _Samples(NamedTuple):
@@ -112,6 +113,7 @@ class _Samples(NamedTuple):
     odd: Oddity | None = None
     why_none: str = ""
     blank: bool = False
+    no_returns: int = 0
 
 
 def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:
@@ -130,7 +132,8 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     elif samples.looked_at > MANY_POINTS:
         kept = f"{samples.looked_at} points to {len(points)}, one a voxel of {options.voxel_m:.3g} m"
         odd = Oddity(frame.frame_id, "down-sampled in parts", kept)
-    return cloud, CloudCounts(samples.looked_at, len(samples.points_in_cam), len(points), odd, samples.blank)
+    valid, no_returns = len(samples.points_in_cam), samples.no_returns
+    return cloud, CloudCounts(samples.looked_at, valid, len(points), odd, samples.blank, no_returns)
 
 
 def landmarks_of(options: CloudOptions, frames: Sequence[Frame]) -> list[Landmarks]:
@@ -168,7 +171,16 @@ def prepare_clouds(
         reason = odd[0] if odd else "the source has no frames"
         raise SourceError(f"none of the {len(frames)} frames gave a point cloud; the first: {reason}")
     odd += [Oddity(frame.frame_id, BLANK) for frame, (_, counts) in zip(frames, results, strict=True) if counts.blank]
-    return CloudSet.from_clouds([cloud for cloud, _ in results]), shortened(odd)
+    return CloudSet.from_clouds([cloud for cloud, _ in results]), shortened(odd) + _no_returns(results)
+
+
+def _no_returns(results: Sequence[tuple[PointCloud, CloudCounts]]) -> tuple[str, ...]:
+    """The note that counts the points of scans that are no returns, where there are any."""
+    lost = sum(counts.no_returns for _, counts in results)
+    if not lost:
+        return ()
+    looked_at = sum(counts.looked_at for _, counts in results)
+    return (f"{lost} of {looked_at} points ({lost / looked_at:.1%}) are no returns (zero, or no number): left out",)
 
 
 def is_blank(image: Bytes) -> bool:
@@ -244,7 +256,9 @@ def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
     kept = in_range(cloud, options)
     colours = kept.colours if options.colours else None
     why_none = "" if len(kept) else out_of_range(cloud, options)
-    return _Samples(np.asarray(kept.points_in_cam, np.float32), colours, len(cloud), why_none=why_none)
+    zeros = 0 if len(kept) == len(cloud) else int((~(_ranges(cloud) > 0)).sum())  # true for NaN
+    lost, points = zeros + cloud.no_numbers, np.asarray(kept.points_in_cam, np.float32)
+    return _Samples(points, colours, len(cloud) + cloud.no_numbers, why_none=why_none, no_returns=lost)
 
 
 def in_range(cloud: PointCloud, options: CloudOptions) -> PointCloud:

@@ -26,6 +26,7 @@ def deskewed(cloud: PointCloud, velocity: Floats, after_s: float = 0.0) -> Point
     middle_s = (np.arange(STEPS_A_SWEEP) + 0.5) / STEPS_A_SWEEP * last_s
     motions = se3.exp((middle_s - after_s)[:, None] * velocity).astype(np.float32)
     points = np.einsum("nij,nj->ni", motions[step, :3, :3], cloud.points_in_cam) + motions[step, :3, 3]
+    points[~cloud.points_in_cam.any(axis=1)] = 0.0  # no returns stay what they are
     return replace(cloud, points_in_cam=points, normals_in_cam=None, times_s=None)
 
 

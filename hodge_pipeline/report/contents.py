@@ -118,6 +118,7 @@ class EdgeRow:
     residual_m: float
     residual_deg: float
     verdict: str = ""
+    why: str = ""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
 from hodge_pipeline.recording.solved import record_graph
 from hodge_pipeline.refine.pose_graph import RUN_GRAPH, SolvedFile, write_solved
@@ -16,6 +18,7 @@ from hodge_pipeline.report.contents import (
     SourceSummary,
     StageRow,
 )
+from hodge_pipeline.report.diagnosis_page import LISTED
 from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.store import artifacts
@@ -32,19 +35,22 @@ def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
     """Write the folder, made if it is not there; what the recording left out, in words."""
     make_folder(folder, "--run")
     write_solved(folder / RUN_GRAPH, solved)
-    write_edges(folder / "edges.csv", _edges(solved), solved.graph.vertex_ids)
+    edges = _edges(solved)
+    write_edges(folder / "edges.csv", edges, solved.graph.vertex_ids)
     artifacts.write_json(folder / SOLVED, solved.summary())
-    write_report(folder, _report(solved))
-    solution = solved.solution
+    write_report(folder, _report(solved, edges))
+    source, solution = solved.source, solved.solution
     start = solution.world_from_cam if solved.start is None else solved.start
-    notes = solved.source.notes
-    name, before = solved.source.name, _before(solved)
-    return record_graph(folder, name, solved.graph, start, solution, before, notes, is_scanner=True)
+    sets, is_scanner = _before(solved), not source.of_cameras
+    return record_graph(folder, source.name, solved.graph, start, solution, sets, source.notes, is_scanner=is_scanner)
 
 
 def _edges(solved: SolvedFile) -> Edges:
-    solution = solved.solution
-    return with_residuals(Edges.measured(solved.graph), solution.world_from_cam, solution.weights)
+    """All edges with what the poses leave of them; of a robust solve with each verdict, as in `hodge diagnose`."""
+    solution, edges = solved.solution, Edges.measured(solved.graph)
+    if solved.choices.robust:
+        edges = diagnose(solved.graph, DiagnosisOptions(trust=solved.choices.trust)).put_into(edges)
+    return with_residuals(edges, solution.world_from_cam, solution.weights)
 
 
 def _before(solved: SolvedFile) -> dict[str, Floats]:
@@ -57,18 +63,24 @@ def _outcome(solved: SolvedFile) -> RefinementSummary:
     return RefinementSummary("worse" if solved.doubt else "solved", solved.headline, reason)
 
 
-def _report(solved: SolvedFile) -> Report:
+def _report(solved: SolvedFile, edges: Edges) -> Report:
     source, graph, solution = solved.source, solved.graph, solved.solution
     sets = {**_before(solved), "result": solution.world_from_cam}
     return Report(
         title=source.name,
         source=SourceSummary(
-            source.name, str(source.path), graph.vertex_count, notes=source.notes, format="pose graph", kind="poses"
+            source.name,
+            str(source.path),
+            graph.vertex_count,
+            notes=source.notes,
+            format="pose graph",
+            kind="poses",
+            is_scanner=not source.of_cameras,
         ),
         before="start",
         refinement=_outcome(solved),
-        graph=graph_summary(_edges(solved), graph.vertex_ids, solution.component),
-        worst_edges=worst_edges(_edges(solved), graph.vertex_ids),
+        graph=graph_summary(edges, graph.vertex_ids, solution.component),
+        worst_edges=worst_edges(edges, graph.vertex_ids, LISTED),
         stages=(StageRow("solve", solved.wall_s, solved.cpu_s, float("nan")),),
         notes=notes_of("solver", solution.notes),
         versions=versions(),

@@ -132,6 +132,7 @@ def worst_edges(edges: Edges, vertex_ids: NDArray[np.generic], count: int = 10) 
             residual_m=float(worst.residual_m[row]),
             residual_deg=float(np.rad2deg(worst.residual_rad[row])),
             verdict=str(worst.verdict[row]),
+            why=str(worst.why[row]),
         )
         for row, (i, j) in enumerate(vertex_ids[worst.pairs].tolist())
     )

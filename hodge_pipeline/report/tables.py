@@ -203,11 +203,12 @@ def worst_edges_table(report: Report) -> Table:
         "i": [edge.i for edge in edges],
         "j": [edge.j for edge in edges],
         "source": [edge.source for edge in edges],
+        "verdict": [edge.verdict or "–" for edge in edges],
+        "why": [edge.why or "–" for edge in edges],
         "fitness": [number(edge.fitness, ".2f") for edge in edges],
         "weight": [number(edge.weight, ".2g") for edge in edges],
         "off by": [report.length(edge.residual_m, edges[0].residual_m) for edge in edges],
         "turned by": [number(edge.residual_deg, ".2f", "°") for edge in edges],
-        "verdict": [edge.verdict or "–" for edge in edges],
     }
     told = {
         "fitness": " Fitness: share of the cloud that found a partner.",
@@ -217,7 +218,10 @@ def worst_edges_table(report: Report) -> Table:
     header = tuple(name for name, cells in columns.items() if set(cells) != {"–"})
     rows = tuple(zip(*(columns[name] for name in header), strict=True))
     caption = "Measured motions that disagree most with the result, worst first: a wrong edge, or a wrong result there."
-    return Table("Worst edges", header, rows, caption + "".join(told.get(name, "") for name in header), 3)
+    caption += " edges.csv has all." + "".join(told.get(name, "") for name in header)
+    words = sum(name in ("i", "j", "source", "verdict", "why") for name in header)
+    wide = tuple(column for column, name in enumerate(header) if name == "why")
+    return Table("Worst edges", header, rows, caption, words, wide=wide)
 
 
 def stages_table(report: Report) -> Table:

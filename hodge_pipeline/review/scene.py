@@ -10,7 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG
-from hodge_pipeline.recording.shapes import is_scanner, or_grey, up_and_ahead
+from hodge_pipeline.recording.shapes import or_grey, up_and_ahead
 from hodge_pipeline.report.diagnosis_plots import COLOURS as REPORTED
 from hodge_pipeline.review.closeup import Closeup, placed, quat_wxyz
 from hodge_pipeline.review.listing import witnesses
@@ -103,7 +103,7 @@ class Scene:
         _, radius = _ball(known[:, :3, 3])
         self._size = max(radius, 0.5) if self._subject.unit == "m" else radius
         clouds = self._subject.clouds
-        self._up, ahead = up_and_ahead(known if len(known) else np.eye(4)[None], clouds is None or is_scanner(clouds))
+        self._up, ahead = up_and_ahead(known if len(known) else np.eye(4)[None], self._subject.is_scanner)
         centre, radius = _ball(np.concatenate([known[:, :3, 3], _sampled(clouds, poses)]))
         return centre + max(radius, self._size) * (1.8 * self._up - 1.3 * ahead), centre
 

@@ -12,6 +12,7 @@ import numpy as np
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.pairs.edits import FILE
 from hodge_pipeline.recipe.schema import Recipe
+from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.refine.candidates import NO_EDGE
 from hodge_pipeline.refine.model import refinable
 from hodge_pipeline.refine.model_options import load_model_refinement
@@ -64,6 +65,11 @@ class Subject:
     def is_run(self) -> bool:
         """Whether `hodge solve` fuses it again."""
         return self.recipe is not None
+
+    @property
+    def is_scanner(self) -> bool:
+        """Whether its poses have x ahead and z up: those of a pose graph whose format tells of no cameras, of scans."""
+        return not (self.is_run or self.source.of_cameras) if self.clouds is None else is_scanner(self.clouds)
 
     @property
     def finish(self) -> str:

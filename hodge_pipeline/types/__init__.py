@@ -96,6 +96,7 @@ class PointCloud:
 
     `landmarks` are other points, of the frame's image; None where nobody asked for them. `times_s (N,)` is when each
     point was measured, seconds after the first, by a scanner that turns while it moves; None where nobody says.
+    `no_numbers` is how many more points the reader left out, whose coordinates are no numbers.
     """
 
     points_in_cam: Floats32
@@ -103,6 +104,7 @@ class PointCloud:
     colours: Bytes | None = None
     landmarks: Landmarks | None = None
     times_s: Floats32 | None = None
+    no_numbers: int = 0
 
     def __len__(self) -> int:
         return len(self.points_in_cam)
@@ -165,6 +167,7 @@ class Source:
     - `positions` of its frames that are known from elsewhere, such as satellite fixes; None where it has none.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
     - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
+    - `of_cameras`: its format says that poses are cameras', z ahead and y down; a graph of others is a robot's, z up.
     """
 
     name: str
@@ -176,6 +179,7 @@ class Source:
     files: tuple[Path, ...] = ()
     contents: tuple[str, ...] = ()
     positions: Positions | None = None
+    of_cameras: bool = False
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]

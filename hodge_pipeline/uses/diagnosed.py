@@ -18,11 +18,14 @@ from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.diagnosis.wording import advice, ranked
 from hodge_pipeline.pairs.edits import joining, pair_names, read_history
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
+from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.diagnosis_page import PageContents, document
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
 from hodge_pipeline.report.document import render
 from hodge_pipeline.report.edge_pictures import edge_pictures
+from hodge_pipeline.report.verdict import NOTHING_MOVED_M
 from hodge_pipeline.run_folder import Run
+from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
@@ -35,14 +38,14 @@ from hodge_pipeline.types.text import command
 PICTURED, LEAST_PICTURED = 6, 2
 SUGGESTED, REGISTERED = 12, 6
 """Pairs that are ranked, and those that a command to type names."""
-COMMANDED = 20
+COMMANDED = 3
 """Edges at most that a command to type names."""
 
 
 @dataclass(frozen=True)
 class Subject:
     """A graph to judge. A run also has its frames and clouds; `edges` are the graph's, some of them off by hand; pairs
-    (P, 2) were `tried` in vain.
+    (P, 2) were `tried` in vain; `harmless` says why its wrong edges need not be disabled.
     """
 
     path: Path
@@ -56,6 +59,7 @@ class Subject:
     frames: Sequence[Frame] = ()
     clouds: CloudSet | None = None
     notes: tuple[str, ...] = ()
+    harmless: str = ""
 
     @property
     def disabled(self) -> Bools:
@@ -69,7 +73,9 @@ def open_subject(path: Path, trust: str | None = None) -> Subject:
     `trust`: which edges are a backbone, in place of what the run's recipe says.
     """
     subject = _run_subject(path, Run.load(path)) if is_run_folder(path) else _file_subject(path)
-    return subject if trust is None else replace(subject, options=replace(subject.options, trust=trust))
+    if trust is None:
+        return subject
+    return replace(subject, options=replace(subject.options, trust=trust), harmless="")
 
 
 def _file_subject(path: Path) -> Subject:
@@ -82,15 +88,17 @@ def _file_subject(path: Path) -> Subject:
 
 
 def _run_subject(path: Path, run: Run) -> Subject:
-    _ = run.report  # raises where the run has not ended
+    report = run.report  # raises where the run has not ended
     last, recipe = run.result, run.recipe
+    edges = _edited(path, last.graph, last.graph_edges)
+    as_solved = np.array_equal(edges.status, last.graph_edges.status)
     frames, notes = run.key_frames_with_images()
     unknown = tuple(str(Note("option unknown", detail=line)) for line in run.options_left_out)
     return Subject(
         path,
         path.resolve().name,
         last.graph,
-        _edited(path, last.graph, last.graph_edges),
+        edges,
         is_run=True,
         options=recipe.diagnosis,
         suggestions=recipe.suggestions,
@@ -98,7 +106,16 @@ def _run_subject(path: Path, run: Run) -> Subject:
         frames=frames,
         clouds=run.clouds,
         notes=(*unknown, *notes),
+        harmless=_harmless(report) if as_solved else "",
     )
+
+
+def _harmless(report: Report) -> str:
+    """Why a run is as good without its wrong edges disabled; empty where they bend poses, or nobody weighed them."""
+    if report.wrong_edges is None or report.wrong_edges.matters(report.scale):
+        return ""
+    moved = report.length(max(report.wrong_edges.moved_m, NOTHING_MOVED_M * report.scale))
+    return f"Without the wrong edges no pose moves by more than {moved}: nothing to do."
 
 
 def _edited(path: Path, graph: ViewGraph, edges: Edges) -> Edges:
@@ -133,7 +150,9 @@ def diagnose_subject(subject: Subject) -> Diagnosed:
     pieces = int(found.piece.max(initial=-1)) + 1
     apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
     energy, complaints = energy_rows(subject.graph, found.world_from_cam, found.piece, found.kept)
+    harmless = (subject.harmless,) if subject.harmless and (found.verdict == WRONG).any() else ()
     notes = (
+        *harmless,
         *subject.notes,
         *found.notes,
         *((apart,) if pieces > 1 else ()),
@@ -144,7 +163,8 @@ def diagnose_subject(subject: Subject) -> Diagnosed:
         subject.graph, found, SUGGESTED, overlapping=_overlapping(subject, found), tried=subject.tried
     )
     commands = _commands(subject, found, suggestions)
-    return Diagnosed(subject, found, advice(found, subject.disabled), energy, commands, notes, suggestions)
+    told = advice(found, subject.disabled, is_harmless=bool(harmless))
+    return Diagnosed(subject, found, told, energy, commands, notes, suggestions)
 
 
 def _overlapping(subject: Subject, found: Diagnosis) -> Ints | None:
@@ -174,18 +194,20 @@ def _side_by_side(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
 
 
 def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> tuple[str, ...]:
-    meant = (found.verdict == WRONG) & ~subject.disabled & ~_beside_kept(subject.graph, found)
+    used, beside = (found.verdict == WRONG) & ~subject.disabled, _beside_kept(subject.graph, found)
+    meant = used & ~beside & (not subject.harmless)
     rows = np.array([row for row in ranked(found) if meant[row]], int)
     wrong = pair_names(subject.graph.vertex_ids, subject.graph.edges[rows])
     if not subject.is_run:
-        if len(wrong) > COMMANDED:
-            return (command("hodge", "solve", subject.path, "--out", "solved.g2o", "--robust"),)
-        off = [word for pair in wrong for word in ("--disable", pair)]
-        return (command("hodge", "solve", subject.path, "--out", "solved.g2o", *off),) if wrong else ()
+        trust = ("--trust", subject.options.trust) if subject.options.trust != AUTO else ()
+        left_out = len(wrong) > COMMANDED or bool((used & beside).any())
+        off = ("--robust", *trust) if left_out else [word for pair in wrong for word in ("--disable", pair)]
+        return (command("hodge", "solve", subject.path, "--out", "solved.g2o", *off),) if off else ()
     useful = suggestions.pairs[suggestions.score >= subject.suggestions.min_gain][:REGISTERED]
     if not wrong and not len(useful):
         return ()
-    edit = "--disable", ",".join(wrong) if len(wrong) <= COMMANDED else WRONG
+    by_word = np.array_equal(meant, (subject.edges.verdict == WRONG) & ~subject.disabled)
+    edit = "--disable", WRONG if by_word else ",".join(wrong)
     if not wrong:
         edit = "--register", ",".join(pair_names(subject.graph.vertex_ids, useful))
     return command("hodge", "edit", subject.path, *edit), command("hodge", "solve", subject.path)

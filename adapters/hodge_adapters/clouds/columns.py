@@ -37,6 +37,7 @@ def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
     normals: list[Floats32] = []
     colours: list[NDArray[Any]] = []
     times: list[Floats] = []
+    no_numbers = 0
     for columns in parts:
         if not all(name in columns for name in "xyz"):
             raise SourceError(f"{path}: no x, y and z among {', '.join(columns) or 'nothing'}: give a file of points")
@@ -44,6 +45,7 @@ def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
         with np.errstate(invalid="ignore"):
             finite: Bools = np.asarray((np.abs(found) < MAX_METRES).all(axis=1))
         points.append(found[finite])
+        no_numbers += len(found) - len(points[-1])
         names = next((names for names in NORMALS if names[0] in columns), None)
         if names:
             normals.append(_unit(_stack(columns, names)[finite]))
@@ -57,6 +59,7 @@ def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
         _joined(normals) if normals else None,
         _eight_bits(_joined(colours)) if colours else None,
         times_s=seconds_after_first(_joined(times)) if times else None,
+        no_numbers=no_numbers,
     )
 
 

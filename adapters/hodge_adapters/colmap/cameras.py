@@ -33,7 +33,11 @@ def pinhole_camera(record: CameraRecord, size: tuple[int, int]) -> Camera:
     Raises `SourceError` where there is none: a panorama, or parameters that are no camera.
     """
     if record.model == "EQUIRECTANGULAR":
-        raise SourceError(f"camera {record.camera_id}: a panorama has no pinhole camera: cut it into views first")
+        raise SourceError(
+            f"camera {record.camera_id}: EQUIRECTANGULAR is a panorama, which no pinhole camera sees: cut each into "
+            "perspective views of one rig (as pycolmap's example panorama_sfm.py does) and reconstruct these; "
+            "`colmap bundle_adjuster` adjusts the panoramas as they are"
+        )
     scaled = scaled_camera(record, size)
     numbers = scaled.focal_length_x, scaled.focal_length_y, scaled.principal_point_x, scaled.principal_point_y
     if not np.isfinite(numbers).all() or min(numbers[:2]) <= 0:

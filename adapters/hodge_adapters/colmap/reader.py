@@ -137,7 +137,8 @@ class ColmapReader:
         )
         lost = [frame.frame_id for frame in frames if frame.read_colour is None]
         if lost:
-            notes.append(f"{len(lost)} of {len(frames)} images are not there as files: {listed(lost)}")
+            advice = "" if colour_folder else ": images=FOLDER names where they are"
+            notes.append(f"{len(lost)} of {len(frames)} images are not there as files: {listed(lost)}{advice}")
         graph, database = self._graph(folder, model, bool(readable), notes)
         files = (*model.files, *database, *readable.values())
         return Source(

@@ -69,7 +69,7 @@ class PairLogReader:
             graph = replace(graph, information=_matched(beside, found.pairs, matrices, notes))
             notes.append(f"information of {beside.name}")
         files = (path,) if beside is None else (path, beside)
-        return Source(path.stem, path, graph=graph, notes=tuple(notes), files=files)
+        return Source(path.stem, path, graph=graph, notes=tuple(notes), files=files, of_cameras=True)
 
     def _information_file(self, path: Path) -> Path | None:
         if isinstance(self.information, Path):

@@ -98,7 +98,7 @@ class LogReader:
         if len(found.pairs):
             ids, rows = np.unique(found.pairs, return_inverse=True)
             graph = ViewGraph.from_edges(ids, rows.reshape(-1, 2), found.i_from_j, source="log")
-        return Source(path.stem, path, trajectory=trajectory, graph=graph, files=(path,))
+        return Source(path.stem, path, trajectory=trajectory, graph=graph, files=(path,), of_cameras=True)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
