@@ -95,7 +95,7 @@ def test_from_clouds_to_poses() -> None:
     clouds = [se3.transform(se3.inverse(pose), surface()) for pose in truth]
     edges = hodge_pipeline.register_clouds(clouds, [(0, 1), (1, 2), (0, 2)])
     assert edges.proposed_by.tolist() == ["gicp"] * 3 and edges.converged.all()
-    graph = edges.as_graph(np.arange(3))
+    graph = edges.as_graph(range(3))
     poses = hodge_pipeline.solve_robust(graph, start=np.tile(np.eye(4), (3, 1, 1))).world_from_cam
     assert np.abs(poses - truth).max() < 2e-3
     assert hodge_pipeline.diagnose(graph).kept.all()

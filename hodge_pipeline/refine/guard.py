@@ -87,6 +87,8 @@ class Decision:
     reason: str
     measures: tuple[Measure, ...] = ()
     change: Change | None = None
+    doubt: str = ""
+    """Why even what is kept may be wrong."""
 
     @property
     def keeps_input(self) -> bool:

@@ -9,6 +9,8 @@ import numpy as np
 
 from hodge_pipeline.types import Bools, Floats, Ints, ModelQuality
 
+CONTRADICTING_PX = 4.0
+"""Mean error at which observations contradict each other: COLMAP leaves out each that is farther off."""
 LEAST_CAP_PX = 4.0
 """COLMAP's own limit (`filter_max_reproj_error`): beyond it an observation is wrong, and how far off tells no more."""
 CAP_MEDIANS = 3.0
@@ -44,6 +46,12 @@ class Cost:
     beyond: float
     images_off: tuple[str, ...]
     images_in_doubt: tuple[str, ...]
+
+    @property
+    def doubt(self) -> str:
+        """Why these poses may be wrong although nothing fits better; empty where nothing says so."""
+        off = f"in doubt, since tracks contradict each other by {self.px:.3g} px (merged wrongly, or cameras are wrong)"
+        return off if self.px > CONTRADICTING_PX else ""
 
     @property
     def is_sound(self) -> bool:

@@ -135,7 +135,7 @@ def _refine(
     names = [(one.name, cost) for one, cost in zip(found.candidates, found.costs, strict=True)]
     candidates = names if len(inputs) == 1 else [(f"{len(inputs)} models apart", found.inputs), *names]
     notes = (*model.notes, *found.notes, *(str(scale) for scale in scales))
-    decision = replace(decision, measures=measures, change=change)
+    decision = replace(decision, measures=measures, change=change, doubt=found.costs[at].doubt)
     kept = 0 if decision.keeps_input else at + len(candidates) - len(names)
     return RefinedModel(inputs, start, model, scales, final, tuple(candidates), kept, found.solved, decision, notes)
 

@@ -23,6 +23,7 @@ from hodge_pipeline.report.contents import (
     StageRow,
 )
 from hodge_pipeline.report.summary import graph_summary, worst_edges
+from hodge_pipeline.report.verdict import capital
 from hodge_pipeline.store import yaml_file
 from hodge_pipeline.store.cost import Cost
 from hodge_pipeline.store.store import versions
@@ -41,7 +42,10 @@ def summary(decision: Decision) -> RefinementSummary:
     """The decision as the report shows it."""
     rows = tuple(MeasureRow(m.name, m.before, m.after, m.better, m.unit, m.is_worse) for m in decision.measures)
     change = "" if decision.change is None else f"The {decision.change}."
-    return RefinementSummary(decision.outcome, HEADLINES[decision.outcome], decision.reason, rows, change)
+    headline = HEADLINES[decision.outcome]
+    if decision.doubt:
+        headline = f"{capital(decision.doubt)}: {headline[:1].lower()}{headline[1:]}"
+    return RefinementSummary(decision.outcome, headline, decision.reason, rows, change)
 
 
 def _scales(result: RefinedModel) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types.arrays import Bools, Floats, Ints, Words
@@ -278,10 +278,10 @@ class Edges:
         reasons, counts = np.unique(self.why[self.status == REJECTED], return_counts=True)
         return dict(zip(reasons.tolist(), counts.tolist(), strict=True))
 
-    def as_graph(self, vertex_ids: NDArray[np.generic]) -> ViewGraph:
+    def as_graph(self, vertex_ids: ArrayLike) -> ViewGraph:
         """The viewing graph of all rows, each of which has a motion: `select` first."""
         columns = {name: getattr(self, name) for name in MEASURED}
-        return ViewGraph(vertex_ids=vertex_ids, edges=self.pairs, source=self.proposed_by, **columns)
+        return ViewGraph(vertex_ids=np.asarray(vertex_ids), edges=self.pairs, source=self.proposed_by, **columns)
 
 
 MEASURED = ("i_from_j", "information", "fitness", "rmse_m", "correspondences")
