@@ -258,6 +258,20 @@ def test_an_edge_of_a_vertex_to_itself_is_none_that_was_left_out():
     assert solve_robust(looped, start=truth).confirmed is solve_robust(graph, start=truth).confirmed is None
 
 
+def test_a_ring_in_the_plane_with_noise_out_of_it_is_confirmed():
+    rng = np.random.default_rng(0)
+    turn = 2 * np.pi * np.arange(60) / 60
+    truth = se3.exp(np.outer(turn + np.pi / 2, [0, 0, 1.0, 0, 0, 0]))
+    truth[:, :2, 3] = 3 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    edges = np.sort([(i, (i + ahead) % 60) for i in range(60) for ahead in range(1, 5)], axis=1)
+    motions = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ se3.exp(0.003 * rng.normal(size=(240, 6)))
+    motions[::40] = motions[::40] @ se3.exp(np.array([0, 0, 1.0, 2.0, -2.0, 0]))
+    graph = ViewGraph.from_edges(np.arange(60), edges, motions, np.tile(np.eye(6) / 0.003**2, (240, 1, 1)))
+    solution = solve_robust(graph)
+    assert solution.confirmed is True
+    np.testing.assert_array_equal(np.flatnonzero(solution.weights == 0), np.arange(0, 240, 40))
+
+
 def test_edges_of_very_different_lengths_are_confirmed(data_dir: Path) -> None:
     graph = open_source(data_dir / "pose_graphs/sesync/cubicle.g2o").graph
     assert solve_robust(graph).confirmed is True

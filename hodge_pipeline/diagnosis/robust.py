@@ -178,21 +178,24 @@ def confirmed(graph: ViewGraph, kept: Ints) -> bool:
     loops = tree_loops(graph.edges, graph.vertex_count)
     if not len(loops):
         return False
-    log_chance = _log_chance(graph, loops)
+    squares = np.median(se3.log(graph.i_from_j) ** 2, axis=0)
+    most = np.repeat(squares.reshape(2, 3).max(axis=1), 3)
+    moving = squares > 0, squares > most / FLAT  # out of a plane there may be noise alone, which says nothing
     out, cycles = every - len(kept), len(loops)
-    log_choices = gammaln(every + 1) - gammaln(out + 1) - gammaln(len(kept) + 1) + math.log(every)
-    mean = -float(log_chance.sum()) / cycles
+    log_choices = gammaln(every + 1) - gammaln(out + 1) - gammaln(len(kept) + 1) + math.log(len(moving) * every)
+    mean = max(-float(_log_chance(graph, loops, axes).sum()) / cycles for axes in moving)
     # Chernoff's bound of the gamma distribution's tail
     return mean > 1 and cycles * (1 + math.log(mean) - mean) + log_choices < math.log(LEVEL)
 
 
-def _log_chance(graph: ViewGraph, loops: Loops) -> Floats:
-    """The logarithm of how likely (L,) a cycle of such edges in random directions leaves less; axes along which most
-    edges do not move do not count.
-    """
+FLAT = 100.0
+"""Times as large as usual along the axis that moves most are squares of motions along one that holds noise alone."""
+
+
+def _log_chance(graph: ViewGraph, loops: Loops, axes: Bools) -> Floats:
+    """The logarithm of how likely (L,) a cycle of such edges in random directions leaves less along these axes (6,)."""
     left = se3.log(loop_products(loops, graph.i_from_j))
     squares = se3.log(graph.i_from_j) ** 2
-    axes = np.median(squares, axis=0) > 0
     if not axes.any():
         return np.zeros(len(left))
     spread = np.stack([np.add.reduceat(column[loops.edge], loops.offsets[:-1]) for column in squares.T], axis=1)
