@@ -17,6 +17,7 @@ from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeErro
 from hodge_pipeline.refine.pose_graph import Choices, disabled_edges, solve_file
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.types import ViewGraph
+from tests.backbone_graphs import drive
 
 
 def graph_file(path: Path, planar: bool = False) -> ViewGraph:
@@ -197,6 +198,13 @@ def test_what_nothing_confirms_is_said_first_and_fails(tmp_path):
     tree = graph.select(np.array([0]))
     write_g2o(tmp_path / "tree.g2o", tree)
     assert json.loads(hodge(tmp_path / "tree.g2o", "--robust", "--json"))["confirmed"] is None
+
+
+def test_loops_that_nothing_confirms_are_said_first(tmp_path: Path) -> None:
+    made = drive(wrong=1.0, loops=20)
+    write_g2o(tmp_path / "drive.g2o", made.graph, made.odometry())
+    said = " ".join(hodge(tmp_path / "drive.g2o", "--robust").split())
+    assert "verdict Solved by consecutive edges alone, since nothing confirms the 20 others" in said
 
 
 @pytest.mark.parametrize("ring", ["", "EDGE_SE2 0 1 1 0 0 0 0 0 0 0 0\nEDGE_SE2 2 2 1 0 0 1 0 0 1 0 1\n"])

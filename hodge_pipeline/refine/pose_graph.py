@@ -79,6 +79,9 @@ class SolvedFile:
         fell = f"{name} {after:.6g}" if before is None else f"{name} {before:.6g} → {after:.6g}"
         if not self.doubt and summary["edges_ignored"] == summary["edges"]:
             return "Nothing to solve: no edge joins two vertices with information, so every pose is as it was"
+        if self.choices.robust and self.solution.confirmed is None and "tested_edges" in self.solution.metrics:
+            others = f"nothing confirms the {summary['edges_ignored']} others (without --robust all count)"
+            return f"Solved by consecutive edges alone, since {others}: {fell}"
         proven = ", globally optimal" if summary["certified"] else ""
         return f"Solved, but {self.doubt}: {fell}" if self.doubt else f"Solved{proven}: {fell}"
 
