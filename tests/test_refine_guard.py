@@ -4,10 +4,8 @@ from dataclasses import replace
 from typer.testing import CliRunner
 
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.refine.guard import Change, Decision, Measure, decide
-from hodge_pipeline.refine.judge import Cost
+from hodge_pipeline.refine.guard import Change, Measure, decide
 from hodge_pipeline.refine.verdict import chi2_measure
-from hodge_pipeline.report.refined import summary
 
 BETTER = Measure("held-out distance", 0.010, 0.009)
 WORSE = Measure("held-out score", 0.90, 0.88, better="higher")
@@ -67,12 +65,3 @@ def test_the_help_sends_a_graph_file_to_solve():
 def test_a_change_is_told_in_millimetres_and_degrees():
     told = str(Change(0.0125, 0.25, 0.004, 0.5))
     assert told == "poses moved by 12.5 mm and 0.25° (RMS), known to 4 mm and 0.5°"
-
-
-def test_tracks_that_contradict_each_other_are_said_first():
-    good = Cost(0.9, 0.5, 4.0, 1000, 0, 0, 0.0, (), ())
-    assert not good.doubt and summary(Decision("optimal", "already optimal")).headline.startswith("No significant")
-    doubt = replace(good, px=24.1, cap_px=60.0).doubt
-    headline = summary(Decision("refined", "mean error 67 -> 24.1 px", doubt=doubt)).headline
-    assert headline.startswith("In doubt, since tracks contradict each other by 24.1 px")
-    assert headline.endswith(": better than the poses given")

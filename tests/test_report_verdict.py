@@ -12,6 +12,8 @@ import pytest
 
 from hodge_pipeline.evaluation.difference import MEASURABLE, sign_of
 from hodge_pipeline.evaluation.residuals import with_residuals
+from hodge_pipeline.refine.guard import Decision
+from hodge_pipeline.refine.judge import Cost
 from hodge_pipeline.report.brief import brief
 from hodge_pipeline.report.contents import (
     Path3D,
@@ -21,6 +23,7 @@ from hodge_pipeline.report.contents import (
     SourceSummary,
     WrongEdges,
 )
+from hodge_pipeline.report.refined import summary
 from hodge_pipeline.report.summary import graph_summary, unheld, weigh_wrong
 from hodge_pipeline.report.verdict import judge, suspicions
 from hodge_pipeline.report.write import write_report
@@ -76,6 +79,15 @@ def test_a_largest_error_that_got_worse_is_named_too() -> None:
     refined = RefinementSummary("refined", "Better than the poses given", "clouds lie nearer")
     verdict = judge(replace(report, trajectories=rows, refinement=refined))
     assert verdict.headline == "Better than the poses given, but largest error 50 cm → 70 cm"
+
+
+def test_tracks_that_contradict_each_other_are_said_first() -> None:
+    good = Cost(0.9, 0.5, 4.0, 1000, 0, 0, 0.0, (), ())
+    assert not good.doubt
+    decision = Decision("refined", "mean error 67 -> 24.1 px", doubt=replace(good, px=24.1, cap_px=60.0).doubt)
+    verdict = judge(replace(told((0.5, 0.020), (0.4, 0.017)), refinement=summary(decision)))
+    assert verdict.headline.startswith("In doubt, since tracks contradict each other by 24.1 px")
+    assert verdict.headline.endswith(": better than the poses given") and verdict.is_doubtful
 
 
 def test_a_difference_below_what_was_measured_is_none(tmp_path: Path) -> None:

@@ -178,12 +178,16 @@ def confirmed(graph: ViewGraph, kept: Ints) -> bool:
     loops = tree_loops(graph.edges, graph.vertex_count)
     if not len(loops):
         return False
-    squares = np.median(se3.log(graph.i_from_j) ** 2, axis=0)
-    most = np.repeat(squares.reshape(2, 3).max(axis=1), 3)
-    moving = squares > 0, squares > most / FLAT  # out of a plane there may be noise alone, which says nothing
+    left, squares = se3.log(loop_products(loops, graph.i_from_j)), se3.log(graph.i_from_j) ** 2
+    usual = np.median(squares, axis=0)
+    most = np.repeat(usual.reshape(2, 3).max(axis=1), 3)
+    limit = np.repeat([UNIFORM_RAD2, np.inf], 3)
+    moving = usual > 0, usual > most / FLAT  # out of a plane there may be noise alone, which says nothing
     out, cycles = every - len(kept), len(loops)
     log_choices = gammaln(every + 1) - gammaln(out + 1) - gammaln(len(kept) + 1) + math.log(len(moving) * every)
-    mean = max(-float(_log_chance(graph, loops, axes).sum()) / cycles for axes in moving)
+    mean = max(
+        -float(_log_chance(loops, left[:, axes], squares[:, axes], limit[axes]).sum()) / cycles for axes in moving
+    )
     # Chernoff's bound of the gamma distribution's tail
     return mean > 1 and cycles * (1 + math.log(mean) - mean) + log_choices < math.log(LEVEL)
 
@@ -192,16 +196,15 @@ FLAT = 100.0
 """Times as large as usual along the axis that moves most are squares of motions along one that holds noise alone."""
 
 
-def _log_chance(graph: ViewGraph, loops: Loops, axes: Bools) -> Floats:
-    """The logarithm of how likely (L,) a cycle of such edges in random directions leaves less along these axes (6,)."""
-    left = se3.log(loop_products(loops, graph.i_from_j))
-    squares = se3.log(graph.i_from_j) ** 2
-    if not axes.any():
+def _log_chance(loops: Loops, left: Floats, squares: Floats, most: Floats) -> Floats:
+    """The logarithm of how likely (L,) a cycle of edges in random directions leaves less than `left (L, a)` along some
+    axes; `squares (E, a)` of the edges' own motions, and the largest variances `most (a,)`.
+    """
+    if not left.shape[1]:
         return np.zeros(len(left))
-    spread = np.stack([np.add.reduceat(column[loops.edge], loops.offsets[:-1]) for column in squares.T], axis=1)
-    spread[:, :3] = np.minimum(spread[:, :3], UNIFORM_RAD2)
-    spread = np.maximum(spread[:, axes], np.finfo(float).tiny)
-    chance = gammainc(axes.sum() / 2, (left[:, axes] ** 2 / spread).sum(axis=1) / 2)
+    spread = np.add.reduceat(squares[loops.edge], loops.offsets[:-1], axis=0)
+    spread = np.clip(spread, np.finfo(float).tiny, most)
+    chance = gammainc(left.shape[1] / 2, (left**2 / spread).sum(axis=1) / 2)
     return np.asarray(np.log(np.maximum(chance, np.finfo(float).tiny)))
 
 

@@ -200,7 +200,9 @@ class CandidateRow:
 
 @dataclass(frozen=True)
 class RefinementSummary:
-    """What became of a refinement: `outcome` is refined, optimal, worse or forced; why; and what it rests on."""
+    """What became of a refinement: `outcome` is refined, optimal, worse or forced; why; what it rests on; and why even
+    what is kept may be wrong, if anything says so.
+    """
 
     outcome: str
     headline: str
@@ -209,6 +211,7 @@ class RefinementSummary:
     change: str = ""
     scale: str = ""
     candidates: tuple[CandidateRow, ...] = ()
+    doubt: str = ""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from hodge_pipeline.report.contents import (
     StageRow,
 )
 from hodge_pipeline.report.summary import graph_summary, worst_edges
-from hodge_pipeline.report.verdict import capital
 from hodge_pipeline.store import yaml_file
 from hodge_pipeline.store.cost import Cost
 from hodge_pipeline.store.store import versions
@@ -43,9 +42,7 @@ def summary(decision: Decision) -> RefinementSummary:
     rows = tuple(MeasureRow(m.name, m.before, m.after, m.better, m.unit, m.is_worse) for m in decision.measures)
     change = "" if decision.change is None else f"The {decision.change}."
     headline = HEADLINES[decision.outcome]
-    if decision.doubt:
-        headline = f"{capital(decision.doubt)}: {headline[:1].lower()}{headline[1:]}"
-    return RefinementSummary(decision.outcome, headline, decision.reason, rows, change)
+    return RefinementSummary(decision.outcome, headline, decision.reason, rows, change, doubt=decision.doubt)
 
 
 def _scales(result: RefinedModel) -> str:

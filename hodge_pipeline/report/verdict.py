@@ -97,6 +97,7 @@ def judge(report: Report) -> Verdict:
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
     told = (*_unsettled(report), *_other_scale(report), *report.notes)
     doubts = [DOUBTS[note.kind] for note in told if note.kind in DOUBTS]
+    doubts += [report.refinement.doubt] if report.refinement and report.refinement.doubt else []
     headline = capital(": ".join(f"{text[:1].lower()}{text[1:]}" for text in (*doubts, headline)))
     return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason, bool(doubts))
 
