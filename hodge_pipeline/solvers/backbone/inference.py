@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from hodge_pipeline.solvers.backbone.chain import Chain, one_of_each_place, places_along
+from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place, places_along
 from hodge_pipeline.solvers.backbone.evidence import EVEN, Scales, Wrong, learn_scales, mixture, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, linearise, root, settled, without
 from hodge_pipeline.solvers.backbone.polish import polished
@@ -57,15 +58,41 @@ def infer(
 
     `scales`: of the errors; learned from the loops where none are given.
     """
-    poses = chain.poses()
-    scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
+    scales, shares = learn_scales(chain, chain.poses(), wrong) if scales is None else (scales, EVEN)
     chain = scales.applied(chain)
-    linear = start = linearise(chain, poses)
-    judged = _judge(start, None, shares, wrong)
-    limit = np.log(max(len(always), 1))
-    used = (judged.factor > limit) | always
+    start = linearise(chain, chain.poses())
+    alone = _judge(start, None, shares, wrong)
+    found = _inferred(start, alone.factor > np.log(max(len(always), 1)), shares, wrong, always, thin, scales)
+    for place in crowded(chain, alone.factor):
+        if found is None or (found.used & place).any():
+            break
+        # a lone wrong loop that chance favours may have refuted these
+        other = _inferred(start, place, shares, wrong, always, thin, scales)
+        found = other if other is not None and other.log_evidence > found.log_evidence else found
+    return found
+
+
+def crowded(chain: Chain, factor: Floats) -> list[Bools]:
+    """The loops (M,) of each of the few places that have the most of those for which something speaks, two at least."""
+    rows, ends = np.flatnonzero(factor > 0), places_along(chain)
+    count = loops_at_place(ends[rows])
+    first = one_of_each_place(ends[rows])
+    first = first[np.argsort(-count[first], kind="stable")][:CROWDED]
+    near = [np.abs(ends - ends[rows[row]]).max(axis=1) <= 1.0 for row in first[count[first] > 1]]
+    return [place & (factor > 0) for place in near]
+
+
+CROWDED = 3
+
+
+def _inferred(
+    start: Linear, used: Bools, shares: Floats, wrong: Wrong, always: Bools, thin: bool, scales: Scales
+) -> Inferred | None:
+    """The loops judged from those that are `used (M,)` first on."""
+    chain = start.chain
+    linear, limit, used = start, np.log(max(len(always), 1)), used | always
     ends = places_along(chain)
-    best, top, seen = (judged, start), -np.inf, b""
+    top, seen = -np.inf, b""
     for number in range(ROUNDS):
         rows = np.flatnonzero(used)
         if number < SETTLING and len(rows):  # later: a group that is mistaken vouches for itself
@@ -87,9 +114,13 @@ def infer(
         seen = np.packbits(used).tobytes()
     judged, linear = best
     used = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
-    confirmed = _confirmed(linear, judged, used, wrong)
-    used |= always
+    found, confirmed = _of_right_places(start, linear, judged, used, wrong)
+    used, mistaken = found | always, (used & ~found).any()
     rows = thinned(chain, np.flatnonzero(used)).active
+    if mistaken:
+        fit = settled(Fit(Reduced.of(chain, rows), start), MOST_STEPS, TOLERANCE)
+        linear, judged = fit.linear, _judge(fit.linear, fit, shares, wrong)
+        top = mixture(judged.log_density)[1] - float(judged.log_density[1].sum())
     linear, width = polished(rows, linear if used.any() else start)
     return Inferred(used, judged, linear.poses, scales, width, top, confirmed)
 
@@ -137,25 +168,36 @@ def _limit(judged: Judged) -> float:
     return float(np.log(max((1 / (1 + np.exp(np.clip(judged.log_odds, -500, 500)))).sum(), 1)))
 
 
-def _confirmed(linear: Linear, judged: Judged, used: Bools, wrong: Wrong) -> bool:
-    """Whether the used loops say more together than chance finds, and so do the places that they join.
+def _of_right_places(start: Linear, linear: Linear, judged: Judged, used: Bools, wrong: Wrong) -> tuple[Bools, bool]:
+    """The used loops (M,) of places that are not mistaken for others, and whether they say more than chance finds.
 
-    Loops of one place agree also where it is mistaken for another: of each, one is judged at the poses that those of
-    the other places lead to.
+    Loops of one place agree also where it is mistaken: of each, one is judged at the poses that those of the other
+    right places lead to, beginning with the place that says most by itself.
     """
     if not used.any() or (judged.factor[used] - np.log(len(used))).sum() <= by_chance(len(used)):
-        return False
+        return used, False
     chain, ends, rows = linear.chain, places_along(linear.chain), np.flatnonzero(used)
-    count, chosen = len(one_of_each_place(ends)), rows[one_of_each_place(ends[rows])]
-    reduced = thinned(chain, chosen)
-    fit = settled(Fit(reduced, linear), MOST_STEPS, TOLERANCE)
-    factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[reduced.active]
-    return float(np.maximum(factor - np.log(count), 0.0).sum()) > MISTAKEN
+    first, near = one_of_each_place(ends[rows]), loops_at_place(ends)[one_of_each_place(ends)]
+    chosen, size = rows[first], loops_at_place(ends[rows])[first]
+    rivals = np.log(np.maximum((near >= size[:, None]).sum(axis=1), 1))
+    alone = _judge(start, None, EVEN, wrong).factor[chosen] - rivals
+    strongest = np.arange(len(chosen)) == np.argmax(alone)
+    right = strongest
+    for _ in range(ROUNDS):
+        fit = settled(Fit(thinned(chain, chosen[right]), start), MOST_STEPS, TOLERANCE)
+        factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals
+        said, before, right = float(np.maximum(factor, 0.0).sum()), right, factor > 0
+        if said <= alone.max():
+            right = right | strongest
+        if (before == right).all():
+            break
+    nearest = cKDTree(ends[chosen]).query(ends, p=np.inf)[1]
+    return used & right[nearest], max(said, float(alone.max())) > MISTAKEN
 
 
-MISTAKEN = float(np.log(20.0))
+MISTAKEN = float(np.log(4.0))
 """Log-evidence that places may reach by chance, all of which are mistaken for others by loops that agree: one graph in
-twenty. More would refuse the loops of a path that closes once: these can say no more than the drift is small.
+four. More would refuse the loops of a path that closes once: these can say no more than the drift is small.
 """
 
 
