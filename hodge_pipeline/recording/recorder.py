@@ -26,7 +26,6 @@ from hodge_pipeline.types.arrays import evenly
 
 Notes = tuple[str, ...]
 
-
 TRIANGLE_BYTES = 60
 
 

@@ -34,7 +34,6 @@ TRUTH_PATTERN = "*.gt.freiburg*"
 MAX_GAP_FRAMES = 1.0
 SNIFFED_BYTES = 1 << 16
 
-
 COLOUR_FOLDERS = ("image", "color", "rgb")
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
 TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")

@@ -271,7 +271,6 @@ def settled(fit: Fit, steps: int, tolerance: float) -> Fit:
 
 HALVINGS = 4
 
-
 LEAST_LEFT = 1e-6
 
 
