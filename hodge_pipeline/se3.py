@@ -33,12 +33,13 @@ def hat(v: Floats) -> Floats:
 def so3_exp(phi: Floats) -> Floats:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians (paper, Section 3.3)."""
     half = 0.5 * np.sqrt(np.einsum("...i,...i->...", phi, phi))
-    return _rotation(*np.moveaxis(phi, -1, 0) * (0.5 * np.sinc(half / np.pi)), np.cos(half))
+    return _rotation(np.moveaxis(phi, -1, 0) * (0.5 * np.sinc(half / np.pi)), np.cos(half))
 
 
-def _rotation(x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:
-    """Rotation matrices (..., 3, 3) of unit quaternions, whose parts are (...,) each."""
-    out = np.empty((*x.shape, 3, 3))
+def _rotation(vector: Floats, w: Floats) -> Floats:
+    """Rotation matrices (..., 3, 3) of unit quaternions with this vector (3, ...) and scalar w (...,)."""
+    x, y, z = vector
+    out = np.empty((*w.shape, 3, 3))
     for row, (own, after, last) in enumerate(((x, y, z), (y, z, x), (z, x, y))):
         out[..., row, row] = 1 - 2 * (after**2 + last**2)
         out[..., row, (row + 1) % 3] = 2 * (own * after - w * last)
@@ -207,7 +208,7 @@ def from_quat_xyzw(translation: Floats, quat_xyzw: Floats) -> Floats:
     """Motions (..., 4, 4); quaternions (..., 4) of any length but zero are normalised."""
     quat = np.asarray(quat_xyzw, float)
     quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-    return from_parts(_rotation(*np.moveaxis(quat, -1, 0)), translation)
+    return from_parts(_rotation(np.moveaxis(quat[..., :3], -1, 0), quat[..., 3]), translation)
 
 
 def to_quat_xyzw(b_from_a: Floats) -> Floats:
