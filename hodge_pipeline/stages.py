@@ -305,6 +305,10 @@ class TrackedModel(Protocol):
     def adjusted(self, priors: PositionPriors | None = None) -> TrackedModel:
         """Bundle adjustment of poses and points. Raises `SourceError` where it fails."""
 
+    def with_robust_loss(self) -> TrackedModel:
+        """The same model, whose adjustments let an observation that is far off pull little."""
+        ...
+
     @property
     def moves_intrinsics(self) -> bool:
         """Whether that adjusts the cameras' intrinsics too."""

@@ -88,6 +88,7 @@ class ColmapModel:
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
     refine: Intrinsics = "none"
+    robust: bool = False
     known: PriorOptions = field(default_factory=PriorOptions)
     placing: str = ""
     """What gave the model its place in the world, empty where nothing did."""
@@ -263,7 +264,7 @@ class ColmapModel:
 
     def _adjusted(self, priors: PositionPriors | None) -> ColmapModel:
         copy = self._copy()
-        loose = adjust(copy, self._behind(), self.bodies, priors, refine=self.refine)
+        loose = adjust(copy, self._behind(), self.bodies, priors, refine=self.refine, robust=self.robust)
         if loose:
             after = refreshed(self.records, copy)
             poses = np.array([image.world_from_cam for image in after.images])
@@ -272,6 +273,10 @@ class ColmapModel:
                     copy.points3D[point_id].xyz = xyz
         update_errors(copy)
         return replace(self, reconstruction=copy, files=(), tracks=self.records)
+
+    def with_robust_loss(self) -> ColmapModel:
+        """The same model, whose adjustments let an observation that is far off pull little."""
+        return replace(self, robust=True)
 
     @property
     def moves_intrinsics(self) -> bool:
@@ -301,7 +306,7 @@ class ColmapModel:
                 held.append(at)
                 image = records.images[records.image_rows[at]]
                 copy.delete_observation(image.image_id, int(records.points.columns[at]))
-        adjust(copy, [], self.bodies, None, move_bodies=move_bodies)
+        adjust(copy, [], self.bodies, None, move_bodies=move_bodies, robust=self.robust)
         return reprojection_errors(refreshed(records, copy))[1][held]
 
     def write(self, folder: Path) -> None:
