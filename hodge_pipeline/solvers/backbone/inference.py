@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,7 +17,6 @@ from hodge_pipeline.types import Bools, Floats, Ints
 ROUNDS = 6
 SAMPLES = 64
 MOST_STEPS = 15
-TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -58,41 +58,50 @@ def infer(
 
     `scales`: of the errors; learned from the loops where none are given.
     """
-    scales, shares = learn_scales(chain, chain.poses(), wrong) if scales is None else (scales, EVEN)
+    scales, shares = learn_scales(chain, chain.poses, wrong) if scales is None else (scales, EVEN)
     chain = scales.applied(chain)
-    start = linearise(chain, chain.poses())
+    start = linearise(chain, chain.poses)
     alone = _judge(start, None, shares, wrong)
-    found = _inferred(start, alone.factor > np.log(max(len(always), 1)), shares, wrong, always, thin, scales)
+    judge = partial(_inferred, start, alone, shares=shares, wrong=wrong, always=always, thin=thin, scales=scales)
+    found = judge(alone.factor > np.log(max(len(always), 1)))
     for place in crowded(chain, alone.factor):
         if found is None or (found.used & place).any():
             break
-        # a lone wrong loop that chance favours may have refuted these
-        other = _inferred(start, place, shares, wrong, always, thin, scales)
+        other = judge(place)  # a lone wrong loop that chance favours may have refuted these
         found = other if other is not None and other.log_evidence > found.log_evidence else found
     return found
 
 
 def crowded(chain: Chain, factor: Floats) -> list[Bools]:
-    """The loops (M,) of each of the few places that have the most of those for which something speaks, two at least."""
-    rows, ends = np.flatnonzero(factor > 0), places_along(chain)
-    count = loops_at_place(ends[rows])
-    first = one_of_each_place(ends[rows])
-    first = first[np.argsort(-count[first], kind="stable")][:CROWDED]
-    near = [np.abs(ends - ends[rows[row]]).max(axis=1) <= 1.0 for row in first[count[first] > 1]]
-    return [place & (factor > 0) for place in near]
+    """The loops (M,) of each of the `MOST_PLACES` places at which most loops lie, two at least, that a factor (M,) > 0
+    speaks for.
+    """
+    told, ends = factor > 0, places_along(chain)
+    rows = np.flatnonzero(told)
+    count, first = loops_at_place(ends[rows]), one_of_each_place(ends[rows])
+    first = first[np.argsort(-count[first], kind="stable")][:MOST_PLACES]
+    return [told & (np.abs(ends - ends[rows[row]]).max(axis=1) <= 1.0) for row in first[count[first] > 1]]
 
 
-CROWDED = 3
+MOST_PLACES = 3
 
 
 def _inferred(
-    start: Linear, used: Bools, shares: Floats, wrong: Wrong, always: Bools, thin: bool, scales: Scales
+    start: Linear,
+    alone: Judged,
+    used: Bools,
+    *,
+    shares: Floats,
+    wrong: Wrong,
+    always: Bools,
+    thin: bool,
+    scales: Scales,
 ) -> Inferred | None:
-    """The loops judged from those that are `used (M,)` first on."""
+    """The loops judged, at first at the poses that those which are `used (M,)` lead to."""
     chain = start.chain
     linear, limit, used = start, np.log(max(len(always), 1)), used | always
     ends = places_along(chain)
-    top, seen = -np.inf, b""
+    best, top, seen = (alone, start), -np.inf, b""
     for number in range(ROUNDS):
         rows = np.flatnonzero(used)
         if number < SETTLING and len(rows):  # later: a group that is mistaken vouches for itself
@@ -100,7 +109,7 @@ def _inferred(
         reduced = thinned(chain, rows)
         if not thin and len(reduced.active) < len(rows):
             return None
-        fit = settled(Fit(reduced, linear), MOST_STEPS, TOLERANCE)
+        fit = settled(Fit(reduced, linear), MOST_STEPS)
         linear = fit.linear
         judged = _judge(linear, fit, shares, wrong)
         shares, likelihood = mixture(judged.log_density)
@@ -113,12 +122,12 @@ def _inferred(
             break
         seen = np.packbits(used).tobytes()
     judged, linear = best
-    used = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
-    found, confirmed = _of_right_places(start, linear, judged, used, wrong)
-    used, mistaken = found | always, (used & ~found).any()
+    agreed = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
+    used, confirmed = _of_right_places(start, linear, judged, agreed, wrong)
+    used |= always
     rows = thinned(chain, np.flatnonzero(used)).active
-    if mistaken:
-        fit = settled(Fit(Reduced.of(chain, rows), start), MOST_STEPS, TOLERANCE)
+    if (agreed & ~used).any():
+        fit = settled(Fit(Reduced.of(chain, rows), start), MOST_STEPS)
         linear, judged = fit.linear, _judge(fit.linear, fit, shares, wrong)
         top = mixture(judged.log_density)[1] - float(judged.log_density[1].sum())
     linear, width = polished(rows, linear if used.any() else start)
@@ -129,7 +138,7 @@ def refused(found: Inferred, chain: Chain, always: Bools) -> Inferred:
     """The result without the loops that nothing confirms: at the poses of the bare chain and of those of `always`."""
     chain = found.scales.applied(chain)
     rows = thinned(chain, np.flatnonzero(always)).active
-    linear, width = polished(rows, linearise(chain, chain.poses()))
+    linear, width = polished(rows, linearise(chain, chain.poses))
     return replace(found, used=always.copy(), poses=linear.poses, loop_width=width)
 
 
@@ -177,14 +186,14 @@ def _of_right_places(start: Linear, linear: Linear, judged: Judged, used: Bools,
     if not used.any() or (judged.factor[used] - np.log(len(used))).sum() <= by_chance(len(used)):
         return used, False
     chain, ends, rows = linear.chain, places_along(linear.chain), np.flatnonzero(used)
-    first, near = one_of_each_place(ends[rows]), loops_at_place(ends)[one_of_each_place(ends)]
+    first, sizes = one_of_each_place(ends[rows]), np.sort(loops_at_place(ends)[one_of_each_place(ends)])
     chosen, size = rows[first], loops_at_place(ends[rows])[first]
-    rivals = np.log(np.maximum((near >= size[:, None]).sum(axis=1), 1))
+    rivals = np.log(np.maximum(len(sizes) - np.searchsorted(sizes, size), 1))  # places that could be found by chance
     alone = _judge(start, None, EVEN, wrong).factor[chosen] - rivals
     strongest = np.arange(len(chosen)) == np.argmax(alone)
     right = strongest
     for _ in range(ROUNDS):
-        fit = settled(Fit(thinned(chain, chosen[right]), start), MOST_STEPS, TOLERANCE)
+        fit = settled(Fit(thinned(chain, chosen[right]), start), MOST_STEPS)
         factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals
         said, before, right = float(np.maximum(factor, 0.0).sum()), right, factor > 0
         if said <= alone.max():
