@@ -44,7 +44,7 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     chain = unbroken = joined(chain)
     wrong = Wrong.of(chain, chain.poses)  # one for all trials: evidence is against all loops being wrong
     judge = partial(infer, wrong=wrong, always=always, thin=thin)
-    first = judge(chain)
+    first = judge(chain, anew=True)
     if first is None:
         return None
     found = first

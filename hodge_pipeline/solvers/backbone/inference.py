@@ -51,12 +51,13 @@ class Inferred:
 
 
 def infer(
-    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None
+    chain: Chain, wrong: Wrong, always: Bools, thin: bool = True, scales: Scales | None = None, *, anew: bool = False
 ) -> Inferred | None:
     """Judge the loops of a chain; those of `always (M,)` count whatever they say. Where they would leave more than
     `MOST_UNKNOWNS`, all are judged at the poses of some of the right ones, or None comes back without `thin`.
 
-    `scales`: of the errors; learned from the loops where none are given.
+    `scales`: of the errors; learned from the loops where none are given. `anew`: where nothing confirms them, judged
+    again from the places of most loops on.
     """
     scales, shares = learn_scales(chain, chain.poses, wrong) if scales is None else (scales, EVEN)
     chain = scales.applied(chain)
@@ -64,12 +65,11 @@ def infer(
     alone = _judge(start, None, shares, wrong)
     judge = partial(_inferred, start, alone, shares=shares, wrong=wrong, always=always, thin=thin, scales=scales)
     found = judge(alone.factor > np.log(max(len(always), 1)))
-    for place in crowded(chain, alone.factor):
-        if found is None or (found.used & place).any():
-            break
-        other = judge(place)  # a lone wrong loop that chance favours may have refuted these
-        found = other if other is not None and other.log_evidence > found.log_evidence else found
-    return found
+    if found is None or found.confirmed or not anew:
+        return found
+    # a lone wrong loop that chance favours may have refuted the others
+    others = [judge(place) for place in crowded(chain, alone.factor)]
+    return max([found, *filter(None, others)], key=lambda each: (each.confirmed, each.log_evidence))
 
 
 def crowded(chain: Chain, factor: Floats) -> list[Bools]:
@@ -186,16 +186,21 @@ def _of_right_places(start: Linear, linear: Linear, judged: Judged, used: Bools,
     if not used.any() or (judged.factor[used] - np.log(len(used))).sum() <= by_chance(len(used)):
         return used, False
     chain, ends, rows = linear.chain, places_along(linear.chain), np.flatnonzero(used)
-    first, sizes = one_of_each_place(ends[rows]), np.sort(loops_at_place(ends)[one_of_each_place(ends)])
+    first = one_of_each_place(ends[rows])
     chosen, size = rows[first], loops_at_place(ends[rows])[first]
-    rivals = np.log(np.maximum(len(sizes) - np.searchsorted(sizes, size), 1))  # places that could be found by chance
+    away = ends[cKDTree(ends[chosen]).query(ends, p=np.inf)[0] > 1.0]
+    sizes = np.sort(loops_at_place(away)[one_of_each_place(away)])
+    rivals = np.log(len(sizes) - np.searchsorted(sizes, size) + MISTAKEN_PLACES)
     alone = _judge(start, None, EVEN, wrong).factor[chosen] - rivals
     strongest = np.arange(len(chosen)) == np.argmax(alone)
-    right = strongest
-    for _ in range(ROUNDS):
+    right = np.ones(len(chosen), bool)
+    for number in range(ROUNDS):
         fit = settled(Fit(thinned(chain, chosen[right]), start), MOST_STEPS)
         factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals
-        said, before, right = float(np.maximum(factor, 0.0).sum()), right, factor > 0
+        if not number and factor.sum() > MISTAKEN:
+            return used, True
+        said, before = float(np.maximum(factor, 0.0).sum()), right
+        right = factor > 0 if number else strongest
         if said <= alone.max():
             right = right | strongest
         if (before == right).all():
@@ -204,10 +209,12 @@ def _of_right_places(start: Linear, linear: Linear, judged: Judged, used: Bools,
     return used & right[nearest], max(said, float(alone.max())) > MISTAKEN
 
 
-MISTAKEN = float(np.log(4.0))
-"""Log-evidence that places may reach by chance, all of which are mistaken for others by loops that agree: one graph in
-four. More would refuse the loops of a path that closes once: these can say no more than the drift is small.
+MISTAKEN_PLACES = 0.2
+"""To each right one, of places that loops agree on: beside those of at least as many loops that are not used. With
+none, a path that closes once is closed where its loops say little more than that the drift is as stated.
 """
+MISTAKEN = float(np.log(20.0))
+"""The log-odds of right places against mistaken ones that are enough."""
 
 
 def by_chance(count: int) -> float:
