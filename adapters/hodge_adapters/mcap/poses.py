@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_adapters.association import interpolated_poses
-from hodge_adapters.mcap.recording import PoseTopic, Recording
+from hodge_adapters.mcap.recording import Recording
 from hodge_adapters.mcap.topics import named_topic
 from hodge_adapters.text_rows import listed
 from hodge_pipeline.types import Floats, Trajectory
