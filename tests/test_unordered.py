@@ -231,6 +231,17 @@ def test_frames_that_see_through_each_other_are_cut_apart_although_their_edges_a
         assert "4 contradict each other" in found.notes[0]
 
 
+def test_margins_of_free_space_are_of_the_scene_not_of_a_room() -> None:
+    room_m = 0.02
+    seen = [wall_at(2.0 * room_m), wall_at(2.0 * room_m), wall_at(4.0 * room_m), wall_at(4.0 * room_m)]
+    clouds, views = CloudSet.from_clouds([cloud for cloud, _ in seen]), [view for _, view in seen]
+    graph = ViewGraph.from_edges(np.arange(4), np.array([[0, 1], [2, 3], [1, 2]]), np.tile(np.eye(4), (3, 1, 1)))
+    pieces = Pieces(graph, np.zeros(4, np.int64), np.tile(np.eye(4), (4, 1, 1)))
+    found = unfolded(clouds, pieces, 0, views.__getitem__, GlobalStart().diagnosis, room_m)
+    assert found.piece[0] == found.piece[1] != found.piece[2] == found.piece[3]
+    assert unfolded(clouds, pieces, 0, views.__getitem__, GlobalStart().diagnosis, 1.0) is pieces
+
+
 def test_a_wall_seen_from_farther_off_contradicts_nothing() -> None:
     seen = [wall_at(2.0), wall_at(2.0), wall_at(4.0), wall_at(4.0)]
     clouds, views = CloudSet.from_clouds([cloud for cloud, _ in seen]), [view for _, view in seen]

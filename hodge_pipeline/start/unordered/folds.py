@@ -57,8 +57,11 @@ class Contradictions:
         return len(self.pairs) > max(1.0, FOLDED_SHARE * self.looked_at)
 
 
-def contradictions(clouds: CloudSet, pieces: Pieces, held: Ints, view_of: ViewOf) -> Contradictions:
-    """What free space says of frames that the poses bring together, whether an edge joins them or not.
+def contradictions(
+    clouds: CloudSet, pieces: Pieces, held: Ints, view_of: ViewOf, room_m: float = 1.0
+) -> Contradictions:
+    """What free space says of frames that the poses bring together, whether an edge joins them or not; `room_m` is what
+    a metre of a room is in this scene.
 
     Frames of one part `held (N,)` by odometry are left out: what contradicts there has drifted, and looks like nothing.
     """
@@ -69,7 +72,7 @@ def contradictions(clouds: CloudSet, pieces: Pieces, held: Ints, view_of: ViewOf
     chosen = (pieces.piece[first] == pieces.piece[second]) & (held[first] != held[second])
     pairs = some_of(every[chosen], MOST_PAIRS)
     motions = se3.inverse(pieces.poses[pairs[:, 0]]) @ pieces.poses[pairs[:, 1]]
-    seen_through = violations(clouds, pairs, motions, view_of)
+    seen_through = violations(clouds, pairs, motions, view_of, room_m)
     certain = seen_through > CERTAIN * MOST_VIOLATION  # false for NaN
     return Contradictions(pairs[certain], int(np.isfinite(seen_through).sum()))
 
@@ -80,10 +83,11 @@ def unfolded(
     given: int,
     view_of: ViewOf,
     options: DiagnosisOptions,
+    room_m: float = 1.0,
 ) -> Pieces:
     """The pieces, cut where they hold frames that contradict each other; the first `given` edges are cut last."""
     held = connected_components(pieces.graph.edges[:given], len(pieces.piece))
-    found = contradictions(clouds, pieces, held, view_of)
+    found = contradictions(clouds, pieces, held, view_of, room_m)
     if not found.folded:
         return pieces
     first, before = found, len(pieces.graph.edges)
@@ -97,7 +101,7 @@ def unfolded(
         judged = diagnose(graph, options)
         strength = strength[judged.kept]
         pieces = Pieces.kept(graph, judged)
-        found = contradictions(clouds, pieces, held, view_of)
+        found = contradictions(clouds, pieces, held, view_of, room_m)
         if not found.folded:
             break
         forbidden = np.unique(np.concatenate([forbidden, found.pairs]), axis=0)
