@@ -18,6 +18,7 @@ class Rank(IntEnum):
 WORDING: dict[str, tuple[Rank, str]] = {
     # What stages report in their own words.
     "reader": (Rank.FACT, "{detail}"),
+    "reader's doubt": (Rank.LOOK, "{detail}"),
     "clouds": (Rank.FACT, "{detail}"),
     "start": (Rank.FACT, "{detail}"),
     "measured": (Rank.FACT, "{detail}"),
@@ -42,6 +43,12 @@ WORDING: dict[str, tuple[Rank, str]] = {
         "with furniture or targets in sight.",
     ),
     "scale": (Rank.LOOK, "{detail}"),
+    "depth unit": (Rank.DOUBT, "Depth is probably not in metres: {detail}."),
+    "depth steps": (
+        Rank.LOOK,
+        "depth is another sensor's than a Kinect, Xtion, Astra or Structure sensor, or in another unit: {detail}",
+    ),
+    "depth range": (Rank.LOOK, "{detail}: is the depth scale right (source.reader.depth_scale)?"),
     "given poses": (Rank.FACT, "{count} of {detail} poses given"),
     "given file": (Rank.FACT, "{detail}"),
     "key frames": (

@@ -11,7 +11,7 @@ from hodge_adapters.text_rows import listed, names_in
 from hodge_adapters.tum.image_lists import StampedImages
 from hodge_pipeline.errors import SourceError
 
-COLOUR_FOLDERS = ("image", "color", "rgb")
+COLOUR_FOLDERS = ("image", "images", "color", "rgb")
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
 TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
 _NUMBER = re.compile(r"\D*(\d+)")
