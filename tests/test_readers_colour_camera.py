@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hodge_adapters.seven_scenes.colour_camera import LIRIS, NOMINAL, ColourCamera, colour_pixels
-from hodge_adapters.seven_scenes.reader import SevenScenesReader
+from hodge_adapters.seven_scenes.reader import LIRIS, NOMINAL, ColourCamera, SevenScenesReader, colour_pixels
 from hodge_pipeline import se3
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.recipe.schema import load_recipe
