@@ -65,10 +65,10 @@ class Change:
             f"{length * 1000:.3g} mm" if self.is_metric else f"{length:.3g} units"
             for length in (self.translation_m, self.translation_uncertainty_m)
         )
-        return (
-            f"poses moved by {moved} and {self.rotation_deg:.2g}° (RMS), "
-            f"known to {known} and {self.rotation_uncertainty_deg:.2g}°"
-        )
+        told = f"poses moved by {moved} and {self.rotation_deg:.2g}° (RMS)"
+        if self.translation_uncertainty_m != self.translation_uncertainty_m:
+            return f"{told}; the measurements do not tell how well they are known"
+        return f"{told}, known to {known} and {self.rotation_uncertainty_deg:.2g}°"
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,6 @@ MOST_SIZES = 3
 """Pieces whose sizes a headline tells."""
 NO_MEASURE = "nothing was there to compare the poses by, before and after."
 
-
 REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",

@@ -17,8 +17,7 @@ from hodge_adapters.association import interpolated_poses
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.fitted_camera import assumed_camera_doubts, fitting
-from hodge_adapters.images.frames import image_frame
-from hodge_adapters.images.lens import Lens
+from hodge_adapters.images.frames import Lens, image_frame
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs, stamped_images
 from hodge_pipeline.errors import SourceError
