@@ -44,7 +44,8 @@ LOOKS = {
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
     "scale": "{detail}",
     "reader's doubt": "{detail}",
-    "depth steps": "depth is another sensor's than a Kinect, Xtion, Astra or Structure sensor, or in another unit: {detail}",
+    "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "
+    "{detail}",
     "depth range": "{detail}: is the depth scale right (source.reader.depth_scale)?",
     "tracking lost": "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
     "blank images": "{count} frames have depth, but a colour image that shows nothing, black or of one even colour "
