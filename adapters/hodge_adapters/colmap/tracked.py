@@ -18,11 +18,10 @@ from hodge_adapters.colmap.bundle import Intrinsics, adjust
 from hodge_adapters.colmap.content import content_of, read_reconstruction, refreshed
 from hodge_adapters.colmap.database import database_pairs
 from hodge_adapters.colmap.edges import covisible_pairs, measured_graph
-from hodge_adapters.colmap.points import parallaxes, points_of_rays
+from hodge_adapters.colmap.points import parallaxes, points_of_rays, reprojection_errors, update_errors
 from hodge_adapters.colmap.priors import Known, body_priors, placing
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import Model
-from hodge_adapters.colmap.reprojection import reprojection_errors, update_errors
 from hodge_adapters.colmap.resection import resected
 from hodge_adapters.colmap.scale import depth_ratios
 from hodge_adapters.colmap.ties import held_apart, merge_matched_points
@@ -42,7 +41,6 @@ from hodge_pipeline.types import (
 
 LEAST_LEFT = 3
 """Entries of a track: two would meet in a point wherever the images are."""
-
 
 FEW_BEHIND = 0.01
 """Of the observations: where more are behind their cameras, these are wrong and not the points."""
