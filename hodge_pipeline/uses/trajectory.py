@@ -24,7 +24,6 @@ from hodge_pipeline.uses.recipe_run import run as recipe_run
 
 Array = TypeVar("Array")
 
-
 FARTHEST_M = 200.0
 """Metres: no depth sensor has half of its pixels beyond it; a room in millimetres has 1000 and more."""
 
