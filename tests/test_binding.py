@@ -56,7 +56,7 @@ def test_a_stage_by_name_has_its_defaults(tmp_path: Path) -> None:
         ("clouds:\n  voxel_m: -1\n", "r.yaml:7: clouds.voxel_m: input should be greater than 0, got -1"),
         ("clouds:\n  voxel_m: true\n", "r.yaml:7: clouds.voxel_m: expected a finite number, got True"),
         ("clouds:\n  voxel_m: .inf\n", "r.yaml:7: clouds.voxel_m: expected a finite number, got inf"),
-        ("seed: true\n", "r.yaml:6: seed: expected a finite number, got True"),
+        ("outer_iterations: true\n", "r.yaml:6: outer_iterations: expected a finite number, got True"),
         ("clouds: 3\n", "r.yaml:6: clouds: expected a mapping of options, got 3"),
         ("outer_iterations: two\n", "r.yaml:6: outer_iterations: input should be a valid integer"),
         ("fusion: [{stage: tsfd}]\n", "r.yaml:6: fusion.0: no stage 'tsfd' of kind 'fusion' (did you mean 'tsdf'?)"),
