@@ -26,7 +26,7 @@ from hodge_pipeline.registration.global_registrars import FpfhConsensus
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.stages import GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.start.unordered.similarity import LocalDescriptors, all_pairs, similar_pairs
+from hodge_pipeline.start.unordered.start import LocalDescriptors, all_pairs, similar_pairs
 from hodge_pipeline.types import CloudSet, Ints
 
 REACH = 5

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.review.opening import Viewer
 from hodge_pipeline.review.scene import Scene
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.subject import Subject
-from hodge_pipeline.review.viewer import Viewer
 from hodge_pipeline.types import CloudSet, Edges, Floats, Solution, Source, ViewGraph
 
 FRAMES, EDGES, POINTS = 5000, 50_000, 20_000_000

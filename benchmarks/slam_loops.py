@@ -91,7 +91,7 @@ def line(
     loops, right = ~consecutive(graph) & np.isfinite(off_m), off_m < limit_m
     chain = make_chain(graph, linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph)))
     bare = np.empty((graph.vertex_count, 4, 4))
-    bare[chain.order] = chain.poses()
+    bare[chain.order] = chain.poses
     found = diagnose(graph)
     error, seconds = timed(lambda: diagnose(graph).world_from_cam, places, runs)
     used = found.kept & loops

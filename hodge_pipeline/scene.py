@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.decomposition import Energies
+from hodge_pipeline.complex.energies import Energies
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, Solution, Source, Trajectory, ViewGraph

@@ -8,7 +8,6 @@ any leading batch shape.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats
@@ -16,7 +15,6 @@ from hodge_pipeline.types import Bools, Floats
 SMALL_ANGLE = 1e-4
 ARM_M = 1.0
 """Metres: a rotation counts as the displacement that it causes at this distance, about that of a room's walls."""
-
 
 LEAST_PRECISION, MOST_PRECISION = 1e-6, 1e6
 """Of the median one, in units in which that is 1: eigenvalues of an information beyond are clipped."""
@@ -33,15 +31,37 @@ def hat(v: Floats) -> Floats:
 
 def so3_exp(phi: Floats) -> Floats:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians (paper, Section 3.3)."""
-    phi = np.asarray(phi, float)
-    return np.asarray(Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix()).reshape(*phi.shape[:-1], 3, 3)
+    half = 0.5 * np.sqrt(np.einsum("...i,...i->...", phi, phi))
+    return _rotation(np.moveaxis(phi, -1, 0) * (0.5 * np.sinc(half / np.pi)), np.cos(half))
+
+
+def _rotation(vector: Floats, w: Floats) -> Floats:
+    """Rotation matrices (..., 3, 3) of unit quaternions with this vector (3, ...) and scalar w (...,)."""
+    x, y, z = vector
+    out = np.empty((*w.shape, 3, 3))
+    for row, (own, after, last) in enumerate(((x, y, z), (y, z, x), (z, x, y))):
+        out[..., row, row] = 1 - 2 * (after**2 + last**2)
+        out[..., row, (row + 1) % 3] = 2 * (own * after - w * last)
+        out[..., row, (row + 2) % 3] = 2 * (own * last + w * after)
+    return out
 
 
 def so3_log(rotation: Floats) -> Floats:
     """Rotation vectors (..., 3) of rotation matrices (..., 3, 3), of length at most π.
 
-    At exactly π the axis has two signs: its largest entry is taken positive. By the row of 4 q qᵀ with the largest
-    diagonal (Markley 2008), which is accurate at every angle and, where the matrix is a rotation, needs no projection.
+    At exactly π the axis has two signs: its largest entry is taken positive.
+    """
+    quat = _quat_xyzw(rotation)
+    sine = np.linalg.norm(quat[..., :3], axis=-1)
+    angle = 2 * np.arctan2(sine, quat[..., 3])
+    return np.asarray(quat[..., :3] * (angle / np.where(sine > 0, sine, 1.0))[..., None])
+
+
+def _quat_xyzw(rotation: Floats) -> Floats:
+    """Quaternions (..., 4), w not negative, of no unit length, of rotation matrices (..., 3, 3).
+
+    By the row of 4 q qᵀ with the largest diagonal (Markley 2008), which is accurate at every angle and, where the
+    matrix is a rotation, needs no projection.
     """
     rotation = np.asarray(rotation, float)
     r = np.moveaxis(rotation.reshape(-1, 3, 3), 0, 2)
@@ -55,10 +75,7 @@ def so3_log(rotation: Floats) -> Floats:
     row = np.argmax(np.einsum("iin->in", outer), axis=0)
     quat = outer[row, :, np.arange(len(row))]
     quat *= np.where(quat[:, 3:] < 0, -1.0, 1.0)
-    sine = np.linalg.norm(quat[:, :3], axis=1)
-    angle = 2 * np.arctan2(sine, quat[:, 3])
-    phi = quat[:, :3] * (angle / np.where(sine > 0, sine, 1.0))[:, None]
-    return np.asarray(phi.reshape(*rotation.shape[:-2], 3))
+    return np.asarray(quat.reshape(*rotation.shape[:-2], 4))
 
 
 def _series(angle: Floats) -> tuple[Floats, Floats]:
@@ -188,16 +205,15 @@ def transform(b_from_a: Floats, points_in_a: Floats) -> Floats:
 
 def from_quat_xyzw(translation: Floats, quat_xyzw: Floats) -> Floats:
     """Motions (..., 4, 4); quaternions (..., 4) of any length but zero are normalised."""
-    quat_xyzw = np.asarray(quat_xyzw, float)
-    rotation = np.asarray(Rotation.from_quat(quat_xyzw.reshape(-1, 4)).as_matrix())
-    return from_parts(rotation.reshape(*quat_xyzw.shape[:-1], 3, 3), translation)
+    quat = np.asarray(quat_xyzw, float)
+    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+    return from_parts(_rotation(np.moveaxis(quat[..., :3], -1, 0), quat[..., 3]), translation)
 
 
 def to_quat_xyzw(b_from_a: Floats) -> Floats:
     """Unit quaternions (..., 4) of the rotations, w not negative."""
-    rotation = np.asarray(b_from_a)[..., :3, :3]
-    quat = np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()).reshape(*rotation.shape[:-2], 4)
-    return np.where(quat[..., 3:] < 0, -quat, quat)
+    quat = _quat_xyzw(np.asarray(b_from_a)[..., :3, :3])
+    return np.asarray(quat / np.linalg.norm(quat, axis=-1, keepdims=True))
 
 
 def project_to_so3(matrix: Floats) -> Floats:

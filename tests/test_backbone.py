@@ -63,7 +63,7 @@ def test_selected_inversion_is_the_dense_inverse() -> None:
 def test_the_reduced_chain_ends_at_the_minimum_over_all_poses(dimension: int) -> None:
     graph = drive(dimension=dimension, wrong=0.0, loops=30).graph
     chain = chain_of(graph)
-    bare = Fit(Reduced.of(chain, np.arange(len(chain.loop_edge))), linearise(chain, chain.poses()))
+    bare = Fit(Reduced.of(chain, np.arange(len(chain.loop_edge))), linearise(chain, chain.poses))
     found = settled(bare, 30, 1e-12)
     assert found.cost < bare.cost / 10
     exact = solve(graph)
@@ -73,7 +73,7 @@ def test_the_reduced_chain_ends_at_the_minimum_over_all_poses(dimension: int) ->
 
 def test_left_out_residuals_are_those_of_a_solve_without_the_loop() -> None:
     chain = chain_of(drive(wrong=0.0, loops=12).graph)
-    found = settled(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses())), 30, 1e-12)
+    found = settled(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses)), 30, 1e-12)
     without = left_out(found, uncertainty(found.linear, found))
     for row in (0, 5, 11):
         others = Reduced.of(chain, np.delete(np.arange(12), row))

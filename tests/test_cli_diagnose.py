@@ -27,8 +27,7 @@ from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import frames_table
 from hodge_pipeline.report.diagnosis_plots import side_by_side as pieces_apart
-from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views
-from hodge_pipeline.report.matches import side_by_side
+from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views, side_by_side
 from hodge_pipeline.types import PointCloud, ViewGraph
 from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject
 from synthetic import tiny_sequence  # noqa: F401 - a fixture

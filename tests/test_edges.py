@@ -97,11 +97,14 @@ def test_iou_equals_that_of_python_sets(seed: int, count: int) -> None:
         world = cloud.points_in_cam.astype(float) + pose[:3, 3]
         sets.append({tuple(cell) for cell in np.floor(world / 0.3).astype(int)})
     iou = pairwise_iou(clouds, poses, 0.3).toarray()
+    partners = np.flatnonzero(rng.integers(0, 2, count))
+    of_partners = pairwise_iou(clouds, poses, 0.3, partners=partners).toarray()
     for i in range(count):
         for j in range(count):
             union = len(sets[i] | sets[j])
             expected = len(sets[i] & sets[j]) / union if i < j and union else 0.0
             assert iou[i, j] == pytest.approx(expected)
+            assert of_partners[i, j] == pytest.approx(expected if {i, j} & set(partners.tolist()) else 0.0)
 
 
 def test_iou_in_many_blocks_is_that_of_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_pipeline.pairs.budget import spread, thinning_order
+from hodge_pipeline.pairs.combined import spread, thinning_order
 from hodge_pipeline.types import Edges
 
 

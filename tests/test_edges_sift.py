@@ -13,8 +13,7 @@ import pytest
 
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.pairs.sift import SiftEdges
-from hodge_pipeline.pairs.sift_features import Features
+from hodge_pipeline.pairs.sift import Features, SiftEdges
 from hodge_pipeline.pairs.sift_matching import count_inliers
 from hodge_pipeline.pairs.sift_similarity import most_similar
 from hodge_pipeline.registration.descriptors import match

@@ -189,3 +189,10 @@ def test_a_scheduler_that_is_not_there_is_one_line(address: str, monkeypatch: py
     monkeypatch.setattr("hodge_pipeline.executors.dask.TIMEOUT_S", 0.5)
     with pytest.raises(WorkerError, match=f"no Dask scheduler answers at '{address}'"), cluster_workers(address):
         raise AssertionError
+
+
+def test_workers_of_tracking_pairs_and_scores_load_no_scipy() -> None:
+    tasks = "registration.tracking, hodge_pipeline.registration.rgbd, hodge_pipeline.evaluation.cloud_distance"
+    code = f"import sys, hodge_pipeline.{tasks}\nprint({{'scipy', 'open3d', 'matplotlib', 'rerun'}} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

@@ -17,9 +17,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.fusion import tsdf
 from hodge_pipeline.fusion.boxes import boxes_of
-from hodge_pipeline.fusion.cloud import CloudFuser
+from hodge_pipeline.fusion.cloud import CloudFuser, VoxelCloud
 from hodge_pipeline.fusion.tsdf import TsdfFuser
-from hodge_pipeline.fusion.voxel_cloud import VoxelCloud
 from hodge_pipeline.types import Camera, Frame, Model, PointCloud
 
 CAMERA = Camera(width=80, height=60, fx=60.0, fy=60.0, cx=39.5, cy=29.5)
@@ -293,7 +292,7 @@ def test_a_voxel_holds_the_mean() -> None:
 def test_a_cloud_in_parts_is_the_cloud_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(5)
     parts = rng.uniform(-3, 3, (12, 500, 3))
-    monkeypatch.setattr("hodge_pipeline.fusion.voxel_cloud.MERGE_AT", 700)
+    monkeypatch.setattr("hodge_pipeline.fusion.cloud.MERGE_AT", 700)
     many, once = VoxelCloud(0.5, 10_000), VoxelCloud(0.5, 10_000)
     once.origin = np.floor(parts[0].mean(axis=0))
     for part in parts:

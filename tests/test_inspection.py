@@ -101,9 +101,9 @@ def test_an_oddity_is_named(row: int, change: dict[str, Any], expected: str) -> 
 
 def test_a_wrong_depth_scale_is_suspected() -> None:
     frames = [replace(frame, read_depth=partial(constant_depth, 2000.0)) for frame in walk(3)]
-    assert oddities_of(frames) == ["the median depth is 2e+03 m: is the depth scale right?"]
+    assert oddities_of(frames) == ["the median depth is 2e+03 m: is the depth scale right (source.reader.depth_scale)?"]
     near = [replace(frame, read_depth=partial(constant_depth, 0.4)) for frame in frames]
-    assert oddities_of(near) == ["all depth lies within 0.4 m: is this a close-up, or is the depth scale wrong?"]
+    assert oddities_of(near)[0].startswith("all depth lies within 0.4 m, as in a close-up: is the depth scale right")
 
 
 def test_frames_that_cannot_be_read_are_told() -> None:

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hodge_adapters.mcap.images import decode_rvl
 from hodge_adapters.mcap.protobuf import protobuf_decoder
 from hodge_adapters.mcap.reader import McapReader
 from hodge_adapters.mcap.records import Malformed
 from hodge_adapters.mcap.ros_cdr import ros_decoder
-from hodge_adapters.mcap.ros_rvl import decode_rvl
 from hodge_adapters.mcap.ros_tf import TransformTree
 from hodge_pipeline import se3
 from hodge_pipeline.testing import check_reader

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.descriptors import match, root_sift
-from hodge_pipeline.registration.guided import guided_match
 from hodge_pipeline.registration.landmarks import back_projected, find_landmarks
-from hodge_pipeline.registration.rgbd import Rgbd
+from hodge_pipeline.registration.rgbd import Rgbd, guided_match
 from hodge_pipeline.registration.visual import VisualMotion, visual_motion
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, Landmarks, PointCloud
 

@@ -14,7 +14,7 @@ from hodge_pipeline.pairs.edits import read_history_file
 from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.opening import Review
-from hodge_pipeline.review.pictures import Pictures
+from hodge_pipeline.review.routes import Pictures
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.types import Floats
 from test_readers_colmap_rigs import write_model

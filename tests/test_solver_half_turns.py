@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.half_turns import turned_back
 from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.solvers.minimise import turned_back
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import ViewGraph
 

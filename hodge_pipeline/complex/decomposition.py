@@ -10,32 +10,12 @@ from scipy.sparse.linalg import splu
 
 from hodge_pipeline.complex.coboundary import grounded_laplacian
 from hodge_pipeline.complex.components import connected_components, first_of_component
+from hodge_pipeline.complex.energies import Energies
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints
 
 RELATIVE_RESIDUAL = 1e-13
 ENOUGH = 1e-9
-
-
-@dataclass(frozen=True)
-class Energies:
-    """Energy Σ w|ω|² of the parts of a 1-form, (rotation in rad², translation in m²) each, on so many simplices.
-
-    Exact: what moving the poses takes away; co-exact: the curl of triangles; harmonic: loops that no triangle fills.
-    """
-
-    simplices: tuple[int, ...]
-    exact: tuple[float, float]
-    coexact: tuple[float, float]
-    harmonic: tuple[float, float]
-
-    @property
-    def shares(self) -> dict[str, tuple[float, float]]:
-        """The share of each part in the rotation's and the translation's energy; 0 where there is none at all."""
-        parts = {"exact": self.exact, "coexact": self.coexact, "harmonic": self.harmonic}
-        total = np.sum(list(parts.values()), axis=0)
-        scale = np.where(total > 0, total, 1.0)
-        return {name: (float(part[0] / scale[0]), float(part[1] / scale[1])) for name, part in parts.items()}
 
 
 @dataclass(frozen=True)

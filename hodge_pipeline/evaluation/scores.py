@@ -6,7 +6,7 @@ between two sets mean anything. For the same reason the score is always printed 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
@@ -58,8 +58,7 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind, 
         return np.zeros((0, 2), np.int64)
     find = _near_centroids if kind == "distance" else _overlapping_voxels
     some = some_of(np.arange(len(usable)), MOST_FRAMES)
-    found = find([clouds[int(row)] for row in usable], world_from_cam[usable], some, scale)
-    clouds.forget()
+    found = find(clouds.read(usable), world_from_cam[usable], some, scale)
     pairs = np.unique(np.sort(found[found[:, 0] != found[:, 1]], axis=1), axis=0)
     return np.asarray(usable[pairs], np.int64)
 
@@ -69,7 +68,7 @@ def has_pose(world_from_cam: Floats) -> Bools:
     return np.asarray(np.isfinite(world_from_cam).all(axis=(-1, -2)))
 
 
-def _near_centroids(clouds: Sequence[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:
+def _near_centroids(clouds: Iterable[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:
     """Pairs (P, 2) of one of `some` rows and any row."""
     means = np.array([cloud.points_in_cam.mean(axis=0, dtype=float) for cloud in clouds])
     centroids = np.einsum("nij,nj->ni", world_from_cam[:, :3, :3], means) + world_from_cam[:, :3, 3]
@@ -79,7 +78,7 @@ def _near_centroids(clouds: Sequence[PointCloud], world_from_cam: Floats, some: 
     return np.stack([some[near["i"]], near["j"]], axis=1)
 
 
-def _overlapping_voxels(clouds: Sequence[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:
+def _overlapping_voxels(clouds: Iterable[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:
     """Pairs (P, 2) of one of `some` rows and any row."""
     iou = pairwise_iou(clouds, world_from_cam, scale * IOU_VOXEL_M, above=IOU, partners=some).tocoo()
     return np.stack([iou.row, iou.col], axis=1)

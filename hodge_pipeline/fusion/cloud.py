@@ -7,16 +7,24 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
+from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.fusion.depth_points import depth_points
 from hodge_pipeline.fusion.views import Skipped, posed
-from hodge_pipeline.fusion.voxel_cloud import VoxelCloud
 from hodge_pipeline.stages import Advance, no_progress
-from hodge_pipeline.types import Bools, Floats, Frame, Model, PointCloud
+from hodge_pipeline.types import Bools, Bytes, Camera, Floats, Floats32, Frame, Ints, Model, PointCloud
 
 POINTS_AT_ONCE = 1 << 20
+
+MAX_STEP = 0.05
+"""Share of the depth: a larger step between neighbouring pixels is an edge of an object, which has no normal."""
+
+AXIS_BITS = 21
+HALF = 1 << (AXIS_BITS - 1)
+MERGE_AT = 1_000_000
+"""Rows that wait before they are merged: a merge sorts all voxels, so it must be rare."""
+POSITION, COLOUR, NORMAL, COUNT = slice(0, 3), slice(3, 6), slice(6, 9), 9
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -93,3 +101,117 @@ class CloudFuser:
         if far:
             notes.append(f"{far} points left out: more than a million voxels from the first frame")
         return notes
+
+
+def depth_points(
+    depth_m: Floats32, colour: Bytes | None, camera: Camera, stride: int, min_depth_m: float, max_depth_m: float
+) -> PointCloud:
+    """One point for each `stride`-th pixel whose depth is within the bounds, in the camera's axes.
+
+    A normal faces the camera; it is 0 where the pixel lies at an edge or beside a missing measurement.
+    """
+    z = depth_m[::stride, ::stride].astype(float)
+    v, u = np.mgrid[0 : depth_m.shape[0] : stride, 0 : depth_m.shape[1] : stride]
+    grid = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+    valid = (z >= max(min_depth_m, 1e-6)) & (z <= max_depth_m)
+    return PointCloud(
+        points_in_cam=grid[valid].astype(np.float32),
+        normals_in_cam=_normals(grid)[valid].astype(np.float32),
+        colours=None if colour is None else _at(colour, depth_m.shape, stride)[valid],
+    )
+
+
+def _at(colour: Bytes, depth_shape: tuple[int, ...], stride: int) -> Bytes:
+    """The colours of the strided depth pixels; the images may differ in size, not in field of view."""
+    rows = (2 * np.arange(0, depth_shape[0], stride) + 1) * colour.shape[0] // (2 * depth_shape[0])
+    columns = (2 * np.arange(0, depth_shape[1], stride) + 1) * colour.shape[1] // (2 * depth_shape[1])
+    return colour[np.ix_(rows, columns)]
+
+
+def _normals(grid: Floats) -> Floats:
+    """Unit normals (H, W, 3) by central differences; 0 at the border and at edges."""
+    down, right = grid[2:, 1:-1] - grid[:-2, 1:-1], grid[1:-1, 2:] - grid[1:-1, :-2]
+    z = grid[1:-1, 1:-1, 2]
+    smooth = (np.abs(down[..., 2]) < 2 * MAX_STEP * z) & (np.abs(right[..., 2]) < 2 * MAX_STEP * z)
+    normals = np.cross(down, right)
+    length = np.linalg.norm(normals, axis=-1)
+    away = np.einsum("hwk,hwk->hw", normals, grid[1:-1, 1:-1]) > 0
+    out = np.zeros_like(grid)
+    scale = np.where(away, -1.0, 1.0) / np.where(smooth & (length > 1e-12), length, np.inf)
+    out[1:-1, 1:-1] = normals * scale[..., None]
+    return out
+
+
+class VoxelCloud:
+    """Sums of position, colour, normal and count for each voxel, in two arrays sorted by voxel.
+
+    Where there are more than `max_points` voxels, their side doubles until there are not.
+    """
+
+    def __init__(self, voxel_m: float, max_points: int) -> None:
+        self.voxel_m, self.max_points = voxel_m, max_points
+        self.origin: Floats | None = None
+        self._keys, self._sums = np.zeros(0, np.int64), np.zeros((0, 10))
+        self._waiting: list[tuple[Ints, Floats]] = []
+
+    def add(self, points_in_world: Floats, colours: Bytes | None, normals_in_world: Floats | None) -> int:
+        """Add points (N, 3); gives how many lie more than a million voxels from the first ones, and are left out."""
+        if len(points_in_world) == 0:
+            return 0
+        if self.origin is None:
+            self.origin = np.floor(points_in_world.mean(axis=0))
+        cells = np.floor((points_in_world - self.origin) / self.voxel_m)
+        near = (np.abs(cells) < HALF - 1).all(axis=1)
+        sums = np.zeros((len(cells), 10))
+        sums[:, POSITION], sums[:, COUNT] = points_in_world - self.origin, 1
+        if colours is not None:
+            sums[:, COLOUR] = colours
+        if normals_in_world is not None:
+            sums[:, NORMAL] = normals_in_world
+        self._waiting.append(_reduced(_packed(cells[near].astype(np.int64)), sums[near]))
+        if sum(len(keys) for keys, _ in self._waiting) > MERGE_AT:
+            self._merge()
+        return int((~near).sum())
+
+    def points(self) -> tuple[Floats32, Floats32, Bytes]:
+        """The mean position, unit normal (0 where none was given) and colour of each voxel."""
+        self._merge()
+        sums = self._sums
+        count = sums[:, COUNT, None]
+        origin = np.zeros(3) if self.origin is None else self.origin
+        length = np.linalg.norm(sums[:, NORMAL], axis=1, keepdims=True)
+        normals = sums[:, NORMAL] / np.where(length > 1e-9, length, np.inf)
+        colours = np.rint(sums[:, COLOUR] / count).astype(np.uint8)
+        return (sums[:, POSITION] / count + origin).astype(np.float32), normals.astype(np.float32), colours
+
+    def _merge(self) -> None:
+        self._keys, self._sums = _reduced(
+            np.concatenate([self._keys, *(keys for keys, _ in self._waiting)]),
+            np.concatenate([self._sums, *(sums for _, sums in self._waiting)]),
+        )
+        self._waiting = []
+        while len(self._keys) > self.max_points:
+            self.voxel_m *= 2
+            self._keys, self._sums = _reduced(_packed(_unpacked(self._keys) >> 1), self._sums)
+
+
+def _packed(cells: Ints) -> Ints:
+    shifted = cells + HALF
+    return np.asarray((shifted[:, 0] << 2 * AXIS_BITS) | (shifted[:, 1] << AXIS_BITS) | shifted[:, 2])
+
+
+def _unpacked(keys: Ints) -> Ints:
+    mask = (1 << AXIS_BITS) - 1
+    return np.stack([keys >> 2 * AXIS_BITS, (keys >> AXIS_BITS) & mask, keys & mask], axis=1) - HALF
+
+
+def _reduced(keys: Ints, sums: Floats) -> tuple[Ints, Floats]:
+    """One row for each key, ascending: the sum of its rows."""
+    if len(keys) == 0:
+        return keys, sums
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
+    # A product with a sparse matrix of ones sums each run of rows where they lie, without a sorted copy of them.
+    runs = csr_matrix((np.ones(len(order)), order, np.append(starts, len(order))), shape=(len(starts), len(order)))
+    return keys[starts], np.asarray(runs @ sums)

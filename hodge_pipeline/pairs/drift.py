@@ -65,12 +65,12 @@ class DriftEdges:
         """The pairs of one sequence's rows, in their order, and their IoU."""
         if len(rows) < 2:
             return NOTHING, np.zeros(0)
-        own, poses = [clouds[int(row)] for row in rows], world_from_cam[rows]
+        poses = world_from_cam[rows]
         way_m = path_length_m(poses, median_range_m(clouds, rows))
         pairs, overlap = [NOTHING], [np.zeros(0)]
         for octave in range(OCTAVES):
             voxel_m = self.voxel_m * 2**octave
-            iou = pairwise_iou(own, poses, voxel_m, above=self.min_iou).tocoo()
+            iou = pairwise_iou(clouds.read(rows), poses, voxel_m, above=self.min_iou).tocoo()
             i, j = iou.row.astype(np.int64), iou.col.astype(np.int64)
             drift_m = self.drift_share * (way_m[j] - way_m[i])
             mine = (j - i > self.reach) & (drift_m <= voxel_m) & ((drift_m > voxel_m / 2) | (octave == 0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -36,25 +36,29 @@ def voxels(points_in_world: Floats, voxel_m: float, origin: Ints) -> Ints:
     return np.unique((cells[:, 0] << 2 * AXIS_BITS) | (cells[:, 1] << AXIS_BITS) | cells[:, 2])
 
 
-def incidence(clouds: Sequence[PointCloud], world_from_cam: Floats, voxel_m: float) -> csr_matrix:
-    """The CSR matrix (N frames, M voxels) of int32, 1 where a frame has a point in a voxel.
+def incidence(
+    clouds: Iterable[PointCloud], world_from_cam: Floats, voxel_m: float, partners: Ints | None = None
+) -> tuple[csr_matrix, Ints]:
+    """The CSR matrix (N frames, M voxels) of int32, 1 where a frame has a point in a voxel that one of the `partners`
+    (all frames where None are named) has a point in; and in how many voxels (N,) each frame has points at all.
 
     The row of a frame without points, or with a pose that is not finite, is empty.
     """
-    usable = [
-        len(cloud) > 0 and bool(np.isfinite(pose).all()) for cloud, pose in zip(clouds, world_from_cam, strict=True)
-    ]
-    first = np.argmax(usable) if any(usable) else 0
-    origin = np.floor(world_from_cam[first, :3, 3] / voxel_m).astype(np.int64) if any(usable) else np.zeros(3, np.int64)
+    finite = np.asarray(np.isfinite(world_from_cam).all(axis=(1, 2)))
+    origin = np.floor(world_from_cam[finite][:1, :3, 3].sum(axis=0) / voxel_m).astype(np.int64)
     nothing = np.zeros(0, np.int64)
     keys = [
         voxels(se3.transform(pose, cloud.points_in_cam.astype(float)), voxel_m, origin) if use else nothing
-        for cloud, pose, use in zip(clouds, world_from_cam, usable, strict=True)
+        for cloud, pose, use in zip(clouds, world_from_cam, finite, strict=True)
     ]
-    names, columns = np.unique(np.concatenate([nothing, *keys]), return_inverse=True)
-    rows = np.concatenate([[0], np.cumsum([len(k) for k in keys])])
-    ones = np.ones(len(columns), np.int32)
-    return csr_matrix((ones, columns, rows), shape=(len(keys), len(names)))
+    named = keys if partners is None else [keys[row] for row in partners]
+    names = np.append(np.unique(np.concatenate([nothing, *named])), np.iinfo(np.int64).max)  # above every key
+    places = ((np.searchsorted(names, own), own) for own in keys)
+    columns = [place[names[place] == own].astype(np.int32) for place, own in places]
+    rows = np.concatenate([[0], np.cumsum([len(own) for own in columns])])
+    entries = np.concatenate([np.zeros(0, np.int32), *columns])
+    matrix = csr_matrix((np.ones(len(entries), np.int32), entries, rows), shape=(len(keys), len(names)))
+    return matrix, np.array([len(own) for own in keys], np.int64)
 
 
 def _blocks(count: int) -> Iterator[slice]:
@@ -63,7 +67,7 @@ def _blocks(count: int) -> Iterator[slice]:
 
 
 def pairwise_iou(
-    clouds: Sequence[PointCloud],
+    clouds: Iterable[PointCloud],
     world_from_cam: Floats,
     voxel_m: float,
     above: float = 0.0,
@@ -76,8 +80,8 @@ def pairwise_iou(
     in the world frame under the poses (N, 4, 4), on the lattice through the world's origin. Where `partners (R,)` are
     named, only pairs with one of them.
     """
-    seen = incidence(clouds, world_from_cam, voxel_m)
-    count, sizes = seen.shape[0], np.diff(seen.indptr)
+    seen, sizes = incidence(clouds, world_from_cam, voxel_m, partners)
+    count = len(sizes)
     partners = np.arange(count) if partners is None else partners
     is_partner = np.isin(np.arange(count), partners)
     rows, columns, values = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
@@ -128,5 +132,4 @@ class OverlapEdges:
             return Edges.proposed(np.zeros((0, 2), np.int64), "overlap")
         partners = some_of_each_place(world_from_cam, 2 * self.voxel_m)
         iou = pairwise_iou(clouds, world_from_cam, self.voxel_m, above=self.min_iou, partners=partners).tocoo()
-        clouds.forget()
         return Edges.proposed(np.stack([iou.row, iou.col], axis=1), "overlap", iou.data)

@@ -53,8 +53,7 @@ class PlaceEdges:
             return Edges.proposed(np.zeros((0, 2), np.int64), "place")
         some = rows[:: max(1, len(rows) // CLOUDS_IN_REACH)]
         reach_m = float(np.median([_range_m(clouds[row]) for row in some.tolist()]))
-        contexts = np.array([context(clouds[row], reach_m) for row in rows.tolist()])
-        clouds.forget()
+        contexts = np.array([context(cloud, reach_m) for cloud in clouds.read(rows)])
         names = np.array([frames[row].sequence for row in rows], dtype=np.str_)
         near = _nearest_rings(contexts, min(self.compared, len(rows)))
         pairs = near[(names[near[:, 0]] != names[near[:, 1]]) | (near[:, 1] - near[:, 0] > self.reach)]

@@ -67,13 +67,12 @@ def first_frame(points: Floats32, clouds: CloudSet, world_from_cam: Floats) -> I
     around = (cells[:, None] + [[0, 0, 0], *np.eye(3, dtype=int), *-np.eye(3, dtype=int)]).reshape(-1, 3)
     keys, cell_of = np.unique(shapes.numbered(around - low, size), return_inverse=True)
     first = np.full(len(keys), len(clouds) - 1)
-    for row in known[::-1].tolist():
-        seen = se3.transform(world_from_cam[row], np.asarray(clouds[row].points_in_cam, float))
+    for row, cloud in zip(known[::-1], clouds.read(known[::-1]), strict=True):
+        seen = se3.transform(world_from_cam[row], np.asarray(cloud.points_in_cam, float))
         own = np.floor(seen / cell_m).astype(np.int64) - low
         own = shapes.numbered(own[((own >= 0) & (own < size)).all(axis=1)], size)
         place = np.minimum(np.searchsorted(keys, own), len(keys) - 1)
         first[place[keys[place] == own]] = row
-    clouds.forget()
     return np.asarray(first[cell_of.reshape(len(points), -1)].min(axis=1))
 
 

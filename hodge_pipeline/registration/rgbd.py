@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -19,14 +19,18 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.assessment import MIN_POINTS, SAME_FITNESS, Assessment, assess, unregistered
 from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.gicp import Gicp, PreparedCloud
-from hodge_pipeline.registration.guided import guided_match
 from hodge_pipeline.registration.visual import VisualMotion, visual_motion
-from hodge_pipeline.types import Floats, Ints, Landmarks, PointCloud, Registration
+from hodge_pipeline.types import Floats, Floats32, Ints, Landmarks, PointCloud, Registration
 
 ASSESSED_POINTS = 1000
 MATCHES_PER_SAMPLE = 75.0
 """Matches that count as one independent measurement: they share the errors of lens, shutter and the delay between depth
 and colour. Calibrated on real pairs, as `points_per_sample`."""
+
+RATIO = 0.9
+"""A match is this much nearer than the second nearest of the neighbourhood."""
+FAR = 9.0
+"""Above any squared distance of unit descriptors."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -183,3 +187,34 @@ class PreparedFrame(PreparedCloud):
         self.landmarks = np.asarray(landmarks.points_in_cam, np.float64)
         self.descriptors = root_sift(np.asarray(landmarks.descriptors))
         self.pixel_rad = np.asarray(landmarks.pixel_rad, np.float64)
+
+
+class Marked(Protocol):
+    """A frame's landmarks (n, 3) in its axes, and their unit descriptors (n, 128)."""
+
+    landmarks: Floats
+    descriptors: Floats32
+
+
+def guided_match(target: Marked, source: Marked, i_from_j: Floats, within_m: float) -> Ints:
+    """Rows (M, 2) of landmarks of i and j that are each other's nearest by descriptor among those within `within_m`.
+
+    Near a guess a landmark must stand out among its neighbours alone, so that repeated and faint ones match as well.
+    """
+    if not len(target.landmarks) or not len(source.landmarks):
+        return np.zeros((0, 2), np.int64)
+    moved = se3.transform(i_from_j, source.landmarks)
+    squared = _squared_distances(target.landmarks, moved)
+    unlike = np.where(squared < within_m**2, 2.0 - 2.0 * (target.descriptors @ source.descriptors.T), FAR)
+    of_source = unlike.argmin(axis=0)
+    columns = np.arange(len(of_source))
+    nearest = unlike[of_source, columns]
+    mutual = (unlike.argmin(axis=1)[of_source] == columns) & (nearest < FAR)
+    unlike[of_source, columns] = FAR
+    stands_out = nearest < RATIO**2 * unlike.min(axis=0)
+    kept = np.flatnonzero(mutual & stands_out)
+    return np.stack([of_source[kept], kept], axis=1).astype(np.int64)
+
+
+def _squared_distances(a: Floats, b: Floats) -> Floats:
+    return np.asarray((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T)

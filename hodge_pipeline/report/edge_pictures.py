@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.evaluation.difference import length
+from hodge_pipeline.pairs.sift_matching import CONFIDENCE, MOST_RANSAC_STEPS
 from hodge_pipeline.recording.shapes import SCANNER_AXES, is_scanner
+from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import EdgePictures
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.report.matches import side_by_side
 from hodge_pipeline.report.painting import UNKNOWN_UNIT, painted
 from hodge_pipeline.report.photographs import images_of
-from hodge_pipeline.types import CloudSet, Floats, Frame, Ints, PointCloud, ViewGraph
+from hodge_pipeline.report.raster import GAP, beside
+from hodge_pipeline.types import Bytes, CloudSet, Floats, Floats32, Frame, Ints, PointCloud, ViewGraph
 
 IMAGE_WIDTH = 420
 LEAST_UP = 0.1
@@ -29,6 +32,12 @@ BLUE, ORANGE = (0, 114, 178), (230, 120, 0)
 CUT_SHARE, SEEN_SHARE = 0.04, 0.03
 """How thick a cut through clouds is, and how large an offset must be to be seen in it: of the clouds' extent."""
 EXAGGERATIONS = (2, 5, 10, 20, 50, 100)
+
+RATIO = 0.8
+MAX_FEATURES = 1000
+MAX_ERROR_PX = 2.0
+FEWEST = 8
+ODD_COLOUR, AGREEING_COLOUR = (160, 160, 160), (0, 158, 115)
 
 
 def edge_pictures(
@@ -166,3 +175,48 @@ def _images(first: Frame, second: Frame) -> Iterator[Picture]:
         "alike match too: see whether the whole views fit."
     )
     yield Picture(title, caption, raster.jpeg(found.image))
+
+
+@dataclass(frozen=True)
+class Matched:
+    """The picture (H, W, 3), the number of matches, and how many of them one relative pose explains."""
+
+    image: Bytes
+    matches: int
+    agreeing: int
+
+
+def side_by_side(first: Bytes, second: Bytes) -> Matched:
+    """Two RGB images with a line for each match: green where one relative pose explains it, else grey."""
+    canvas = beside([first, second])
+    found = [_features(image) for image in (first, second)]
+    pairs = match(found[0][1], found[1][1], RATIO)
+    agreeing = _agreeing(found[0][0], found[1][0], pairs)
+    offset = np.array([first.shape[1] + GAP, 0], np.float32)
+    for colour, rows in ((ODD_COLOUR, ~agreeing), (AGREEING_COLOUR, agreeing)):
+        for a, b in pairs[rows]:
+            start, end = np.round([found[0][0][a], found[1][0][b] + offset]).astype(int).tolist()
+            cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
+    return Matched(canvas, len(pairs), int(agreeing.sum()))
+
+
+def _features(image: Bytes) -> tuple[Floats32, Floats32]:
+    """Pixels (n, 2) and unit descriptors (n, 128)."""
+    detector = cv2.SIFT_create(nfeatures=MAX_FEATURES)  # type: ignore[attr-defined]
+    points, descriptors = detector.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    if not points:
+        return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
+    return np.array([point.pt for point in points], np.float32), root_sift(descriptors.astype(np.uint8))
+
+
+def _agreeing(first: Floats32, second: Floats32, pairs: Ints) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Where (M,) a match is explained by the fundamental matrix that explains most: the same answer every time."""
+    if len(pairs) < FEWEST:
+        return np.zeros(len(pairs), bool)
+    cv2.setRNGSeed(0)
+    model, inlier = cv2.findFundamentalMat(
+        first[pairs[:, 0]], second[pairs[:, 1]], cv2.FM_RANSAC, MAX_ERROR_PX, CONFIDENCE, MOST_RANSAC_STEPS
+    )
+    if model is None or inlier is None or inlier.sum() < FEWEST:
+        return np.zeros(len(pairs), bool)
+    return np.asarray(inlier.ravel() > 0)

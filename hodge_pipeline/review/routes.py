@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from importlib.resources import as_file, files
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -13,11 +16,11 @@ from pydantic import TypeAdapter, ValidationError
 from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import pair_names
-from hodge_pipeline.report.document import JPEG
+from hodge_pipeline.report.document import JPEG, Picture
+from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.review.front import Answer, Route, Site
 from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
-from hodge_pipeline.review.pictures import Pictures
 from hodge_pipeline.review.session import MODES, Session
 from hodge_pipeline.stages import Advance
 from hodge_pipeline.types.input_files import read_input
@@ -32,6 +35,9 @@ FILES = {
 SUGGESTED = 12
 QUERY = TypeAdapter(Query)
 Asked = dict[str, Any]
+
+KEPT = 8
+"""Edges whose pictures are kept, 150 kB each."""
 
 
 def site(session: Session, viewer: Any = None) -> Site:
@@ -212,3 +218,39 @@ def _frames(session: Session, asked: Asked) -> list[int]:
         if str(name) not in rows:
             raise GraphError(f"{name}: is no frame: give its id, as the table names it")
     return [rows[str(name)] for name in names]
+
+
+class Pictures:
+    """The pictures of edges at the present poses, made when they are first asked for."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._made: OrderedDict[tuple[int, int, int], tuple[Picture, ...]] = OrderedDict()
+        self._lock = Lock()
+
+    def of(self, row: int) -> tuple[Picture, ...]:
+        """The pictures of an edge; none where nothing is judged yet. Raises `GraphError` for a row without an edge."""
+        with self._session.changed:
+            subject, table, settled, judged = (
+                self._session.subject, self._session.table, self._session.settled, self._session.judged,
+            )  # fmt: skip
+        if not 0 <= row < len(table):
+            raise GraphError(f"there is no edge {row}: rows go from 0 to {len(table) - 1}")
+        if judged is None:
+            return ()
+        key = id(subject), settled.revision, row
+        with self._lock:
+            if key not in self._made:
+                poses = replace(judged.diagnosis, world_from_cam=settled.world_from_cam, piece=settled.component)
+                found = edge_pictures(
+                    table.graph, poses, np.array([row]), subject.frames, subject.clouds, has_metres=subject.unit == "m"
+                )
+                plots = tuple(_told(plot) for one in found for plot in one.plots)
+                self._made[key] = plots
+                while len(self._made) > KEPT:
+                    self._made.popitem(last=False)
+            return self._made[key]
+
+
+def _told(plot: Picture) -> Picture:
+    return replace(plot, title=plot.title.replace("robust poses say", "solution says"))

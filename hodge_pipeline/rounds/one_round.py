@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import connected_components, in_runs
-from hodge_pipeline.complex.decomposition import Energies
+from hodge_pipeline.complex.energies import Energies
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions, SolveWith
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG

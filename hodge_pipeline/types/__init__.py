@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,10 +63,7 @@ class ImageFile:
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """An image as its file holds it, to be passed through undecoded.
-
-    `units_per_metre` is set for depth images only.
-    """
+    """An image as its file holds it, to be passed through undecoded; `units_per_metre` of depth images alone."""
 
     contents: bytes
     media_type: str
@@ -163,7 +162,7 @@ class Source:
     """What a reader's `open` gives: any of lazy frames, a trajectory, a measured graph.
 
     - `trajectory` is the whole trajectory that the frames' poses come from, on its own stamps, where there is one.
-    - `notes` say what was skipped or repaired, with counts: one line each.
+    - `notes` say what was skipped or repaired, with counts: one line each; `doubts` what may be wrong about the rest.
     - `positions` of its frames that are known from elsewhere, such as satellite fixes; None where it has none.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
     - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
@@ -180,6 +179,7 @@ class Source:
     contents: tuple[str, ...] = ()
     positions: Positions | None = None
     of_cameras: bool = False
+    doubts: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]
@@ -283,6 +283,10 @@ class PositionPriors:
     covariances: Floats
 
 
+CLOUDS_AT_ONCE = 256
+"""Read one after another before their memory is given back: 15 to 60 MB."""
+
+
 class CloudSet(Sequence[PointCloud]):
     """The down-sampled cloud of every frame, as memory-mapped columns: opening one costs no copy.
 
@@ -327,12 +331,8 @@ class CloudSet(Sequence[PointCloud]):
     def from_clouds(cls, clouds: Sequence[PointCloud]) -> CloudSet:
         """One set of these clouds, in order; missing normals and colours become zeros, missing landmarks none."""
         empty = np.zeros((0, 3), np.float32)
-
-        def zeros(cloud: PointCloud) -> Floats32:
-            return np.zeros((len(cloud), 3), np.float32)
-
-        normals = [zeros(c) if c.normals_in_cam is None else c.normals_in_cam for c in clouds]
-        colours = [zeros(c) if c.colours is None else c.colours for c in clouds]
+        normals = [np.zeros((len(c), 3)) if c.normals_in_cam is None else c.normals_in_cam for c in clouds]
+        colours = [np.zeros((len(c), 3)) if c.colours is None else c.colours for c in clouds]
         landmarks = [Landmarks.none() if c.landmarks is None else c.landmarks for c in clouds]
         return cls(
             _offsets([len(cloud) for cloud in clouds]),
@@ -350,7 +350,7 @@ class CloudSet(Sequence[PointCloud]):
         for name in self.FILES:
             with (folder / f"{name}.npy").open("wb") as file:
                 # Not numpy's own writing to files: on a disk that fills up its last bytes are lost without an error.
-                np.save(_Stream(file.write), getattr(self, name))
+                np.save(cast(Any, SimpleNamespace(write=file.write)), getattr(self, name))
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -369,7 +369,14 @@ class CloudSet(Sequence[PointCloud]):
         return PointCloud(self.points[cut], self.normals[cut], self.colours[cut], landmarks)
 
     def __iter__(self) -> Iterator[PointCloud]:
-        return (self[row] for row in range(len(self)))
+        return self.read(range(len(self)))
+
+    def read(self, rows: Iterable[int]) -> Iterator[PointCloud]:
+        """The clouds of these rows one after another; the memory of those before is given back."""
+        for number, row in enumerate(rows, start=1):
+            yield self[row]
+            if number % CLOUDS_AT_ONCE == 0:
+                self.forget()
 
     def forget(self) -> None:
         """Give back the memory of what was read of the files; it is read again when it is needed."""
@@ -387,13 +394,6 @@ class CloudSet(Sequence[PointCloud]):
     def reach_m(self) -> float:
         """How far the farthest point of any cloud is from its camera; 1 where there is none."""
         return max((float(np.linalg.norm(c.points_in_cam, axis=1).max()) for c in self if len(c)), default=0.0) or 1.0
-
-
-class _Stream:
-    """A file that is written by Python alone."""
-
-    def __init__(self, write: Callable[[bytes], int]) -> None:
-        self.write = write
 
 
 def _offsets(sizes: Sequence[int]) -> Ints:

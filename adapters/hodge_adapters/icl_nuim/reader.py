@@ -5,6 +5,7 @@ The first two have y pointing up, so fy = −480; the world is the files' own.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,13 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.association import interpolated_poses
 from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
-from hodge_adapters.icl_nuim.redwood import find_log, is_redwood, list_images
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
+from hodge_adapters.images.fitted_camera import UNSTAMPED_STEP_S, assumed_camera_doubts
 from hodge_adapters.images.frames import image_frame
 from hodge_adapters.posed import posed_frames
 from hodge_adapters.seven_scenes.files import FrameFiles, read_poses
-from hodge_adapters.text_rows import first_text
+from hodge_adapters.text_rows import first_text, listed, names_in
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs
@@ -33,6 +34,13 @@ REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
 TRUTH_PATTERN = "*.gt.freiburg*"
 MAX_GAP_FRAMES = 1.0
 SNIFFED_BYTES = 1 << 16
+
+
+COLOUR_FOLDERS = ("image", "images", "color", "rgb")
+LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
+TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
+_NUMBER = re.compile(r"\D*(\d+)")
+_IMAGES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -170,10 +178,17 @@ class IclNuimReader:
         own = None if self.camera else find_camera_file(path)
         if own:
             notes.append(f"intrinsics from {own.relative_to(path)}")
+        doubts: tuple[str, ...] = ()
+        if own is None and not self.camera:
+            stamps_s = UNSTAMPED_STEP_S * listing.stamps_s
+            doubts = assumed_camera_doubts(REDWOOD, listing.depth, listing.colour, stamps_s, self.depth_scale or 1000.0)
+            notes.append(
+                "Redwood's intrinsics taken (525 525 319.5 239.5), since there is no camera file in the folder"
+            )
         default = read_intrinsics(own) if own else REDWOOD
         frames = self._frames(listing, default, poses, 1000.0, notes, is_true=False)
         files = (*filter(None, [log, own]), *listing.depth, *filter(None, listing.colour))
-        return Source(path.resolve().name, path, frames, notes=tuple(notes), files=files)
+        return Source(path.resolve().name, path, frames, notes=tuple(notes), files=files, doubts=doubts)
 
 
 def _estimated(path: Path, numbers: list[int], notes: list[str]) -> tuple[Floats, Path | None]:
@@ -204,3 +219,49 @@ def _is_numbered(association: Path) -> bool:
     lines = first_text(association, SNIFFED_BYTES).splitlines()
     row = next((line.split() for line in lines if line.strip() and not line.startswith("#")), [""])
     return row[0].isdigit()
+
+
+def is_redwood(folder: Path) -> bool:
+    """Whether the folder has a depth and a colour folder, and nothing of a TUM sequence that lost its lists."""
+    if any((folder / name).is_file() for name in TUM_FILES):
+        return False
+    has_colour = any((folder / name).is_dir() for name in COLOUR_FOLDERS)
+    return has_colour and (folder / "depth").is_dir()
+
+
+def list_images(folder: Path, notes: list[str]) -> StampedImages:
+    """The images of a folder by the number that their names start with, their stamp; depth without colour is noted."""
+    depth = _by_number(folder / "depth", notes)
+    if not depth:
+        raise SourceError(
+            f"{folder / 'depth'}: no numbered PNG in it: give the folder with depth/ and image/ or color/"
+        )
+    colour_folder = next((folder / name for name in COLOUR_FOLDERS if (folder / name).is_dir()), None)
+    colour = _by_number(colour_folder, notes) if colour_folder else {}
+    numbers = sorted(depth)
+    alone = [number for number in numbers if number not in colour]
+    if alone:
+        notes.append(f"{len(alone)} frames have no colour image: {listed(alone)}")
+    none_s, one_run = np.zeros(len(numbers)), np.zeros(len(numbers), np.int64)
+    stamps_s = np.array(numbers, float)
+    return StampedImages(stamps_s, [depth[n] for n in numbers], [colour.get(n) for n in numbers], none_s, (), one_run)
+
+
+def find_log(folder: Path) -> Path | None:
+    """The trajectory of a folder, by its usual places."""
+    return next((folder / name for name in LOG_FILES if (folder / name).is_file()), None)
+
+
+def _by_number(folder: Path, notes: list[str]) -> dict[int, Path]:
+    names = [name for name in names_in(folder) if name.lower().endswith(_IMAGES)]
+    found: dict[int, Path] = {}
+    skipped: list[str] = []
+    for name in names:
+        match = _NUMBER.match(name)
+        if match is None or int(match[1]) in found:
+            skipped.append(name)
+        else:
+            found[int(match[1])] = folder / name
+    if skipped:
+        notes.append(f"{folder.name}: {len(skipped)} images without a number of their own left out: {listed(skipped)}")
+    return found

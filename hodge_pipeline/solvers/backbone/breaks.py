@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,12 +98,14 @@ class Testimony:
         after = local(poses[high], total[np.maximum(b, high)] - total[np.minimum(b, high)])
         return end, before + after + chain.carried(se3.inverse(poses[high]) @ poses[b], chain.covariance[loop])
 
-    def seeds(self, rows: Ints) -> list[int]:
-        """Loops of these with which others near them agree most, those of their own place together as one: each differs
-        from the others.
+    def seeds(self, among: Ints) -> Iterator[tuple[int, Floats]]:
+        """Unused loops with which others near them agree most, those of their own place together as one: each differs
+        from the others; and the factor (K,) with each of all `among` which they are.
         """
+        left = ~self.used[among]
+        rows = among[left]
         if not len(rows):
-            return []
+            return
         near = cKDTree(self.ends[rows]).query(self.ends[rows], k=min(4 * NEIGHBOURS, len(rows)))[1]
         near = near.reshape(len(rows), -1)
         apart = np.abs(self.ends[rows[near]] - self.ends[rows][:, None]).max(axis=2) >= 1.0
@@ -114,14 +117,16 @@ class Testimony:
             gain = np.maximum(np.logaddexp(self.factor(rows[first], second), 0.0) - self.explained[second], 0.0)
             share = 1.0 if kind is apart else 1 / np.bincount(first, minlength=len(rows))[first]
             potential += np.bincount(first, share * gain, minlength=len(rows))
-        out: list[int] = []
-        left = np.ones(len(rows), bool)
-        while left.any() and len(out) < SEEDS:
-            seed = int(np.argmax(np.where(left, potential, -1.0)))
-            out.append(int(rows[seed]))
-            left[left] = self.factor(np.full(int(left.sum()), rows[seed]), rows[left]) <= 0
-            left[seed] = False
-        return out
+        of_all = np.full(len(among), -1.0)
+        of_all[left] = potential
+        for _ in range(SEEDS):
+            if not left.any():
+                return
+            row = int(np.argmax(np.where(left, of_all, -1.0)))
+            factor = self.factor(np.full(len(among), among[row]), among)
+            left &= factor <= 0
+            left[row] = False
+            yield int(among[row]), factor
 
     def gains(self, seed: int, rows: Ints, factor: Floats) -> Floats:
         """What each of these loops (K,), with this `factor`, gains if `seed` is right: a place counts once, and that of
@@ -207,8 +212,7 @@ def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:
     chain = told.chain
     rows = np.flatnonzero(chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])
     out = []
-    for seed in told.seeds(rows[~told.used[rows]]):
-        factor = told.factor(np.full(len(rows), seed), rows)
+    for seed, factor in told.seeds(rows):
         low, high = chain.ends[seed]
         at = np.arange(low + 1, high + 1)
         score = _over(chain, rows, told.gains(seed, rows, factor))[at]
@@ -275,7 +279,7 @@ def strained_break(fit: Fit, usual: Usual) -> Break | None:
     strained = np.flatnonzero(0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM) > STRAIN)
     if not len(strained):
         return None
-    poses, turned = chain.poses(), linear.poses[high].copy()
+    poses, turned = chain.poses, linear.poses[high].copy()
     turned[:, :3, 3] = 0.0
     ahead = chain.exp((chain.adjoint(se3.inverse(turned)) @ residual[..., None])[..., 0])
     motion = se3.inverse(poses[low]) @ poses[high] @ ahead

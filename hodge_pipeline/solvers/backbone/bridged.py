@@ -23,7 +23,6 @@ from hodge_pipeline.solvers.backbone.fit import Fit, linearise, settled
 from hodge_pipeline.solvers.backbone.inference import (
     BY_CHANCE,
     MOST_STEPS,
-    TOLERANCE,
     Inferred,
     by_chance,
     infer,
@@ -43,7 +42,7 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
     """
     chain = unbroken = joined(chain)
-    wrong = Wrong.of(chain, chain.poses())  # one for all trials: evidence is against all loops being wrong
+    wrong = Wrong.of(chain, chain.poses)  # one for all trials: evidence is against all loops being wrong
     judge = partial(infer, wrong=wrong, always=always, thin=thin)
     first = judge(chain)
     if first is None:
@@ -78,7 +77,7 @@ def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]
 def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     """Breaks worth a trial, with what each must win beside what it has won."""
     scaled = found.scales.applied(chain)
-    linear, (right, wrong) = linearise(scaled, chain.poses()), found.judged.log_density
+    linear, (right, wrong) = linearise(scaled, chain.poses), found.judged.log_density
     shares = np.log(mixture(found.judged.log_density)[0])
     told = Testimony.of(scaled, linear, np.logaddexp(shares[0] + right - wrong, shares[1]), wrong, found.used)
     usual, least, fold = Usual.of(chain), by_chance(len(right)), np.log(max(told.testimonies(), 1))
@@ -87,7 +86,7 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     worth = [(each, least) for each in agreed[:MOST_TRIED]]
     reduced = thinned(scaled, np.flatnonzero(found.used))
     if len(reduced.runs):
-        fit = settled(Fit(reduced, linearise(scaled, found.poses)), MOST_STEPS, TOLERANCE)
+        fit = settled(Fit(reduced, linearise(scaled, found.poses)), MOST_STEPS)
         strained = strained_break(fit, usual)
         if strained is not None and strained.log_evidence > BY_CHANCE:
             worth.append((strained, BY_CHANCE - strained.log_evidence))
@@ -104,7 +103,7 @@ def bridged(chain: Chain, broken: Break) -> Chain:
 def joined(chain: Chain) -> Chain:
     """The chain with bridges between paths, as of several robots, where loops of several places agree how they lie."""
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
-        poses = chain.poses()
+        poses = chain.poses
         wrong = Wrong.of(chain, poses)
         scaled = learn_scales(chain, poses, wrong)[0].applied(chain)
         linear, none = linearise(scaled, poses), np.zeros(len(chain.ends))
@@ -113,8 +112,7 @@ def joined(chain: Chain) -> Chain:
         best, found = BY_CHANCE + float(np.log(len(pairs))), None
         for low, high in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).tolist():
             rows = np.flatnonzero((pairs == [low, high]).all(axis=1))
-            for seed in told.seeds(rows) if len(rows) > 1 else ():
-                factor = told.factor(np.full(len(rows), seed), rows)
+            for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
                 if (score := float(told.gains(seed, rows, factor).sum())) > best:
                     best, found = score, (low, high, seed)
         if found is None:

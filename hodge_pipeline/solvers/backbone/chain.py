@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -51,6 +52,7 @@ class Chain:
         """Positions (n,) that a step leads to."""
         return np.asarray((self.step_edge >= 0) | self.bridged)
 
+    @cached_property
     def poses(self) -> Floats:
         """World from each position (n, 4, 4), each path composed from the identity."""
         out = np.empty((self.size, 4, 4))
@@ -59,6 +61,11 @@ class Chain:
             before = before @ self.step[row] if inner[row] else self.step[row]
             out[row] = before
         return out
+
+    def with_loops(self, rows: Ints, ends: Ints) -> Chain:
+        """The chain with these of its loops alone, between other ends (K, 2)."""
+        motion, covariance = self.motion[rows], self.covariance[rows]
+        return replace(self, loop_edge=self.loop_edge[rows], ends=ends, motion=motion, covariance=covariance)
 
     def adjoint(self, poses: Floats) -> Floats:
         """Ad (..., p, p) of the free axes."""

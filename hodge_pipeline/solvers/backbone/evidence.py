@@ -13,7 +13,7 @@ from scipy.special import gammaln
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.fit import linearise, root
-from hodge_pipeline.types import Floats
+from hodge_pipeline.types import Floats, Ints
 
 PAIRS = 4000
 """Random pairs of positions that say how far apart places lie."""
@@ -151,7 +151,10 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     Each loop counts by itself: that loops at one place err alike, and steps too, would else be taken for small errors.
     Decoys, motions of loops between other places, tell what as many would explain by chance at each scale.
     """
-    own, decoys = _Model.of(chain, poses, wrong), _Model.of(decoyed(chain), poses, wrong)
+    alone = _learned_from(chain.path, np.arange(len(chain.ends)), chain.ends)
+    rows, ends = (np.concatenate(each) for each in zip(alone, _learned_from(chain.path, *_decoys(chain)), strict=True))
+    models = _Model.of(chain.with_loops(rows, ends), poses, wrong)
+    own, decoys = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
     share = len(own.residual) / max(len(decoys.residual), 1)
 
     def value(logs: Floats, unit: float) -> float:
@@ -186,19 +189,23 @@ def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Fl
     return best, top
 
 
-def decoyed(chain: Chain) -> Chain:
-    """The chain with each loop's motion, `DECOYS` times, between two other places of one path, at random."""
+def _decoys(chain: Chain) -> tuple[Ints, Ints]:
+    """Each loop (K,), `DECOYS` times, and two other places (K, 2) of one path, at random."""
     rng = np.random.default_rng(1)
     loop = np.repeat(np.arange(len(chain.loop_edge)), DECOYS)
-    count = len(loop)
-    first = rng.integers(0, chain.size, count)
+    first = rng.integers(0, chain.size, len(loop))
     begin = np.searchsorted(chain.path, chain.path[first])
     length = np.searchsorted(chain.path, chain.path[first], side="right") - begin
-    second = begin + np.minimum((rng.random(count) * length).astype(np.int64), length - 1)
-    ends = np.sort(np.stack([first, second], axis=1), axis=1)
-    return replace(
-        chain, loop_edge=chain.loop_edge[loop], ends=ends, motion=chain.motion[loop], covariance=chain.covariance[loop]
-    )
+    second = begin + np.minimum((rng.random(len(loop)) * length).astype(np.int64), length - 1)
+    return loop, np.sort(np.stack([first, second], axis=1), axis=1)
+
+
+def _learned_from(path: Ints, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
+    """Those of the loops and their ends that scales are learned from."""
+    rows = np.flatnonzero(path[ends[:, 0]] == path[ends[:, 1]])
+    if len(rows) > MOST_LOOPS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
+    return loop[rows], ends[rows]
 
 
 @dataclass(frozen=True)
@@ -215,22 +222,20 @@ class _Model:
 
     @classmethod
     def of(cls, chain: Chain, poses: Floats, wrong: Wrong) -> _Model:
-        a, b = chain.ends.T
-        rows = np.flatnonzero(chain.path[a] == chain.path[b])
-        if len(rows) > MOST_LOOPS:
-            rows = np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
-        bridges = replace(chain, step_covariance=chain.step_covariance * chain.bridged[:, None, None])
-        fixed = linearise(bridges, poses).path(a[rows], b[rows])
-        chain = replace(chain, step_covariance=chain.step_covariance * ~chain.bridged[:, None, None])
-        parts = []
-        for step in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
-            part = Scales(*step, *step).applied(chain)
-            linear = linearise(part, poses)
-            parts.append((linear.path(a[rows], b[rows]), linear.loops[1][rows]))
+        """Of all loops of a chain."""
+        linear, parts = linearise(chain, poses), []
+        for step in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
+            part = replace(linear, chain=Scales(*step, *step).applied(chain))
+            parts.append((part.path(*chain.ends.T), part.loops[1]))
         path, own = (np.stack(each) for each in zip(*parts, strict=True))
+        fixed, path, own = path[0], path[1:] - path[0], own[1:]
         for parted in (path, own):
             parted[2] -= parted[0] + parted[1]
-        return cls(linear.loops[0][rows], fixed, path, own, wrong.log_density(chain, poses)[rows])
+        return cls(linear.loops[0], fixed, path, own, wrong.log_density(chain, poses))
+
+    def select(self, rows: slice) -> _Model:
+        """That of these loops."""
+        return _Model(self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows], self.away[rows])
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""

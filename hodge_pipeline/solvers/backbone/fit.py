@@ -230,10 +230,12 @@ class Fit:
         """χ² of the chain and the active loops."""
         return float(np.einsum("mi,mij,mj->", self.residual, self.precision, self.residual))
 
-    def moves(self) -> Floats:
-        """The Gauss–Newton move (R, p) of the ends, about the world's origin."""
-        at_ends = self.factor.solve(self.force(self.precision @ self.residual[..., None]))
-        return np.asarray((np.linalg.inv(self.linear.shift[self.reduced.ends]) @ at_ends)[..., 0])
+    def moves(self) -> tuple[Floats, float]:
+        """The Gauss–Newton move (R, p) of the ends, about the world's origin, and how much of χ² it should win."""
+        force = self.force(self.precision @ self.residual[..., None])
+        at_ends = self.factor.solve(force)
+        about_origin = np.linalg.inv(self.linear.shift[self.reduced.ends]) @ at_ends
+        return about_origin[..., 0], float((at_ends * force).sum())
 
     def moved(self, moves: Floats) -> Floats:
         """The poses (n, 4, 4) after a move (R, p) of the loops' ends: runs bend by their covariance, what lies beyond
@@ -252,24 +254,27 @@ class Fit:
         return np.asarray(linear.chain.exp(out) @ linear.poses)
 
 
-def settled(fit: Fit, steps: int, tolerance: float) -> Fit:
-    """The fit at the poses of least cost with the active loops, or after as many steps: until a step wins less than
-    this share of the cost. A step that wins nothing is halved.
+LEAST_WON, HALVINGS = 1e-3, 4
+"""Of χ²: a step that wins less moves nothing by more than a thirtieth of its standard deviation."""
+
+
+def settled(fit: Fit, steps: int, least_won: float = LEAST_WON) -> Fit:
+    """The fit at the poses of least cost with the active loops, or after as many steps: until one would win less of χ²
+    than this. A step that wins nothing is halved.
     """
     for _ in range(steps if len(fit.reduced.active) else 0):
-        moves, before = fit.moves(), fit.cost
+        (moves, won), before = fit.moves(), fit.cost
+        if won < least_won:
+            break
         for _ in range(HALVINGS):
             tried = replace(fit, linear=linearise(fit.linear.chain, fit.moved(moves)))
             if tried.cost < before:
                 fit = tried
                 break
             moves = moves / 2
-        if not fit.cost < (1 - tolerance) * before:
+        if not fit.cost < before:
             break
     return fit
-
-
-HALVINGS = 4
 
 
 LEAST_LEFT = 1e-6

@@ -15,7 +15,6 @@ from hodge_pipeline.types import Bools, Floats, Ints
 ROUNDS = 6
 SAMPLES = 64
 MOST_STEPS = 15
-TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ def infer(
 
     `scales`: of the errors; learned from the loops where none are given.
     """
-    poses = chain.poses()
+    poses = chain.poses
     scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
     chain = scales.applied(chain)
     linear = start = linearise(chain, poses)
@@ -73,7 +72,7 @@ def infer(
         reduced = thinned(chain, rows)
         if not thin and len(reduced.active) < len(rows):
             return None
-        fit = settled(Fit(reduced, linear), MOST_STEPS, TOLERANCE)
+        fit = settled(Fit(reduced, linear), MOST_STEPS)
         linear = fit.linear
         judged = _judge(linear, fit, shares, wrong)
         shares, likelihood = mixture(judged.log_density)
@@ -98,7 +97,7 @@ def refused(found: Inferred, chain: Chain, always: Bools) -> Inferred:
     """The result without the loops that nothing confirms: at the poses of the bare chain and of those of `always`."""
     chain = found.scales.applied(chain)
     rows = thinned(chain, np.flatnonzero(always)).active
-    linear, width = polished(rows, linearise(chain, chain.poses()))
+    linear, width = polished(rows, linearise(chain, chain.poses))
     return replace(found, used=always.copy(), poses=linear.poses, loop_width=width)
 
 
@@ -148,7 +147,7 @@ def _confirmed(linear: Linear, judged: Judged, used: Bools, wrong: Wrong) -> boo
     chain, ends, rows = linear.chain, places_along(linear.chain), np.flatnonzero(used)
     count, chosen = len(one_of_each_place(ends)), rows[one_of_each_place(ends[rows])]
     reduced = thinned(chain, chosen)
-    fit = settled(Fit(reduced, linear), MOST_STEPS, TOLERANCE)
+    fit = settled(Fit(reduced, linear), MOST_STEPS)
     factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[reduced.active]
     return float(np.maximum(factor - np.log(count), 0.0).sum()) > MISTAKEN
 

@@ -20,7 +20,7 @@ CROWDED_POWER = 0.5
 1 for the same error in all.
 """
 ROUNDS = 5
-STEPS, TOLERANCE = 3, 1e-3
+STEPS = 3
 SAME_WEIGHT = 0.01
 """Loops whose weights change by less are not solved for again."""
 
@@ -38,7 +38,7 @@ def polished(rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
     weights = np.ones(count)
     for _ in range(ROUNDS):
         weighted = replace(chain, covariance=chain.covariance / weights[:, None, None])
-        fit = settled(Fit(reduced, replace(linear, chain=weighted)), STEPS, TOLERANCE)
+        fit = settled(Fit(reduced, replace(linear, chain=weighted)), STEPS)
         linear, (residual, covariance) = fit.linear, fit.loops
         chi2 = gaussian(residual, covariance * weights[rows, None, None])[1]
         before = weights[rows]

@@ -93,7 +93,7 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, lattice: bool = False)
         return None
     if trust == AUTO and steps.sum() < FEWEST_STEPS * len(np.unique(chain.path[chain.step_edge >= 0])):
         return None
-    if trust == AUTO and tested_steps(chain, chain.poses()).sum() > TESTED * steps.sum():
+    if trust == AUTO and tested_steps(chain, chain.poses).sum() > TESTED * steps.sum():
         return None
     loops = len(chain.loop_edge)
     many_loops = loops > LOOPS_AT_A_STEP * steps.sum()
@@ -105,7 +105,7 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, lattice: bool = False)
         return None
     chain, found = inferred
     doubted = trust == AUTO and not found.confirmed and loops > steps.sum()
-    if doubted and tested_by_pairs(chain, chain.poses()).sum() > AGREEING * steps.sum():
+    if doubted and tested_by_pairs(chain, chain.poses).sum() > AGREEING * steps.sum():
         return None  # many loops agree with each other, and none with the backbone: it is what is wrong
     return _backbone(graph, chain, found, steps)
 
@@ -132,7 +132,6 @@ def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools) -> 
 
 UNUSED = 0.49
 """The most probable that a loop which does not count is: too little speaks for it."""
-
 
 LONGEST = 3
 """Steps of a cycle with one loop: cycles of several loops close too where these agree on a place that is wrong."""

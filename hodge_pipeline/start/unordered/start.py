@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.pairs.sift_similarity import global_descriptors, most_similar, vocabulary
 from hodge_pipeline.registration.acceptance import CONTRADICTS
-from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
+from hodge_pipeline.registration.global_features import DescribedCloud, describe
+from hodge_pipeline.registration.global_landmarks import DescribedImage
+from hodge_pipeline.registration.global_pairs import describe_clouds, load_description, match_pairs
 from hodge_pipeline.registration.odometry_path import contradicts_odometry
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.solvers.backbone.trust import SEQUENTIAL
@@ -23,9 +26,8 @@ from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, weigh
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans
-from hodge_pipeline.start.unordered.similarity import LocalDescriptors, all_pairs, similar_pairs
 from hodge_pipeline.start.unordered.views import Views
-from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Ints, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
 from hodge_pipeline.types.notes import Note, notes_of
 
@@ -73,7 +75,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     notes += [f"{int((~found.kept).sum())} of {graph.edge_count} edges are distrusted"]
     given = int(found.kept[: graph.edge_count - measured.edge_count].sum())
     pieces = Pieces.kept(graph, found)
-    pieces = unfolded(clouds, pieces, given, views, options.limits, options.diagnosis)
+    pieces = unfolded(clouds, pieces, given, views, options.diagnosis, options.limits.room_m)
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
     poses = laid_apart(pieces.piece, pieces.poses, clouds)
@@ -141,3 +143,39 @@ def tried(count: int, hypotheses: Edges) -> str:
     refused = ", ".join(f"{number} {reason}" for reason, number in hypotheses.rejected_counts.items())
     text = f"{len(hypotheses)} of {every} pairs were matched, {int(hypotheses.counts.sum())} may be edges"
     return f"{text} ({refused})" if refused else text
+
+
+class LocalDescriptors:
+    """Unit local descriptors of each row, whatever they were made of: RootSIFT, or the roots of FPFH histograms."""
+
+    def __init__(self, described: Path, clouds: CloudSet, voxel_m: float) -> None:
+        self._described, self._clouds, self._voxel_m = described, clouds, voxel_m
+
+    def descriptors(self, row: int) -> Floats32:
+        """Descriptors (n, D) of one frame."""
+        found = load_description(self._described, row)
+        if isinstance(found, DescribedImage):
+            return found.descriptors
+        if not isinstance(found, DescribedCloud):  # another registrar's own: geometry is compared by FPFH all the same
+            found = describe(self._clouds[row], self._voxel_m)
+        features = max((found, *found.coarser), key=len).features
+        positive = np.maximum(features, 0)
+        return np.asarray(np.sqrt(positive / np.maximum(positive.sum(axis=1, keepdims=True), 1e-12)))
+
+
+def all_pairs(rows: Ints) -> Ints:
+    """Every pair (P, 2) of these rows, i < j."""
+    i, j = np.triu_indices(len(rows), 1)
+    return np.stack([rows[i], rows[j]], axis=1).astype(np.int64)
+
+
+def similar_pairs(local: LocalDescriptors, rows: Ints, options: GlobalStart, ordered: bool) -> Ints:
+    """Pairs (P, 2), i < j, of each row and the most similar others, by VLAD (Jégou et al. 2010).
+
+    The vocabulary is learnt from the rows themselves, so indoor and outdoor, near and far need nothing else.
+    `ordered`: whether rows that follow each other are joined already; see `GlobalStart.reach`.
+    """
+    centres = vocabulary(local, rows, options.words, options.seed)
+    vectors = global_descriptors(local, rows, centres)
+    reach = options.reach if ordered else 0
+    return np.asarray(np.sort(rows[most_similar(vectors, options.similar_per_frame, reach)], axis=1))
