@@ -14,13 +14,14 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from global_peers import FpfhFgr, FpfhRansac, KissMatcher
 
 from hodge_adapters.clouds.reader import CloudFolderReader
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.gicp import Gicp
-from hodge_pipeline.registration.global_registrars import FpfhConsensus, FpfhFgr, FpfhRansac, KissMatcher
+from hodge_pipeline.registration.global_registrars import FpfhConsensus
 from hodge_pipeline.stages import GlobalRegistrar
 from hodge_pipeline.start.unordered.options import HypothesisLimits
 from hodge_pipeline.types import Floats, PointCloud, number_of

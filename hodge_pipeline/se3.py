@@ -16,7 +16,6 @@ SMALL_ANGLE = 1e-4
 ARM_M = 1.0
 """Metres: a rotation counts as the displacement that it causes at this distance, about that of a room's walls."""
 
-
 LEAST_PRECISION, MOST_PRECISION = 1e-6, 1e6
 """Of the median one, in units in which that is 1: eigenvalues of an information beyond are clipped."""
 

@@ -48,7 +48,6 @@ class Tell(Protocol):
 
     def __call__(self, *notes: Note) -> None:
         """Nothing comes back."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -81,19 +80,15 @@ class Steps(Protocol):
 
         A step's name is its function's, or `name`, with the number of its call. `total` is how far `advance` counts.
         """
-        ...
 
     def remember(self, value: object, key: str) -> None:
         """Let `value`, this very object, stand for `key` wherever it is an input."""
-        ...
 
     def key(self, value: Any) -> str:
         """The key of an input: of the step that made it, else of its contents."""
-        ...
 
     def note(self, *notes: Note) -> None:
         """Tell the user, the log and the report, once."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -114,11 +109,9 @@ class FrameReader(Protocol):
 
     def sniff(self, path: Path) -> Sniff:
         """How sure it is that this path is its format; reads no more than names and a header, never raises."""
-        ...
 
     def open(self, path: Path) -> Source:
         """What is there, lazily. Raises `SourceError` that names file, record and remedy."""
-        ...
 
 
 @runtime_checkable
@@ -129,7 +122,6 @@ class Start(Protocol):
         """The frames to register with their clouds (`clouds`: `registration.clouds.CloudOptions`) and first poses, and
         how all frames follow from them. What costs time is computed by `steps`, so that it is computed once.
         """
-        ...
 
 
 @runtime_checkable
@@ -138,7 +130,6 @@ class EdgeBuilder(Protocol):
 
     def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs, given the current poses (N, 4, 4). Frames without points get none."""
-        ...
 
 
 @runtime_checkable
@@ -147,11 +138,9 @@ class Registrar(Protocol):
 
     def prepare(self, cloud: PointCloud) -> Any:
         """What it needs of one cloud (trees, covariances): made once in each worker, never pickled."""
-        ...
 
     def register(self, target: Any, source: Any, i_from_j: Floats) -> Registration:
         """Moves the prepared cloud j (source) onto i (target), from the guess `i_from_j` (4, 4)."""
-        ...
 
 
 @runtime_checkable
@@ -160,11 +149,9 @@ class GlobalRegistrar(Protocol):
 
     def describe(self, cloud: PointCloud) -> Any:
         """What it needs of one cloud (features): arrays, made once and kept in a file."""
-        ...
 
     def match(self, target: Any, source: Any) -> Match:
         """Where the described cloud j (source) lies in i (target); the same answer every time."""
-        ...
 
 
 class Workers(Protocol):
@@ -176,7 +163,6 @@ class Workers(Protocol):
         The task is a module-level function or a partial of one. A worker that dies costs its blocks a retry;
         `WorkerError` after several. An error that the task raises is raised here.
         """
-        ...
 
 
 @runtime_checkable
@@ -185,7 +171,6 @@ class Executor(Protocol):
 
     def open(self) -> AbstractContextManager[Workers]:
         """Workers that live until the context is left. The same task gives the same result on any executor."""
-        ...
 
 
 @runtime_checkable
@@ -198,7 +183,6 @@ class ConsistencySolver(Protocol):
         The graph's fixed vertices stay at their start and its priors count, or a `GraphError` refuses them. See
         `hodge_pipeline.testing.check_solver`.
         """
-        ...
 
 
 @runtime_checkable
@@ -207,7 +191,6 @@ class Refiner(Protocol):
 
     def refine(self, frames: Sequence[Frame], world_from_cam: Floats, advance: Advance = no_progress) -> Floats:
         """Poses (N, 4, 4)."""
-        ...
 
 
 @runtime_checkable
@@ -216,7 +199,6 @@ class Fuser(Protocol):
 
     def fuse(self, frames: Sequence[Frame], world_from_cam: Floats, advance: Advance = no_progress) -> Model:
         """The scene in the world frame."""
-        ...
 
 
 @runtime_checkable
@@ -229,7 +211,6 @@ class Writer(Protocol):
         Gives what was written, counted, and what the format cannot hold, a line each, or None. `SourceError` where the
         source has nothing of that kind.
         """
-        ...
 
 
 class TrackedModel(Protocol):
@@ -242,133 +223,109 @@ class TrackedModel(Protocol):
     @property
     def name(self) -> str:
         """What a person calls it: the folder it came from."""
-        ...
 
     @property
     def native(self) -> Any:
         """The model as its own library holds it."""
-        ...
 
     @property
     def files(self) -> tuple[Path, ...]:
         """The files that it was read from, to be given back; none where it has been joined or made in memory."""
-        ...
 
     @property
     def measurements(self) -> tuple[Path, ...]:
         """The files beside the model that its edges come from: matches, depth."""
-        ...
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What was skipped or repaired so far, one line each."""
-        ...
 
     @property
     def frames(self) -> Sequence[Frame]:
         """The posed images (N), in order, with what can be read of them; positions in the model's unit."""
-        ...
 
     @property
     def body_names(self) -> tuple[str, ...]:
         """The bodies (B), as the model names them."""
-        ...
 
     @property
     def world_from_body(self) -> Floats:
         """Their poses (B, 4, 4)."""
-        ...
 
     @property
     def body_of_frame(self) -> Ints:
         """The body (N,) that carries each image."""
-        ...
 
     @property
     def body_from_cam(self) -> Floats:
         """Where (N, 4, 4) the body carries it."""
-        ...
 
     @property
     def quality(self) -> ModelQuality:
         """How well points and images agree."""
-        ...
 
     def depth_ratios(self) -> Sequence[Floats]:
         """For each image with depth, in a few hundred of them: metres that the sensor saw over units that the model
         has, at the tracked points.
         """
-        ...
 
     def seen_points(self) -> CloudSet:
         """For each body the points that its images track, in its axes and the model's unit, with their colours."""
-        ...
 
     def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
         """Relative poses of the bodies, estimated anew from what their images share, and what was left out."""
-        ...
 
     def scaled(self, factor: float) -> TrackedModel:
         """The model in another unit of length."""
-        ...
 
     def placed(self) -> TrackedModel:
         """The model in the world of positions that are known of its images; as it is where none are."""
-        ...
 
     @property
     def placing(self) -> str:
         """What gave the model its place in the world, empty where nothing did."""
-        ...
 
     @property
     def known_positions(self) -> PositionPriors | None:
         """Where bodies should be, of a model that was placed by known positions, metres."""
-        ...
 
     @property
     def held_apart(self) -> int:
         """How many pairs of images are well matched while they hardly share a point."""
-        ...
 
     def resected(self, bodies: Bools | None = None) -> Floats:
         """Poses (B, 4, 4): of the chosen bodies (B,), all by default, those that the points as they are give them."""
-        ...
 
     def moved(self, world_from_body: Floats) -> TrackedModel:
         """The bodies at these poses (B, 4, 4), each point where that fits its observations best."""
-        ...
 
     def merged(self) -> TrackedModel:
         """Points that a match calls one merged where one position fits; this very model where there are none."""
-        ...
 
     def adjusted(self, priors: PositionPriors | None = None) -> TrackedModel:
         """Bundle adjustment of poses and points. Raises `SourceError` where it fails."""
+
+    def with_robust_loss(self) -> TrackedModel:
+        """The same model, whose adjustments let an observation that is far off pull little."""
         ...
 
     @property
     def moves_intrinsics(self) -> bool:
         """Whether that adjusts the cameras' intrinsics too."""
-        ...
 
     def standard_errors(self) -> Floats:
         """Standard errors (B, 2) of each body's rotation and position, radians and units."""
-        ...
 
     def held_out_errors(self, entries: Bools, *, move_bodies: bool) -> Floats:
         """Errors (H,) in pixels of the observations chosen from the N of `quality`, after an adjustment of the points,
         and of the bodies where those move, without them; those that their points cannot spare are left out.
         """
-        ...
 
     def write(self, folder: Path) -> None:
         """Write it in its own format into a folder that exists."""
-        ...
 
     def read_back(self, folder: Path, notes: tuple[str, ...]) -> TrackedModel:
         """What a model made from this one has written to a folder, with its notes."""
-        ...
 
 
 @runtime_checkable
@@ -377,11 +334,9 @@ class ModelReader(Protocol):
 
     def open_models(self, source: Path | Sequence[Any]) -> Sequence[TrackedModel]:
         """The models at a path, or those that the format's own library holds in memory. Raises `SourceError`."""
-        ...
 
     def join(self, models: Sequence[TrackedModel]) -> Sequence[TrackedModel]:
         """The models again, those that measurements tie together as one: in the gauge and unit of its largest."""
-        ...
 
 
 @runtime_checkable
@@ -392,8 +347,6 @@ class PoseRewriter(Protocol):
         """The path of `refined.<suffix>` in the folder: the original with the trajectory's poses in place of its own;
         stamps, as the reader gave them, order, comments and further columns stay as they are.
         """
-        ...
 
     def copy(self, folder: Path, original: Path) -> Path:
         """`refined.<suffix>` in the folder, the original byte for byte. Gives the path."""
-        ...

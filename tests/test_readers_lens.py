@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from hodge_adapters.images.camera_files import read_intrinsics
-from hodge_adapters.images.lens import (
+from hodge_adapters.images.frames import (
     Lens,
     encoded_straight_colour,
     encoded_straight_depth,

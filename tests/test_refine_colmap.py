@@ -14,6 +14,7 @@ from hodge_adapters.colmap.tracked import ColmapModel
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import SourceError, WorkspaceError
+from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.pairs.edits import listed_edges
 from hodge_pipeline.refine.scale import metric_scale
 from test_readers_colmap import synthetic
@@ -104,6 +105,55 @@ def test_one_image_of_many_that_is_off_is_no_optimum(tmp_path: Path) -> None:
     (result,) = hodge_pipeline.refine_colmap(model, database="none", overrides=FREE).results
     assert result.decision.outcome == "refined"
     assert len(result.candidates[0][1].images_off) == 1 and not result.candidates[result.kept_row][1].images_off
+
+
+def swapped(model: pycolmap.Reconstruction, share: float) -> pycolmap.Reconstruction:
+    """The model with a share of each image's observations given to another point."""
+    rng = np.random.default_rng(0)
+    for image_id, image in model.images.items():
+        seen = [column for column in range(image.num_points2D()) if image.points2D[column].has_point3D()]
+        columns = rng.permutation(seen)[: 2 * int(share * len(seen) / 2)].tolist()
+        for one, other in zip(columns[::2], columns[1::2], strict=True):
+            owners = image.points2D[one].point3D_id, image.points2D[other].point3D_id
+            model.delete_observation(image_id, one)
+            model.delete_observation(image_id, other)
+            model.add_observation(owners[1], pycolmap.TrackElement(image_id, one))
+            model.add_observation(owners[0], pycolmap.TrackElement(image_id, other))
+    return model
+
+
+@pytest.mark.parametrize("share", [0.1, 0.9])
+def test_wrong_tracks_do_not_bend_the_model(tmp_path: Path, share: float) -> None:
+    """A tenth of the observations pulls no pose; where nothing but wrong ones is left the input comes back, exit 3."""
+    model = noisy(tmp_path)
+    true = pycolmap.Reconstruction(model)
+    start = swapped(pycolmap.Reconstruction(disturbed(model, tmp_path / "start")), share)
+    done = hodge_pipeline.refine_colmap(start, database="none", overrides=FREE)
+    decision, ids = done.results[0].decision, true.reg_image_ids()
+    if share > 0.5:
+        assert (decision.outcome, done.exit_code) == ("worse", 3) and "tracks contradict" in decision.doubt
+        return
+    assert decision.outcome == "refined" and not decision.doubt
+    models = (true, start, done.models[0])
+    poses = [se3.from_parts(np.eye(3), [m.images[i].projection_center() for i in ids]) for m in models]
+    off = [absolute_error(one, poses[0], with_scale=True).rmse_m for one in poses[1:]]
+    assert off[1] < 0.05 * off[0]
+
+
+@pytest.mark.filterwarnings("error:Mean of empty slice")
+def test_a_model_of_few_points_is_no_better_for_a_billionth_of_a_pixel() -> None:
+    """As two images of one point are: neither is its change of a known size."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 2, 1
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = point.xy + 1e-5
+    (result,) = hodge_pipeline.refine_colmap(model, database="none", overrides=FREE).results
+    assert result.decision.outcome == "optimal" and "better than any keypoint" in result.decision.reason
+    (forced,) = hodge_pipeline.refine_colmap(model, database="none", force=True, overrides=FREE).results
+    assert "known to" not in str(forced.decision.change)
 
 
 def test_an_optimal_model_is_given_back_byte_for_byte(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -71,8 +70,6 @@ def made(kind: str, name: str) -> Any:
     ],
 )
 def test_every_stage_keeps_its_contract(kind: str, name: str, what: str) -> None:
-    if name == "kiss_matcher" and importlib.util.find_spec("kiss_matcher") is None:
-        pytest.skip("the extra kiss is not installed")
     lacks = LACKS.get(f"{kind}: {name}", set()) & {what}
     testing.CHECKS[kind](made(kind, name), lacks=lacks, properties=[what])
 

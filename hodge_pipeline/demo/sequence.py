@@ -145,11 +145,9 @@ class World(Protocol):
     @property
     def frames(self) -> int:
         """How many there are."""
-        ...
 
     def write(self, draft: Path, advance: Advance) -> None:
         """Everything into an empty folder; `advance(1)` after each frame."""
-        ...
 
 
 def make_sequence(folder: Path | str, options: World | None = None, advance: Advance = no_progress) -> Path:

@@ -14,7 +14,6 @@ from hodge_pipeline.stages import EdgeBuilder
 SolveWith: TypeAlias = Literal["all", "kept"]
 """The edges that a round is solved with: all that were accepted, or of these what the diagnosis keeps."""
 
-
 CONSISTENT_FROM = 0.7
 """Probability from which an edge is consistent: a wrong one kept costs as much as two or three right ones lost."""
 WRONG_BELOW = 0.2

@@ -23,9 +23,8 @@ from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.short_cycles import tree_loops
 from hodge_pipeline.solvers.backbone.trust import NONE, Backbone, find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
-from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.reweighted import reweighted
-from hodge_pipeline.solvers.setup import held_rows
+from hodge_pipeline.solvers.setup import check_choice, held_rows
 from hodge_pipeline.solvers.weights import edge_weights, is_planar
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, ViewGraph
 

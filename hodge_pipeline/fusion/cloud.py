@@ -17,10 +17,8 @@ from hodge_pipeline.types import Bools, Bytes, Camera, Floats, Floats32, Frame, 
 
 POINTS_AT_ONCE = 1 << 20
 
-
 MAX_STEP = 0.05
 """Share of the depth: a larger step between neighbouring pixels is an edge of an object, which has no normal."""
-
 
 AXIS_BITS = 21
 HALF = 1 << (AXIS_BITS - 1)

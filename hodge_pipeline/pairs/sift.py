@@ -25,7 +25,6 @@ from hodge_pipeline.types import Bytes, CloudSet, Edges, Floats, Floats32, Frame
 
 log = logging.getLogger("hodge_pipeline")
 
-
 DESCRIPTOR_LENGTH = 128
 MatOfBytes: TypeAlias = NDArray[np.uint8]
 

@@ -18,7 +18,6 @@ class LocalFeatures(Protocol):
 
     def descriptors(self, row: int) -> Floats32:
         """Unit descriptors (n, D)."""
-        ...
 
 
 def vocabulary(features: LocalFeatures, rows: Ints, words: int, seed: int) -> Floats32:

@@ -103,11 +103,6 @@ def complex_mesh(outer: int) -> str:
     return f"{COMPLEX}/{round_name(outer)}"
 
 
-def complex_columns(outer: int) -> str:
-    """The triangles and their curl, in columns."""
-    return f"/complex/{round_name(outer)}"
-
-
 def complex_text(outer: int) -> str:
     """The complex in numbers, and the energy of the 1-form on it."""
     return f"/text/complex/{round_name(outer)}"

@@ -21,13 +21,12 @@ from hodge_pipeline.recording.growth import log_growth
 from hodge_pipeline.recording.merge import Merged, find_parts, merge
 from hodge_pipeline.recording.registration import log_registration
 from hodge_pipeline.recording.stream import log_markdown, log_notes, writing
-from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, Model, Solution, ViewGraph
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Model, Solution, ViewGraph
 from hodge_pipeline.types.arrays import evenly
 
 Notes = tuple[str, ...]
 
-
-TRIANGLE_BYTES, COLUMN_BYTES = 60, 28
+TRIANGLE_BYTES = 60
 
 
 class Recorder:
@@ -195,8 +194,6 @@ def log_complex(
         return notes
     triangles = complex_.simplices[2]
     curl_m = triangle_curl_m(graph, triangles)
-    if 0 < len(triangles) * COLUMN_BYTES <= max_bytes:
-        _log_columns(stream, outer, triangles, curl_m)
     kept = options.count(options.edge_lines, len(triangles), TRIANGLE_BYTES, max_bytes)
     corners = solution.world_from_cam[triangles, :3, 3]
     drawable = np.flatnonzero(np.isfinite(corners).all(axis=(1, 2)))
@@ -209,15 +206,6 @@ def log_complex(
     thinned = (drawn,) if len(rows) < len(triangles) else ()
     log_notes(stream, outer, thinned)
     return thinned
-
-
-def _log_columns(stream: rr.RecordingStream, outer: int, triangles: Ints, curl_m: Floats) -> None:
-    """Every triangle, drawn or not, as components that a program reads back."""
-    stream.log(
-        layout.complex_columns(outer),
-        rr.AnyValues(a=triangles[:, 0], b=triangles[:, 1], c=triangles[:, 2], curl_m=curl_m.astype(np.float32)),
-        static=True,
-    )
 
 
 def _energy(graph: ViewGraph, start: Floats, solution: Solution) -> list[str]:

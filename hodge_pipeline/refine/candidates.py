@@ -18,6 +18,7 @@ from hodge_pipeline.types import Bools, Floats, PositionPriors, ViewGraph
 
 MODEL = "model"
 GIVEN, ADJUSTED, RESECTED = "as given", "bundle adjustment", "resection and bundle adjustment"
+ROBUST = "resection and robust bundle adjustment"
 CONSISTENT, MENDED = "consistent poses and bundle adjustment", "images that are off placed anew and bundle adjustment"
 MENDINGS = 3
 """Rounds: an image placed anew gives its neighbours points to be placed by."""
@@ -120,7 +121,12 @@ def weigh(
     weighing = _Weighing(inputs, start, steps)
     weighing.add(ADJUSTED, start)
     if not weighing.costs[0].is_sound:
-        weighing.add(RESECTED, start, steps.step(resected_poses, start, None, title="resection").poses)
+        poses = steps.step(resected_poses, start, None, title="resection").poses
+        weighing.add(RESECTED, start, poses)
+        if not weighing.costs[weighing.best].is_sound:
+            key, start = steps.key([start, ROBUST]), start.with_robust_loss()
+            steps.remember(start, key)
+            weighing.add(ROBUST, start, poses)
     depth = depth_edges(start, options, steps, workers) if is_metric else no_depth_edges(start)
     solved = None
     if not weighing.is_settled or start.held_apart or depth.graph.edge_count:
@@ -146,7 +152,7 @@ def _consistent(
         weighing.notes.append(NO_EDGE_LEFT)
         return solved
     with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
-    priors = position_priors(solved, options.depth_weight) if with_depth else None
+    priors = position_priors(solved) if with_depth else None
     weighing.add(CONSISTENT, start, solved.solution.world_from_cam, priors)
     return solved
 

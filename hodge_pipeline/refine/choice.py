@@ -15,6 +15,8 @@ from hodge_pipeline.refine.judge import LEAST_CAP_PX
 from hodge_pipeline.stages import Step, Steps, TrackedModel
 from hodge_pipeline.types import Floats
 
+FINEST_PX = 0.01
+"""Mean error: no keypoint is located better, so less of it is no better model."""
 LEAST_GAIN = 0.01
 """Of the cost: less is what an adjustment gains by fitting the noise of the keypoints."""
 CLEAR_GAIN = 0.5
@@ -108,7 +110,11 @@ def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
     """Why the input is kept all the same, empty where the candidate is clearly better."""
     before, after = found.costs[0], found.costs[at]
     start, model = found.candidates[0].model, found.candidates[at].model
-    gain = 1.0 - after.px / before.px if before.px > 0 else 0.0
+    if before.px < FINEST_PX:
+        return f"observations fit to {before.px:.2g} px, better than any keypoint is located"
+    if after.doubt:
+        return "no candidate fits the tracks: mend matches or cameras (--refine focal), or --force the best one"
+    gain = 1.0 - after.px / before.px
     if gain < LEAST_GAIN:
         return f"the best candidate gains {gain:.2%} of the mean error, less than its noise"
     if gain >= CLEAR_GAIN:

@@ -65,10 +65,10 @@ class Change:
             f"{length * 1000:.3g} mm" if self.is_metric else f"{length:.3g} units"
             for length in (self.translation_m, self.translation_uncertainty_m)
         )
-        return (
-            f"poses moved by {moved} and {self.rotation_deg:.2g}° (RMS), "
-            f"known to {known} and {self.rotation_uncertainty_deg:.2g}°"
-        )
+        told = f"poses moved by {moved} and {self.rotation_deg:.2g}° (RMS)"
+        if self.translation_uncertainty_m != self.translation_uncertainty_m:
+            return f"{told}; the measurements do not tell how well they are known"
+        return f"{told}, known to {known} and {self.rotation_uncertainty_deg:.2g}°"
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ class Decision:
     """What becomes of a refinement, why, and the measures behind it.
 
     - `refined`: the result is written;
-    - `optimal`: it differs from the input by less than its own uncertainty, and what was held out is no better: the
-      input is given back;
-    - `worse`: a measure got worse: the input is given back, and the exit code is 3;
+    - `optimal`: what was held out fits the input as well, or, where nothing was, it differs from the input by less than
+      its own uncertainty: the input is given back;
+    - `worse`: the result fails a measure of its own: the input is given back, and the exit code is 3;
     - `forced`: as `worse`, but the result is written all the same;
     - `nothing`: no measurement related the poses: nothing is written but the report, and the exit code is 3.
     """
@@ -104,14 +104,18 @@ class Decision:
 def decide(measures: Sequence[Measure], change: Change | None = None, *, force: bool = False) -> Decision:
     """The decision on a refinement. With `force` a worse result is written; an optimal input is still given back.
 
-    Measures come before the uncertainty, which is that of edges which hardly fix the poses, or state too little.
+    Measurements held out come before the uncertainty, which is that of edges which hardly fix the poses, or state too
+    little. Where the result fits its own edges better, and those held out no better, the input is as good as they tell.
     """
     measures = tuple(measures)
     worse = [measure for measure in measures if measure.is_worse]
-    if worse:
+    held_out = [measure for measure in measures if measure.is_held_out]
+    if worse and (force or not all(measure.is_held_out for measure in worse)):
         reason = "worse by its own measures: " + "; ".join(str(measure) for measure in worse)
         return Decision("forced" if force else "worse", reason, measures, change)
-    better = any(measure.is_held_out and measure.is_better for measure in measures)
-    if change is not None and not change.is_significant and not better:
+    if held_out and not any(measure.is_better for measure in held_out):
+        told = "; ".join(str(measure) for measure in held_out)
+        return Decision("optimal", f"already optimal: what was held out fits no better: {told}", measures, change)
+    if not held_out and change is not None and not change.is_significant:
         return Decision("optimal", f"already optimal: {change}", measures, change)
     return Decision("refined", "; ".join(str(measure) for measure in measures) or "nothing measured", measures, change)

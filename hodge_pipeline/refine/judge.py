@@ -56,7 +56,7 @@ class Cost:
     @property
     def is_sound(self) -> bool:
         """Whether no image and hardly an observation is left that another candidate could explain."""
-        return not self.images_off and self.beyond <= SOUND_SHARE
+        return not self.images_off and self.beyond <= SOUND_SHARE and not self.doubt
 
 
 def costs(inputs: Sequence[ModelQuality], candidates: Sequence[ModelQuality]) -> list[Cost]:

@@ -160,7 +160,9 @@ def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool
     if scales[0].is_observable and not scales[0].is_one:
         return Decision("refined", f"in metres now; {told}")
     if not choice.row:
-        return Decision("optimal", f"already optimal: {choice.reason}")
+        return Decision(
+            "worse" if before.doubt else "optimal", f"{'' if before.doubt else 'already optimal: '}{choice.reason}"
+        )
     return Decision("forced", f"{choice.reason}; {told}") if choice.reason else Decision("refined", told)
 
 
@@ -222,7 +224,9 @@ def _change(start: TrackedModel, scale: Scale, model: TrackedModel, in_world: bo
     """How far the poses moved from those of the input, laid onto each other: in metres where depth tells the scale."""
     before, after = start.world_from_body, model.world_from_body
     moved = se3.log(se3.inverse(_laid_onto(before, after)) @ after)
-    rotation, position = np.sqrt(np.nanmean(model.standard_errors() ** 2, axis=0))
+    errors = model.standard_errors()
+    known = errors[np.isfinite(errors).all(axis=1)]
+    rotation, position = np.sqrt((known**2).mean(axis=0)) if len(known) else (np.nan, np.nan)
     if scale.is_observable:  # the size of the whole is as sure as the scale
         size = np.sqrt(np.mean(np.sum((after[:, :3, 3] - after[:, :3, 3].mean(axis=0)) ** 2, axis=1)))
         position = float(np.hypot(position, scale.sigma * size))

@@ -42,15 +42,6 @@ class DescribedCloud:
         """The open3d cloud."""
         return _geometry(self.points, self.normals)
 
-    @property
-    def open3d_features(self) -> Any:
-        """The features as open3d wants them."""
-        from hodge_pipeline.registration.one_thread import o3d
-
-        out = o3d.pipelines.registration.Feature()
-        out.data = np.ascontiguousarray(self.features.T, dtype=np.float64)
-        return out
-
 
 def describe(cloud: PointCloud, voxel_m: float, most_points: float = np.inf) -> DescribedCloud:
     """The features of a cloud at a scale of `voxel_m`; none where it has fewer than 20 points at that scale, or more

@@ -27,7 +27,6 @@ MATCHES_PER_SAMPLE = 75.0
 """Matches that count as one independent measurement: they share the errors of lens, shutter and the delay between depth
 and colour. Calibrated on real pairs, as `points_per_sample`."""
 
-
 RATIO = 0.9
 """A match is this much nearer than the second nearest of the neighbourhood."""
 FAR = 9.0

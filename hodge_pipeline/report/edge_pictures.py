@@ -33,7 +33,6 @@ CUT_SHARE, SEEN_SHARE = 0.04, 0.03
 """How thick a cut through clouds is, and how large an offset must be to be seen in it: of the clouds' extent."""
 EXAGGERATIONS = (2, 5, 10, 20, 50, 100)
 
-
 RATIO = 0.8
 MAX_FEATURES = 1000
 MAX_ERROR_PX = 2.0

@@ -16,7 +16,6 @@ LEAST_POINTS = 3
 LEAST_SPREAD = 1e-3
 """Second singular value over the first of the points clicked, below which they lie on a line."""
 
-
 Point = tuple[float, float, float]
 
 

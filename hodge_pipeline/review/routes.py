@@ -36,7 +36,6 @@ SUGGESTED = 12
 QUERY = TypeAdapter(Query)
 Asked = dict[str, Any]
 
-
 KEPT = 8
 """Edges whose pictures are kept, 150 kB each."""
 

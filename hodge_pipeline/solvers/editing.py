@@ -18,14 +18,12 @@ from hodge_pipeline.solvers.full_information import FullObjective
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.minimise import descend_isotropic, full_objective, here, metrics_of, minimise
 from hodge_pipeline.solvers.newton import Descent, Limits, descend, still_to_come
-from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.priors import PER_EDGE
 from hodge_pipeline.solvers.problem import make_problem, reweighted
-from hodge_pipeline.solvers.setup import Setup, held_rows, prepare
+from hodge_pipeline.solvers.setup import Setup, check_choice, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
 LIMITS = Limits(max_iterations=100, relative_tolerance=1e-9)
-
 
 SHARE = 10
 """One free vertex in so many moves at most."""

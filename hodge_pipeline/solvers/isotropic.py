@@ -38,7 +38,6 @@ LONG_LEVER = 50.0
 the parking garage, with 75, CG takes 50 steps to solve a system, on graphs with less than 5 from 3 to 17.
 """
 
-
 TOLERANCE, MOST_STEPS = 1e-3, 300
 """Of the translations that go with turned rotations: what is left is the next step's."""
 

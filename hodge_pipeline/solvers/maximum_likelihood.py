@@ -20,10 +20,9 @@ from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
 from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Limits, Point
-from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.priors import with_world, without_world
 from hodge_pipeline.solvers.reweighted import reweighted
-from hodge_pipeline.solvers.setup import InitialName, Setup, held_rows, prepare
+from hodge_pipeline.solvers.setup import InitialName, Setup, check_choice, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, SolverIteration, ViewGraph
 
 ObjectiveName: TypeAlias = Literal["isotropic", "full"]

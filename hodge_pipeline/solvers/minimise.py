@@ -32,7 +32,6 @@ CG_STEPS_BEFORE_DIRECT = 200
 WARM_START_TOLERANCE = 1e-5
 """The isotropic optimum starts the full objective: nearer than this they differ anyway."""
 
-
 NEAR_RAD = 0.01
 """So near half a turn an edge pulls with a hundredth of its weight: the square, 1e-4, is what a step wins, and the
 first steps of a descent stop for no more than that.

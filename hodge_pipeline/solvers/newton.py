@@ -57,15 +57,12 @@ class Objective(Protocol):
 
     def at(self, rotations: Floats, translations: Floats) -> Point:
         """The point at these poses."""
-        ...
 
     def step(self, point: Point, tolerance: float, enough: float) -> Step:
         """The step from a point, its linear system solved to a relative tolerance, or until it wins too little."""
-        ...
 
     def moved(self, point: Point, direction: Floats) -> Point:
         """The point reached along a direction."""
-        ...
 
 
 @dataclass(frozen=True)

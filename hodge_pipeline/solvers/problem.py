@@ -26,7 +26,6 @@ SAME_RATIO = 1e-13
 MOST_CORRECTIONS = 32
 """Edges whose weights a factor follows by a low-rank correction; a new one costs about as much as this many solves."""
 
-
 CHUNK = 1 << 12
 """Edges whose blocks are made at a time: they stay in the cache, and memory never holds those of all edges."""
 

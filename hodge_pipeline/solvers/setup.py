@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.chordal import initial_rotations
 from hodge_pipeline.solvers.newton import Point
-from hodge_pipeline.solvers.options import check_choice
 from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
 from hodge_pipeline.solvers.rotations import project
 from hodge_pipeline.solvers.weights import Weights, edge_weights, is_planar
@@ -127,3 +127,9 @@ def _gauge(component: Ints, fixed: Ints, start: Floats | None) -> Floats:
     free = ~held[component]
     gauge[free] = start[first[component[free]]]
     return gauge
+
+
+def check_choice(name: str, value: object, choices: Any) -> None:
+    """Raises `GraphError` that lists the choices where the value is none of a `Literal` type's."""
+    if value not in get_args(choices):
+        raise GraphError(f"{name} {value!r} does not exist: take {' or '.join(map(repr, get_args(choices)))}")

@@ -23,7 +23,6 @@ NAMED = 5
 MARGIN = 0.2
 """How much surer it must be than the reader of the recipe."""
 
-
 Fingerprints = dict[Path, tuple[Any, ...]]
 
 

@@ -14,11 +14,9 @@ class Watcher(Protocol):
 
     def stage(self, title: str, total: int) -> AbstractContextManager[Advance]:
         """A context whose value is called with the units just finished, of `total` in all."""
-        ...
 
     def note(self, note: Note) -> None:
         """A fact, as soon as it is known."""
-        ...
 
 
 class Nobody:

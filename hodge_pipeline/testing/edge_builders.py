@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from hodge_pipeline.stages import EdgeBuilder
-from hodge_pipeline.testing.data import room, without_points
-from hodge_pipeline.testing.stage import Contract
+from hodge_pipeline.testing.stage import Contract, room, without_points
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame
 from hodge_pipeline.types.edges import CANDIDATE
 

@@ -12,8 +12,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Fuser
-from hodge_pipeline.testing.data import room
-from hodge_pipeline.testing.stage import Contract, raises
+from hodge_pipeline.testing.stage import Contract, raises, room
 from hodge_pipeline.types import Floats, Floats32, Frame, Model
 
 WALL_M, TOLERANCE_M = 2.0, 0.02

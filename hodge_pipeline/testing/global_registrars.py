@@ -8,8 +8,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.stages import GlobalRegistrar
-from hodge_pipeline.testing.data import nothing, off_by, room, seen_from
-from hodge_pipeline.testing.stage import Contract
+from hodge_pipeline.testing.stage import Contract, nothing, off_by, room, seen_from
 from hodge_pipeline.types import Match, PointCloud
 
 PAIR = (2, 4)

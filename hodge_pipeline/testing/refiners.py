@@ -6,8 +6,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.stages import Refiner
-from hodge_pipeline.testing.data import room
-from hodge_pipeline.testing.stage import Contract
+from hodge_pipeline.testing.stage import Contract, room
 from hodge_pipeline.types import Floats
 
 

@@ -11,8 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.stages import Registrar
-from hodge_pipeline.testing.data import nothing, off_by, room, seen_from
-from hodge_pipeline.testing.stage import Contract
+from hodge_pipeline.testing.stage import Contract, nothing, off_by, room, seen_from
 from hodge_pipeline.types import Floats, PointCloud, Registration
 
 PAIR = (2, 4)

@@ -17,8 +17,7 @@ from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.scene import Scene
 from hodge_pipeline.stages import Start
 from hodge_pipeline.store.store import Store
-from hodge_pipeline.testing.data import CLOUD_VOXEL_M, off_by, room
-from hodge_pipeline.testing.stage import Contract
+from hodge_pipeline.testing.stage import CLOUD_VOXEL_M, Contract, off_by, room
 from hodge_pipeline.types import Source
 
 CLOUDS = CloudOptions(stride=1, voxel_m=CLOUD_VOXEL_M)

@@ -15,8 +15,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import HodgeError, SourceError
 from hodge_pipeline.scene import own_trajectory
 from hodge_pipeline.stages import FrameReader, PoseRewriter, Writer
-from hodge_pipeline.testing.data import room
-from hodge_pipeline.testing.stage import Contract, raises
+from hodge_pipeline.testing.stage import Contract, raises, room
 from hodge_pipeline.types import Floats, Source, Trajectory, ViewGraph
 
 READ_BACK = 1e-5

@@ -24,12 +24,14 @@ def adjust(
     *,
     move_bodies: bool = True,
     refine: Intrinsics = "none",
+    robust: bool = False,
 ) -> set[int]:
     """Adjust it in place with COLMAP's own options; the points alone where bodies are not to move.
 
     As in COLMAP, observations (image, keypoint) of points `behind` their camera take no part; gives the points whose
     place is therefore not adjusted to their whole track. Without priors the gauge is that of two images; with them the
-    model keeps to theirs. Raises `SourceError` where the adjustment fails.
+    model keeps to theirs. `robust`: with a Cauchy loss of one pixel, for tracks that contradict each
+    other. Raises `SourceError` where the adjustment fails.
     """
     part = pycolmap.Reconstruction(reconstruction)
     loose = {key for key, point in reconstruction.points3D.items() if point.track.length() < 2}
@@ -42,7 +44,7 @@ def adjust(
             part.delete_observation(image_id, column)
     if not part.num_points3D():
         raise SourceError("no point was seen by two images: nothing ties the poses: triangulate points first")
-    _solve(_adjuster(part, bodies, priors, move_bodies, refine))
+    _solve(_adjuster(part, bodies, priors, move_bodies, refine, robust))
     for frame_id in bodies.frame_ids:
         reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
     for camera_id, camera in part.cameras.items():
@@ -58,6 +60,7 @@ def _adjuster(
     priors: PositionPriors | None,
     move_bodies: bool,
     refine: Intrinsics,
+    robust: bool,
 ) -> pycolmap.BundleAdjuster:
     options, config = _options(refine), pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
@@ -67,10 +70,13 @@ def _adjuster(
             config.set_constant_rig_from_world_pose(frame_id)
     elif priors is None:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if robust:
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     if priors is None:
         return pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
     # what tracks and priors make of each other must not hang on a few bad tracks
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    if not robust:
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     known = _pose_priors(reconstruction, bodies, priors)
     return pycolmap.create_pose_prior_bundle_adjuster(options, _prior_options(), config, known, reconstruction)
 

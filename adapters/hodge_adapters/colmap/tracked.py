@@ -18,11 +18,10 @@ from hodge_adapters.colmap.bundle import Intrinsics, adjust
 from hodge_adapters.colmap.content import content_of, read_reconstruction, refreshed
 from hodge_adapters.colmap.database import database_pairs
 from hodge_adapters.colmap.edges import covisible_pairs, measured_graph
-from hodge_adapters.colmap.points import parallaxes, points_of_rays
+from hodge_adapters.colmap.points import parallaxes, points_of_rays, reprojection_errors, update_errors
 from hodge_adapters.colmap.priors import Known, body_priors, placing
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import Model
-from hodge_adapters.colmap.reprojection import reprojection_errors, update_errors
 from hodge_adapters.colmap.resection import resected
 from hodge_adapters.colmap.scale import depth_ratios
 from hodge_adapters.colmap.ties import held_apart, merge_matched_points
@@ -42,7 +41,6 @@ from hodge_pipeline.types import (
 
 LEAST_LEFT = 3
 """Entries of a track: two would meet in a point wherever the images are."""
-
 
 FEW_BEHIND = 0.01
 """Of the observations: where more are behind their cameras, these are wrong and not the points."""
@@ -90,6 +88,7 @@ class ColmapModel:
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
     refine: Intrinsics = "none"
+    robust: bool = False
     known: PriorOptions = field(default_factory=PriorOptions)
     placing: str = ""
     """What gave the model its place in the world, empty where nothing did."""
@@ -265,7 +264,7 @@ class ColmapModel:
 
     def _adjusted(self, priors: PositionPriors | None) -> ColmapModel:
         copy = self._copy()
-        loose = adjust(copy, self._behind(), self.bodies, priors, refine=self.refine)
+        loose = adjust(copy, self._behind(), self.bodies, priors, refine=self.refine, robust=self.robust)
         if loose:
             after = refreshed(self.records, copy)
             poses = np.array([image.world_from_cam for image in after.images])
@@ -274,6 +273,10 @@ class ColmapModel:
                     copy.points3D[point_id].xyz = xyz
         update_errors(copy)
         return replace(self, reconstruction=copy, files=(), tracks=self.records)
+
+    def with_robust_loss(self) -> ColmapModel:
+        """The same model, whose adjustments let an observation that is far off pull little."""
+        return replace(self, robust=True)
 
     @property
     def moves_intrinsics(self) -> bool:
@@ -303,7 +306,7 @@ class ColmapModel:
                 held.append(at)
                 image = records.images[records.image_rows[at]]
                 copy.delete_observation(image.image_id, int(records.points.columns[at]))
-        adjust(copy, [], self.bodies, None, move_bodies=move_bodies)
+        adjust(copy, [], self.bodies, None, move_bodies=move_bodies, robust=self.robust)
         return reprojection_errors(refreshed(records, copy))[1][held]
 
     def write(self, folder: Path) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 
 from hodge_adapters.colmap.bodies import Bodies
 from hodge_adapters.colmap.cameras import colmap_camera
+from hodge_adapters.colmap.points import error_cap
 from hodge_adapters.colmap.records import Model
-from hodge_adapters.colmap.reprojection import error_cap
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints
 

@@ -51,7 +51,6 @@ _RGB = {
     "bayer_grbg8": (1, cv2.COLOR_BayerGB2RGB),
 }
 
-
 _MAX_NIBBLES = 11
 
 

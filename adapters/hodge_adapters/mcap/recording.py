@@ -12,7 +12,6 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from hodge_adapters.mcap.clouds import CloudLayout, foxglove_layout, ros_layout
-from hodge_adapters.mcap.complaints import Complaints
 from hodge_adapters.mcap.fields import (
     Decoder,
     Message,
@@ -31,7 +30,7 @@ from hodge_adapters.mcap.fields import (
 from hodge_adapters.mcap.fixes import Fix, fix_of
 from hodge_adapters.mcap.images import ImageLayout, compressed_layout, raw_layout
 from hodge_adapters.mcap.log import LogFile
-from hodge_adapters.mcap.message_file import Logged, MessageFile, Tally
+from hodge_adapters.mcap.message_file import Complaints, Logged, MessageFile, Tally
 from hodge_adapters.mcap.records import Malformed
 from hodge_adapters.mcap.ros1_bag import MAGIC as BAG_MAGIC
 from hodge_adapters.mcap.ros1_bag import BagFile

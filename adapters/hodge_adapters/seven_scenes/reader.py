@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.images import pixels
@@ -33,29 +32,15 @@ from hodge_adapters.seven_scenes.files import (
     with_depth,
 )
 from hodge_adapters.text_rows import listed
-from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source, Trajectory
 
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0, (640, 480))
-IDENTITY = tuple(np.eye(4).ravel().tolist())
-
-
+KINECT_COLOUR_FOCAL, KINECT_BASELINE_M = 525.0, 0.025
+"""Of a Kinect's colour camera as built: parallel to the depth camera, which sees it at its left."""
 ASSUMED_DEPTH_M = 2.0
 """Where a whole image has no depth."""
-
-NOMINAL = (1.0, 0.0, 0.0, -0.025, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-"""A Kinect's colour camera as built: 2.5 cm beside the depth camera, which sees it at its left, and parallel."""
-LIRIS = (
-    0.99996518, 0.00267651265, -0.00790410123, -0.0255589432,
-    -0.00274093113, 0.999963028, -0.00815045208, 0.000101096363,
-    0.00788199421, 0.00817183288, 0.999935546, 0.00203183217,
-    0.0, 0.0, 0.0, 1.0,
-)  # fmt: skip
-"""The calibration of LIRIS's Kinect (projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html), which work
-on localisation in 7-Scenes has used for its sensor (Brachmann and others, DSAC*)."""
-KINECT_FOCAL = 525.0
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -76,25 +61,12 @@ class SevenScenesReader:
     no_depth: tuple[int, ...] = Field(
         (0, 65535), description="stored values that mean no depth; 7-Scenes has 65535, its re-exports have 0 as well"
     )
-    colour_camera: Literal["same", "kinect", "liris"] = Field(
+    colour_camera: Literal["same", "kinect"] = Field(
         "same",
         description="where colour was seen from: same as depth, as if they were calibrated; kinect: 525 pixels and "
-        "2.5 cm beside, as the sensor is built; liris: a calibration of another Kinect that is much used for 7-Scenes. "
-        "On red kitchen the colour gradient at edges of depth is 1.3, 2.3 and 1.8 times that elsewhere",
+        "2.5 cm beside, as the sensor is built (on red kitchen the colour gradient at edges of depth is then 2.3 times "
+        "that elsewhere instead of 1.3)",
     )
-    colour_intrinsics: tuple[float, float, float, float] | None = Field(
-        None, description="fx fy cx cy of the colour camera, instead of those that colour_camera means"
-    )
-    colour_from_depth: tuple[float, ...] | None = Field(
-        None, description="4x4 by rows: depth's axes into the colour camera's, metres, instead of colour_camera's"
-    )
-
-    @field_validator("colour_from_depth")
-    @classmethod
-    def _check_motion(cls, values: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if values is not None and (len(values) != 16 or not se3.is_motion(np.reshape(values, (4, 4)))):
-            raise ValueError("expected the 16 numbers of a rigid motion")
-        return values
 
     def sniff(self, path: Path) -> Sniff:
         """Certain where a file named `frame-000000.depth.png` lies in the folder or in a sequence below it."""
@@ -189,31 +161,17 @@ class SevenScenesReader:
             sequence=files.sequence,
             colour_size=colour_size,
         )
-        colour = self._colour(camera)
-        if colour is None or "color" not in files.paths:
+        if self.colour_camera == "same" or "color" not in files.paths:
             return frame
         read = partial(
             read_registered_colour,
             files.paths["color"],
-            colour=colour,
             depth_path=files.paths["depth"],
             camera=camera,
             units_per_metre=self.depth_scale,
             no_depth=self.no_depth,
         )
         return replace(frame, read_colour=read, encoded_colour=None, image=None)
-
-    def _colour(self, camera: Camera) -> ColourCamera | None:
-        """The colour camera, None where it is taken to be the depth camera."""
-        if self.colour_camera == "same" and self.colour_from_depth is None and self.colour_intrinsics is None:
-            return None
-        fx, fy, cx, cy = self.colour_intrinsics or (
-            (camera.fx, camera.fy, camera.cx, camera.cy)
-            if self.colour_camera == "same"
-            else (KINECT_FOCAL, KINECT_FOCAL, camera.cx, camera.cy)
-        )
-        motion = self.colour_from_depth or {"kinect": NOMINAL, "liris": LIRIS, "same": IDENTITY}[self.colour_camera]
-        return ColourCamera(Camera(camera.width, camera.height, fx, fy, cx, cy), motion)
 
 
 def _trajectory(usable: Sequence[FrameFiles], poses: Floats) -> Trajectory | None:
@@ -222,51 +180,27 @@ def _trajectory(usable: Sequence[FrameFiles], poses: Floats) -> Trajectory | Non
     return Trajectory(stamps[good], poses[good]) if good.any() else None
 
 
-@plain_dataclass(frozen=True)
-class ColourCamera:
-    """The colour camera's intrinsics, and `colour_from_depth` (4x4 by rows): points from depth's axes into its own."""
-
-    camera: Camera
-    colour_from_depth: tuple[float, ...]
-
-    @property
-    def motion(self) -> Floats:
-        """`colour_from_depth` (4, 4)."""
-        return np.array(self.colour_from_depth).reshape(4, 4)
-
-
 def read_registered_colour(
-    path: Path,
-    *,
-    colour: ColourCamera,
-    depth_path: Path,
-    camera: Camera,
-    units_per_metre: float,
-    no_depth: tuple[int, ...],
+    path: Path, *, depth_path: Path, camera: Camera, units_per_metre: float, no_depth: tuple[int, ...]
 ) -> Bytes:
-    """Colour (H, W, 3) on the pixels of the depth image: black where the colour camera does not look.
+    """Colour (H, W, 3) of a Kinect on the pixels of its depth image: black where the colour camera does not look.
 
     Pixels without depth are taken to be as far as the median of the others. What the colour camera cannot see from
     where it stands gets the colour of what hides it: at 2.5 cm beside, a rim of a few pixels.
     """
-    image = pixels.read_colour(path, size=(colour.camera.width, colour.camera.height))
-    depth = pixels.read_depth(
-        depth_path, units_per_metre=units_per_metre, no_depth=no_depth, size=(camera.width, camera.height)
+    size = camera.width, camera.height
+    image = pixels.read_colour(path, size=size)
+    depth = pixels.read_depth(depth_path, units_per_metre=units_per_metre, no_depth=no_depth, size=size)
+    return np.asarray(
+        cv2.remap(image, *colour_pixels(depth, camera), cv2.INTER_LINEAR, borderValue=(0, 0, 0)), np.uint8
     )
-    columns, rows = colour_pixels(depth, camera, colour)
-    return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderValue=(0, 0, 0)), np.uint8)
 
 
-def colour_pixels(depth_m: Floats32, camera: Camera, colour: ColourCamera) -> tuple[Floats32, Floats32]:
-    """For each pixel of the depth image (H, W) the column and row where the colour camera sees it, -1 for nowhere."""
+def colour_pixels(depth_m: Floats32, camera: Camera) -> tuple[Floats32, Floats32]:
+    """For each pixel of the depth image (H, W) the column and row where the colour camera sees it."""
     valid = depth_m > 0
-    far = float(np.median(depth_m[valid])) if valid.any() else ASSUMED_DEPTH_M
-    z = np.where(valid, depth_m, np.float32(far)).astype(np.float64)
-    v, u = np.indices(depth_m.shape, dtype=np.float64)
-    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
-    moved = se3.transform(colour.motion, points.reshape(-1, 3)).reshape(points.shape)
-    ahead = moved[..., 2] > 1e-6
-    depth = np.where(ahead, moved[..., 2], 1.0)
-    columns = np.where(ahead, colour.camera.fx * moved[..., 0] / depth + colour.camera.cx, -1.0)
-    rows = np.where(ahead, colour.camera.fy * moved[..., 1] / depth + colour.camera.cy, -1.0)
-    return np.clip(columns, -1.0, 1e6).astype(np.float32), np.clip(rows, -1.0, 1e6).astype(np.float32)
+    z = np.where(valid, depth_m, np.median(depth_m[valid]) if valid.any() else ASSUMED_DEPTH_M)
+    v, u = np.indices(depth_m.shape)
+    columns = KINECT_COLOUR_FOCAL * ((u - camera.cx) / camera.fx - KINECT_BASELINE_M / z) + camera.cx
+    rows = KINECT_COLOUR_FOCAL * (v - camera.cy) / camera.fy + camera.cy
+    return np.asarray(columns, np.float32), np.asarray(rows, np.float32)

@@ -133,7 +133,6 @@ def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools) -> 
 UNUSED = 0.49
 """The most probable that a loop which does not count is: too little speaks for it."""
 
-
 LONGEST = 3
 """Steps of a cycle with one loop: cycles of several loops close too where these agree on a place that is wrong."""
 OF_STEPS = 3.0
