@@ -63,6 +63,13 @@ def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
     assert command == "hodge run tum --source in --set source.reader.depth_scale=1000 --out runs/in"
 
 
+def test_posed_scans_of_an_e57_start_from_their_poses() -> None:
+    facts = {"frames": 3, "frames with depth": 0, "frames with a pose": 3, "formats": [{"reader": "clouds"}]}
+    command = next_command(Path("hall.e57"), facts, None)
+    assert command == "hodge run scans --source hall.e57 --set start=given --out runs/hall"
+    assert "start" not in next_command(Path("hall.e57"), {**facts, "frames with a pose": 0}, None)
+
+
 def test_a_sound_sequence_has_no_oddities() -> None:
     found: list[str] = []
     facts = frame_facts(walk(10), found)
