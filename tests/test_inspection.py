@@ -65,6 +65,8 @@ def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
 
 def test_posed_scans_of_an_e57_start_from_their_poses() -> None:
     facts = {"frames": 3, "frames with depth": 0, "frames with a pose": 3, "formats": [{"reader": "clouds"}]}
+    model = {"frames": 7, "frames with depth": 0, "formats": [{"reader": "colmap"}]}
+    assert next_command(Path("sparse/0"), model, None) == "hodge refine colmap sparse/0 --out runs/0"
     command = next_command(Path("hall.e57"), facts, None)
     assert command == "hodge run scans --source hall.e57 --set start=given --out runs/hall"
     assert "start" not in next_command(Path("hall.e57"), {**facts, "frames with a pose": 0}, None)
