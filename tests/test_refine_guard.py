@@ -46,10 +46,12 @@ def test_what_was_held_out_counts_before_a_large_uncertainty():
 
 def test_poses_that_held_out_measurements_fit_as_well_or_better_are_given_back_without_complaint():
     """True poses: the result fits its own edges better, what was held out worse."""
-    for after in (0.88, 0.90, 0.91):
+    for after in (0.88, 0.90, 0.904):
         held_out = replace(WORSE, after=after, tolerance=0.015, is_held_out=True)
         decision = decide([held_out, BETTER], MOVED)
         assert decision.outcome == "optimal" and decision.exit_code == 0
+    assert decide([replace(held_out, after=0.91)], STILL).outcome == "optimal"
+    assert decide([replace(held_out, after=0.91)], MOVED).outcome == "refined", "fewer pairs tell less"
     failed = replace(BETTER, after=0.02)
     assert decide([held_out, failed], MOVED).outcome == "worse"
 
