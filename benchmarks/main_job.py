@@ -60,7 +60,7 @@ def measure(recipe: str, source: Path, frames: int, overrides: list[str], keep: 
             sys.exit(done.stderr)
         after = os.times()
         report: dict[str, Any] = json.loads((out / "report.json").read_text())
-        sizes = {name: (out / name).stat().st_size / 1e6 for name in ("report.html", "recording.rrd")}
+        sizes = {file.name: file.stat().st_size / 1e6 for file in (out / "report.html", *out.glob("recording.rrd"))}
         posed = sum(not line.startswith("#") for line in (out / "poses.tum").read_text().splitlines())
     cpu = after.children_user + after.children_system - before.children_user - before.children_system
     return {
@@ -133,7 +133,9 @@ def parts(runs: dict[str, dict[str, Any]]) -> str:
             row[name] += 1e3 * stage["cpu_s"] / run["frames"]
     each["start of processes, libraries"] = each.pop("start of processes, libraries")
     lines = [f"| CPU ms a frame | {' | '.join(runs)} |", "|---" * (1 + len(runs)) + "|"]
-    lines += [f"| {part} | {' | '.join(f'{ms:.1f}' for ms in row.values())} |" for part, row in each.items()]
+    lines += [
+        f"| {part} | {' | '.join(f'{ms:.1f}' if ms else '–' for ms in row.values())} |" for part, row in each.items()
+    ]
     return "\n".join(lines)
 
 

@@ -100,6 +100,23 @@ def test_stated_errors_are_believed_up_to_a_scale(misstated: tuple[float, float]
     assert (found.kept & made.right).sum() >= made.right.sum() - 3
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_unit_of_the_stated_information_and_of_lengths_changes_no_verdict(dimension: int, unit: float) -> None:
+    graph = drive(seed=dimension - 2, count=300, dimension=dimension, loops=80).graph
+    information = graph.information
+    in_other_units = replace(graph, information=unit * information)
+    longer = replace(
+        graph,
+        i_from_j=se3.rescaled(graph.i_from_j, unit**0.5),
+        information=se3.rescaled_information(information, unit**0.5),
+    )
+    expected = diagnose(graph)
+    assert (expected.verdict == "consistent").sum() > 300
+    for other in (in_other_units, longer):
+        np.testing.assert_array_equal(diagnose(other).verdict, expected.verdict)
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("in_groups", [False, True])
 def test_where_all_loops_are_wrong_the_backbone_comes_back(dimension: int, in_groups: bool) -> None:

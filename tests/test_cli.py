@@ -108,8 +108,8 @@ def test_a_run_that_never_began_does_not_hold_its_folder(tmp_path: Path) -> None
 def test_version_and_the_schema_of_both_kinds_of_recipe() -> None:
     assert hodge("--version").stdout.startswith("hodge-pipeline 0.")
     run, model = (json.loads(hodge("recipes", *name, "--schema").stdout) for name in ((), ("colmap_refine",)))
-    assert "outer_iterations" in run["properties"] and "held_out_share" not in run["properties"]
-    assert "held_out_share" in model["properties"] and "outer_iterations" not in model["properties"]
+    assert "outer_iterations" in run["properties"] and "model" not in run["properties"]
+    assert "model" in model["properties"] and "outer_iterations" not in model["properties"]
 
 
 def test_a_run_prints_a_summary_or_json_or_nothing(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811

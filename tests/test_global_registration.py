@@ -207,6 +207,14 @@ def test_a_scanner_saw_through_what_stands_before_its_walls() -> None:
     assert not np.isfinite(view.nearest_m[:3]).any()  # nothing was measured overhead: it accuses nobody
 
 
+def test_a_scanner_saw_through_nothing_below_its_lowest_beam() -> None:
+    down, turn = np.radians(np.linspace(2, 24, 64)), np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    ring_m, around = (grid.ravel() for grid in np.meshgrid(1.8 / np.tan(down), turn))
+    ground = np.column_stack([ring_m * np.cos(around), ring_m * np.sin(around), np.full(len(ring_m), -1.8)])
+    found = free_space(panorama(ground), ground + np.array([1.0, 0.0, 0.0]))
+    assert found.on > 400 and found.before == 0
+
+
 def test_a_scan_of_the_ground_is_seen_from_its_scanner() -> None:
     beams, turn = np.radians(np.linspace(-24, -2, 32)), np.linspace(0, 2 * np.pi, 400, endpoint=False)
     up, round_ = (grid.ravel() for grid in np.meshgrid(beams, turn))

@@ -17,6 +17,7 @@ from hodge_adapters.clouds.ply import read_ply
 from hodge_adapters.colmap.database import database_names
 from hodge_adapters.mcap.records import MAGIC
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.sources.inspect import inspect
 from hodge_pipeline.types.input_files import beginning, open_input, read_input, read_input_text
 from reading_targets import TARGETS
 
@@ -39,6 +40,14 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
                 read(path)
             assert refused.value.strerror
         assert beginning(path, 10) == b""
+
+
+@pytest.mark.parametrize("name", ["drive.mcap", "graph.g2o", "poses.tum"])
+def test_a_pointer_of_git_lfs_is_told(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 12345\n")
+    with pytest.raises(SourceError, match="is a pointer of Git LFS, not the file itself: run git lfs pull"):
+        inspect(path)
 
 
 def test_a_file_is_read_to_its_limit(tmp_path: Path) -> None:

@@ -63,6 +63,15 @@ def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
     assert command == "hodge run tum --source in --set source.reader.depth_scale=1000 --out runs/in"
 
 
+def test_posed_scans_of_an_e57_start_from_their_poses() -> None:
+    facts = {"frames": 3, "frames with depth": 0, "frames with a pose": 3, "formats": [{"reader": "clouds"}]}
+    model = {"frames": 7, "frames with depth": 0, "formats": [{"reader": "colmap"}]}
+    assert next_command(Path("sparse/0"), model, None) == "hodge refine colmap sparse/0 --out runs/0"
+    command = next_command(Path("hall.e57"), facts, None)
+    assert command == "hodge run scans --source hall.e57 --set start=given --out runs/hall"
+    assert "start" not in next_command(Path("hall.e57"), {**facts, "frames with a pose": 0}, None)
+
+
 def test_a_sound_sequence_has_no_oddities() -> None:
     found: list[str] = []
     facts = frame_facts(walk(10), found)
@@ -94,9 +103,9 @@ def test_an_oddity_is_named(row: int, change: dict[str, Any], expected: str) -> 
 
 def test_a_wrong_depth_scale_is_suspected() -> None:
     frames = [replace(frame, read_depth=partial(constant_depth, 2000.0)) for frame in walk(3)]
-    assert oddities_of(frames) == ["the median depth is 2e+03 m: is the depth scale right?"]
+    assert oddities_of(frames) == ["the median depth is 2e+03 m: is the depth scale right (source.reader.depth_scale)?"]
     near = [replace(frame, read_depth=partial(constant_depth, 0.4)) for frame in frames]
-    assert oddities_of(near) == ["all depth lies within 0.4 m: is this a close-up, or is the depth scale wrong?"]
+    assert oddities_of(near)[0].startswith("all depth lies within 0.4 m, as in a close-up: is the depth scale right")
 
 
 def test_frames_that_cannot_be_read_are_told() -> None:

@@ -1,11 +1,14 @@
 import math
 from dataclasses import replace
 
+import numpy as np
+import pytest
 from typer.testing import CliRunner
 
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.refine.guard import Change, Measure, decide
-from hodge_pipeline.refine.verdict import chi2_measure
+from hodge_pipeline.refine.verdict import chi2_measure, first_as_good, spread_corrections
+from hodge_pipeline.scene import KeyFrames
 
 BETTER = Measure("held-out distance", 0.010, 0.009)
 WORSE = Measure("held-out score", 0.90, 0.88, better="higher")
@@ -39,6 +42,43 @@ def test_what_was_held_out_counts_before_a_large_uncertainty():
     assert decide([held_out], STILL).outcome == "refined"
     assert decide([replace(held_out, after=0.73)], STILL).outcome == "optimal"
     assert decide([WORSE], STILL).outcome == "worse"
+
+
+def test_poses_that_held_out_measurements_fit_as_well_or_better_are_given_back_without_complaint():
+    """True poses: the result fits its own edges better, what was held out worse."""
+    for after in (0.88, 0.90, 0.904):
+        held_out = replace(WORSE, after=after, tolerance=0.015, is_held_out=True)
+        decision = decide([held_out, BETTER], MOVED)
+        assert decision.outcome == "optimal" and decision.exit_code == 0
+    assert decide([replace(held_out, after=0.91)], STILL).outcome == "optimal"
+    assert decide([replace(held_out, after=0.91)], MOVED).outcome == "refined", "fewer pairs tell less"
+    failed = replace(BETTER, after=0.02)
+    assert decide([held_out, failed], MOVED).outcome == "worse"
+
+
+def key_frames(count: int) -> tuple[KeyFrames, np.ndarray]:
+    """Key frames on a straight line, every frame one, and poses that jump about it by 1 cm."""
+    given = np.tile(np.eye(4), (count, 1, 1))
+    given[:, 0, 3] = 0.1 * np.arange(count)
+    after = given.copy()
+    after[:, 1, 3] = 0.01 * (-1.0) ** np.arange(count)
+    rows, none, stamps = np.arange(count), np.zeros(count, np.int64), np.arange(count) / 30
+    return KeyFrames(rows, given, given, none, stamps, np.ones(count, bool), stamps, none, rows), after
+
+
+def test_a_wider_correction_keeps_more_of_the_given_steps():
+    frames, after = key_frames(33)
+    found = spread_corrections(frames, after)
+    np.testing.assert_array_equal(found[-1], after)
+    sideways = np.abs(np.diff(found[:, :, 1, 3], axis=1)).max(axis=1)
+    assert sideways[-1] == pytest.approx(0.02) and (sideways[:-1] < 1e-9).all(), "even knots moved alike"
+
+
+def test_the_widest_correction_is_kept_that_fits_as_well_as_the_best():
+    pairs = np.random.default_rng(0).normal(0.8, 0.05, 40)
+    assert first_as_good(np.array([pairs - 0.02, pairs - 0.001, pairs])) == 1
+    noisy = np.random.default_rng(1).normal(0.0, 0.02, 40)
+    assert first_as_good(np.array([pairs - 0.02, pairs - 0.002 + noisy, pairs])) == 1
 
 
 def test_a_measure_within_its_tolerance_is_not_worse_and_a_lost_one_is():

@@ -156,6 +156,7 @@ def test_pairs_that_see_one_bare_wall_slide_and_are_no_edges(tmp_path: Path) -> 
         found = register_pairs(saved(tmp_path, clouds), Gicp(), pairs, np.tile(np.eye(4), (3, 1, 1)), workers)
     said = Acceptance().reasons(found).tolist()
     assert said == ["", "", "what they share lets them slide"], "consecutive frames are held all the same"
+    assert set(Acceptance().reasons(found, in_order=False)) == {said[2]}, "of scans in no order none is consecutive"
     assert Acceptance(min_spread=0.0).reasons(found).tolist() == ["", "", ""]
 
 

@@ -19,7 +19,15 @@ from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView
 from hodge_pipeline.stages import no_progress
 from hodge_pipeline.start.unordered.folds import Pieces, contradictions, unfolded, within_parts
-from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, _ambiguous, allowed_hue_conflict, allowed_violation
+from hodge_pipeline.start.unordered.hypotheses import (
+    AMBIGUOUS,
+    LEAST_HUE_CONFLICT,
+    LEAST_VIOLATION,
+    MOST_VIOLATION,
+    _ambiguous,
+    allowed_hue_conflict,
+    allowed_violation,
+)
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
@@ -182,11 +190,10 @@ def test_a_tour_takes_the_nearest_and_pairs_come_back_to_their_rows() -> None:
 
 
 def test_what_a_run_allows_its_pairs_to_see_through_follows_its_camera() -> None:
-    limits = HypothesisLimits()
-    assert allowed_violation(np.array([0.0, 0.0, 0.001, 0.1]), limits) == limits.violation_floor
-    assert allowed_violation(np.array([0.01, 0.01, np.nan, 0.3]), limits) == pytest.approx(0.08)
-    assert allowed_violation(np.full(5, 0.2), limits) == limits.max_violation
-    assert allowed_violation(np.full(2, np.nan), limits) == limits.violation_floor
+    assert allowed_violation(np.array([0.0, 0.0, 0.001, 0.1])) == LEAST_VIOLATION
+    assert allowed_violation(np.array([0.01, 0.01, np.nan, 0.3])) == pytest.approx(0.08)
+    assert allowed_violation(np.full(5, 0.2)) == MOST_VIOLATION
+    assert allowed_violation(np.full(2, np.nan)) == LEAST_VIOLATION
 
 
 def test_parts_grow_from_the_strongest_edges_and_hold_no_forbidden_pair() -> None:
@@ -213,9 +220,9 @@ def test_frames_that_see_through_each_other_are_cut_apart_although_their_edges_a
     graph = ViewGraph.from_edges(np.arange(4), np.array([[0, 1], [2, 3], [1, 2]]), np.tile(np.eye(4), (3, 1, 1)))
     graph.correspondences[:] = [900, 900, 100]
     pieces = Pieces(graph, np.zeros(4, np.int64), np.tile(np.eye(4), (4, 1, 1)))
-    limits, options = HypothesisLimits(), GlobalStart().diagnosis
-    assert contradictions(clouds, pieces, np.arange(len(pieces.piece)), views.__getitem__, limits).folded == (far_m > 2)
-    found = unfolded(clouds, pieces, 0, views.__getitem__, limits, options)
+    options = GlobalStart().diagnosis
+    assert contradictions(clouds, pieces, np.arange(len(pieces.piece)), views.__getitem__).folded == (far_m > 2)
+    found = unfolded(clouds, pieces, 0, views.__getitem__, options)
     if far_m == 2:
         assert found is pieces
     else:
@@ -224,17 +231,28 @@ def test_frames_that_see_through_each_other_are_cut_apart_although_their_edges_a
         assert "4 contradict each other" in found.notes[0]
 
 
+def test_margins_of_free_space_are_of_the_scene_not_of_a_room() -> None:
+    room_m = 0.02
+    seen = [wall_at(2.0 * room_m), wall_at(2.0 * room_m), wall_at(4.0 * room_m), wall_at(4.0 * room_m)]
+    clouds, views = CloudSet.from_clouds([cloud for cloud, _ in seen]), [view for _, view in seen]
+    graph = ViewGraph.from_edges(np.arange(4), np.array([[0, 1], [2, 3], [1, 2]]), np.tile(np.eye(4), (3, 1, 1)))
+    pieces = Pieces(graph, np.zeros(4, np.int64), np.tile(np.eye(4), (4, 1, 1)))
+    found = unfolded(clouds, pieces, 0, views.__getitem__, GlobalStart().diagnosis, room_m)
+    assert found.piece[0] == found.piece[1] != found.piece[2] == found.piece[3]
+    assert unfolded(clouds, pieces, 0, views.__getitem__, GlobalStart().diagnosis, 1.0) is pieces
+
+
 def test_a_wall_seen_from_farther_off_contradicts_nothing() -> None:
     seen = [wall_at(2.0), wall_at(2.0), wall_at(4.0), wall_at(4.0)]
     clouds, views = CloudSet.from_clouds([cloud for cloud, _ in seen]), [view for _, view in seen]
     poses = np.tile(np.eye(4), (4, 1, 1))
     graph = ViewGraph.from_edges(np.arange(4), np.zeros((0, 2), int), np.zeros((0, 4, 4)))
-    rows, limits = np.arange(4), HypothesisLimits()
+    rows = np.arange(4)
     together = Pieces(graph, np.zeros(4, np.int64), poses)
-    assert len(contradictions(clouds, together, rows, views.__getitem__, limits).pairs) == 4
+    assert len(contradictions(clouds, together, rows, views.__getitem__).pairs) == 4
     poses = poses.copy()
     poses[2:, 2, 3] = -2.0
-    apart = contradictions(clouds, Pieces(graph, np.zeros(4, np.int64), poses), rows, views.__getitem__, limits)
+    apart = contradictions(clouds, Pieces(graph, np.zeros(4, np.int64), poses), rows, views.__getitem__)
     assert apart.looked_at == 6 and not len(apart.pairs)
 
 
@@ -243,9 +261,9 @@ def test_what_odometry_holds_is_not_cut_where_it_drifts() -> None:
     clouds, views = CloudSet.from_clouds([cloud for cloud, _ in seen]), [view for _, view in seen]
     chain = ViewGraph.from_edges(np.arange(4), np.array([[0, 1], [1, 2], [2, 3]]), np.tile(np.eye(4), (3, 1, 1)))
     pieces = Pieces(chain, np.zeros(4, np.int64), np.tile(np.eye(4), (4, 1, 1)))
-    limits, options = HypothesisLimits(), GlobalStart().diagnosis
-    assert unfolded(clouds, pieces, 3, views.__getitem__, limits, options) is pieces
-    assert unfolded(clouds, pieces, 0, views.__getitem__, limits, options) is not pieces
+    options = GlobalStart().diagnosis
+    assert unfolded(clouds, pieces, 3, views.__getitem__, options) is pieces
+    assert unfolded(clouds, pieces, 0, views.__getitem__, options) is not pieces
 
 
 def painted(poster: tuple[int, int, int]) -> PointCloud:
@@ -268,10 +286,9 @@ def test_colours_tell_two_places_of_one_shape_apart_in_any_light() -> None:
 
 
 def test_what_hues_may_differ_by_follows_the_best_pairs_of_a_run() -> None:
-    limits = HypothesisLimits()
-    assert allowed_hue_conflict(np.array([]), limits) == limits.hue_floor
-    assert allowed_hue_conflict(np.array([0.0, 0.0, 0.1, np.nan]), limits) == limits.hue_floor
-    assert np.isclose(allowed_hue_conflict(np.full(5, 0.01), limits), 0.12)
+    assert allowed_hue_conflict(np.array([])) == LEAST_HUE_CONFLICT
+    assert allowed_hue_conflict(np.array([0.0, 0.0, 0.1, np.nan])) == LEAST_HUE_CONFLICT
+    assert np.isclose(allowed_hue_conflict(np.full(5, 0.01)), 0.12)
 
 
 def test_pairs_that_fit_in_several_ways_are_told_unless_others_join_their_scans() -> None:

@@ -39,7 +39,11 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings
 
     options = [word for setting in settings for word in ("--set", f"source.reader.{setting}")]
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
+    if name == "colmap" and not facts["frames with depth"]:  # images alone are nothing to register
+        return command("hodge", "refine", "colmap", path, "--out", f"runs/{path.stem}")
     recipe = "lidar" if facts.get("scanner") and not reader else {"clouds": "scans"}.get(name, name)
+    if path.suffix.lower() == ".e57" and facts["frames with a pose"] == facts["frames"]:
+        options += ["--set", "start=given"]  # the surveyor's poses, which keep the scans in his world
     if recipe in recipe_names():
         return command("hodge", "run", recipe, "--source", path, *options, "--out", f"runs/{path.stem}")
     recipe = "seven_scenes" if facts["frames with depth"] else "clouds"

@@ -6,6 +6,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Callable, Mapping
+from math import inf
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -87,7 +88,9 @@ def _value(annotation: Any, value: Any, where: Where, keys: Keys, seed: int | No
         return None
     if get_origin(annotation) in (typing.Union, types.UnionType):
         inner = [arg for arg in get_args(annotation) if registry.kind_of(arg) or _is_section(arg)]
-        return _value(inner[0], value, where, keys, seed) if inner else value
+        return (
+            _value(inner[0], value, where, keys, seed) if inner else _number(get_args(annotation), value, where, keys)
+        )
     kind = registry.kind_of(annotation)
     if kind:
         return bind_stage(kind.name, value, where, keys, seed)
@@ -95,10 +98,21 @@ def _value(annotation: Any, value: Any, where: Where, keys: Keys, seed: int | No
         item = get_args(annotation)[0]
         return tuple(_value(item, each, where, (*keys, row), seed) for row, each in enumerate(value))
     if not _is_section(annotation):
-        return value
+        return _number((annotation,), value, where, keys)
     if isinstance(value, Mapping) and value.get("stage") == registry.name_of_class(annotation):
         value = {key: item for key, item in value.items() if key != "stage"}  # an option that takes this stage alone
     return bind(annotation, value, where, keys, seed=seed)
+
+
+def _number(types_: tuple[Any, ...], value: Any, where: Where, keys: Keys) -> Any:
+    """The value of an option of one of these types, unless it is a truth value for a number, which pydantic takes for
+    1 or 0, or has no end where the option is no limit.
+    """
+    is_number = bool({int, float} & set(types_))
+    is_limit = str(keys[-1]).startswith("max_") or "limit" in str(keys[-1])
+    if (is_number and isinstance(value, bool) and bool not in types_) or (value in (inf, -inf) and not is_limit):
+        raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected a finite number, got {value!r}", keys)
+    return value
 
 
 def bind_stage(kind: str, value: Any, where: Where, keys: Keys, seed: int | None = None) -> Any:

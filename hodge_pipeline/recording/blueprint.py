@@ -64,7 +64,7 @@ def make_tabs(contents: Contents, eyes: Eyes) -> list[rrb.Container]:
         _solver_tab(contents, eyes.graph),
         *([model_tab(eyes.room)] if "model" in contents.stages else []),
         *([evaluation_tab(contents, eyes.graph)] if "evaluation" in contents.stages else []),
-        _text_tab(contents),
+        _text_tab(),
     ]
 
 
@@ -228,7 +228,7 @@ def _series(contents: Contents, origin: str, path: str, name: str) -> list[rrb.T
     return [view] if contents.holds(f"{origin}/{path}") else []
 
 
-def _text_tab(contents: Contents) -> rrb.Horizontal:
+def _text_tab() -> rrb.Horizontal:
     documents = [rrb.TextDocumentView(origin=layout.RECIPE, name="Recipe")]
     documents += [rrb.TextDocumentView(origin=layout.SOURCE, name="Source")]
     log = rrb.TextLogView(origin=layout.LOG, name="Log")

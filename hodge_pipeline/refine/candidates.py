@@ -152,7 +152,7 @@ def _consistent(
         weighing.notes.append(NO_EDGE_LEFT)
         return solved
     with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
-    priors = position_priors(solved, options.depth_weight) if with_depth else None
+    priors = position_priors(solved) if with_depth else None
     weighing.add(CONSISTENT, start, solved.solution.world_from_cam, priors)
     return solved
 

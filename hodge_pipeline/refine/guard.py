@@ -38,6 +38,11 @@ class Measure:
         """Whether it got better by more than the tolerance."""
         return sign_of(self.before, self.after, self.tolerance, self.better) > 0
 
+    @property
+    def leans_better(self) -> bool:
+        """Whether it got better by more than a third of the tolerance: one standard error where that is three."""
+        return sign_of(self.before, self.after, self.tolerance / 3, self.better) > 0
+
     def __str__(self) -> str:
         return f"{self.name} {self.before:.4g} -> {self.after:.4g}{self.unit and ' '}{self.unit}"
 
@@ -76,9 +81,10 @@ class Decision:
     """What becomes of a refinement, why, and the measures behind it.
 
     - `refined`: the result is written;
-    - `optimal`: it differs from the input by less than its own uncertainty, and what was held out is no better: the
-      input is given back;
-    - `worse`: a measure got worse: the input is given back, and the exit code is 3;
+    - `optimal`: what was held out fits the input as well (poses that move by more than their uncertainty need a gain of
+      one standard error, others of three), or, where nothing was, it differs from the input by less than
+      its own uncertainty: the input is given back;
+    - `worse`: the result fails a measure of its own: the input is given back, and the exit code is 3;
     - `forced`: as `worse`, but the result is written all the same;
     - `nothing`: no measurement related the poses: nothing is written but the report, and the exit code is 3.
     """
@@ -104,14 +110,19 @@ class Decision:
 def decide(measures: Sequence[Measure], change: Change | None = None, *, force: bool = False) -> Decision:
     """The decision on a refinement. With `force` a worse result is written; an optimal input is still given back.
 
-    Measures come before the uncertainty, which is that of edges which hardly fix the poses, or state too little.
+    Measurements held out come before the uncertainty, which is that of edges which hardly fix the poses, or state too
+    little. Where the result fits its own edges better, and those held out no better, the input is as good as they tell.
     """
     measures = tuple(measures)
     worse = [measure for measure in measures if measure.is_worse]
-    if worse:
+    held_out = [measure for measure in measures if measure.is_held_out]
+    moved = change is None or change.is_significant
+    if worse and (force or not all(measure.is_held_out for measure in worse)):
         reason = "worse by its own measures: " + "; ".join(str(measure) for measure in worse)
         return Decision("forced" if force else "worse", reason, measures, change)
-    better = any(measure.is_held_out and measure.is_better for measure in measures)
-    if change is not None and not change.is_significant and not better:
+    if held_out and not any(measure.is_better or (moved and measure.leans_better) for measure in held_out):
+        told = "; ".join(str(measure) for measure in held_out)
+        return Decision("optimal", f"already optimal: what was held out fits no better: {told}", measures, change)
+    if not held_out and not moved:
         return Decision("optimal", f"already optimal: {change}", measures, change)
     return Decision("refined", "; ".join(str(measure) for measure in measures) or "nothing measured", measures, change)

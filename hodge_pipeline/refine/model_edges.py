@@ -14,7 +14,8 @@ from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, ViewGraph
 
-LEAST_HELD_OUT = 4
+HELD_OUT_SHARE, LEAST_HELD_OUT = 0.2, 4
+"""Of the pairs with depth: kept out of registration and solve, to judge the result by."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, steps: Steps, wor
     body = model.body_of_frame[images]
     between = body[candidates.pairs[:, 0]] != body[candidates.pairs[:, 1]]
     pairs = candidates.pairs[between]
-    held = held_out(len(pairs), options.held_out_share, options.seed)
+    held = held_out(len(pairs), HELD_OUT_SHARE, options.seed)
     chosen = Edges.of(pairs[~held], "depth")
     registered = steps.step(
         register_edges, chosen, clouds, options.registration, poses, title="registration", workers=workers

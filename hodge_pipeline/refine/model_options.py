@@ -30,18 +30,6 @@ class ModelRefinement:
     seed: int = Field(default=0, ge=0, description="of everything random")
     clouds: CloudOptions = CloudOptions()
     acceptance: Acceptance = Acceptance(min_spread=0.0)
-    held_out_share: float = Field(
-        default=0.2,
-        ge=0,
-        le=0.5,
-        description="of the pairs with depth: kept out of registration and solve, to judge the result by",
-    )
-    depth_weight: float = Field(
-        default=1.0,
-        ge=0,
-        description="of the solved positions in the bundle adjustment, against the tracks; 0: tracks alone. Used only "
-        "where depth took part in the solve, since tracks know all that edges from the same images know",
-    )
 
 
 def load_model_refinement(name_or_path: str = RECIPE, overrides: Sequence[str] = ()) -> ModelRefinement:

@@ -93,7 +93,7 @@ def solve_bodies(graph: ViewGraph, world_from_body: Floats, solver: ConsistencyS
     return Solved(right, solution)
 
 
-def position_priors(solved: Solved, weight: float) -> PositionPriors | None:
+def position_priors(solved: Solved) -> PositionPriors | None:
     """Where the solution puts each body, as sure as its edges are; none of bodies that no edge holds.
 
     The bodies that fix the gauge are taken to be as sure as the others on average.
@@ -101,13 +101,13 @@ def position_priors(solved: Solved, weight: float) -> PositionPriors | None:
     poses = solved.solution.world_from_cam
     kept = solved.graph.select(np.flatnonzero(solved.kept))
     rows = np.unique(kept.edges)
-    if weight <= 0 or not len(rows):
+    if not len(rows):
         return None
     try:
         covariance = marginal_covariances(kept, poses, rows)[:, 3:, 3:]
     except GraphError:
         return None
-    turned = poses[rows, :3, :3] @ covariance @ np.swapaxes(poses[rows, :3, :3], 1, 2) / weight
+    turned = poses[rows, :3, :3] @ covariance @ np.swapaxes(poses[rows, :3, :3], 1, 2)
     held = np.trace(turned, axis1=1, axis2=2) <= 0
     if held.all():
         return None

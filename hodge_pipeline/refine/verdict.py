@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from hodge_pipeline.pairs.held_out import held_out_pairs
 from hodge_pipeline.refine.guard import Decision, Measure, decide
 from hodge_pipeline.refine.uncertainty import change, mean_chi2
 from hodge_pipeline.rounds.one_round import Work
-from hodge_pipeline.scene import Round
+from hodge_pipeline.scene import KeyFrames, Round
 from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.stages import Step, Workers
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source, Trajectory
@@ -28,6 +28,9 @@ SIGMAS = 3.0
 """Standard errors of the mean change of the score that its own noise may reach."""
 LEAST_TOLERANCE = 0.002
 """Of the score: what a fraction of a millimetre does."""
+KNOTS_APART = (16, 8, 4, 2, 1)
+"""Key frames: between two knots of the correction the steps are those given, which may be better than registered ones.
+The widest spacing is kept that fits the held-out pairs as well as the best."""
 
 LEAST_JOINED = 0.2
 """Of the key frames: the least that overlap with another one where the given poses are of these frames."""
@@ -49,29 +52,49 @@ def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
 
     Without an edge there is nothing to decide: nothing is written but the report.
     """
-    last, key_frames = rounds[-1], work.scene.key_frames
-    decision = _decision(work, rounds, key_frames.world_from_key)
+    key_frames = work.scene.key_frames
+    decision, after = _decision(work, rounds, key_frames)
     work.steps.note(Note("guard", detail=decision.reason))
-    poses = key_frames.first if decision.keeps_input else key_frames.expand(last.world_from_cam)
-    file = None if decision.outcome == "nothing" else _write(work, folder, decision, last)
+    poses = key_frames.first if decision.keeps_input else key_frames.expand(after)
+    file = None if decision.outcome == "nothing" else _write(work, folder, decision, after)
     return Refined(decision, poses, "" if file is None else file.name)
 
 
-def _decision(work: Work, rounds: Sequence[Round], before: Floats) -> Decision:
-    last = rounds[-1]
+def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tuple[Decision, Floats]:
+    """The decision, and the poses (K, 4, 4) of the key frames that it is on."""
+    last, before = rounds[-1], key_frames.world_from_key
+    nothing = _nothing(last)
+    if nothing or last.solution is None:
+        return Decision("nothing", nothing), before
+    chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
+    after, measures = _held_out(work, rounds, key_frames)
+    measures.append(chi2_measure(*chi2))
+    solution = replace(last.solution, world_from_cam=after)
+    return decide(measures, change(last.graph, solution, before), force=work.recipe.guard.force), after
+
+
+def _nothing(last: Round) -> str:
+    """Why nothing was measured that relates the poses; empty where something was."""
     if not last.graph.edge_count or last.solution is None:
         rejected = ", ".join(f"{count} {reason}" for reason, count in last.edges.rejected_counts.items())
-        return Decision("nothing", f"no edge joins two frames ({rejected or 'no pair overlaps'}): nothing was refined")
+        return f"no edge joins two frames ({rejected or 'no pair overlaps'}): nothing was refined"
     if not (last.solution.weights > 0).any():
-        return Decision("nothing", f"the solver rejected all {last.graph.edge_count} edges: nothing was refined")
+        return f"the solver rejected all {last.graph.edge_count} edges: nothing was refined"
     joined = len(np.unique(last.graph.edges))
     if joined < LEAST_JOINED * last.graph.vertex_count:
         found = f"{joined} of {last.graph.vertex_count} key frames overlap with another one"
-        return Decision("nothing", f"under the given poses only {found}: are they the poses of these frames?")
-    measures = [*_held_out(work, rounds, before)]
-    chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
-    measures.append(chi2_measure(*chi2))
-    return decide(measures, change(last.graph, last.solution, before), force=work.recipe.guard.force)
+        return f"under the given poses only {found}: are they the poses of these frames?"
+    return ""
+
+
+def spread_corrections(key_frames: KeyFrames, after: Floats) -> Floats:
+    """The poses (S, K, 4, 4) of the key frames, corrected as every S-th one was: the widest of `KNOTS_APART` first."""
+    out, count = [], len(after)
+    for apart in KNOTS_APART:
+        knots = np.union1d(np.arange(0, count, apart), count - 1)
+        some = replace(key_frames, rows=key_frames.rows[knots], world_from_key=key_frames.world_from_key[knots])
+        out.append(after if apart == 1 else some.expand(after[knots])[key_frames.rows])
+    return np.array(out)
 
 
 def chi2_measure(before: float, after: float) -> Measure:
@@ -79,24 +102,37 @@ def chi2_measure(before: float, after: float) -> Measure:
     return Measure("edge chi2, mean", before, after, tolerance=CHI2_TOLERANCE * before)
 
 
-def _held_out(work: Work, rounds: Sequence[Round], before: Floats) -> list[Measure]:
-    """The score of the pairs kept out of every round; its tolerance is its own standard error."""
+def _held_out(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tuple[Floats, list[Measure]]:
+    """The corrected poses (K, 4, 4) that keep most of the given steps of those that fit the pairs kept out of every
+    round best; and the score of these pairs, whose tolerance is its own standard error.
+    """
     pairs, after = held_out_pairs(rounds), rounds[-1].world_from_cam
     if not len(pairs):
         work.steps.note(Note("nothing held out", 0))
-        return []
+        return after, []
+    found = spread_corrections(key_frames, after)
     scale = float(work.recipe.scale)
+    poses = np.stack([key_frames.world_from_key, *found])
     distances = work.steps.step(
-        held_out_distances_m, work.scene.clouds, pairs, np.stack([before, after]), scale, title="guard",
-        workers=work.workers,
-    )  # fmt: skip
+        held_out_distances_m, work.scene.clouds, pairs, poses, scale, title="guard", workers=work.workers
+    )
     scores = np.exp(-distances / (scale * SIGMA_M))
+    row = 1 + first_as_good(scores[1:])
+    scores, distances = scores[[0, row]], distances[[0, row]]
     error = float((scores[1] - scores[0]).std() / np.sqrt(len(pairs)))
     tolerance = max(SIGMAS * error, LEAST_TOLERANCE)
     mean_mm, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_mm[0]:.3g} mm apart before, {mean_mm[1]:.3g} mm after"
-    work.steps.note(Note("held out", len(pairs), apart))
-    return [Measure("score of held-out edges", float(mean[0]), float(mean[1]), "higher", tolerance, is_held_out=True)]
+    work.steps.note(Note("held out", len(pairs), f"{apart}, the correction at every {KNOTS_APART[row - 1]}. key frame"))
+    name = "score of held-out edges"
+    return found[row - 1], [Measure(name, float(mean[0]), float(mean[1]), "higher", tolerance, is_held_out=True)]
+
+
+def first_as_good(scores: Floats) -> int:
+    """The first row of scores (S, P) whose mean is that of the best row, within the noise of their differences."""
+    losses = scores[scores.mean(axis=1).argmax()] - scores
+    noise = np.maximum(losses.std(axis=1) / np.sqrt(scores.shape[1]), LEAST_TOLERANCE)
+    return int(np.flatnonzero(losses.mean(axis=1) <= noise)[0])
 
 
 def held_out_distances_m(
@@ -107,7 +143,7 @@ def held_out_distances_m(
     return edge_distances(clouds.folder, pairs, pose_sets, workers, scale=scale)
 
 
-def _write(work: Work, folder: Path, decision: Decision, last: Round) -> Path | None:
+def _write(work: Work, folder: Path, decision: Decision, after: Floats) -> Path | None:
     """`refined.<suffix>`: the input's own bytes where it is kept, else its form with the refined poses."""
     given = work.scene.given
     if given is None:
@@ -124,7 +160,7 @@ def _write(work: Work, folder: Path, decision: Decision, last: Round) -> Path | 
         out = folder / f"refined{original.suffix}"
         shutil.copyfile(original, out)
         return out
-    moved = given.expand(work.scene.key_frames, last.world_from_cam)
+    moved = given.expand(work.scene.key_frames, after)
     refined = Trajectory(given.trajectory.stamps_s, moved)
     if rewriter is not None:
         return Path(rewriter.rewrite(folder, original, refined))

@@ -14,15 +14,16 @@ from hodge_pipeline.types.edges import HELD_OUT, MEASURED, REJECTED, USED
 CONTRADICTS = "contradicts odometry"
 
 
-def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None) -> tuple[Edges, Ints]:
+def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, in_order: bool = True) -> tuple[Edges, Ints]:
     """The table with `status` and `why` of every registered pair: used, or rejected; those held out stay so. Beside it
     the rows (S,) that odometry slid to unnoticed, as the pairs over these steps agree.
 
-    `drift`: what odometry says of the path between two frames; None without odometry.
+    `drift`: what odometry says of the path between two frames; None without odometry. `in_order`: whether rows that
+    follow each other are steps of a path.
     """
     rows = np.flatnonzero(edges.status != HELD_OUT)
     registered = edges.select(rows)
-    reasons = acceptance.reasons(registered)
+    reasons = acceptance.reasons(registered, in_order)
     slid = np.zeros(0, np.int64)
     if drift is not None:
         good = np.flatnonzero(reasons == "")

@@ -299,7 +299,8 @@ def _out_of_range(ranges: Floats32, option: str, options: CloudOptions) -> str:
         return "there is no point in it"
     usual = float(np.median(finite))
     limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
-    unit = f" (millimetres? then source.reader.{option}=1000)" if usual > options.max_range_m else ""
+    units = f"source.reader.{option}"
+    unit = f" (millimetres? then {units}=1000)" if usual > 1000 * options.min_range_m else f" (is {units} right?)"
     return f"its points lie {usual:.3g} m away, in range are {limits}{unit}"
 
 

@@ -94,8 +94,8 @@ class Gicp(_SmallGicp):
 
     both_ways: bool = Field(
         default=False,
-        description="Align j with i, then i with j, and take the middle: each way errs by the sampling of its target. "
-        "Twice the time.",
+        description="Align j with i, then i with j, and take the middle, and the mean of information and fitness: each "
+        "way errs by the sampling of its target. Twice the time.",
     )
 
     def prepare(self, cloud: PointCloud) -> PreparedCloud:
@@ -111,7 +111,10 @@ class Gicp(_SmallGicp):
         if not back.converged:
             return found
         apart = se3.log(se3.inverse(found.i_from_j) @ se3.inverse(back.i_from_j))
-        return replace(found, i_from_j=found.i_from_j @ se3.exp(apart / 2))
+        middle = found.i_from_j @ se3.exp(apart / 2)
+        information = (found.information + se3.pull_back(middle, back.information)) / 2
+        fitness = (found.fitness + back.fitness) / 2
+        return replace(found, i_from_j=middle, information=information, fitness=fitness)
 
     def _one_way(self, target: PreparedCloud, source: PreparedCloud, i_from_j: Floats) -> Registration:
         def align(sample: Any, guess: Floats, **criteria: float) -> Any:

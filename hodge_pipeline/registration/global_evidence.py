@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.free_directions import named_direction
@@ -58,11 +58,17 @@ def depth_view(depth: Floats32, camera: Camera) -> DepthView:
 
 
 def panorama(points: Floats) -> DepthView:
-    """What a scanner at the origin of a scan (N, 3) saw: the nearest point in and around each cell of directions."""
+    """What a scanner at the origin of a scan (N, 3) saw: the nearest point in and around each cell of directions.
+
+    Nothing where the cell, or the one above or below it, holds no point: at the edge of its view, or between rings that
+    are far apart, it saw through nothing.
+    """
     ranges = np.linalg.norm(points, axis=1)
     nearest = np.full((round(np.pi / PANORAMA_STEP), round(2 * np.pi / PANORAMA_STEP)), np.inf, np.float32)
     np.minimum.at(nearest, _cells(points, ranges), ranges.astype(np.float32))
-    return DepthView(minimum_filter(nearest, 3, mode=("nearest", "wrap")), 1, None)
+    beside_unseen = maximum_filter(nearest, (3, 1), mode="nearest") == np.inf
+    nearest = minimum_filter(nearest, 3, mode=("nearest", "wrap"))
+    return DepthView(np.where(beside_unseen, np.float32(np.inf), nearest), 1, None)
 
 
 def _cells(points: Floats, ranges: Floats) -> tuple[Ints, Ints]:

@@ -55,21 +55,19 @@ class Acceptance:
         "stay at their guess in such a direction",
     )
 
-    def reasons(self, registered: Edges) -> NDArray[np.str_]:
-        """Why each pair (P,) is rejected by itself, an empty word where it is accepted."""
+    def reasons(self, registered: Edges, in_order: bool = True) -> NDArray[np.str_]:
+        """Why each pair (P,) is rejected by itself, an empty word where it is accepted.
+
+        Steps of frames that are `in_order` may slide: they stay at their guess.
+        """
         out = np.full(len(registered.pairs), "", "U64")
-        out[_slides(registered, self.min_spread)] = "what they share lets them slide"
+        weak, _ = weak_directions(registered, self.min_spread)
+        out[weak.any(axis=1) & ~(in_order & _consecutive(registered))] = "what they share lets them slide"
         if self.max_rmse_m is not None:
             out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
         out[~(registered.fitness >= self.min_fitness)] = "too little overlap"
         out[registered.correspondences == 0] = "nothing in common"
         return out
-
-
-def _slides(registered: Edges, min_spread: float) -> Bools:
-    """Where (P,) translation is hardly known in some direction, for pairs that are not next to each other."""
-    weak, _ = weak_directions(registered, min_spread)
-    return np.asarray(weak.any(axis=1) & ~_consecutive(registered))
 
 
 def unheld_steps(edges: Edges, min_spread: float) -> Bools:

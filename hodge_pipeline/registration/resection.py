@@ -111,30 +111,23 @@ def _step(points: Floats, seen: Floats, camera: Camera, pose: Floats, scale: flo
         return None
     in_cam, residual = in_cam[usable], residual[usable]
     x, y, z = in_cam.T
-    sigma_z = DEPTH_SIGMAS * depth_sigma(z)
     white = _white(in_cam, residual)
     weight = 1 / (1 + (white**2).sum(axis=1) / (3 * scale**2))
     no_depth = np.isnan(seen[usable, 2])
-    rows_u = _pixel_rows(camera.fx / (PIXEL_SIGMA * z), x / z, 0, in_cam)
-    rows_v = _pixel_rows(camera.fy / (PIXEL_SIGMA * z), y / z, 1, in_cam)
-    rows_z = _moved(in_cam, 2) * np.where(no_depth, 0.0, 1 / sigma_z)[:, None]
-    root = np.sqrt(weight)[:, None]
-    jacobian = np.concatenate([rows_u * root, rows_v * root, rows_z * root])
-    information = jacobian.T @ jacobian
-    gradient = jacobian.T @ (white * root).T.ravel()
+    sigma_z = np.where(no_depth, np.inf, DEPTH_SIGMAS * depth_sigma(z))
+    gain = np.sqrt(weight) / [PIXEL_SIGMA / camera.fx * z, PIXEL_SIGMA / camera.fy * z, sigma_z]
+    u, v, one, none = x / z, y / z, np.ones(len(z)), np.zeros(len(z))
+    # of a point in a camera that moves by exp(ξ), which moves by −(φ × p + ρ)
+    moved = [
+        [u * y, z + v * y, -y],
+        [-z - u * x, -v * x, x],
+        [y, -x, none],
+        [-one, none, none],
+        [none, -one, none],
+        [u, v, -one],
+    ]
+    jacobian = (np.array(moved) * gain).reshape(6, -1)
+    information = jacobian @ jacobian.T
+    gradient = jacobian @ (white * np.sqrt(weight)[:, None]).T.ravel()
     damped = information + 1e-9 * np.trace(information) * np.eye(6)
     return np.linalg.solve(damped, gradient), information
-
-
-def _moved(in_cam: Floats, axis: int) -> Floats:
-    """d(coordinate)/dξ (n, 6) of points in a camera that moves by exp(ξ): they move by −(φ × p + ρ)."""
-    out = np.zeros((len(in_cam), 6))
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    out[:, one], out[:, two] = -in_cam[:, two], in_cam[:, one]
-    out[:, 3 + axis] = -1.0
-    return out
-
-
-def _pixel_rows(gain: Floats, slope: Floats, axis: int, in_cam: Floats) -> Floats:
-    """d(pixel)/dξ (n, 6) over the pixel's sigma: of `f x/z`, with `gain` f/(σ z) and `slope` x/z."""
-    return np.asarray(gain[:, None] * (_moved(in_cam, axis) - slope[:, None] * _moved(in_cam, 2)))

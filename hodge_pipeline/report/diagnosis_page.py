@@ -127,12 +127,12 @@ def frames_table(graph: ViewGraph, diagnosis: Diagnosis) -> Table:
     bad = np.flatnonzero(np.isin(diagnosis.verdict, (WRONG, SUSPECT)))
     counts = np.bincount(graph.edges[bad].ravel(), minlength=graph.vertex_count)
     order = np.argsort(-counts, kind="stable")
-    rows = tuple(_frame_row(graph, diagnosis, bad, int(frame)) for frame in order[:LISTED] if counts[frame] > 1)
+    rows = tuple(_frame_row(graph, bad, int(frame)) for frame in order[:LISTED] if counts[frame] > 1)
     caption = "Where many of a frame's edges are bad look at the frame: its depth, blur, or a place that looks alike."
     return Table("Frames that bad edges share", ("frame", "bad edges", "of its edges", "to"), rows, caption, wide=(3,))
 
 
-def _frame_row(graph: ViewGraph, diagnosis: Diagnosis, bad: Ints, frame: int) -> tuple[str, ...]:
+def _frame_row(graph: ViewGraph, bad: Ints, frame: int) -> tuple[str, ...]:
     own = bad[(graph.edges[bad] == frame).any(axis=1)]
     others = np.where(graph.edges[own, 0] == frame, graph.edges[own, 1], graph.edges[own, 0])
     total = int((graph.edges == frame).any(axis=1).sum())

@@ -43,6 +43,7 @@ DOUBTS = {
     "camera or object": "In doubt, since much of the image moves",
     "unheld": "In doubt, since what frames share lets them slide",
     "path loose": "In doubt, since the scans tell little of how far the scanner went",
+    "depth unit": "In doubt, since depth is probably not in metres",
     "other scale": "In another scale than the truth",
 }
 """How a headline begins where the run says that its result may be wrong, whatever was measured."""

@@ -48,14 +48,12 @@ class Closeup:
         for name, row, colour, pose, parts in zip(
             NAMES, (pair.i, pair.j, pair.j), (FIRST, SECOND, SOLVED), poses, shown, strict=True
         ):
-            self._cloud(name, pair, clouds, row, colour, pose, up, size)
+            self._cloud(name, pair, clouds, row, colour, pose, up)
             for number, part in enumerate(self._parts[name]):
                 part.visible = number in parts
         self._picks(pair.picks(), size)
 
-    def _cloud(
-        self, name: str, pair: Shown, clouds: CloudSet, row: int, colour: Any, pose: Floats, up: Floats, size: float
-    ) -> None:
+    def _cloud(self, name: str, pair: Shown, clouds: CloudSet, row: int, colour: Any, pose: Floats, up: Floats) -> None:
         """A node at the middle of a cloud, its points below it in parts; sent where they are other points."""
         middle, size_m = extent(clouds[row])
         placing = pair.is_placed and name == "second"

@@ -122,7 +122,7 @@ class Work:
         """The table with the status of every registered pair; one that odometry measured, and that was registered to
         somewhere else, keeps odometry's measurement.
         """
-        found, slid = accepted(edges, self.recipe.acceptance, self.scene.drift)
+        found, slid = accepted(edges, self.recipe.acceptance, self.scene.drift, self.scene.in_order)
         if len(slid):
             self.steps.note(Note("slid", len(slid), in_runs(slid, self.scene.first.vertex_ids)))
         return found if self.scene.drift is None else with_odometry(found, self.scene.first.edges)

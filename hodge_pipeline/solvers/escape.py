@@ -98,7 +98,7 @@ def _rounded_descent(
 
 def _rounded(frames: Floats, component: Ints) -> Floats:
     """The rotations (n, d, d) nearest to the frames on their component's d main axes (SE-Sync, algorithm 2)."""
-    n, d, r = frames.shape
+    _, d, r = frames.shape
     spread = np.zeros((component.max() + 1, r, r))
     np.add.at(spread, component, np.swapaxes(frames, 1, 2) @ frames)
     axes = np.linalg.eigh(spread)[1][:, :, -d:]

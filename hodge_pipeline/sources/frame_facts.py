@@ -10,10 +10,10 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.sources.depth_units import PLAUSIBLE_DEPTH_M, SAMPLED_FRAMES, doubts_of
 from hodge_pipeline.types import Bools, Floats, Floats32, Frame, Trajectory
 from hodge_pipeline.types.arrays import evenly
 
-SAMPLED_FRAMES = 8
 LISTED = 5
 GAP, JUMP = 5.0, 10.0
 """Times the median step: what counts as a gap in time, and as a jump of the pose."""
@@ -23,10 +23,6 @@ FEWEST_SWEEPS, SWEEP_POINTS = 10, 300_000
 SECTORS, ALL_ROUND = 36, 0.9
 """Of ten degrees each; the share of them that holds points of a scanner that sees all round it."""
 MOSTLY_EMPTY = 0.9
-PLAUSIBLE_DEPTH_M = (0.1, 30.0)
-"""The median depth of a scene; outside, the scale is probably wrong."""
-NEAR_M = 1.3
-"""Where the depth of a room, in millimetres but read as TUM's 5000 to the metre, ends: 6.5 m."""
 
 
 def frame_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
@@ -160,10 +156,10 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
     values = np.concatenate(depths) if depths else np.zeros(0)
     valid = values[values > 0]
     median = float(np.median(valid)) if len(valid) else None
-    if median is not None and not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
-        oddities.append(f"the median depth is {median:.3g} m: is the depth scale right?")
-    elif median is not None and valid.max() < NEAR_M and with_depth[0].read_depth is not None:
-        oddities.append(f"all depth lies within {valid.max():.2g} m: is this a close-up, or is the depth scale wrong?")
+    if with_depth and with_depth[0].read_depth is not None:
+        oddities.extend(str(doubt) for doubt in doubts_of(valid))
+    elif median is not None and not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
+        oddities.append(f"the median distance is {median:.3g} m: are the points in metres?")
     return {
         "frames looked into": len(depths),
         "depth range in metres": [float(valid.min()), float(valid.max())] if len(valid) else None,

@@ -66,7 +66,7 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     """
     known = guesses(path) if path.is_file() or path.is_dir() else []
     source = (reader or guess_reader(path, known)).open(path)
-    oddities: list[str] = []
+    oddities = list(source.doubts)
     facts: dict[str, Any] = {
         "path": str(path),
         "formats": [{"reader": g.name, "confidence": g.sniff.confidence, "why": g.sniff.reason} for g in known],

@@ -10,6 +10,7 @@ from hodge_pipeline import registry
 from hodge_pipeline.errors import HodgeError, SourceError
 from hodge_pipeline.stages import FrameReader
 from hodge_pipeline.types import Source
+from hodge_pipeline.types.input_files import open_input
 
 LOOKED_AT = 60
 """Paths inside a folder that the readers are asked about: some hundredths of a second."""
@@ -42,6 +43,10 @@ def _nothing(path: Path) -> str:
     if path.is_file() and path.suffix.lower() in PACKED:
         return "packed: unpack it first"
     if not path.is_dir():
+        try:
+            open_input(path).close()
+        except OSError as error:
+            return error.strerror or ""
         return ""
     children = _children(path)
     packed = [child.name for child in children if child.suffix.lower() in PACKED]

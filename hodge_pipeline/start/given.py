@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
-from hodge_pipeline.errors import RecipeError, SourceError
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import associate
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
@@ -51,10 +50,9 @@ SAME_M = 1e-6
 class GivenStart:
     """Starts from the poses of another program, and registers key frames among the frames."""
 
-    poses: Literal["frames", "file"] = Field(
-        default="file", description="frames: the source's own poses; file: those of `path`"
+    path: Path | None = Field(
+        default=None, description="a trajectory of any format that a reader opens; null: the poses of the frames"
     )
-    path: Path | None = Field(default=None, description="a trajectory of any format that a reader opens")
     match: Match = Field(
         default="auto",
         description="how a frame finds its pose in the file: stamp, between two poses; number, that of the frame; row, "
@@ -81,7 +79,7 @@ class GivenStart:
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """The key frames at their given poses, without an edge yet.
 
-        Raises `RecipeError` where no file is named, `SourceError` where its poses are not of these frames.
+        Raises `SourceError` where there are none, or those of the file are not of these frames.
         """
         matched, file = self._matched(source, steps)
         known = np.isfinite(matched.world_from_cam).all(axis=(1, 2))
@@ -132,13 +130,11 @@ class GivenStart:
         return np.concatenate(found)
 
     def _matched(self, source: Source, steps: Steps) -> tuple[Matched, GivenFile | None]:
-        if self.poses == "frames":
+        if self.path is None:
             matched = own_poses(source.frames)
             if not len(matched.pose_times):
                 raise SourceError(f"{source.path}: its frames have no poses: give a file of them (start.path)")
             return matched, None
-        if self.path is None:
-            raise RecipeError("start.path: no file of poses named: give one, or set start.poses to frames")
         trajectory = read_trajectory(self.path, steps)
         matched = match_poses(trajectory, source.frames, self.match, self.max_gap_s, str(self.path))
         true = _true_at(matched.pose_times, matched, source)

@@ -162,7 +162,7 @@ class Source:
     """What a reader's `open` gives: any of lazy frames, a trajectory, a measured graph.
 
     - `trajectory` is the whole trajectory that the frames' poses come from, on its own stamps, where there is one.
-    - `notes` say what was skipped or repaired, with counts: one line each.
+    - `notes` say what was skipped or repaired, with counts: one line each; `doubts` what may be wrong about the rest.
     - `positions` of its frames that are known from elsewhere, such as satellite fixes; None where it has none.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
     - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
@@ -179,6 +179,7 @@ class Source:
     contents: tuple[str, ...] = ()
     positions: Positions | None = None
     of_cameras: bool = False
+    doubts: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]

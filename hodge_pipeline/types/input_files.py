@@ -11,6 +11,8 @@ from typing import BinaryIO
 
 MAX_WHOLE_BYTES = 1 << 31
 """What is read whole is no longer: 2 GiB of text are 20 million edges, or a model of 10,000 images with its tracks."""
+_LFS_HEAD, _LFS_BYTES = b"version https://git-lfs", 1024
+"""What stands in a working tree in the place of a file that Git LFS keeps elsewhere; pointers are shorter."""
 _KINDS = {
     stat.S_IFDIR: (errno.EISDIR, "a folder"),
     stat.S_IFIFO: (errno.EINVAL, "a pipe"),
@@ -31,7 +33,10 @@ def open_input(path: Path) -> BinaryIO:
     except ValueError as error:  # a zero byte in the name
         raise OSError(errno.EINVAL, "no name of a file", str(path)) from error
     try:
-        _check_regular(path, os.fstat(handle).st_mode)
+        status = os.fstat(handle)
+        _check_regular(path, status.st_mode)
+        if status.st_size < _LFS_BYTES and os.pread(handle, len(_LFS_HEAD), 0) == _LFS_HEAD:
+            raise OSError(errno.ENODATA, "is a pointer of Git LFS, not the file itself: run git lfs pull", str(path))
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)

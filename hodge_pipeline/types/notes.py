@@ -25,6 +25,7 @@ DOUBTS = {
     "frames out.",
     "unheld": "The path may slide: at {count} of {detail} what both frames see, such as a bare wall, does not hold "
     "the camera in every direction, and no other edge tests the step.",
+    "depth unit": "Depth is probably not in metres: {detail}.",
     "other scale": "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
     "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not "
     "of the camera.",
@@ -42,6 +43,10 @@ LOOKS = {
     "single frame": "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
     "scale": "{detail}",
+    "reader's doubt": "{detail}",
+    "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "
+    "{detail}",
+    "depth range": "{detail}: is the depth scale right (source.reader.depth_scale)?",
     "tracking lost": "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
     "blank images": "{count} frames have depth, but a colour image that shows nothing, black or of one even colour "
     "({detail}): surfaces alone place them",

@@ -93,7 +93,7 @@ def refine_trajectory(
     given = poses_of(poses) if open3d else np.asarray(poses, float)
     source = _source(frames, given)
     chosen = recipe or (recipe_for(Path(frames)) if isinstance(frames, (str, Path)) else recipe_of(frames))
-    ours = ["start.stage=given", "start.poses=frames", f"guard.force={str(force).lower()}"]
+    ours = ["start.stage=given", f"guard.force={str(force).lower()}"]
     loaded = load_recipe(chosen, [*ours, *overrides])
     with tempfile.TemporaryDirectory(prefix="hodge-refine-") as scratch:
         folder = Path(scratch) / "run" if out is None else Path(out)

@@ -16,6 +16,7 @@ from hodge_adapters.association import interpolated_poses
 from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
+from hodge_adapters.images.fitted_camera import UNSTAMPED_STEP_S, assumed_camera_doubts
 from hodge_adapters.images.frames import image_frame
 from hodge_adapters.posed import posed_frames
 from hodge_adapters.seven_scenes.files import FrameFiles, read_poses
@@ -34,7 +35,8 @@ TRUTH_PATTERN = "*.gt.freiburg*"
 MAX_GAP_FRAMES = 1.0
 SNIFFED_BYTES = 1 << 16
 
-COLOUR_FOLDERS = ("image", "color", "rgb")
+
+COLOUR_FOLDERS = ("image", "images", "color", "rgb")
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
 TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
 _NUMBER = re.compile(r"\D*(\d+)")
@@ -176,10 +178,17 @@ class IclNuimReader:
         own = None if self.camera else find_camera_file(path)
         if own:
             notes.append(f"intrinsics from {own.relative_to(path)}")
+        doubts: tuple[str, ...] = ()
+        if own is None and not self.camera:
+            stamps_s = UNSTAMPED_STEP_S * listing.stamps_s
+            doubts = assumed_camera_doubts(REDWOOD, listing.depth, listing.colour, stamps_s, self.depth_scale or 1000.0)
+            notes.append(
+                "Redwood's intrinsics taken (525 525 319.5 239.5), since there is no camera file in the folder"
+            )
         default = read_intrinsics(own) if own else REDWOOD
         frames = self._frames(listing, default, poses, 1000.0, notes, is_true=False)
         files = (*filter(None, [log, own]), *listing.depth, *filter(None, listing.colour))
-        return Source(path.resolve().name, path, frames, notes=tuple(notes), files=files)
+        return Source(path.resolve().name, path, frames, notes=tuple(notes), files=files, doubts=doubts)
 
 
 def _estimated(path: Path, numbers: list[int], notes: list[str]) -> tuple[Floats, Path | None]:

@@ -25,12 +25,13 @@ CAMERA_FILES = (
     "calibration.txt",
     "camera_intrinsic.json",
     "intrinsic/intrinsic_depth.txt",
+    "K.txt",
     "info.txt",
     "TUM1.yaml",
     "TUM2.yaml",
     "TUM3.yaml",
 )
-"""The last but three as ScanNet exports it, then BundleFusion's."""
+"""After Open3D's JSON as ScanNet exports it, deep-video-mvs, and BundleFusion."""
 LONGEST_READOUT_S = 1.0
 """Of a rolling shutter: slower cameras give no video."""
 _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"

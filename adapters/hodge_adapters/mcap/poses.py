@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_adapters.association import interpolated_poses
-from hodge_adapters.mcap.recording import PoseTopic, Recording
+from hodge_adapters.mcap.recording import Recording
 from hodge_adapters.mcap.topics import named_topic
 from hodge_adapters.text_rows import listed
 from hodge_pipeline.types import Floats, Trajectory
@@ -74,7 +74,7 @@ def _from_topic(
     if not len(stamps_s):
         notes.append(f"trajectory of {body or 'what it moves'} in {topic.frame or 'its world'} from {name}")
         return Poses(of_frames, trajectory)
-    body_from_cam = _body_from_cam(recording, name, topic, body, camera_frame, stamps_s, notes)
+    body_from_cam = _body_from_cam(recording, name, body, camera_frame, stamps_s, notes)
     if body_from_cam is None:
         return Poses(np.full_like(of_frames, np.nan), trajectory, linked=False)
     along = recording.transforms.lookup(body, camera_frame, trajectory.stamps_s) if body != camera_frame else None
@@ -87,7 +87,6 @@ def _from_topic(
 def _body_from_cam(
     recording: Recording,
     name: str,
-    topic: PoseTopic,
     body: str,
     camera_frame: str,
     stamps_s: Floats,

@@ -98,7 +98,7 @@ class McapReader:
         poses = find_poses(recording, camera_frame, stamps_s, options, notes)
         positions = positions_of(recording.fixes, notes)
         if not frames and poses.trajectory is None and positions is None:
-            raise _nothing(path, recording, notes)
+            raise _nothing(path, recording)
         return Source(
             name=path.stem if path.is_file() else path.resolve().name,
             path=path,
@@ -252,7 +252,7 @@ def _topics(recording: Recording) -> str:
     return listed([f"{topic} ({name})" for topic, name in sorted(recording.topics.items())])
 
 
-def _nothing(path: Path, recording: Recording, notes: list[str]) -> SourceError:
+def _nothing(path: Path, recording: Recording) -> SourceError:
     why = "".join(f"; {note}" for note in recording.complaints.notes())
     remedy = "record depth images, point clouds or odometry"
     if not recording.topics:

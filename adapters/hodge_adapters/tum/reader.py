@@ -16,10 +16,10 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters.association import interpolated_poses
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
+from hodge_adapters.images.fitted_camera import assumed_camera_doubts, fitting
 from hodge_adapters.images.frames import Lens, image_frame
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs, stamped_images
-from hodge_adapters.tum.known_cameras import fitting
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Source, Trajectory
@@ -42,7 +42,7 @@ CAMERAS = {
     "default": Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480)),
 }
 RECORDED_ON = {"fr1": {"2011-05-10"}, "fr2": {"2011-07-28"}, "fr3": {"2012-07-08", "2012-07-09"}}
-"""The days, UTC, of the benchmark's sequences: what tells fr1 from fr2, whose lenses bend images nearly alike."""
+"""The days, UTC, of the benchmark's sequences: images hardly tell fr1 from fr2, whose lenses bend them nearly alike."""
 TRUTH_FILE = "groundtruth.txt"
 
 _FREIBURG = re.compile(r"(?:freiburg|fr)([123])(?![0-9a-z])|freiburg([123])", re.IGNORECASE)
@@ -55,8 +55,8 @@ class TumReader:
     camera: str | tuple[float, float, float, float] = Field(
         "auto",
         description="fr1, fr2, fr3, default (525 525 319.5 239.5), a file in the folder, or fx fy cx cy in pixels; "
-        "auto: intrinsics.txt or another camera file in the folder, else the folder's name (freiburg1), else that of "
-        "fr1, fr2 and fr3 under which frames agree better than under default, else default",
+        "auto: intrinsics.txt or another camera file in the folder, else the folder's name (freiburg1), else the day "
+        "of its stamps, else that of fr1, fr2 and fr3 under which frames agree better than under default, else default",
     )
     depth_scale: float | None = Field(
         None, gt=0, description="stored units per metre; none: DepthMapFactor of the camera file, else TUM's 5000"
@@ -110,6 +110,8 @@ class TumReader:
         notes: list[str] = []
         listing = read_pairs(path, self.max_difference_s, notes)
         found, camera_file = self._intrinsics(path, listing, notes)
+        scale = self.depth_scale or found.units_per_metre or UNITS_PER_METRE
+        doubts = self._doubts(found, listing, scale)
         camera = found.camera_of(listing.depth, notes)
         colour_size = pixels.colour_size(listing.colour, (camera.width, camera.height), notes)
         lens = Lens(camera, found.distortion) if found.distortion and self.undistort else None
@@ -117,7 +119,6 @@ class TumReader:
             notes.append(
                 f"the lens's distortion is {'taken out of the images' if lens else 'left in: undistort is off'}"
             )
-        scale = self.depth_scale or found.units_per_metre or UNITS_PER_METRE
         trajectory, truth_file = self._truth(path, listing.stamps_s, notes)
         poses = self._poses(trajectory, listing, notes)
         ids = frame_ids(listing.stamps_s)
@@ -144,6 +145,7 @@ class TumReader:
             ),
             trajectory=trajectory,
             notes=tuple(notes),
+            doubts=doubts,
             files=(*listing.files, *camera_file, *truth_file, *listing.depth, *filter(None, listing.colour)),
         )
 
@@ -160,18 +162,20 @@ class TumReader:
             name = f"fr{match[1] or match[2]}"
             notes.append(f"intrinsics of {name} taken: by the folder's name")
             return CAMERAS[name], ()
+        days = {str(day) for day in np.asarray(listing.stamps_s, "datetime64[s]").astype("datetime64[D]")}
+        dated = next((name for name, recorded in RECORDED_ON.items() if recorded & days), None)
+        if dated:
+            notes.append(f"intrinsics of {dated} taken: by the day of the stamps, {', '.join(sorted(days))}")
+            return CAMERAS[dated], ()
         tried = self._tried(listing)
         own = "give those of your camera with camera=[fx,fy,cx,cy]"
         if tried:
-            days = {str(day) for day in np.asarray(listing.stamps_s, "datetime64[s]").astype("datetime64[D]")}
-            dated = next((name for name in tried if RECORDED_ON[name] & days), None)
-            name = dated or next(iter(tried))
-            others = "" if dated else " or ".join(f"camera={other}" for other in tried if other != name)
-            doubt = f"; images tell little between these and the stamps' date nothing: set {others} if it was that"
+            name, *others = tried
+            doubt = f"; set {' or '.join(f'camera={other}' for other in others)} if it was that" if others else ""
             gains = ", ".join(f"{name} by {100 * gain:.0f} %" for name, gain in tried.items())
             notes.append(
                 f"intrinsics of {name} taken, tried on the images: errors are smaller than with 525 525 319.5 239.5 "
-                f"({gains}){doubt if others else ''}: {own}"
+                f"({gains}){doubt}: {own}"
             )
             return CAMERAS[name], ()
         notes.append(
@@ -186,6 +190,11 @@ class TumReader:
             return {}
         scale = self.depth_scale or UNITS_PER_METRE
         return fitting(CAMERAS, "default", listing.depth, listing.colour, listing.stamps_s, scale)
+
+    def _doubts(self, taken: Intrinsics, listing: StampedImages, scale: float) -> tuple[str, ...]:
+        if taken is not CAMERAS["default"] or self.camera == "default":
+            return ()
+        return assumed_camera_doubts(taken, listing.depth, listing.colour, listing.stamps_s, scale)
 
     def _from_file(self, file: Path, notes: list[str]) -> tuple[Intrinsics, tuple[Path, ...]]:
         found = read_intrinsics(file)

@@ -103,9 +103,11 @@ FIRST, FINEST = np.log(4.0), np.log(2.0) / 3
 MOST_RATIO = np.log(2.0)
 """Between the scales of rotation and of translation, where information is stated."""
 UNITS, TRIED = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8]), 3
-"""Logarithms of scales at which the search begins too where the information is the identity that stands for unknown,
-and how many of them, the likeliest: rotation and translation have each a unit of their own then.
+"""Logarithms of scales at which the search begins too, and how many of them, the likeliest. Where the information is
+the identity that stands for unknown, rotation and translation have each a unit of their own then.
 """
+FARTHEST = 3 * np.log(4.0)
+"""Where information is stated, the search begins at such units alone: one that is nearer explains mistaken places."""
 BY_CHANCE = float(np.log(100.0))
 """Nats by which loops must be likelier there."""
 LEAST_SHARE = 1e-3
@@ -159,17 +161,19 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
 
     def value(logs: Floats, unit: float) -> float:
         ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
-        if not unit and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
+        if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
             return -np.inf
         prior = -0.5 * float((logs - unit) @ (logs - unit)) / FOLD**2
         return float(own.value(logs)[0] - share * max(decoys.value(logs)[0], 0.0) + prior)
 
     found = _likeliest(value, 0.0)
-    if not chain.stated:
-        values = np.array([value(np.full(4, unit), unit) for unit in UNITS])
-        others = [_likeliest(value, unit) for unit in UNITS[np.argsort(-values, kind="stable")[:TRIED]].tolist()]
-        other = max(others, key=lambda each: each[1])
-        found = other if other[1] > found[1] + BY_CHANCE else found
+    units = UNITS[np.abs(UNITS) >= FARTHEST] if chain.stated else UNITS
+    values = np.array([value(np.full(4, unit), unit) for unit in units])
+    tried = np.argsort(-values, kind="stable")[:TRIED]
+    tried = tried[values[tried] > found[1]] if chain.stated else tried
+    others = [_likeliest(value, unit) for unit in units[tried].tolist()]
+    other = max(others, key=lambda each: each[1], default=found)
+    found = other if other[1] > found[1] + BY_CHANCE else found
     return Scales(*map(float, np.exp(found[0]))), own.value(found[0])[1]
 
 

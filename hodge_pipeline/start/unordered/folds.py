@@ -16,8 +16,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.evaluation.scores import some_of
-from hodge_pipeline.start.unordered.hypotheses import ViewOf, violations
-from hodge_pipeline.start.unordered.options import HypothesisLimits
+from hodge_pipeline.start.unordered.hypotheses import MOST_VIOLATION, ViewOf, violations
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, ViewGraph
 
 MOST_PAIRS = 5000
@@ -59,9 +58,10 @@ class Contradictions:
 
 
 def contradictions(
-    clouds: CloudSet, pieces: Pieces, held: Ints, view_of: ViewOf, limits: HypothesisLimits
+    clouds: CloudSet, pieces: Pieces, held: Ints, view_of: ViewOf, room_m: float = 1.0
 ) -> Contradictions:
-    """What free space says of frames that the poses bring together, whether an edge joins them or not.
+    """What free space says of frames that the poses bring together, whether an edge joins them or not; `room_m` is what
+    a metre of a room is in this scene.
 
     Frames of one part `held (N,)` by odometry are left out: what contradicts there has drifted, and looks like nothing.
     """
@@ -72,8 +72,8 @@ def contradictions(
     chosen = (pieces.piece[first] == pieces.piece[second]) & (held[first] != held[second])
     pairs = some_of(every[chosen], MOST_PAIRS)
     motions = se3.inverse(pieces.poses[pairs[:, 0]]) @ pieces.poses[pairs[:, 1]]
-    seen_through = violations(clouds, pairs, motions, view_of)
-    certain = seen_through > CERTAIN * limits.max_violation  # false for NaN
+    seen_through = violations(clouds, pairs, motions, view_of, room_m)
+    certain = seen_through > CERTAIN * MOST_VIOLATION  # false for NaN
     return Contradictions(pairs[certain], int(np.isfinite(seen_through).sum()))
 
 
@@ -82,12 +82,12 @@ def unfolded(
     pieces: Pieces,
     given: int,
     view_of: ViewOf,
-    limits: HypothesisLimits,
     options: DiagnosisOptions,
+    room_m: float = 1.0,
 ) -> Pieces:
     """The pieces, cut where they hold frames that contradict each other; the first `given` edges are cut last."""
     held = connected_components(pieces.graph.edges[:given], len(pieces.piece))
-    found = contradictions(clouds, pieces, held, view_of, limits)
+    found = contradictions(clouds, pieces, held, view_of, room_m)
     if not found.folded:
         return pieces
     first, before = found, len(pieces.graph.edges)
@@ -101,7 +101,7 @@ def unfolded(
         judged = diagnose(graph, options)
         strength = strength[judged.kept]
         pieces = Pieces.kept(graph, judged)
-        found = contradictions(clouds, pieces, held, view_of, limits)
+        found = contradictions(clouds, pieces, held, view_of, room_m)
         if not found.folded:
             break
         forbidden = np.unique(np.concatenate([forbidden, found.pairs]), axis=0)

@@ -33,8 +33,12 @@ RIVAL_OVERLAP, RIVAL_VIOLATION = 0.8, 2.0
 since rings of a scanner fit each other; in furnished ones it is seen through by 4 to 20 times as much.
 """
 AMBIGUOUS, NO_LEAD = "it fits in several ways", "another motion explains as many matches"
-USUAL_VIOLATIONS = 8.0
-USUAL_HUE_CONFLICTS = 12.0
+USUAL_VIOLATIONS, LEAST_VIOLATION, MOST_VIOLATION = 8.0, 0.03, 0.15
+"""Times the median of a run's pairs, within these: the share of the points in view that the other depth image saw
+through, above which a pair is refused. Places that look alike differ in what surrounds them.
+"""
+USUAL_HUE_CONFLICTS, LEAST_HUE_CONFLICT = 12.0, 0.02
+"""Times the best quarter of a run's pairs, this at least: the share of common points whose hue may differ."""
 ViewOf = Callable[[int], DepthView | None]
 
 
@@ -100,8 +104,8 @@ class _Evidence:
     def reasons(self, best: Ints, limits: HypothesisLimits) -> NDArray[np.str_]:
         """Why each motion is refused, an empty word where it is not; the rows `best` say what is usual in this run."""
         out = np.full(len(self.hue), "", "U64")
-        out[self.hue > allowed_hue_conflict(self.hue[best], limits)] = "their colours differ"
-        violated = self.seen_through > allowed_violation(self.seen_through[best], limits)
+        out[self.hue > allowed_hue_conflict(self.hue[best])] = "their colours differ"
+        violated = self.seen_through > allowed_violation(self.seen_through[best])
         out[violated] = "one camera saw through the other's surface"
         out[self.slides] = "what they share lets them slide"
         out[~(self.rmse_m <= limits.max_rmse_m)] = "points too far apart"
@@ -148,23 +152,23 @@ def _ambiguous(
     mine = best[pair]
     fits = edges.overlap >= RIVAL_OVERLAP * edges.overlap[mine]
     told = np.isfinite(seen_through) & np.isfinite(seen_through[mine])
-    as_free = seen_through <= np.maximum(RIVAL_VIOLATION * seen_through[mine], limits.violation_floor)
+    as_free = seen_through <= np.maximum(RIVAL_VIOLATION * seen_through[mine], LEAST_VIOLATION)
     fits &= np.where(told, as_free, ~_leads(inliers[mine], inliers))
     return np.isin(pair[best], pair[edges.counts & edges.counts[mine] & _differs(edges, mine, limits) & fits])
 
 
-def allowed_violation(seen_through: Floats, limits: HypothesisLimits) -> float:
+def allowed_violation(seen_through: Floats) -> float:
     """The violation up to which a pair may be right, from those (P,) of a run, most of which are right."""
     known = seen_through[np.isfinite(seen_through)]
     usual = float(np.median(known)) if len(known) else 0.0
-    return float(np.clip(USUAL_VIOLATIONS * usual, limits.violation_floor, limits.max_violation))
+    return float(np.clip(USUAL_VIOLATIONS * usual, LEAST_VIOLATION, MOST_VIOLATION))
 
 
-def allowed_hue_conflict(conflicts: Floats, limits: HypothesisLimits) -> float:
+def allowed_hue_conflict(conflicts: Floats) -> float:
     """The hue conflict up to which a pair may be right, from those (P,) of a run, a quarter of which are right."""
     known = conflicts[np.isfinite(conflicts)]
     good = float(np.quantile(known, 0.25)) if len(known) else 0.0
-    return max(USUAL_HUE_CONFLICTS * good, limits.hue_floor)
+    return max(USUAL_HUE_CONFLICTS * good, LEAST_HUE_CONFLICT)
 
 
 def violations(clouds: CloudSet, pairs: Ints, i_from_j: Floats, view_of: ViewOf, scale: float = 1.0) -> Floats:

@@ -27,26 +27,6 @@ class HypothesisLimits:
     room_m: float = Field(
         default=1.0, gt=0, description="metres: a metre of a room in this scene, for the margins of depth images"
     )
-    max_violation: float = Field(
-        default=0.15,
-        ge=0,
-        le=1,
-        description="share of points in view that the other depth image saw through, at most, however noisy the camera",
-    )
-    violation_floor: float = Field(
-        default=0.03,
-        ge=0,
-        le=1,
-        description="what every camera may: below it no pair is refused. Between the two, 8 times the median of the "
-        "run's pairs is allowed: places that look alike differ in what surrounds them",
-    )
-    hue_floor: float = Field(
-        default=0.02,
-        ge=0,
-        le=1,
-        description="share of common points whose hue may differ, in coloured clouds; where the best quarter of the "
-        "run's pairs reaches a twelfth of it, as where colours lie badly on depth, 12 times that",
-    )
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))

@@ -75,7 +75,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     notes += [f"{int((~found.kept).sum())} of {graph.edge_count} edges are distrusted"]
     given = int(found.kept[: graph.edge_count - measured.edge_count].sum())
     pieces = Pieces.kept(graph, found)
-    pieces = unfolded(clouds, pieces, given, views, options.limits, options.diagnosis)
+    pieces = unfolded(clouds, pieces, given, views, options.diagnosis, options.limits.room_m)
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
     poses = laid_apart(pieces.piece, pieces.poses, clouds)

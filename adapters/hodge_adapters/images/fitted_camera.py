@@ -1,4 +1,4 @@
-"""Which of several known cameras took a sequence: that under which its frames agree best on how the camera moved."""
+"""Which of several cameras took a sequence: that under which its frames agree best on how the camera moved."""
 
 from __future__ import annotations
 
@@ -19,10 +19,16 @@ PAIRS, SPAN_S, HOPS = 24, 0.35, 3
 CORNERS, CORNER_QUALITY, CORNERS_APART_PX, BACKWARD_PX = 400, 0.005, 8.0, 0.7
 FEWEST_CORNERS, FEWEST_PAIRS = 60, 6
 RANGE_M, EDGE_STEP = (0.3, 5.0), 0.03
-LARGEST_PX, FOCAL_PX = 3.0, 525.0
-"""An error counts as this at most; errors of all cameras are measured in pixels of one focal length."""
+LARGEST_PX = 3.0
+"""An error counts as this at most."""
 SURE = 2.5
 """Standard errors of the mean over the pairs by which a camera must fit better."""
+FOCALS = tuple(0.4 * 1.12**k for k in range(13))
+"""Focal lengths over the width of the image, from 103 to 35 degrees across."""
+UNSTAMPED_STEP_S = 0.1
+"""Images without stamps are taken for every third of a video: of a slower one, pairs are far apart and not followed."""
+OTHER_FOCAL = 0.1
+"""Relative: of four cameras of known focal length images tell it to 4 %, in whatever unit depth is."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +50,7 @@ def fitting(
     units_per_metre: float,
 ) -> dict[str, float]:
     """By how much (0.05: 5 %) each camera that surely fits better than the `standard` one does, the best first."""
-    found = [
-        [_misfit(camera, pair) for camera in cameras.values()]
-        for pair in _pairs(depth, colour, stamps_s, units_per_metre)
-    ]
-    errors = np.array(found).reshape(-1, len(cameras))
-    errors = np.log(errors[np.isfinite(errors).all(axis=1)])
+    errors = _errors(list(cameras.values()), depth, colour, stamps_s, units_per_metre)
     if len(errors) < FEWEST_PAIRS:
         return {}
     names = list(cameras)
@@ -57,6 +58,71 @@ def fitting(
     better = [k for k in range(len(names)) if _surely_positive(gain[:, k])]
     better.sort(key=lambda k: -float(gain[:, k].mean()))
     return {names[k]: float(-np.expm1(-gain[:, k].mean())) for k in better}
+
+
+def assumed_camera_doubts(
+    taken: Intrinsics, depth: Sequence[Path], colour: Sequence[Path | None], stamps_s: Floats, units_per_metre: float
+) -> tuple[str, ...]:
+    """A doubt where frames agree better under another focal length than under that of a camera only assumed.
+
+    Raises `SourceError`, with the focal length that images tell, where they have another shape than that camera's.
+    """
+    size = pixels.common_size(depth)
+    told = focal_px(size, depth, colour, stamps_s, units_per_metre)
+    centre = size[0] / 2 - 0.5, size[1] / 2 - 0.5
+    camera = f"[{told:.0f},{told:.0f},{centre[0]:g},{centre[1]:g}]" if told else "[fx,fy,cx,cy]"
+    remedy = f"give those of your camera with --set source.reader.camera={camera}"
+    fits = f"; a focal length of about {told:.0f} pixels fits the images best" if told else ""
+    width, height = taken.size or size
+    if not pixels.same_shape((width, height), size):
+        raise SourceError(
+            f"{depth[0].parent}: images of {size[0]}x{size[1]}, but intrinsics of {width}x{height}{fits}: {remedy}"
+        )
+    mine = taken.fx * size[0] / width
+    if told is None or abs(told / mine - 1) < OTHER_FOCAL:
+        return ()
+    return (f"a camera of focal length {mine:g} is assumed{fits}: {remedy}",)
+
+
+def focal_px(
+    size: tuple[int, int],
+    depth: Sequence[Path],
+    colour: Sequence[Path | None],
+    stamps_s: Floats,
+    units_per_metre: float,
+) -> float | None:
+    """The focal length, in pixels of images of this (width, height), under which frames agree best on how the camera
+    moved; None where they do not tell, as of a camera at rest.
+    """
+    width, height = size
+    centre = width / 2 - 0.5, height / 2 - 0.5
+    cameras = [Intrinsics(f * width, f * width, *centre, size) for f in FOCALS]
+    errors = _errors(cameras, depth, colour, stamps_s, units_per_metre)
+    best = int(errors.mean(axis=0).argmin()) if len(errors) >= FEWEST_PAIRS else 0
+    sides = [best - 2, best + 2]
+    if (
+        sides[0] < 0
+        or sides[1] >= len(FOCALS)
+        or not all(_surely_positive(errors[:, k] - errors[:, best]) for k in sides)
+    ):
+        return None
+    below, least, above = errors[:, best - 1 : best + 2].mean(axis=0)
+    shift = 0.5 * (below - above) / (below - 2 * least + above)
+    return float(width * FOCALS[best] * (FOCALS[1] / FOCALS[0]) ** shift)
+
+
+def _errors(
+    cameras: Sequence[Intrinsics],
+    depth: Sequence[Path],
+    colour: Sequence[Path | None],
+    stamps_s: Floats,
+    units_per_metre: float,
+) -> Floats:
+    """Logarithms of the misfit (pairs, cameras), of the pairs that every camera has one of."""
+    pairs = _pairs(depth, colour, stamps_s, units_per_metre)
+    errors = np.array([[_misfit(camera, pair) for camera in cameras] for pair in pairs]).reshape(-1, len(cameras))
+    found: Floats = np.log(errors[np.isfinite(errors).all(axis=1)])
+    return found
 
 
 def _surely_positive(values: Floats) -> bool:
@@ -128,18 +194,22 @@ def _misfit(camera: Intrinsics, pair: Followed) -> float:
         np.asarray(cv2.undistortPoints(pixels[:, None].astype(float), matrix, lens), float).reshape(-1, 2)
         for pixels in (pair.first, pair.second)
     )
-    errors = [_motion_error(first, pair.first_m, second), _motion_error(second, pair.second_m, first)]
+    focal_px = float(np.sqrt(camera.fx * abs(camera.fy)))
+    errors = [
+        _motion_error(first, pair.first_m, second, focal_px),
+        _motion_error(second, pair.second_m, first, focal_px),
+    ]
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def _motion_error(slopes: Floats, depth_m: Floats, seen: Floats) -> float:
+def _motion_error(slopes: Floats, depth_m: Floats, seen: Floats, focal_px: float) -> float:
     known = np.isfinite(depth_m)
     if known.sum() < FEWEST_CORNERS // 2:
         return float("nan")
     points = np.column_stack([slopes[known], np.ones(known.sum())]) * depth_m[known, None]
     seen, eye = seen[known], np.eye(3)
     found, turn, shift, inliers = cv2.solvePnPRansac(
-        points, seen, eye, None, iterationsCount=300, reprojectionError=LARGEST_PX / FOCAL_PX, flags=cv2.SOLVEPNP_EPNP
+        points, seen, eye, None, iterationsCount=300, reprojectionError=LARGEST_PX / focal_px, flags=cv2.SOLVEPNP_EPNP
     )
     if not found or inliers is None:
         return float("nan")
@@ -150,6 +220,6 @@ def _motion_error(slopes: Floats, depth_m: Floats, seen: Floats) -> float:
             return float("nan")
         turn, shift = cv2.solvePnPRefineLM(points[rows], seen[rows], eye, None, turn, shift)
         projected = cv2.projectPoints(points, turn, shift, eye, None)[0].reshape(-1, 2)
-        errors = FOCAL_PX * np.linalg.norm(projected - seen, axis=1)
+        errors = focal_px * np.linalg.norm(projected - seen, axis=1)
         rows = np.flatnonzero(errors < LARGEST_PX)
     return float(np.sqrt(np.mean(np.minimum(errors, LARGEST_PX) ** 2)))

@@ -1,0 +1,98 @@
+"""Whether depth is in metres: by its range, and by the steps in which structured light and stereo store it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Floats, Floats32, Frame
+from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.notes import Note
+
+SAMPLED_FRAMES = 8
+PLAUSIBLE_DEPTH_M = (0.1, 30.0)
+"""The median depth of a scene; outside, the scale is probably wrong."""
+NEAR_M, FAR_M = 1.3, 10.0
+"""Where the depth of a room, in millimetres but read as TUM's 5000 to the metre, ends: 6.5 m. As far as depth cameras
+for rooms are specified to see: RealSense D435; Kinect and Xtion 4 to 8."""
+PRIMESENSE_STEP = 2.89e-3
+"""Of 1/z, in 1/m: an eighth of a pixel over 580 px times 7.5 cm. Seven Kinect sequences show 2.88 to 2.92e-3, two
+recordings of a RealSense 1.63 and 1.01e-3."""
+WRONG_UNITS, SAME, ALIKE = (0.2, 5.0, 8.0, 10.0), 0.03, 1.45
+"""Depth too large by so much: millimetres read as TUM's, the reverse, OpenNI's shifted by three bits, tenths of a
+millimetre; sensors of one kind differ less than `SAME`. A step `ALIKE` times PrimeSense's may be another sensor's."""
+SEEN_M = 4.0
+"""A median depth above it is more than a Kinect sees well: finer steps are then more likely those of a wrong unit."""
+FEWEST_PIXELS, FEWEST_VALUES, ROUNDINGS = 5, 20, 5
+"""Pixels of a value that count; steps to judge by, each so many roundings of the stored number long."""
+WHOLE, MOSTLY = 0.15, 0.9
+"""So far from a whole multiple of the base step may a step lie, and so many must not lie farther."""
+
+
+def depth_doubts(frames: Sequence[Frame]) -> tuple[Note, ...]:
+    """What speaks against depth being in metres, by a few depth images, evenly over the sequence.
+
+    An image that cannot be read is left to whoever reads it next.
+    """
+    readers = [frame.read_depth for frame in frames if frame.read_depth is not None]
+    values: list[Floats32] = []
+    for row in evenly(len(readers), SAMPLED_FRAMES):
+        try:
+            values.append(readers[row]().ravel())
+        except (SourceError, OSError):
+            continue
+    return doubts_of(np.concatenate(values)) if values else ()
+
+
+def doubts_of(depth_m: NDArray[np.floating[Any]]) -> tuple[Note, ...]:
+    """The same by depths of many pixels, 0 where there is none."""
+    valid = depth_m[depth_m > 0]
+    if not len(valid):
+        return ()
+    median, far, most = (float(value) for value in np.quantile(valid, (0.5, 0.75, 0.99)))
+    step = inverse_step(valid)
+    by_steps = None if step is None else _by_steps(step, median)
+    if by_steps is not None:
+        return (by_steps,)
+    if not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
+        return (Note("depth range", detail=f"the median depth is {median:.3g} m"),)
+    if most < NEAR_M:
+        return (Note("depth range", detail=f"all depth lies within {most:.2g} m, as in a close-up"),)
+    if far > FAR_M:
+        return (Note("depth range", detail=f"a quarter of depth lies beyond {far:.3g} m, as out of doors"),)
+    return ()
+
+
+def inverse_step(depth_m: NDArray[np.floating[Any]]) -> float | None:
+    """The step of 1/z, in 1/m, of which depths are whole multiples, as structured light and stereo measure them; None
+    where they are not: time of flight, phones, renderings.
+    """
+    values, counts = np.unique(depth_m, return_counts=True)
+    z: Floats = values[counts >= FEWEST_PIXELS].astype(float)
+    gaps = np.diff(z)
+    if len(gaps) < FEWEST_VALUES:
+        return None
+    # Near the camera steps are shorter than the unit of the file, and rounded to it.
+    coarse = gaps >= 0.999 * ROUNDINGS * gaps.min()
+    steps = (1 / z[:-1] - 1 / z[1:])[coarse]
+    if len(steps) < FEWEST_VALUES:
+        return None
+    base = float(np.median(steps[steps <= 1.5 * np.quantile(steps, 0.2)]))
+    multiples = steps / base
+    return base if (np.abs(multiples - np.round(multiples)) < WHOLE).mean() > MOSTLY else None
+
+
+def _by_steps(step: float, median_m: float) -> Note | None:
+    """A note where depth would have PrimeSense's steps in another unit; other sensors have finer ones."""
+    too_large = PRIMESENSE_STEP / step
+    detail = (
+        f"its steps, {1000 * step:.2g} mm at 1 m, are {1 / too_large:.3g} times those of PrimeSense's, which "
+        f"source.reader.depth_scale {too_large:.3g} times as large would give"
+    )
+    if any(abs(too_large / unit - 1) < SAME for unit in WRONG_UNITS) and (too_large < 1 or median_m > SEEN_M):
+        return Note("depth unit", detail=detail)
+    return Note("depth steps", detail=detail) if SAME < abs(np.log(too_large)) < np.log(ALIKE) else None

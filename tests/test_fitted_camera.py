@@ -1,0 +1,84 @@
+"""The focal length that images tell, and what is said of a camera that is only assumed."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hodge_adapters.icl_nuim.reader import IclNuimReader
+from hodge_adapters.images import fitted_camera
+from hodge_adapters.images.camera_files import Intrinsics
+from hodge_adapters.tum import reader
+from hodge_adapters.tum.reader import CAMERAS, TumReader
+from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.sources.inspect import inspect
+from readers_data import linked
+
+FOCAL_PX = 525.0
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A film of 640x480 and 525 pixels of focal length, in Redwood's layout."""
+    folder = tmp_path_factory.mktemp("fitted")
+    film = make_sequence(folder / "film", DemoOptions(frames=30, width=640, height=480, stride=2, turns=0.2))
+    for kind in ("depth", "rgb"):
+        (folder / "room" / kind).mkdir(parents=True)
+        for number, file in enumerate(sorted((film / kind).iterdir())):
+            shutil.copy(file, folder / "room" / kind / f"{number}{file.suffix}")
+    return folder / "room"
+
+
+def test_the_focal_length_is_told_whatever_the_unit_of_depth(office: Path) -> None:
+    source = IclNuimReader(camera=(1.0, 1.0, 1.0, 1.0)).open(office)
+    depth, colour = source.files[:30], source.files[30:]
+    stamps_s = np.arange(30) / 10
+    for units in (5000.0, 6000.0):
+        told = fitted_camera.focal_px((640, 480), depth, colour, stamps_s, units)
+        assert told == pytest.approx(FOCAL_PX, rel=0.05)
+    assert fitted_camera.focal_px((640, 480), depth[:1] * 30, colour[:1] * 30, stamps_s, 5000.0) is None  # at rest
+
+
+def test_an_assumed_camera_that_images_contradict_is_told(office: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = IclNuimReader(depth_scale=5000.0)
+    source = options.open(office)
+    assert source.doubts == () and any("Redwood's intrinsics taken" in note for note in source.notes)
+    monkeypatch.setattr("hodge_adapters.icl_nuim.reader.REDWOOD", Intrinsics(400.0, 400.0, 319.5, 239.5, (640, 480)))
+    (doubt,) = options.open(office).doubts
+    assert "focal length 400 is assumed" in doubt and ",319.5,239.5]" in doubt
+    assert doubt in inspect(office, options)["oddities"]
+    assert IclNuimReader(depth_scale=5000.0, camera=(400.0, 400.0, 319.5, 239.5)).open(office).doubts == ()
+
+
+def test_images_of_another_shape_are_refused_with_what_they_tell(office: Path, tmp_path: Path) -> None:
+    for kind in ("depth", "rgb"):
+        (tmp_path / kind).mkdir()
+        for file in (office / kind).iterdir():
+            image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(tmp_path / kind / f"{file.stem}.png"), image[60:420])
+    with pytest.raises(
+        SourceError, match=r"images of 640x360, .* a focal length of about 5\d\d pixels .*319.5,179.5\]"
+    ):
+        IclNuimReader(depth_scale=5000.0).open(tmp_path)
+
+
+def test_errors_count_in_each_camera_s_own_pixels(office: Path) -> None:
+    """A longer focal length makes every error a smaller slope: it does not fit better for that."""
+    source = IclNuimReader(camera=(1.0, 1.0, 1.0, 1.0)).open(office)
+    longer = {name: Intrinsics(f, f, 319.5, 239.5, (640, 480)) for name, f in (("own", 525.0), ("longer", 640.0))}
+    found = fitted_camera.fitting(longer, "own", source.files[:30], source.files[30:], np.arange(30) / 10, 5000.0)
+    assert found == {}
+
+
+def test_the_day_of_the_stamps_counts_more_than_the_images(
+    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "fitting", lambda *_: {"fr2": 0.02, "fr3": 0.02})
+    source = TumReader().open(linked(data_dir / "tum/fr1_rpy_part", tmp_path))
+    assert source.frames[0].camera.fx == CAMERAS["fr1"].fx
+    assert "intrinsics of fr1 taken: by the day of the stamps, 2011-05-10" in source.notes
