@@ -138,6 +138,10 @@ class Scales:
             covariance=chain.covariance * np.outer(loop, loop),
         )
 
+    def surprise(self) -> float:
+        """How improbable it is beforehand that steps err by so much more than stated, in nats."""
+        return float(0.5 * (np.log(np.maximum([self.step_turn, self.step_shift], 1.0)) ** 2).sum() / FOLD**2)
+
     def units(self, chain: Chain) -> tuple[Floats, Floats]:
         """The factor on each free axis (p,), of steps and of loops."""
         split, size = turns(chain), len(chain.axes)

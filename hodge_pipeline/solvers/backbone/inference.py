@@ -123,7 +123,8 @@ def _inferred(
         seen = np.packbits(used).tobytes()
     judged, linear = best
     agreed = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
-    used, confirmed = _of_right_places(start, linear, judged, agreed, wrong)
+    enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0)
+    used, confirmed = _of_right_places(start, linear, judged, agreed, wrong, enough)
     used |= always
     rows = thinned(chain, np.flatnonzero(used)).active
     if (agreed & ~used).any():
@@ -177,8 +178,11 @@ def _limit(judged: Judged) -> float:
     return float(np.log(max((1 / (1 + np.exp(np.clip(judged.log_odds, -500, 500)))).sum(), 1)))
 
 
-def _of_right_places(start: Linear, linear: Linear, judged: Judged, used: Bools, wrong: Wrong) -> tuple[Bools, bool]:
-    """The used loops (M,) of places that are not mistaken for others, and whether they say more than chance finds.
+def _of_right_places(
+    start: Linear, linear: Linear, judged: Judged, used: Bools, wrong: Wrong, enough: float
+) -> tuple[Bools, bool]:
+    """The used loops (M,) of places that are not mistaken for others, and whether they say more than chance finds:
+    log-odds that are `enough`.
 
     Loops of one place agree also where it is mistaken: of each, one is judged at the poses that those of the other
     right places lead to, beginning with the place that says most by itself.
@@ -189,32 +193,44 @@ def _of_right_places(start: Linear, linear: Linear, judged: Judged, used: Bools,
     first = one_of_each_place(ends[rows])
     chosen, size = rows[first], loops_at_place(ends[rows])[first]
     away = ends[cKDTree(ends[chosen]).query(ends, p=np.inf)[0] > 1.0]
-    sizes = np.sort(loops_at_place(away)[one_of_each_place(away)])
-    rivals = np.log(len(sizes) - np.searchsorted(sizes, size) + MISTAKEN_PLACES)
-    alone = _judge(start, None, EVEN, wrong).factor[chosen] - rivals
-    strongest = np.arange(len(chosen)) == np.argmax(alone)
+    unused = loops_at_place(away)[one_of_each_place(away)]
+
+    def rivals(right: Bools) -> Floats:
+        sizes = np.sort(np.concatenate([unused, size[~right]]))
+        return np.asarray(np.log(len(sizes) - np.searchsorted(sizes, size) + MISTAKEN_PLACES))
+
+    alone = _judge(start, None, EVEN, wrong).factor[chosen]
     right = np.ones(len(chosen), bool)
+    strongest = np.arange(len(chosen)) == np.argmax(alone - rivals(right))
     for number in range(ROUNDS):
         fit = settled(Fit(thinned(chain, chosen[right]), start), MOST_STEPS)
-        factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals
-        if not number and factor.sum() > MISTAKEN:
+        factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals(right)
+        if not number and together(factor) > enough:
             return used, True
-        said, before = float(np.maximum(factor, 0.0).sum()), right
-        right = factor > 0 if number else strongest
-        if said <= alone.max():
+        before, right = right, factor > enough if number else strongest
+        by_itself = float((alone - rivals(strongest))[strongest][0])
+        said = max(together(factor[factor > enough]), by_itself)
+        if said == by_itself:
             right = right | strongest
         if (before == right).all():
             break
     nearest = cKDTree(ends[chosen]).query(ends, p=np.inf)[1]
-    return used & right[nearest], max(said, float(alone.max())) > MISTAKEN
+    return used & right[nearest], said > enough
+
+
+def together(log_odds: Floats) -> float:
+    """The log-odds that all places are right: of what is expected beforehand, that of one counts."""
+    return float(log_odds.sum()) + max(len(log_odds) - 1, 0) * float(np.log(MISTAKEN_PLACES))
 
 
 MISTAKEN_PLACES = 0.2
-"""To each right one, of places that loops agree on: beside those of at least as many loops that are not used. With
-none, a path that closes once is closed where its loops say little more than that the drift is as stated.
+"""To each right one, of places that loops agree on, beside those of at least as many loops that are not used. With more
+a path that closes once would stay open: its loops can say little more than that the drift is as stated.
 """
 MISTAKEN = float(np.log(20.0))
-"""The log-odds of right places against mistaken ones that are enough."""
+"""The log-odds of right places against mistaken ones that are enough, where steps err as stated; where it takes larger
+errors for places to be right, mistaken ones may have said so: see `Scales.surprise`.
+"""
 
 
 def by_chance(count: int) -> float:
