@@ -101,7 +101,7 @@ def test_depth_and_colour_of_different_moments_are_no_object_before_a_camera_tha
     poses = [frame.true_world_from_cam for frame in swept.frames]
 
     def shares(source: Source) -> tuple[float, float]:
-        """Contradicting the true motion: by itself, and with the twists; colour is a place, a 60th of a second, late."""
+        """Against the true motion, by itself and with the twists; colour is a place, a 60th of a second, late."""
         frames = [replace(source.frames[row], read_colour=source.frames[row + 1].read_colour) for row in (2, 6)]
         key, view = (flow_image(frame, RANGE_M) for frame in frames)
         assert key is not None and view is not None
