@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.clouds.kitti import KITTI_RAISE_DEG, are_of_hdl64, is_scan, raised, read_bin, scan_poses
+from hodge_adapters.clouds.kitti import KITTI_RAISE_DEG, are_of_hdl64, ascends, is_scan, raised, read_bin, scan_poses
 from hodge_adapters.clouds.pcd import read_pcd
 from hodge_adapters.clouds.ply import read_ply, write_ply
 from hodge_adapters.clouds.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
@@ -121,7 +121,12 @@ class CloudFolderReader:
         others = sorted(file.name for file in listing if file.suffix.lower() in OTHER_SCANS)
         if others:
             notes.append(f"{len(others)} files are scans of another format, left out: {listed(others)}: convert to PLY")
-        return sorted(found, key=lambda file: natural(file.name))
+        found.sort(key=lambda file: natural(file.name))
+        times = [file for file in found if file.suffix.lower() == ".bin" and ascends(file)]
+        if times and len(times) < len(found):
+            names = listed([file.name for file in times])
+            notes.append(f"{len(times)} .bin files hold numbers that ascend, such as times, no points: left out: {names}")
+        return [file for file in found if file not in times] or found
 
     def _raise_deg(self, files: list[Path], notes: list[str]) -> float:
         """By how much the points of `.bin` scans are raised; told where the scans themselves decide it."""
