@@ -293,8 +293,9 @@ def test_files_of_times_beside_scans_are_left_out_and_told(tmp_path: Path) -> No
     own = SpinningScanner(Road(10.0), 0, beams=16, columns=60, noise=1.0)
     for number in range(2):
         sweep = own.sweep(number)
-        sweep.points[: 3 * (len(sweep.points) // 3)].tofile(tmp_path / f"raw_{number:02d}.bin")
-        np.sort(sweep.times_s)[: 3 * (len(sweep.points) // 3)].astype("<f4").tofile(tmp_path / f"times_{number:02d}.bin")
+        whole = 3 * (len(sweep.points) // 3)  # so that the times could be rows of three columns
+        sweep.points[:whole].tofile(tmp_path / f"raw_{number:02d}.bin")
+        np.sort(sweep.times_s)[:whole].astype("<f4").tofile(tmp_path / f"times_{number:02d}.bin")
     source = CloudFolderReader().open(tmp_path)
     assert [frame.frame_id for frame in source.frames] == ["raw_00.bin", "raw_01.bin"]
     assert "2 .bin files hold numbers that ascend, such as times, no points: left out: times_00.bin" in source.notes[0]

@@ -37,7 +37,7 @@ def is_scan(name: str) -> bool:
 
 
 def ascends(path: Path) -> bool:
-    """Whether the first numbers of a `.bin` file never fall, as the times of points do in files beside those of scans."""
+    """Whether the first numbers of a `.bin` file never fall: times of points, in a file beside that of the scan."""
     contents = beginning(path, 4 * NUMBERS_LOOKED_AT)
     values = np.frombuffer(contents, "<f4", count=len(contents) // 4)
     return bool(len(values)) and bool(values[-1] > values[0]) and bool((np.diff(values) >= 0).all())
