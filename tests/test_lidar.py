@@ -289,6 +289,18 @@ def test_two_scanners_in_a_folder_are_followed_apart(tmp_path: Path) -> None:
         assert absolute_error(done.poses[names == name], true).max_m < 0.5
 
 
+def test_files_of_times_beside_scans_are_left_out_and_told(tmp_path: Path) -> None:
+    own = SpinningScanner(Road(10.0), 0, beams=16, columns=60, noise=1.0)
+    for number in range(2):
+        sweep = own.sweep(number)
+        whole = 3 * (len(sweep.points) // 3)  # so that the times could be rows of three columns
+        sweep.points[:whole].tofile(tmp_path / f"raw_{number:02d}.bin")
+        np.sort(sweep.times_s)[:whole].astype("<f4").tofile(tmp_path / f"times_{number:02d}.bin")
+    source = CloudFolderReader().open(tmp_path)
+    assert [frame.frame_id for frame in source.frames] == ["raw_00.bin", "raw_01.bin"]
+    assert "2 .bin files hold numbers that ascend, such as times, no points: left out: times_00.bin" in source.notes[0]
+
+
 def sweeps_as(layout: str, folder: Path, count: int, speed_m_s: float = 10.0) -> Path:
     """Sweeps of the street as a folder in KITTI's layout, or as a recording."""
     log, own = Log(), SpinningScanner(Road(speed_m_s), 0, beams=16, columns=360, noise=1.0)
