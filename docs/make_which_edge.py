@@ -79,7 +79,7 @@ def main(folder: Path) -> None:
     source, loops, run = demo_source(DemoOptions()), folder / "loops.g2o", folder / "run"
     write_loops(loops, source)
     options = [f"measured.files=[{{path: {loops}}}]", "edges={stage: sequential, reach: 3}", "outer_iterations=1"]
-    options.append("solve_with=all")
+    options += ["solve_with=all", "solver.tails=gaussian", "start.revisits=null"]
     recipe = load_recipe("demo", [*options, "evaluation.tables=false"], source)
     if (run / "edges.csv").exists():
         write_history(run, History())
