@@ -114,26 +114,26 @@ class CloudFolderReader:
             listing = [file for file in path.glob(self.pattern) if not file.name.startswith(".")]
         except (OSError, ValueError, NotImplementedError) as error:
             raise SourceError(f"{path}: cannot be listed with pattern {self.pattern!r}: {error}") from error
-        found = [file for file in listing if _is_scan(file) and file.is_file()]
-        others = [file for file in listing if file.suffix.lower() in OTHER_SCANS]
+        scans = [file for file in listing if _is_scan(file) and file.is_file()]
+        times = {file for file in scans if file.suffix.lower() == ".bin" and ascends(file)}
+        found = [file for file in scans if file not in times]
+        others = {file for file in listing if file.suffix.lower() in OTHER_SCANS}
         if any(file.suffix.lower() == ".csv" for file in found):
-            others += [file for file in listing if file.suffix.lower() == ".csv" and file not in found]
-        unread = f"{len(others)} files are scans of another format, left out: " + listed(sorted(f.name for f in others))
-        if not found:
-            raise SourceError(
-                f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it"
-                + (f"; {unread}: convert to PLY" if others else ": give a folder of fragments")
+            others |= {file for file in listing if file.suffix.lower() == ".csv"} - set(found)
+        unread = []
+        if times:
+            told = _listed(times)
+            unread.append(
+                f"{len(times)} .bin files hold numbers that ascend, such as times, no points: left out: {told}"
             )
         if others:
-            notes.append(f"{unread}: convert to PLY")
-        found.sort(key=lambda file: natural(file.name))
-        times = [file for file in found if file.suffix.lower() == ".bin" and ascends(file)]
-        if times and len(times) < len(found):
-            names = listed([file.name for file in times])
-            notes.append(
-                f"{len(times)} .bin files hold numbers that ascend, such as times, no points: left out: {names}"
-            )
-        return [file for file in found if file not in times] or found
+            told = _listed(others)
+            unread.append(f"{len(others)} files are scans of another format, left out: {told}: convert to PLY")
+        if not found:
+            why = "; ".join(unread) or "give a folder of fragments"
+            raise SourceError(f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it: {why}")
+        notes += unread
+        return sorted(found, key=lambda file: natural(file.name))
 
     def _raise_deg(self, files: list[Path], notes: list[str]) -> float:
         """By how much the points of `.bin` scans are raised; told where the scans themselves decide it."""
@@ -257,6 +257,10 @@ def _is_scan(path: Path) -> bool:
     """By its ending; `.bin` by its name as well, `.csv` by its first line."""
     ending = path.suffix.lower()
     return ending in READERS and (ending != ".bin" or is_scan(path.name)) and (ending != ".csv" or names_points(path))
+
+
+def _listed(files: set[Path]) -> str:
+    return listed(sorted(file.name for file in files))
 
 
 def _require(path: Path) -> None:
