@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.diagnosis import diagnose, lattice_backbone
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
@@ -230,6 +230,18 @@ def test_corridors_that_are_mistaken_neither_break_the_backbone_nor_make_a_latti
 def test_many_loops_of_one_mistaken_place_do_not_outvote_few_of_several_places() -> None:
     made = drive(seed=8203, count=800, loops=80, wrong=0.9, in_groups=True, misstated=(10.0, 10.0))
     np.testing.assert_array_equal(diagnose(made.graph).kept, made.right)
+
+
+def test_groups_of_wrong_loops_do_not_outvote_the_backbone_of_a_lattice() -> None:
+    made = drive(world="room", loops=300, wrong=0.1, in_groups=True)
+    steps = np.abs(np.diff(made.graph.edges, axis=1)[:, 0]) == 1
+    found = diagnose(made.graph, DiagnosisOptions(trust="none"))
+    cut = np.flatnonzero(steps)[40:400:60]
+    kept = ~np.isin(np.arange(made.graph.edge_count), cut)  # more edges than are right, and six steps fewer
+    backbone = lattice_backbone(made.graph, replace(found, kept=kept), DiagnosisOptions())
+    assert backbone is not None
+    np.testing.assert_array_equal(backbone.used, made.right)
+    assert lattice_backbone(made.graph, replace(found, kept=made.right | ~steps), DiagnosisOptions()) is None
 
 
 def test_edges_written_the_other_way_round_change_nothing() -> None:
