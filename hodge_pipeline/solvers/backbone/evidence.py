@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import gammaln
@@ -151,20 +152,25 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     loops.
 
     Each loop counts by itself: that loops at one place err alike, and steps too, would else be taken for small errors.
-    Decoys, motions of loops between other places, tell what as many would explain by chance at each scale.
+    Decoys, motions of loops between other places, tell what as many would explain by chance at each scale: places at
+    random, and such as far apart along the path, since errors of steps that are large enough explain any short loop.
     """
     alone = _learned_from(chain.path, np.arange(len(chain.ends)), chain.ends)
-    rows, ends = (np.concatenate(each) for each in zip(alone, _learned_from(chain.path, *_decoys(chain)), strict=True))
+    all_of = [alone, *(_learned_from(chain.path, *each) for each in _decoys(chain))]
+    rows, ends = (np.concatenate(each) for each in zip(*all_of, strict=True))
     models = _Model.of(chain.with_loops(rows, ends), poses, wrong)
-    own, decoys = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
-    share = len(own.residual) / max(len(decoys.residual), 1)
+    bounds = np.cumsum([0] + [len(each) for each, _ in all_of]).tolist()
+    own, *decoys = (models.select(slice(*each)) for each in pairwise(bounds))
+
+    def by_chance(logs: Floats) -> float:
+        return max(each.value(logs)[0] * len(own.residual) / max(len(each.residual), 1) for each in decoys)
 
     def value(logs: Floats, unit: float) -> float:
         ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
         if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
             return -np.inf
         prior = -0.5 * float((logs - unit) @ (logs - unit)) / FOLD**2
-        return float(own.value(logs)[0] - share * max(decoys.value(logs)[0], 0.0) + prior)
+        return float(own.value(logs)[0] - max(by_chance(logs), 0.0) + prior)
 
     found = _likeliest(value, 0.0)
     units = UNITS[np.abs(UNITS) >= FARTHEST] if chain.stated else UNITS
@@ -193,15 +199,19 @@ def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Fl
     return best, top
 
 
-def _decoys(chain: Chain) -> tuple[Ints, Ints]:
-    """Each loop (K,), `DECOYS` times, and two other places (K, 2) of one path, at random."""
+def _decoys(chain: Chain) -> tuple[tuple[Ints, Ints], tuple[Ints, Ints]]:
+    """Each loop (K,), `DECOYS` times, and two other places (K, 2) of one path: any, and as many steps apart."""
     rng = np.random.default_rng(1)
     loop = np.repeat(np.arange(len(chain.loop_edge)), DECOYS)
     first = rng.integers(0, chain.size, len(loop))
     begin = np.searchsorted(chain.path, chain.path[first])
     length = np.searchsorted(chain.path, chain.path[first], side="right") - begin
     second = begin + np.minimum((rng.random(len(loop)) * length).astype(np.int64), length - 1)
-    return loop, np.sort(np.stack([first, second], axis=1), axis=1)
+    span = np.diff(chain.ends[loop], axis=1)[:, 0]
+    fits = span < length
+    moved = begin + (first - begin) % np.maximum(length - span, 1)
+    alike = loop[fits], np.stack([moved, moved + span], axis=1)[fits]
+    return (loop, np.sort(np.stack([first, second], axis=1), axis=1)), alike
 
 
 def _learned_from(path: Ints, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
