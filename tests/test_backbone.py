@@ -244,6 +244,25 @@ def test_groups_of_wrong_loops_do_not_outvote_the_backbone_of_a_lattice() -> Non
     assert lattice_backbone(made.graph, replace(found, kept=made.right | ~steps), DiagnosisOptions()) is None
 
 
+def test_wrong_loops_between_ends_that_are_near_along_the_path_are_left_out() -> None:
+    """As of places that a front end takes for the same because it has just left them."""
+    made = drive(world="town", count=800, loops=40, wrong=0.0)
+    rng, graph, count = np.random.default_rng(0), made.graph, 150
+    first = rng.integers(0, 780, count)
+    twist = np.zeros((count, 6))
+    twist[:, 2:5] = rng.normal(size=(count, 3)) * [np.radians(10), 0.3, 0.3]
+    spoiled = ViewGraph.from_edges(
+        graph.vertex_ids,
+        np.concatenate([graph.edges, np.stack([first, first + rng.integers(5, 20, count)], axis=1)]),
+        np.concatenate([graph.i_from_j, se3.exp(twist)]),
+        np.concatenate([graph.information, np.repeat(graph.information[-1:], count, axis=0)]),
+        dimension=2,
+    )
+    backbone = find_backbone(spoiled)
+    assert backbone is not None and backbone.used[: graph.edge_count].all()
+    assert not backbone.used[graph.edge_count :].any()
+
+
 def test_edges_written_the_other_way_round_change_nothing() -> None:
     one, other = (diagnose(drive(turned=turned).graph) for turned in (False, True))
     np.testing.assert_array_equal(one.verdict, other.verdict)

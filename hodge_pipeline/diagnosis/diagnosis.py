@@ -52,8 +52,8 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
 
 
 def lattice_backbone(graph: ViewGraph, found: Diagnosis, options: DiagnosisOptions) -> Backbone | None:
-    """The backbone of a large lattice where edges of more places speak for it than for what `found` keeps: of two scenes
-    that edges may agree on, that of most. None elsewhere, and where no edge is left out.
+    """The backbone of a large lattice where edges of more places speak for it than for what `found` keeps. None
+    elsewhere, and where no edge is left out.
     """
     if options.trust != AUTO or found.kept.all():
         return None
