@@ -16,7 +16,7 @@ import hodge_pipeline
 from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
-from hodge_pipeline.demo.sequence import demo_source
+from hodge_pipeline.demo.sequence import DemoOptions, demo_source
 from hodge_pipeline.diagnosis.result import WRONG
 from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.recipe.schema import load_recipe
@@ -76,10 +76,10 @@ def stacked(path: Path, jpegs: list[bytes]) -> None:
 def main(folder: Path) -> None:
     """The run with the wrong loops, its diagnosis, the edit, the run without them; a picture of each."""
     folder.mkdir(parents=True, exist_ok=True)
-    source, loops, run = demo_source(), folder / "loops.g2o", folder / "run"
+    source, loops, run = demo_source(DemoOptions()), folder / "loops.g2o", folder / "run"
     write_loops(loops, source)
     options = [f"measured.files=[{{path: {loops}}}]", "edges={stage: sequential, reach: 3}", "outer_iterations=1"]
-    options.append("solve_with=all")
+    options += ["solve_with=all", "solver.tails=gaussian", "start.revisits=null"]
     recipe = load_recipe("demo", [*options, "evaluation.tables=false"], source)
     if (run / "edges.csv").exists():
         write_history(run, History())
@@ -109,6 +109,6 @@ if __name__ == "__main__":
     parser.add_argument("--loops", type=Path, help="write the loop closures here and do nothing else")
     chosen = parser.parse_args()
     if chosen.loops:
-        write_loops(chosen.loops, demo_source())
+        write_loops(chosen.loops, demo_source(DemoOptions()))
     else:
         main(chosen.folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +27,14 @@ def write_las(path: Path, points: np.ndarray, bits: int = 16) -> Path:
     return path
 
 
-def write_e57(path: Path, poses: np.ndarray) -> Path:
+def write_e57(path: Path, poses: np.ndarray, scans: Sequence[np.ndarray] | None = None) -> Path:
+    """One scan at each pose; `scans` are points in the axes of each, without them all see the room."""
     pye57 = pytest.importorskip("pye57", reason="pye57 is not installed: pip install 'hodge-pipeline[scans]'")
     file = pye57.E57(str(path), mode="w")
-    for pose in poses:
-        local = se3.transform(se3.inverse(pose), ROOM)
-        columns = {f"cartesian{axis}": local[:, row].copy() for row, axis in enumerate("XYZ")}
-        columns.update({f"color{name}": np.full(len(ROOM), 7, np.uint8) for name in ("Red", "Green", "Blue")})
+    for row, pose in enumerate(poses):
+        local = se3.transform(se3.inverse(pose), ROOM) if scans is None else scans[row]
+        columns = {f"cartesian{axis}": local[:, at].copy() for at, axis in enumerate("XYZ")}
+        columns.update({f"color{name}": np.full(len(local), 7, np.uint8) for name in ("Red", "Green", "Blue")})
         quat_wxyz = se3.to_quat_xyzw(pose)[[3, 0, 1, 2]]
         file.write_scan_raw(columns, rotation=quat_wxyz, translation=pose[:3, 3].copy())
     file.close()

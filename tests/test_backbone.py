@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.diagnosis import diagnose, lattice_backbone
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
@@ -255,6 +255,37 @@ def test_corridors_that_are_mistaken_neither_break_the_backbone_nor_make_a_latti
 def test_many_loops_of_one_mistaken_place_do_not_outvote_few_of_several_places() -> None:
     made = drive(seed=8203, count=800, loops=80, wrong=0.9, in_groups=True, misstated=(10.0, 10.0))
     np.testing.assert_array_equal(diagnose(made.graph).kept, made.right)
+
+
+def test_groups_of_wrong_loops_do_not_outvote_the_backbone_of_a_lattice() -> None:
+    made = drive(world="room", loops=300, wrong=0.1, in_groups=True)
+    steps = np.abs(np.diff(made.graph.edges, axis=1)[:, 0]) == 1
+    found = diagnose(made.graph, DiagnosisOptions(trust="none"))
+    cut = np.flatnonzero(steps)[40:400:60]
+    kept = ~np.isin(np.arange(made.graph.edge_count), cut)  # more edges than are right, and six steps fewer
+    backbone = lattice_backbone(made.graph, replace(found, kept=kept), DiagnosisOptions())
+    assert backbone is not None
+    np.testing.assert_array_equal(backbone.used, made.right)
+    assert lattice_backbone(made.graph, replace(found, kept=made.right | ~steps), DiagnosisOptions()) is None
+
+
+def test_wrong_loops_between_ends_that_are_near_along_the_path_are_left_out() -> None:
+    """As of places that a front end takes for the same because it has just left them."""
+    made = drive(world="town", count=800, loops=40, wrong=0.0)
+    rng, graph, count = np.random.default_rng(0), made.graph, 150
+    first = rng.integers(0, 780, count)
+    twist = np.zeros((count, 6))
+    twist[:, 2:5] = rng.normal(size=(count, 3)) * [np.radians(10), 0.3, 0.3]
+    spoiled = ViewGraph.from_edges(
+        graph.vertex_ids,
+        np.concatenate([graph.edges, np.stack([first, first + rng.integers(5, 20, count)], axis=1)]),
+        np.concatenate([graph.i_from_j, se3.exp(twist)]),
+        np.concatenate([graph.information, np.repeat(graph.information[-1:], count, axis=0)]),
+        dimension=2,
+    )
+    backbone = find_backbone(spoiled)
+    assert backbone is not None and backbone.used[: graph.edge_count].all()
+    assert not backbone.used[graph.edge_count :].any()
 
 
 def test_edges_written_the_other_way_round_change_nothing() -> None:

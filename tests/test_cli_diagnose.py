@@ -92,6 +92,10 @@ def test_many_wrong_edges_are_left_out_by_one_short_command(tmp_path: Path, monk
     assert told == "next     hodge solve ring.g2o --out solved.g2o --robust"
     done = CliRunner().invoke(app, [*told.split()[2:], "--json"], catch_exceptions=False)
     assert json.loads(done.stdout)["edges_ignored"] == 4
+    CliRunner().invoke(app, [*told.split()[2:], "--run", "solved"], catch_exceptions=False)
+    again = diagnose_subject(open_subject(Path("solved")))
+    assert "The robust solve left 4 of the wrong edges out already." in again.notes and again.commands == ()
+    assert [again.advice[row] for row in (3, 17, 30, 41)] == ["nothing: no pose hangs on it"] * 4
 
 
 def test_the_wrong_edges_of_a_run_are_disabled_by_one_word_or_not_at_all(

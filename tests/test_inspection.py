@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hodge_adapters.colmap.reader import ColmapReader
 from hodge_pipeline import se3
 from hodge_pipeline.cli.list import next_command
 from hodge_pipeline.errors import SourceError
@@ -148,6 +149,19 @@ def test_cycles_of_a_square() -> None:
 def test_a_diagonal_fills_the_square() -> None:
     facts = graph_facts(square((0, 2)), [])
     assert (facts["independent cycles"], facts["triangles"], facts["cycles that no triangles fill (b1)"]) == (2, 2, 0)
+
+
+def test_lengths_of_a_model_without_a_scale_are_no_metres(tmp_path: Path) -> None:
+    folder = tmp_path / "model"
+    folder.mkdir()
+    cameras = [f"{row + 1} PINHOLE 40 30 {50 + row} {50 + row} 20 15" for row in range(6)]
+    images = [f"{row + 1} 1 0 0 0 {row} 0 0 {row + 1} {row}.jpg\n" for row in range(6)]
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", [])):
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    facts = inspect(folder)
+    assert facts["cameras"] == ["40x30 fx 50 to 55 (6 cameras)"]
+    assert facts["path length in units of its own"] == 5.0 and not any("metres" in name for name in facts)
+    assert inspect(folder, ColmapReader(scale=2.0))["path length in metres"] == 10.0
 
 
 def test_parallel_edges_and_loops_are_no_cycles() -> None:

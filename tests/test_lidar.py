@@ -20,6 +20,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import make_sequence
 from hodge_pipeline.demo.street import HOUSES_M, Road, build_street
 from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, TRUTH_FILE, SpinningScanner, StreetOptions, Sweep
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.scale import measured_scale
 from hodge_pipeline.recipe.schema import load_recipe
@@ -287,6 +288,22 @@ def test_two_scanners_in_a_folder_are_followed_apart(tmp_path: Path) -> None:
     names = np.array([frame.sequence for frame in done.source.frames])
     for name, true in (("top_*.pcd", exact), ("*_front.ply", exact @ car_from_front)):
         assert absolute_error(done.poses[names == name], true).max_m < 0.5
+
+
+def test_files_of_times_beside_scans_are_left_out_and_told(tmp_path: Path) -> None:
+    own = SpinningScanner(Road(10.0), 0, beams=16, columns=60, noise=1.0)
+    for number in range(2):
+        sweep = own.sweep(number)
+        whole = 3 * (len(sweep.points) // 3)  # so that the times could be rows of three columns
+        sweep.points[:whole].tofile(tmp_path / f"raw_{number:02d}.bin")
+        np.sort(sweep.times_s)[:whole].astype("<f4").tofile(tmp_path / f"times_{number:02d}.bin")
+    source = CloudFolderReader().open(tmp_path)
+    assert [frame.frame_id for frame in source.frames] == ["raw_00.bin", "raw_01.bin"]
+    assert "2 .bin files hold numbers that ascend, such as times, no points: left out: times_00.bin" in source.notes[0]
+    for scan in tmp_path.glob("raw_*"):
+        scan.unlink()
+    with pytest.raises(SourceError, match="2 .bin files hold numbers that ascend"):
+        CloudFolderReader().open(tmp_path)
 
 
 def sweeps_as(layout: str, folder: Path, count: int, speed_m_s: float = 10.0) -> Path:

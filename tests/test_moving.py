@@ -16,7 +16,7 @@ from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.flow import find_corners, flow_image, follow
-from hodge_pipeline.registration.moving import agreement, rival_motion
+from hodge_pipeline.registration.moving import Moments, agreement, rival_motion
 from hodge_pipeline.registration.tracking import FrameBlock, _Tracker, _View
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, track
@@ -91,6 +91,28 @@ def test_nothing_moves_in_a_still_scene(still: Source, tmp_path: Path) -> None:
         found, notes = tracked(source, tmp_path / name)
         assert not {"moving objects", "camera or object"} & {note.kind for note in notes}
         assert largest_error_m(still, found) < 0.03
+
+
+def test_depth_and_colour_of_different_moments_are_no_object_before_a_camera_that_turns(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    options = DemoOptions(frames=14, width=WIDTH, height=HEIGHT, stride=1, turns=0.05)
+    swept = TumReader().open(make_sequence(tmp_path_factory.mktemp("swept") / "sequence", options))
+    poses = [frame.true_world_from_cam for frame in swept.frames]
+
+    def shares(source: Source) -> tuple[float, float]:
+        """Against the true motion, by itself and with the twists; colour is a place, a 60th of a second, late."""
+        frames = [replace(source.frames[row], read_colour=source.frames[row + 1].read_colour) for row in (2, 6)]
+        key, view = (flow_image(frame, RANGE_M) for frame in frames)
+        assert key is not None and view is not None
+        twists = [60 * se3.log(se3.inverse(poses[row]) @ poses[row + 1]) for row in (2, 6)]
+        motion = se3.inverse(poses[3]) @ poses[7]
+        told = agreement(key, view, motion), agreement(key, view, motion, Moments(twists[0], twists[1]))
+        return told[0].contradicting, told[1].contradicting
+
+    by_itself, with_twists = shares(swept)
+    assert by_itself > tracking.DOUBTFUL and with_twists < 0.05
+    assert shares(with_block(swept, 0.4))[1] > tracking.DOUBTFUL
 
 
 def bare(source: Source) -> Source:

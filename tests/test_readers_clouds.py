@@ -314,3 +314,35 @@ def test_a_graph_of_numbers_joins_scans_with_names(tmp_path: Path) -> None:
     options = MeasuredOptions(files=(GraphFile(tmp_path / "edges.log"),))
     found, _ = measured_edges(Source("f", tmp_path, frames), options)
     assert found.edges.tolist() == [[0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "separator"),
+    [
+        ("a.xyz", "", " "),
+        ("a.asc", "//X Y Z R G B\n", " "),
+        ("a.csv", "x,y,z,red,green,blue\n", " , "),
+        ("a.csv", '"x";"y";"z";"red";"green";"blue"\n\n', ";"),
+    ],
+)
+def test_tables_of_points_are_read(tmp_path: Path, name: str, head: str, separator: str) -> None:
+    made = cloud()
+    rows = np.column_stack([made.points_in_cam.astype(str), made.colours.astype(str)])
+    (tmp_path / name).write_text(head + "\n".join(separator.join(row) for row in rows) + "\n")
+    found = check_reader(CloudFolderReader(), tmp_path).frames[0].read_points()
+    np.testing.assert_allclose(found.points_in_cam, made.points_in_cam, atol=1e-6)
+    assert found.colours is None if not head else (found.colours == made.colours).all()
+
+
+def test_tables_of_something_else_are_no_scans_and_told(tmp_path: Path) -> None:
+    (tmp_path / "gps.csv").write_text("stamp,x,y,z\n0,1,2,3\n")
+    (tmp_path / "scan.3d").write_text("1 2 3\n")
+    with pytest.raises(SourceError, match="1 files are scans of another format, left out: scan.3d: convert to PLY"):
+        CloudFolderReader().open(tmp_path)
+    (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n")
+    source = CloudFolderReader().open(tmp_path)
+    assert [frame.frame_id for frame in source.frames] == ["a.csv"]
+    assert "2 files are scans of another format, left out: gps.csv, scan.3d" in source.notes[0]
+    (tmp_path / "a.csv").write_text("x,y,z\n1,2\n")
+    with pytest.raises(SourceError, match=r"a\.csv: its points are no rows of 3 numbers|a\.csv: says 1 points"):
+        CloudFolderReader().open(tmp_path).frames[0].read_points()

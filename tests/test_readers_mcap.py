@@ -237,7 +237,10 @@ def test_calibrations_that_do_not_fit(tmp_path: Path) -> None:
     log.add(INFO, CALIBRATION, {**foxglove_header(100, OPTICAL), **calibration(640, 480, 500, 500, 320, 240)}, CDR)
     with pytest.raises(SourceError, match="no calibration"):
         McapReader().open(log.write(tmp_path / "size.mcap"))
-    with pytest.raises(SourceError, match="calibrates 640x480 images, those of /cam/depth/image are 8x6"):
+    with pytest.raises(
+        SourceError,
+        match="calibrates 640x480 images, those of /cam/depth/image are 8x6: give --set source.reader.camera=",
+    ):
         McapReader(calibration_topic=INFO).open(tmp_path / "size.mcap")
 
 

@@ -11,6 +11,7 @@ import pytest
 import hodge_pipeline
 from hodge_adapters.clouds.ply import write_ply
 from hodge_pipeline import se3
+from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.pairs.sequential import SequentialEdges
 from hodge_pipeline.recipe.schema import load_recipe
@@ -35,6 +36,7 @@ from hodge_pipeline.start.unordered.start import Frames, Start, _ambiguous_pairs
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, ViewGraph
 from hodge_pipeline.types.edges import REJECTED, USED
+from scan_data import write_e57
 from test_global_registration import furnished_corner
 
 OPTIONS = CloudOptions(voxel_m=0.05, min_range_m=0.0, max_range_m=100.0)
@@ -173,6 +175,21 @@ def test_the_recipe_scans_from_files_to_a_report(tmp_path: Path) -> None:
     moved = se3.inverse(run.result.world_from_cam[0]) @ run.result.world_from_cam[1]
     assert np.abs(se3.log(se3.inverse(se3.inverse(first) @ second) @ moved)).max() < 0.01
     assert run.report.before == "start"
+    assert (tmp_path / "run" / "report.html").is_file() and (tmp_path / "run" / "cloud.ply").is_file()
+
+
+def test_stations_of_an_e57_are_refined_from_the_poses_that_it_holds(tmp_path: Path) -> None:
+    wrong = np.array([[0, 0, 0, 0, 0, 0], [0.01, -0.008, 0.012, 0.02, -0.015, 0.01], [-0.006, 0.01, -0.01, 0, 0.02, 0]])
+    given = POSES @ se3.exp(wrong)
+    stations = [seen_from(pose, furnished_corner(k, 10_000)) for k, pose in enumerate(POSES)]
+    path = write_e57(tmp_path / "hall.e57", given, stations)
+    options = ["start=given", "recording.level=off", "executor={stage: local, workers: 0}"]
+    done = hodge_pipeline.run(load_recipe("scans", options, path), tmp_path / "run")
+    assert done.report.before == "start" and "3 of 3 frames have a given pose" in " ".join(map(str, done.report.notes))
+    assert absolute_error(given, POSES).max_m > 0.01  # what is to be mended
+    assert absolute_error(done.result.world_from_cam, POSES).max_m < 0.002
+    # The result lies in the world of the poses given, a building's or a map's.
+    assert np.linalg.norm(done.result.world_from_cam[:, :3, 3] - given[:, :3, 3], axis=1).max() < 0.04
     assert (tmp_path / "run" / "report.html").is_file() and (tmp_path / "run" / "cloud.ply").is_file()
 
 

@@ -52,15 +52,16 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
 
 
 def lattice_backbone(graph: ViewGraph, found: Diagnosis, options: DiagnosisOptions) -> Backbone | None:
-    """The backbone of a large lattice where more edges agree with it than `found` keeps: of two scenes that edges may
-    agree on, that of most. None elsewhere, and where no edge is left out.
+    """The backbone of a large lattice where edges of more places speak for it than for what `found` keeps. None
+    elsewhere, and where no edge is left out.
     """
     if options.trust != AUTO or found.kept.all():
         return None
     backbone = find_backbone(graph, lattice=True)
-    if backbone is None or not backbone.found.confirmed or backbone.used.sum() <= found.kept.sum():
+    if backbone is None or not backbone.found.confirmed:
         return None
-    return backbone
+    used, kept = backbone.used, found.kept
+    return backbone if backbone.places(used & ~kept) > backbone.places(kept & ~used) else None
 
 
 def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:

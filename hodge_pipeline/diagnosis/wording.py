@@ -20,19 +20,22 @@ def ranked(diagnosis: Diagnosis) -> Ints:
     return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), probability.round(1), place))
 
 
-def advice(diagnosis: Diagnosis, disabled: Bools, *, is_harmless: bool = False) -> tuple[str, ...]:
-    """What to do about each edge, in a few words; `disabled (E,)` are off already, `is_harmless`: the wrong ones bend
-    no pose.
-    """
+def advice(diagnosis: Diagnosis, disabled: Bools, harmless: Bools) -> tuple[str, ...]:
+    """What to do about each edge, in a few words; `disabled (E,)` are off already, `harmless (E,)` bend no pose."""
     in_no_listed_cycle = np.ones(len(disabled), bool)
     in_no_listed_cycle[diagnosis.cycles.loops.edge] = False
     columns = zip(
-        diagnosis.verdict.tolist(), disabled.tolist(), in_no_listed_cycle.tolist(), diagnosis.leverage, strict=True
+        diagnosis.verdict.tolist(),
+        disabled.tolist(),
+        harmless.tolist(),
+        in_no_listed_cycle.tolist(),
+        diagnosis.leverage,
+        strict=True,
     )
-    return tuple(_advice(*each, is_harmless) for each in columns)
+    return tuple(_advice(*each) for each in columns)
 
 
-def _advice(verdict: str, is_disabled: bool, in_no_listed_cycle: bool, leverage: float, is_harmless: bool) -> str:
+def _advice(verdict: str, is_disabled: bool, is_harmless: bool, in_no_listed_cycle: bool, leverage: float) -> str:
     if is_disabled:
         return "is disabled; nothing speaks against it: enable it again" if verdict == CONSISTENT else "is disabled"
     if verdict == WRONG:

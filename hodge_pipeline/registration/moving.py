@@ -30,6 +30,29 @@ GREY_LEVELS = 20.0
 """Grey values, of 256, of the mean of a few pixels: more than noise and interpolation change in a static scene."""
 OFF_M, OFF_SIGMAS = 0.05, 3.0
 """By which a depth is off what a motion predicts: what clouds are matched within, and beyond the noise of a pixel."""
+UNTOLD_S = (-1 / 60, 1 / 60)
+"""Seconds by which a colour image may be later than its depth image beyond what is said: half the time between two
+images, within which they are paired. fr1/rpy's stamps keep silent about 15 ms, in which its camera turns by 15 pixels.
+"""
+
+
+class Moments(NamedTuple):
+    """How the cameras of key frame and view moved, twists (6,) a second in their own axes, and the seconds by which the
+    colour image of each is said to be later than its depth image.
+    """
+
+    key_twist: Floats
+    view_twist: Floats
+    key_delay_s: float = 0.0
+    view_delay_s: float = 0.0
+
+    def between_depths(self, key_from_view: Floats, untold_s: float) -> Floats:
+        """The motion (4, 4) between the depth images, from that between the colour images."""
+        key = se3.exp(self.key_twist * (self.key_delay_s + untold_s))
+        return np.asarray(key @ key_from_view @ se3.exp(-self.view_twist * (self.view_delay_s + untold_s)))
+
+
+AT_REST = Moments(np.zeros(6), np.zeros(6))
 
 
 @dataclass(frozen=True)
@@ -57,20 +80,19 @@ class Agreement(NamedTuple):
     misplaced: float
 
 
-def agreement(key: FlowImage, view: FlowImage, key_from_view: Floats) -> Agreement:
+def agreement(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments = AT_REST) -> Agreement:
     """How much of the view contradicts a motion."""
-    compared = _compared(key, view, key_from_view)
-    return Agreement(_contradicting(_misfit(key, view, *compared)), _misplaced(view, *compared))
+    return _compared(key, view, key_from_view, moments)[0]
 
 
-def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floats) -> tuple[Agreement, Rival | None]:
+def rival_motion(
+    corners: Corners, view: FlowImage, found: Followed, guess: Floats, moments: Moments = AT_REST
+) -> tuple[Agreement, Rival | None]:
     """How much contradicts the motion found, and the motion of corners where that has none; None where little
     contradicts it, or no other motion agrees.
     """
     key = corners.image
-    compared = _compared(key, view, found.key_from_view)
-    misfit = _misfit(key, view, *compared)
-    share = Agreement(_contradicting(misfit), _misplaced(view, *compared))
+    share, misfit = _compared(key, view, found.key_from_view, moments)
     if share.contradicting <= MUCH:
         return share, None
     own = _tiles_with(key, corners.pixels[found.rows])
@@ -78,13 +100,38 @@ def rival_motion(corners: Corners, view: FlowImage, found: Followed, guess: Floa
     other = follow(others, view, guess)
     if other is None:
         return share, None
-    others_misfit = _misfit(key, view, *_compared(key, view, other.key_from_view))
+    others_share, others_misfit = _compared(key, view, other.key_from_view, moments)
     won, lost = _votes(key, misfit - others_misfit)
     if won == lost == 0:  # the same motion
         return share, None
     fits_better = won > lost
     moving = own if fits_better else _tiles_with(key, others.pixels[other.rows])
-    return share, Rival(others, other, fits_better, moving, _contradicting(others_misfit))
+    return share, Rival(others, other, fits_better, moving, others_share.contradicting)
+
+
+def _compared(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments) -> tuple[Agreement, Floats]:
+    """How much of the view contradicts a motion, and the misfit (n,) at each tested pixel.
+
+    Where a camera turns, depth lies elsewhere than the colour image's motion says if the two images are not of one
+    moment: where much contradicts, the delay of `UNTOLD_S` with which the least does counts.
+    """
+    told = _at_delay(key, view, key_from_view, moments.between_depths(key_from_view, 0))
+    if told[0].contradicting <= MUCH:
+        return told
+    others = (moments.between_depths(key_from_view, untold_s) for untold_s in UNTOLD_S)
+    tried = [told, *(_at_delay(key, view, key_from_view, motion) for motion in others)]
+    least, misfit = min(tried, key=lambda one: one[0].contradicting)
+    return least._replace(misplaced=told[0].misplaced), misfit
+
+
+def _at_delay(key: FlowImage, view: FlowImage, by_colour: Floats, by_depth: Floats) -> tuple[Agreement, Floats]:
+    """What `_compared` tells, by the motion of the colour images and that of the depth images."""
+    points = _points(key)
+    expected = project(se3.transform(se3.inverse(by_depth), points), view.camera)
+    actual = _depth(view, expected[:, :2])
+    grey_at = project(se3.transform(se3.inverse(by_colour), points), view.camera)[:, :2]
+    misfit = _misfit(key, view, expected, actual, grey_at)
+    return Agreement(_contradicting(misfit), _misplaced(view, expected, actual)), misfit
 
 
 def _misplaced(view: FlowImage, expected: Floats, actual: Floats) -> float:
@@ -92,14 +139,6 @@ def _misplaced(view: FlowImage, expected: Floats, actual: Floats) -> float:
     off = off[np.isfinite(off)] / view.unit_m
     sigma = depth_sigma(expected[np.isfinite(actual), 2] / view.unit_m)
     return float((off > np.maximum(OFF_M, OFF_SIGMAS * sigma)).mean()) if len(off) else 0.0
-
-
-def _compared(key: FlowImage, view: FlowImage, key_from_view: Floats) -> tuple[Floats, Floats]:
-    """Columns u, v, z (n, 3) at which a motion puts the tested pixels of the key frame, and the depths (n,) there; NaN
-    where not both frames have one.
-    """
-    expected = project(se3.transform(se3.inverse(key_from_view), _points(key)), view.camera)
-    return expected, _depth(view, expected[:, :2])
 
 
 def _votes(key: FlowImage, gain: Floats) -> tuple[int, int]:
@@ -123,15 +162,16 @@ def tested_pixels(shape: tuple[int, ...]) -> Floats:
     return np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
 
 
-def _misfit(key: FlowImage, view: FlowImage, expected: Floats, actual: Floats) -> Floats:
-    """Of the tested pixels (n,) of the key frame, `_compared`: how far depth and grey value in the view are off what
-    the motion predicts, 1: by as much as may be or more; NaN where not both frames have a depth.
+def _misfit(key: FlowImage, view: FlowImage, expected: Floats, actual: Floats, grey_at: Floats) -> Floats:
+    """Of the tested pixels (n,) of the key frame: how far the depth (n,) in the view is off columns u, v, z (n, 3), and
+    the grey value at `grey_at (n, 2)` off the key frame's, 1: by as much as may be or more; NaN where not both frames
+    have a depth.
     """
     pixels = tested_pixels(key.depth.shape)
     sigma = DEPTH_SIGMAS * view.unit_m * depth_sigma(expected[:, 2] / view.unit_m)
     off = (actual - expected[:, 2]) / (GATE_PX / PIXEL_SIGMA * sigma)
-    change = _grey(view, expected[:, :2]) - _grey(key, pixels)
-    seen = np.isfinite(actual)
+    change = _grey(view, grey_at) - _grey(key, pixels)
+    seen = np.isfinite(actual) & np.isfinite(change)
     exposure = float(np.median(change[seen])) if seen.any() else 0.0
     return np.asarray(np.minimum(1, off**2 + ((change - exposure) / GREY_LEVELS) ** 2))
 

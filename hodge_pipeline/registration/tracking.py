@@ -17,7 +17,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, is_blank
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
-from hodge_pipeline.registration.moving import Agreement, agreement, rival_motion
+from hodge_pipeline.registration.moving import AT_REST, Agreement, Moments, agreement, rival_motion
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registration.tracked_blocks import TrackedBlock
@@ -98,6 +98,8 @@ class _View:
     def __init__(self, options: TrackingOptions, frame: Frame, place: int) -> None:
         self._options, self._frame, self.place = options, read_once(frame), place
         self.left_out = 0.0
+        self.twist: Floats = np.zeros(6)
+        self.colour_delay_s = frame.colour_delay_s
 
     @cached_property
     def image(self) -> FlowImage | None:
@@ -160,6 +162,7 @@ class _Tracker:
         self._sightings: dict[tuple[int, int], Followed] = {}
         self._moving, self._doubtful, self._blank = set[int](), set[int](), set[int]()
         self._velocity: Floats = np.zeros(6)
+        self._times = block.times + [frame.colour_delay_s for frame in block.frames]
         self._usual_step = float(np.median(np.diff(block.times))) if len(block.times) > 1 else 1.0
 
     def run(self) -> TrackedBlock:
@@ -204,7 +207,7 @@ class _Tracker:
         found = self._flowed(start, before, np.eye(4))
         step = found or self._registrar.register(start.prepared, before.prepared, np.eye(4))
         if self._good(step):
-            self._velocity = -se3.log(step.i_from_j) / self._duration(0, start.place)
+            start.twist = self._velocity = -se3.log(step.i_from_j) / self._duration(0, start.place)
 
     def _begin(self, view: _View) -> None:
         """From here on this view is the key frame, and the last frame tracked."""
@@ -234,7 +237,7 @@ class _Tracker:
             self._lose(view, is_last)
             return
         seconds = self._duration(self._last.place, view.place)
-        self._velocity = se3.log(se3.inverse(self._key_from_last) @ found.i_from_j) / seconds
+        view.twist = self._velocity = se3.log(se3.inverse(self._key_from_last) @ found.i_from_j) / seconds
         self._rows[view.place] = (self._keys[-1].place, found.i_from_j, found.fitness)
         self._last, self._key_from_last, self._missed = view, found.i_from_j, None
         has_left = self._has_moved(found.i_from_j) or self._sees_little(view)
@@ -270,7 +273,8 @@ class _Tracker:
         the key frame's cloud.
         """
         assert key.image is not None and key.corners is not None and view.image is not None
-        against, rival = rival_motion(key.corners, view.image, found, guess)
+        moments = self._moments(key, view, found.key_from_view)
+        against, rival = rival_motion(key.corners, view.image, found, guess, moments)
         if rival is not None and len(rival.followed.rows) >= FEWEST_FOLLOWED:
             self._moving.add(view.place)
             key.leave_out(rival.moving, rival.corners if rival.fits_better else key.corners)
@@ -278,9 +282,18 @@ class _Tracker:
                 self._sightings = {pair: one for pair, one in self._sightings.items() if pair[0] != key.place}
                 found, against = rival.followed, against._replace(contradicting=rival.contradicting)
         if key.left_out:  # the corners' image still has what moves
-            left = agreement(key.image, view.image, found.key_from_view)
+            left = agreement(key.image, view.image, found.key_from_view, moments)
             against = against._replace(misplaced=left.misplaced)
         return found, against
+
+    def _moments(self, key: _View, view: _View, key_from_view: Floats) -> Moments:
+        """How both cameras moved, the view's from the last frame tracked to it; at rest where none was."""
+        if not self._keys:
+            return AT_REST
+        key_from_last = self._key_from_last if key is self._keys[-1] else np.eye(4)
+        step = se3.log(se3.inverse(key_from_last) @ key_from_view)
+        twist = view.twist if view is self._last else step / self._duration(self._last.place, view.place)
+        return Moments(key.twist, twist, key.colour_delay_s, view.colour_delay_s)
 
     def _doubt(self, view: _View, share: float) -> None:
         if share > DOUBTFUL:
@@ -355,7 +368,8 @@ class _Tracker:
         return se3.exp(self._velocity * seconds)
 
     def _duration(self, i: int, j: int) -> float:
-        return max(float(self._block.times[j] - self._block.times[i]), 1e-6)
+        """Seconds between the colour images, which flow follows; two frames may share one."""
+        return max(float(self._times[j] - self._times[i]), self._usual_step / 2, 1e-6)
 
     def _has_moved(self, key_from_view: Floats) -> bool:
         moved = float(np.linalg.norm(key_from_view[:3, 3]))

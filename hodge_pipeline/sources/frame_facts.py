@@ -11,10 +11,11 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.depth_units import PLAUSIBLE_DEPTH_M, SAMPLED_FRAMES, doubts_of
-from hodge_pipeline.types import Bools, Floats, Floats32, Frame, Trajectory
+from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Frame, Trajectory
 from hodge_pipeline.types.arrays import evenly
 
 LISTED = 5
+METRES, OWN_UNIT = "metres", "units of its own"
 GAP, JUMP = 5.0, 10.0
 """Times the median step: what counts as a gap in time, and as a jump of the pose."""
 LEAST_JUMP_M, LEAST_JUMP_DEG = 0.1, 20.0
@@ -25,12 +26,14 @@ SECTORS, ALL_ROUND = 36, 0.9
 MOSTLY_EMPTY = 0.9
 
 
-def frame_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
-    """Facts of a sequence of frames as plain data, a few of its depth images read; what is odd goes to the list."""
+def frame_facts(frames: Sequence[Frame], oddities: list[str], unit: str = METRES) -> dict[str, Any]:
+    """Facts of a sequence of frames as plain data, a few of its depth images read; what is odd goes to the list.
+
+    `unit` is that of lengths between poses.
+    """
     sequences = np.array([frame.sequence for frame in frames])
     stamps = np.array([frame.stamp_s for frame in frames])
     names = [str(frame.frame_id) for frame in frames]
-    cameras = Counter(frame.camera for frame in frames)
     posed = np.array([frame.world_from_cam is not None for frame in frames])
     poses = np.array([np.eye(4) if frame.world_from_cam is None else frame.world_from_cam for frame in frames])
     together = (sequences[1:] == sequences[:-1]) if len(frames) > 1 else np.zeros(0, bool)
@@ -38,22 +41,31 @@ def frame_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
     facts = {
         "sequences": [name for name in dict.fromkeys(sequences.tolist()) if name],
         **stamp_facts(stamps, together, names, oddities),
-        "cameras": [
-            f"{c.width}x{c.height} fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g} ({count} frames)"
-            for c, count in sorted(cameras.items(), key=str)
-            if c is not None
-        ],
+        "cameras": _cameras(Counter(frame.camera for frame in frames if frame.camera is not None)),
         "frames with a pose": int(posed.sum()),
         "frames with colour": sum(frame.read_colour is not None for frame in frames),
         "frames with depth": sum(frame.read_depth is not None for frame in frames),
         "frames with points": sum(frame.read_points is not None for frame in frames),
-        **pose_facts(poses, together & posed[1:] & posed[:-1], names, oddities),
+        **pose_facts(poses, together & posed[1:] & posed[:-1], names, oddities, unit),
     }
     without = len(frames) - facts["frames with depth"]
     if 0 < without < len(frames) and not facts["frames with points"]:
         bare = [str(frame.frame_id) for frame in frames if frame.read_depth is None]
         oddities.append(f"{without} of {len(frames)} frames have no depth: {listed(bare)}")
     return {**facts, **_depth_facts(frames, oddities), **_scanner_facts(frames)}
+
+
+def _cameras(count_of: Counter[Camera]) -> list[str]:
+    """A line each; of more than a few, as of photographs, a line for each size of image."""
+    if len(count_of) <= LISTED:
+        return [
+            f"{c.width}x{c.height} fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g} ({count} frames)"
+            for c, count in sorted(count_of.items(), key=str)
+        ]
+    focal_px: dict[str, list[float]] = {}
+    for camera in count_of:
+        focal_px.setdefault(f"{camera.width}x{camera.height}", []).append(camera.fx)
+    return [f"{size} fx {min(fx):g} to {max(fx):g} ({len(fx)} cameras)" for size, fx in sorted(focal_px.items())]
 
 
 def _scanner_facts(frames: Sequence[Frame]) -> dict[str, Any]:
@@ -108,7 +120,9 @@ def stamp_facts(stamps_s: Floats, together: Bools, names: Sequence[str], odditie
     }
 
 
-def pose_facts(world_from_cam: Floats, together: Bools, names: Sequence[str], oddities: list[str]) -> dict[str, Any]:
+def pose_facts(
+    world_from_cam: Floats, together: Bools, names: Sequence[str], oddities: list[str], unit: str = METRES
+) -> dict[str, Any]:
     """Path length and extent of poses (N, 4, 4); `together (N - 1,)`: where a pose and the next belong together."""
     rows = np.flatnonzero(together)
     if not len(rows):
@@ -116,18 +130,21 @@ def pose_facts(world_from_cam: Floats, together: Bools, names: Sequence[str], od
     relative = se3.inverse(world_from_cam[rows]) @ world_from_cam[rows + 1]
     moved_m = np.linalg.norm(relative[:, :3, 3], axis=1)
     turned_deg = np.rad2deg(se3.rotation_angle(relative))
-    for size, least, unit in ((moved_m, LEAST_JUMP_M, "m"), (turned_deg, LEAST_JUMP_DEG, "°")):
+    for size, least, sign in (
+        (moved_m, LEAST_JUMP_M, "m" if unit == METRES else "units"),
+        (turned_deg, LEAST_JUMP_DEG, "°"),
+    ):
         jumps = size > max(JUMP * float(np.median(size)), least)
         if jumps.any():
             at = rows[np.argmax(size)]
             oddities.append(
-                f"{int(jumps.sum())} jumps of the pose, the largest {size.max():.3g} {unit} between {names[at]} and "
-                f"{names[at + 1]}; half of the steps are below {np.median(size):.3g} {unit}"
+                f"{int(jumps.sum())} jumps of the pose, the largest {size.max():.3g} {sign} between {names[at]} and "
+                f"{names[at + 1]}; half of the steps are below {np.median(size):.3g} {sign}"
             )
     centres = world_from_cam[np.union1d(rows, rows + 1), :3, 3]
     return {
-        "path length in metres": float(moved_m.sum()),
-        "extent of the path in metres": [float(side) for side in np.ptp(centres, axis=0)],
+        f"path length in {unit}": float(moved_m.sum()),
+        f"extent of the path in {unit}": [float(side) for side in np.ptp(centres, axis=0)],
     }
 
 

@@ -11,7 +11,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import clique_counts
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.holes import unfilled_loops
-from hodge_pipeline.sources.frame_facts import LISTED, listed
+from hodge_pipeline.sources.frame_facts import LISTED, METRES, listed
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 MOST_TRIANGLES = 20_000
@@ -20,8 +20,8 @@ INDEFINITE = 1e-9
 """Of the largest eigenvalue: a more negative one is not rounding."""
 
 
-def graph_facts(graph: ViewGraph, oddities: list[str]) -> dict[str, Any]:
-    """Facts of a graph as plain data; what is odd is added to the list."""
+def graph_facts(graph: ViewGraph, oddities: list[str], unit: str = METRES) -> dict[str, Any]:
+    """Facts of a graph, whose lengths have a `unit`, as plain data; what is odd is added to the list."""
     rows, count = graph.edges, graph.vertex_count
     between = rows[rows[:, 0] != rows[:, 1]]
     simple = np.unique(np.sort(between, axis=1), axis=0)
@@ -44,7 +44,7 @@ def graph_facts(graph: ViewGraph, oddities: list[str]) -> dict[str, Any]:
     if len(graph.fixed):
         facts["fixed vertices"] = len(graph.fixed)
     if graph.edge_count:
-        facts.update(_motion_facts(graph, oddities))
+        facts.update(_motion_facts(graph, oddities, unit))
         facts.update(_information_facts(graph, oddities))
     return facts
 
@@ -59,7 +59,7 @@ def _cycle_facts(simple: Ints, vertices: int, pieces: int) -> dict[str, Any]:
     return facts
 
 
-def _motion_facts(graph: ViewGraph, oddities: list[str]) -> dict[str, Any]:
+def _motion_facts(graph: ViewGraph, oddities: list[str], unit: str) -> dict[str, Any]:
     sound = se3.is_motion(graph.i_from_j)
     _note_edges(graph, ~sound, "no rigid motion", oddities)
     if not sound.any():
@@ -67,7 +67,7 @@ def _motion_facts(graph: ViewGraph, oddities: list[str]) -> dict[str, Any]:
     translation_m = np.linalg.norm(graph.i_from_j[sound, :3, 3], axis=1)
     angle_deg = np.rad2deg(se3.rotation_angle(graph.i_from_j[sound]))
     return {
-        "edge translation in metres, median largest": [float(np.median(translation_m)), float(translation_m.max())],
+        f"edge translation in {unit}, median largest": [float(np.median(translation_m)), float(translation_m.max())],
         "edge rotation in degrees, median largest": [float(np.median(angle_deg)), float(angle_deg.max())],
     }
 

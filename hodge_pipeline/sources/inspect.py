@@ -9,7 +9,7 @@ from typing import Any
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import HodgeError, SourceError
-from hodge_pipeline.sources.frame_facts import frame_facts, trajectory_facts
+from hodge_pipeline.sources.frame_facts import METRES, OWN_UNIT, frame_facts, trajectory_facts
 from hodge_pipeline.sources.graph_facts import graph_facts
 from hodge_pipeline.sources.unknown import unknown
 from hodge_pipeline.stages import FrameReader, Sniff
@@ -67,20 +67,21 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     known = guesses(path) if path.is_file() or path.is_dir() else []
     source = (reader or guess_reader(path, known)).open(path)
     oddities = list(source.doubts)
+    unit = METRES if source.in_metres else OWN_UNIT
     facts: dict[str, Any] = {
         "path": str(path),
         "formats": [{"reader": g.name, "confidence": g.sniff.confidence, "why": g.sniff.reason} for g in known],
         "frames": len(source.frames),
     }
     if source.frames:
-        facts.update(frame_facts(source.frames, oddities))
+        facts.update(frame_facts(source.frames, oddities, unit))
     if source.trajectory is not None:
         facts["trajectory poses"] = len(source.trajectory)
         if not source.frames and len(source.trajectory):
             # The poses of a graph's vertices stand in no order of time: a step between them means nothing.
             facts.update(trajectory_facts(source.trajectory, oddities) if source.graph is None else {})
     if source.graph is not None and source.graph.vertex_count:
-        facts["graph"] = graph_facts(source.graph, oddities)
+        facts["graph"] = graph_facts(source.graph, oddities, unit)
     if source.positions is not None:
         facts["positions"] = len(source.positions)
         facts["positions from"] = source.positions.origin

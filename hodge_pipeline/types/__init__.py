@@ -167,6 +167,7 @@ class Source:
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
     - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
     - `of_cameras`: its format says that poses are cameras', z ahead and y down; a graph of others is a robot's, z up.
+    - `in_metres`: False for a model of images alone, whose lengths are in a unit of its own.
     """
 
     name: str
@@ -180,6 +181,7 @@ class Source:
     positions: Positions | None = None
     of_cameras: bool = False
     doubts: tuple[str, ...] = ()
+    in_metres: bool = True
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]

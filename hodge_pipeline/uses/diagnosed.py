@@ -16,22 +16,23 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions, SuggestionOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.diagnosis.wording import advice, ranked
-from hodge_pipeline.pairs.edits import joining, pair_names, read_history
+from hodge_pipeline.pairs.edits import EDGES, joining, pair_names, read_history
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.diagnosis_page import PageContents, document
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
 from hodge_pipeline.report.document import render
 from hodge_pipeline.report.edge_pictures import edge_pictures
+from hodge_pipeline.report.solved import SOLVED
 from hodge_pipeline.report.verdict import NOTHING_MOVED_M
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.edge_table import write_edges
+from hodge_pipeline.store.edge_table import read_edges, write_edges
 from hodge_pipeline.store.workspace import is_run_folder, make_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, Source, ViewGraph
-from hodge_pipeline.types.edges import DISABLED, USED
+from hodge_pipeline.types.edges import DISABLED, IGNORED, USED
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import command
 
@@ -66,6 +67,11 @@ class Subject:
         """The edges (E,) that are off by hand."""
         return np.asarray(self.edges.status == DISABLED)
 
+    @property
+    def left_out(self) -> Bools:
+        """The edges (E,) of a file that a robust solve of it left out."""
+        return np.asarray((self.edges.status == IGNORED) & (not self.is_run))
+
 
 def open_subject(path: Path, trust: str | None = None) -> Subject:
     """The graph of a run's last round, or of a file that a reader knows. Raises `HodgeError` where there is none.
@@ -82,9 +88,10 @@ def _file_subject(path: Path) -> Subject:
     source = read_graph(path)
     assert source.graph is not None
     name = path.stem if path.is_file() else path.name
-    return Subject(
-        path, name, source.graph, _edited(path, source.graph, Edges.measured(source.graph)), notes=source.notes
-    )
+    edges = Edges.measured(source.graph)
+    if (path / SOLVED).is_file() and len(solved := read_edges(path / EDGES)[0]) == len(edges):
+        edges = edges.put(solved.status == IGNORED, status=IGNORED)
+    return Subject(path, name, source.graph, _edited(path, source.graph, edges), notes=source.notes)
 
 
 def _run_subject(path: Path, run: Run) -> Subject:
@@ -151,8 +158,10 @@ def diagnose_subject(subject: Subject) -> Diagnosed:
     apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
     energy, complaints = energy_rows(subject.graph, found.world_from_cam, found.piece, found.kept)
     harmless = (subject.harmless,) if subject.harmless and (found.verdict == WRONG).any() else ()
+    gone = int(((found.verdict == WRONG) & subject.left_out).sum())
     notes = (
         *harmless,
+        *((f"The robust solve left {gone} of the wrong edges out already.",) if gone else ()),
         *subject.notes,
         *found.notes,
         *((apart,) if pieces > 1 else ()),
@@ -163,7 +172,7 @@ def diagnose_subject(subject: Subject) -> Diagnosed:
         subject.graph, found, SUGGESTED, overlapping=_overlapping(subject, found), tried=subject.tried
     )
     commands = _commands(subject, found, suggestions)
-    told = advice(found, subject.disabled, is_harmless=bool(harmless))
+    told = advice(found, subject.disabled, subject.left_out | bool(harmless))
     return Diagnosed(subject, found, told, energy, commands, notes, suggestions)
 
 
@@ -194,7 +203,8 @@ def _side_by_side(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
 
 
 def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> tuple[str, ...]:
-    used, beside = (found.verdict == WRONG) & ~subject.disabled, _beside_kept(subject.graph, found)
+    used = (found.verdict == WRONG) & ~subject.disabled & ~subject.left_out
+    beside = _beside_kept(subject.graph, found)
     meant = used & ~beside & (not subject.harmless)
     rows = np.array([row for row in ranked(found) if meant[row]], int)
     wrong = pair_names(subject.graph.vertex_ids, subject.graph.edges[rows])

@@ -15,7 +15,7 @@ from hodge_adapters.trajectories.text import read_kitti
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Floats32, PointCloud
-from hodge_pipeline.types.input_files import read_input
+from hodge_pipeline.types.input_files import beginning, read_input
 
 POSES, CALIBRATION, TO_CAMERA = "poses.txt", "calib.txt", "Tr:"
 MAX_REFLECTANCE = 255
@@ -27,12 +27,20 @@ KITTI_RAISE_DEG = 0.205
 SCANS_LOOKED_AT = 9
 NEAREST_M = 5.0
 """Nearer points tell less of a beam's angle: lasers lie up to 20 cm from the origin that angles are taken at."""
+NUMBERS_LOOKED_AT = 1024
 _NUMBERED = re.compile(r"\d(\.pcd)?\.bin$")
 
 
 def is_scan(name: str) -> bool:
     """Whether a `.bin` file's name ends in a number, as those of scans do: others are COLMAP's."""
     return _NUMBERED.search(name) is not None
+
+
+def ascends(path: Path) -> bool:
+    """Whether the first numbers of a `.bin` file never fall: times of points, in a file beside that of the scan."""
+    contents = beginning(path, 4 * NUMBERS_LOOKED_AT)
+    values = np.frombuffer(contents, "<f4", count=len(contents) // 4)
+    return bool(len(values)) and bool(values[-1] > values[0]) and bool((np.diff(values) >= 0).all())
 
 
 def read_bin(path: Path) -> PointCloud:

@@ -1,4 +1,4 @@
-"""A folder of point-cloud fragments, PLY or PCD, in sequence, with an optional Redwood `.log` of poses or pairs."""
+"""A folder of point-cloud fragments in sequence, with an optional Redwood `.log` of poses or pairs."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.clouds.kitti import KITTI_RAISE_DEG, are_of_hdl64, is_scan, raised, read_bin, scan_poses
+from hodge_adapters.clouds.kitti import KITTI_RAISE_DEG, are_of_hdl64, ascends, is_scan, raised, read_bin, scan_poses
 from hodge_adapters.clouds.pcd import read_pcd
 from hodge_adapters.clouds.ply import read_ply, write_ply
 from hodge_adapters.clouds.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
+from hodge_adapters.clouds.tables import names_points, read_table
 from hodge_adapters.posed import posed_frames, written
 from hodge_adapters.text_rows import listed, natural
 from hodge_adapters.trajectories.log import read_log_file
@@ -28,7 +29,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, PointCloud, Source, ViewGraph
 
-OTHER_SCANS = frozenset((".xyz", ".pts", ".ptx", ".asc", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
+OTHER_SCANS = frozenset((".pts", ".ptx", ".3d", ".vtk", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
 _NUMBER = re.compile(r"(\d{1,19})\D*$")
 _CLOCK = re.compile(r"(?<!\d)(\d{9,10})([._])(\d{1,9})$")
 """Seconds since 1970 with a fraction, as bag_to_pcd names its files, or with nanoseconds of their own."""
@@ -56,10 +57,10 @@ class CloudFolderReader:
         """By the endings of the files."""
         path = Path(path)
         try:
-            names = [path.name] if path.is_file() else os.listdir(path)
+            names = [path] if path.is_file() else [path / name for name in os.listdir(path)]
         except OSError:
             return Sniff(0.0, "not a folder that can be read")
-        count = sum(_is_scan(name) for name in names)
+        count = sum(map(_is_scan, names))
         if not count:
             return Sniff(0.0, f"no {', '.join(READERS)}")
         return Sniff(0.8 if count * 2 > len(names) else 0.4, f"{count} point clouds among {len(names)} files")
@@ -113,14 +114,25 @@ class CloudFolderReader:
             listing = [file for file in path.glob(self.pattern) if not file.name.startswith(".")]
         except (OSError, ValueError, NotImplementedError) as error:
             raise SourceError(f"{path}: cannot be listed with pattern {self.pattern!r}: {error}") from error
-        found = [file for file in listing if _is_scan(file.name) and file.is_file()]
-        if not found:
-            raise SourceError(
-                f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it: give a folder of fragments"
+        scans = [file for file in listing if _is_scan(file) and file.is_file()]
+        times = {file for file in scans if file.suffix.lower() == ".bin" and ascends(file)}
+        found = [file for file in scans if file not in times]
+        others = {file for file in listing if file.suffix.lower() in OTHER_SCANS}
+        if any(file.suffix.lower() == ".csv" for file in found):
+            others |= {file for file in listing if file.suffix.lower() == ".csv"} - set(found)
+        unread = []
+        if times:
+            told = _listed(times)
+            unread.append(
+                f"{len(times)} .bin files hold numbers that ascend, such as times, no points: left out: {told}"
             )
-        others = sorted(file.name for file in listing if file.suffix.lower() in OTHER_SCANS)
         if others:
-            notes.append(f"{len(others)} files are scans of another format, left out: {listed(others)}: convert to PLY")
+            told = _listed(others)
+            unread.append(f"{len(others)} files are scans of another format, left out: {told}: convert to PLY")
+        if not found:
+            why = "; ".join(unread) or "give a folder of fragments"
+            raise SourceError(f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it: {why}")
+        notes += unread
         return sorted(found, key=lambda file: natural(file.name))
 
     def _raise_deg(self, files: list[Path], notes: list[str]) -> float:
@@ -235,11 +247,20 @@ READERS: Mapping[str, Callable[[Path], PointCloud]] = {
     ".laz": read_las,
     ".e57": read_e57,
     ".bin": read_bin,
+    ".xyz": read_table,
+    ".asc": read_table,
+    ".csv": read_table,
 }
 
 
-def _is_scan(name: str) -> bool:
-    return Path(name).suffix.lower() in READERS and (Path(name).suffix != ".bin" or is_scan(name))
+def _is_scan(path: Path) -> bool:
+    """By its ending; `.bin` by its name as well, `.csv` by its first line."""
+    ending = path.suffix.lower()
+    return ending in READERS and (ending != ".bin" or is_scan(path.name)) and (ending != ".csv" or names_points(path))
+
+
+def _listed(files: set[Path]) -> str:
+    return listed(sorted(file.name for file in files))
 
 
 def _require(path: Path) -> None:

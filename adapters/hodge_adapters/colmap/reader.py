@@ -149,6 +149,7 @@ class ColmapReader:
             graph=None if graph is None else scaled_graph(graph, scale),
             notes=tuple(notes),
             files=files,
+            in_metres=self.scale != "auto" or scale != 1.0,  # which says that no depth told
         )
 
     def _depths(self, folder: Path, colour: Path | None, model: Model) -> list[Path | None]:

@@ -103,7 +103,7 @@ def _body_from_cam(
     if found is None:
         notes.append(
             f"no transform leads from {body} of {name} to {camera_frame}: frames have no pose, "
-            f"the trajectory is of {body}: record /tf_static, or give option pose_child {camera_frame}"
+            f"the trajectory is of {body}: record /tf_static, or give --set source.reader.pose_child={camera_frame}"
         )
     return found
 

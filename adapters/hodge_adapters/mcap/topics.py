@@ -129,7 +129,10 @@ def _camera(name: str, calibration: Calibration, topic: str, layout: ImageLayout
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if is_rectified else (k[0], k[4], k[2], k[5])
     size = f"{calibration.width}x{calibration.height}"
     if (calibration.width, calibration.height) not in (layout.size, (0, 0)):
-        raise SourceError(f"{name}: calibrates {size} images, those of {topic} are {_size(layout)}: give option camera")
+        raise SourceError(
+            f"{name}: calibrates {size} images, those of {topic} are {_size(layout)}: "
+            "give --set source.reader.camera=[fx,fy,cx,cy]"
+        )
     camera = Camera(layout.width, layout.height, fx, fy, cx, cy)
     notes.append(f"{topic}: intrinsics from {name}{' (rectified: P)' if is_rectified else ''}")
     if calibration.is_distorted and not is_rectified:

@@ -13,49 +13,66 @@ from scipy.special import gammaln
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.fit import linearise, root
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
-PAIRS = 4000
-"""Random pairs of positions that say how far apart places lie."""
+PAIRS, FEWEST_PAIRS = 4000, 200
+"""Random pairs of positions that say how far apart places lie; of fewer, any two are taken instead."""
 LEAST_SPREAD = 1e-3
 """Of the largest: the spread of places along an axis in which they hardly differ."""
 
 
 @dataclass(frozen=True)
 class Wrong:
-    """The residual of a loop between two places at random: a Cauchy distribution of `shape (p, p)` in axes that are
+    """The residual of a loop between two places at random: a Cauchy distribution of a shape (p, p) in axes that are
     parallel to the world's and begin at the loop's later end.
+
+    `precision (B, p, p)`, `log_scale (B,)`: for places that are so many steps apart, in octaves; the last of any two.
     """
 
     precision: Floats
-    log_scale: float
+    log_scale: Floats
 
     @classmethod
     def of(cls, chain: Chain, poses: Floats) -> Wrong:
         """As the motions of the loops are between random positions of one path."""
         rng = np.random.default_rng(0)
         pairs = rng.integers(0, chain.size, (PAIRS, 2))
-        pairs = pairs[chain.path[pairs[:, 0]] == chain.path[pairs[:, 1]]]
-        motion = chain.motion[rng.integers(0, len(chain.motion), len(pairs))]
-        residual = parallel(chain, motion, poses[pairs[:, 0]], poses[pairs[:, 1]])
-        moment = residual.T @ residual / max(len(residual), 1)
-        split = turns(chain)
-        shape = np.zeros_like(moment)
-        shape[:split, :split], shape[split:, split:] = (
-            _floored(moment[:split, :split]),
-            _floored(moment[split:, split:]),
-        )
-        size = len(shape)
+        shapes = [_shape(chain, poses, pairs[_on_one_path(chain, pairs)], rng)]
+        for octave in reversed(range(int(np.log2(max(chain.size, 2))))):
+            pairs[:, 1] = pairs[:, 0] + rng.integers(2**octave, 2 ** (octave + 1), PAIRS)
+            near = pairs[_on_one_path(chain, pairs)]
+            shapes.append(_shape(chain, poses, near, rng) if len(near) >= FEWEST_PAIRS else shapes[0])
+        shape = np.stack(shapes[::-1])
+        size = shape.shape[-1]
         norm = gammaln((1 + size) / 2) - gammaln(0.5) - 0.5 * size * np.log(np.pi)
-        return cls(np.asarray(np.linalg.inv(shape), float), 0.5 * float(np.linalg.slogdet(shape)[1]) - float(norm))
+        return cls(np.asarray(np.linalg.inv(shape), float), 0.5 * np.asarray(np.linalg.slogdet(shape)[1]) - norm)
 
     def log_density(self, chain: Chain, poses: Floats) -> Floats:
         """Of all loops (M,)."""
         a, b = chain.ends.T
+        apart = chain.path[a] != chain.path[b]
+        octave = np.minimum(np.log2(np.maximum(b - a, 1)).astype(np.int64), len(self.precision) - 1)
+        octave[apart] = len(self.precision) - 1
         residual = parallel(chain, chain.motion, poses[a], poses[b])
-        squares = np.einsum("mi,ij,mj->m", residual, self.precision, residual)
-        squares[chain.path[a] != chain.path[b]] = residual.shape[1]  # how two paths lie is not known
-        return np.asarray(-0.5 * (1 + residual.shape[1]) * np.log1p(squares) - self.log_scale)
+        squares = np.einsum("mi,mij,mj->m", residual, self.precision[octave], residual)
+        squares[apart] = residual.shape[1]  # how two paths lie is not known
+        return np.asarray(-0.5 * (1 + residual.shape[1]) * np.log1p(squares) - self.log_scale[octave])
+
+
+def _on_one_path(chain: Chain, pairs: Ints) -> Bools:
+    """Pairs (K, 2) of positions, the second of which may lie beyond the last, of one path."""
+    second = np.minimum(pairs[:, 1], chain.size - 1)
+    return np.asarray((second == pairs[:, 1]) & (chain.path[pairs[:, 0]] == chain.path[second]))
+
+
+def _shape(chain: Chain, poses: Floats, pairs: Ints, rng: np.random.Generator) -> Floats:
+    """The spread (p, p) of the residuals of loops between other positions (K, 2)."""
+    motion = chain.motion[rng.integers(0, len(chain.motion), len(pairs))]
+    residual = parallel(chain, motion, poses[pairs[:, 0]], poses[pairs[:, 1]])
+    moment, split = residual.T @ residual / max(len(residual), 1), turns(chain)
+    shape = np.zeros_like(moment)
+    shape[:split, :split], shape[split:, split:] = _floored(moment[:split, :split]), _floored(moment[split:, split:])
+    return shape
 
 
 def turns(chain: Chain) -> int:

@@ -9,7 +9,14 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import infer_bridged
-from hodge_pipeline.solvers.backbone.chain import Chain, linear_forest, make_chain, sequential_edges
+from hodge_pipeline.solvers.backbone.chain import (
+    Chain,
+    linear_forest,
+    make_chain,
+    one_of_each_place,
+    places_along,
+    sequential_edges,
+)
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -60,6 +67,14 @@ class Backbone:
         whole[:, self.chain.axes] = width
         information = graph.information / (whole[:, :, None] * whole[:, None, :])
         return replace(graph, information=information).select(np.flatnonzero(self.used))
+
+    def places(self, edges: Bools) -> int:
+        """How many places these edges (E,) join: those of one place are one testimony, as `places_along` has it."""
+        chain = self.found.scales.applied(self.chain)
+        at = np.flatnonzero(chain.step_edge >= 0)
+        ends = np.concatenate([chain.ends, np.stack([at - 1, at], axis=1)])
+        chosen = edges[np.concatenate([chain.loop_edge, chain.step_edge[at]])]
+        return len(one_of_each_place(places_along(replace(chain, ends=ends))[chosen]))
 
     @property
     def note(self) -> str:
