@@ -19,6 +19,7 @@ from hodge_pipeline.types import Bools, Floats, PositionPriors, ViewGraph
 MODEL = "model"
 GIVEN, ADJUSTED, RESECTED = "as given", "bundle adjustment", "resection and bundle adjustment"
 ROBUST = "resection and robust bundle adjustment"
+AFTER_ROBUST = "bundle adjustment without a robust loss from there"
 CONSISTENT, MENDED = "consistent poses and bundle adjustment", "images that are off placed anew and bundle adjustment"
 MENDINGS = 3
 """Rounds: an image placed anew gives its neighbours points to be placed by."""
@@ -118,12 +119,13 @@ def weigh(
 
     Depth takes part where the model is in metres: else its clouds are in another unit, or not of these images.
     """
-    weighing = _Weighing(inputs, start, steps)
+    weighing, plain, plainly = _Weighing(inputs, start, steps), start, 0
     weighing.add(ADJUSTED, start)
     if not weighing.costs[0].is_sound:
         poses = steps.step(resected_poses, start, None, title="resection").poses
         weighing.add(RESECTED, start, poses)
         if not weighing.costs[weighing.best].is_sound:
+            plainly = len(weighing.candidates)
             key, start = steps.key([start, ROBUST]), start.with_robust_loss()
             steps.remember(start, key)
             weighing.add(ROBUST, start, poses)
@@ -132,6 +134,11 @@ def weigh(
     if not weighing.is_settled or start.held_apart or depth.graph.edge_count:
         solved = _consistent(weighing, start, depth, options, steps)
     _mend(weighing, steps)
+    if start is not plain:
+        weighing.add(AFTER_ROBUST, plain, weighing.candidates[weighing.best].model.world_from_body)
+        if weighing.costs[-1].is_sound:  # the tracks were right: all of what they say counts
+            weighing.candidates[plainly:-1] = []
+            weighing.update()
     notes = (*depth.notes, *weighing.notes)
     return Found(weighing.inputs, weighing.candidates, weighing.costs, solved, depth, notes)
 

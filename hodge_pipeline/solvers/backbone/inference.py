@@ -196,7 +196,7 @@ def _of_right_places(
     unused = loops_at_place(away)[one_of_each_place(away)]
 
     def rivals(right: Bools) -> Floats:
-        sizes = np.sort(np.concatenate([unused, size[~right]]))
+        sizes = np.sort(np.concatenate([unused, size[~right] / ALIKE]))
         return np.asarray(np.log(len(sizes) - np.searchsorted(sizes, size) + MISTAKEN_PLACES))
 
     alone = _judge(start, None, EVEN, wrong).factor[chosen]
@@ -223,8 +223,10 @@ def together(log_odds: Floats) -> float:
     return float(log_odds.sum()) + max(len(log_odds) - 1, 0) * float(np.log(MISTAKEN_PLACES))
 
 
+ALIKE = 0.75
+"""Of a place's loops: a used place of as many that contradicts it is its rival, as is an unused one of all as many."""
 MISTAKEN_PLACES = 0.2
-"""To each right one, of places that loops agree on, beside those of at least as many loops that are not used. With more
+"""To each right one, of places that loops agree on, beside the rivals that are not used. With more
 a path that closes once would stay open: its loops can say little more than that the drift is as stated.
 """
 MISTAKEN = float(np.log(20.0))
