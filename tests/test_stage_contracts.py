@@ -17,7 +17,6 @@ from test_readers_colmap import synthetic
 OWN = "hodge-pipeline "
 PROPERTIES = {kind: check.properties for kind, check in testing.CHECKS.items() if kind != "readers"}
 OPTIONS: dict[str, dict[str, Any]] = {
-    "start: given": {"poses": "frames"},
     "executors: local": {"workers": 2},
     "edges: place": {
         "reach": 1,
