@@ -89,6 +89,31 @@ def drive(
     return Drive(graph, truth, np.arange(len(edges)) < len(steps) + len(good))
 
 
+def round_trip(
+    seed: int, loops: int, *, dimension: int = 3, wrong: int = 0, group: int = 1, only_wrong: bool = False
+) -> Drive:
+    """A circle of 500 steps that ends with `loops` of one place, and as many as `wrong` between others in groups."""
+    count, rng = 500 + loops, np.random.default_rng(seed)
+    turns = np.zeros((count, 6))
+    turns[:, 2] = 2 * np.pi * np.arange(count) / 500
+    truth = se3.exp(turns)
+    truth[:, :2, 3] = 500 / (2 * np.pi) * np.stack([np.sin(turns[:, 2]), -np.cos(turns[:, 2])], axis=1)
+    starts = np.repeat(rng.integers(0, count - group, (-(-wrong // group), 2)), group, axis=0)[:wrong]
+    mistaken = starts + np.tile(np.arange(group), len(starts))[: len(starts), None]
+    closing = np.arange(loops)[:, None] + ([50, 350] if only_wrong else [0, 500])
+    steps = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+    edges = np.concatenate([steps, closing, mistaken[np.abs(np.diff(mistaken, axis=1)[:, 0]) > 1]])
+    exact = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]]
+    exact[count - 1 :] = np.eye(4)
+    size = np.repeat(np.where(np.arange(len(edges))[:, None] < count - 1, [[0.003, 0.03]], [[0.01, 0.05]]), 3, axis=1)
+    noise = size * rng.standard_normal(size.shape)
+    information = np.eye(6) / size[:, None, :] ** 2
+    if dimension == 2:
+        noise[:, [0, 1, 5]] = information[:, [0, 1, 5]] = 0
+    graph = ViewGraph.from_edges(np.arange(count), edges, exact @ se3.exp(noise), information, dimension=dimension)
+    return Drive(graph, truth, np.arange(len(edges)) < count - 1 + (0 if only_wrong else loops))
+
+
 WORLDS = ("ring", "town", "corridor", "room")
 
 

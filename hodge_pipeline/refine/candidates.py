@@ -136,7 +136,8 @@ def weigh(
     _mend(weighing, steps)
     if start is not plain:
         weighing.add(AFTER_ROBUST, plain, weighing.candidates[weighing.best].model.world_from_body)
-        if weighing.costs[-1].is_sound:  # the tracks were right: all of what they say counts
+        added = weighing.candidates[-1].name == AFTER_ROBUST
+        if added and weighing.costs[-1].is_sound:  # the tracks were right: all of what they say counts
             weighing.candidates[plainly:-1] = []
             weighing.update()
     notes = (*depth.notes, *weighing.notes)

@@ -84,6 +84,7 @@ def crowded(chain: Chain, factor: Floats) -> list[Bools]:
 
 
 MOST_PLACES = 3
+"""That are tried, each for as long as the first judgement takes."""
 
 
 def _inferred(
@@ -124,7 +125,7 @@ def _inferred(
     judged, linear = best
     agreed = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
     enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0)
-    used, confirmed = _of_right_places(start, linear, judged, agreed, wrong, enough)
+    used, confirmed = _of_right_places(start, alone, judged, agreed, wrong, enough)
     used |= always
     rows = thinned(chain, np.flatnonzero(used)).active
     if (agreed & ~used).any():
@@ -179,7 +180,7 @@ def _limit(judged: Judged) -> float:
 
 
 def _of_right_places(
-    start: Linear, linear: Linear, judged: Judged, used: Bools, wrong: Wrong, enough: float
+    start: Linear, alone: Judged, judged: Judged, used: Bools, wrong: Wrong, enough: float
 ) -> tuple[Bools, bool]:
     """The used loops (M,) of places that are not mistaken for others, and whether they say more than chance finds:
     log-odds that are `enough`.
@@ -189,7 +190,7 @@ def _of_right_places(
     """
     if not used.any() or (judged.factor[used] - np.log(len(used))).sum() <= by_chance(len(used)):
         return used, False
-    chain, ends, rows = linear.chain, places_along(linear.chain), np.flatnonzero(used)
+    chain, ends, rows = start.chain, places_along(start.chain), np.flatnonzero(used)
     first = one_of_each_place(ends[rows])
     chosen, size = rows[first], loops_at_place(ends[rows])[first]
     away = ends[cKDTree(ends[chosen]).query(ends, p=np.inf)[0] > 1.0]
@@ -199,16 +200,15 @@ def _of_right_places(
         sizes = np.sort(np.concatenate([unused, size[~right] / ALIKE]))
         return np.asarray(np.log(len(sizes) - np.searchsorted(sizes, size) + MISTAKEN_PLACES))
 
-    alone = _judge(start, None, EVEN, wrong).factor[chosen]
-    right = np.ones(len(chosen), bool)
-    strongest = np.arange(len(chosen)) == np.argmax(alone - rivals(right))
+    right, bare = np.ones(len(chosen), bool), alone.factor[chosen]
+    strongest = np.arange(len(chosen)) == np.argmax(bare - rivals(right))
     for number in range(ROUNDS):
         fit = settled(Fit(thinned(chain, chosen[right]), start), MOST_STEPS)
         factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals(right)
         if not number and together(factor) > enough:
             return used, True
         before, right = right, factor > enough if number else strongest
-        by_itself = float((alone - rivals(strongest))[strongest][0])
+        by_itself = float((bare - rivals(strongest))[strongest][0])
         said = max(together(factor[factor > enough]), by_itself)
         if said == by_itself:
             right = right | strongest
