@@ -43,6 +43,8 @@ DOUBTS = {
     "camera or object": "In doubt, since much of the image moves",
     "unheld": "In doubt, since what frames share lets them slide",
     "path loose": "In doubt, since the scans tell little of how far the scanner went",
+    "reader's doubt": "In doubt, since the reader assumes what no file tells",
+    "path scaled": "In doubt, since the path is of another size than the one given",
     "depth unit": "In doubt, since depth is probably not in metres",
     "other scale": "In another scale than the truth",
 }
@@ -110,7 +112,8 @@ def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, 
         refinement = report.refinement
         outcome = REFINEMENTS[refinement.outcome]
         if outcome == "improved" and worse:
-            return "mixed", f"{refinement.headline}, but {but}", f"{refinement.reason}."
+            good = f" ({min(better, key=lambda change: change.share).briefly})" if better else ""
+            return "mixed", f"{refinement.headline}{good}, but {but}", f"{refinement.reason}."
         return outcome, refinement.headline, f"{refinement.reason}."
     if not changes:
         return "not measured", "Not measured", report.unmeasured or NO_MEASURE
