@@ -169,8 +169,8 @@ def _size(work: Work, before: Floats, after: Floats) -> list[Measure]:
     spreads = [float(np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0))) for poses in (before, after)]
     left = [absolute_error(before, after, with_scale=scaled).rmse_m for scaled in (False, True)]
     factor = spreads[1] / spreads[0] if spreads[0] > 0 else 1.0
-    is_still = left[0] * 1000 < STEP_TOLERANCE_MM * float(work.recipe.scale)
-    if is_still or abs(factor - 1) <= TOLD_SIZE or left[1] > SIZE_LEAVES * left[0]:
+    moved = left[0] * 1000 > STEP_TOLERANCE_MM * float(work.recipe.scale)
+    if not (moved and abs(factor - 1) > TOLD_SIZE and left[1] <= SIZE_LEAVES * left[0]):
         return []
     work.steps.note(Note("path scaled", detail=f"{factor:.3g}"))
     return [Measure("change of the path's size", 0.0, abs(factor - 1), tolerance=LARGEST_SIZE)]
