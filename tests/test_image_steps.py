@@ -60,5 +60,4 @@ def test_depth_that_is_warped_alike_in_every_frame_makes_nothing_worse(room: Sou
     refined = hodge_pipeline.refine_trajectory(given, frames, recipe="slam_refine", overrides=SMALL)
     assert refined.decision.outcome == "worse" and refined.poses is given
     assert "change of the path's size" in refined.decision.reason
-    told = {note.kind for note in refined.report.notes}
-    assert {"path scaled", "rougher"} <= told
+    assert "path scaled" in {note.kind for note in refined.report.notes}
