@@ -81,6 +81,8 @@ def test_what_lies_too_near_or_too_far_is_asked_about() -> None:
     assert "within 1.2 m" in str(doubts_of(even / 5)[0])
     assert "beyond 23.2 m" in str(doubts_of(even * 5)[0])
     assert "median depth is 3.3e+03 m" in str(doubts_of(even * 1000)[0])
+    desk = np.concatenate([np.repeat(even, 3), np.repeat(even * 10, 1)]) / 20  # mostly .2 m, some beyond 2 m
+    assert "median depth is 0.2" in str(doubts_of(desk)[0])
     assert doubts_of(np.zeros(10, np.float32)) == ()
 
 
