@@ -12,8 +12,8 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import UNTESTABLE, WRONG
 from hodge_pipeline.diagnosis.robust import RobustSolver
-from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.rounds.one_round import Registered, judge_edges, solve_edges
+from hodge_pipeline.rounds.suggestions import suggest_pairs
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver, Step, no_progress
