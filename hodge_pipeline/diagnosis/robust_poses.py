@@ -17,9 +17,9 @@ from hodge_pipeline.solvers.newton import Limits
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import Bools, Floats, Ints
 
-GATE = 90.0
-"""An edge of a larger χ² has no part in the poses."""
-ONCE, TWICE = (60.0,), (60.0, GATE)
+GATE, UNSETTLED = 90.0, 60.0
+"""An edge of a larger χ² has no part in the poses, the second while these are not settled."""
+ONCE, TWICE = (UNSETTLED,), (UNSETTLED, GATE)
 ANNEALED = (1e4, 1e3, 300.0)
 """Gates for poses that drifted while they grew: edges that they miss by far pull them into place (graduated
 non-convexity, Yang et al. 2020), and what does not follow falls out.

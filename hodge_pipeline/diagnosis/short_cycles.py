@@ -15,7 +15,7 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 LONGEST_ENTRIES = 5_000_000
 GATE = 30.0
-"""χ² over six dimensions of a cycle that closes."""
+"""χ² over six dimensions of a cycle that closes, and of two edges that agree. Generous, since tails are heavy."""
 
 
 def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
