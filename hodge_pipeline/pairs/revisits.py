@@ -13,8 +13,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.occupancy import voxels
 from hodge_pipeline.pairs.drift import displacement_m, median_range_m, path_length_m
-from hodge_pipeline.pairs.overlap import voxels
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import PreparedClouds
 from hodge_pipeline.stages import Advance, Registrar, no_progress
