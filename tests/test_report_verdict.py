@@ -143,6 +143,10 @@ def test_a_path_in_doubt_says_so_first(report: Report) -> None:
     """Whatever fits better: clouds of an object that was followed fit each other."""
     verdict = judge(replace(report, notes=(Note("camera or object", 9, "20 frames, 1–9"),)))
     assert verdict.headline == "In doubt, since much of the image moves: improved against odometry"
+    doubts = (*report.notes, Note("camera or object", 10, "1–9, 12"), Note("depth unit", detail="its steps"))
+    headline = judge(replace(report, notes=doubts)).headline
+    reasons = "much of the image moves and depth is probably not in metres"
+    assert headline == f"In doubt, since {reasons}: improved against odometry"
     assert verdict.mark == "mixed"
 
 

@@ -38,15 +38,14 @@ REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",
 }  # fmt: skip
-DOUBTS = {
-    "unsettled": "Not settled",
-    "camera or object": "In doubt, since much of the image moves",
-    "unheld": "In doubt, since what frames share lets them slide",
-    "path loose": "In doubt, since the scans tell little of how far the scanner went",
-    "depth unit": "In doubt, since depth is probably not in metres",
-    "other scale": "In another scale than the truth",
+DOUBTS = {"unsettled": "not settled", "other scale": "in another scale than the truth"}
+REASONS = {
+    "camera or object": "much of the image moves",
+    "unheld": "what frames share lets them slide",
+    "path loose": "the scans tell little of how far the scanner went",
+    "depth unit": "depth is probably not in metres",
 }
-"""How a headline begins where the run says that its result may be wrong, whatever was measured."""
+"""How a headline begins where the run says that its result may be wrong, whatever was measured, and why."""
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 
 
@@ -96,7 +95,9 @@ def judge(report: Report) -> Verdict:
         all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
     told = (*_unsettled(report), *_other_scale(report), *report.notes)
+    reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS)
     doubts = [DOUBTS[note.kind] for note in told if note.kind in DOUBTS]
+    doubts += [f"in doubt, since {reasons}"] if reasons else []
     doubts += [report.refinement.doubt] if report.refinement and report.refinement.doubt else []
     headline = capital(": ".join(f"{text[:1].lower()}{text[1:]}" for text in (*doubts, headline)))
     return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason, bool(doubts))
