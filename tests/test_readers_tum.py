@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.association import interpolated_poses, nearest_pairs
+from hodge_adapters.association import nearest_pairs
 from hodge_adapters.images.camera_files import resized
 from hodge_adapters.tum import reader
 from hodge_adapters.tum.image_lists import StampedImages, read_pairs
@@ -274,7 +274,7 @@ def test_the_nearer_depth_gets_the_colour_image() -> None:
 
 def test_outside_the_trajectory_there_is_no_pose() -> None:
     trajectory = Trajectory(np.array([1.0, 2.0]), some_poses(2))
-    poses = interpolated_poses(trajectory, np.array([0.99, 1.0, 1.5, 2.0, 2.01]), 1.0)
+    poses = se3.poses_at(trajectory, np.array([0.99, 1.0, 1.5, 2.0, 2.01]), 1.0)
     assert np.isnan(poses[:, 0, 0]).tolist() == [True, False, False, False, True]
     np.testing.assert_allclose(poses[[1, 3]], trajectory.world_from_cam, atol=1e-12)
 
@@ -282,9 +282,9 @@ def test_outside_the_trajectory_there_is_no_pose() -> None:
 def test_a_pose_at_a_frames_own_stamp_is_its_truth_however_sparse_the_truth_is() -> None:
     trajectory = Trajectory(np.array([1.0, 2.0, 3.0]), some_poses(3))
     stamps_s = np.array([1.01, 1.5, 1.985, 3.01])
-    poses = interpolated_poses(trajectory, stamps_s, 0.1, 0.02)
+    poses = se3.poses_at(trajectory, stamps_s, 0.1, 0.02)
     assert np.isnan(poses[:, 0, 0]).tolist() == [False, True, False, True]
-    dense = interpolated_poses(trajectory, stamps_s[[0, 2]], 1.0)
+    dense = se3.poses_at(trajectory, stamps_s[[0, 2]], 1.0)
     np.testing.assert_array_equal(poses[[0, 2]], dense)
 
 
