@@ -85,9 +85,9 @@ def test_page_and_recording(tmp_path: Path) -> None:
     assert "a and b" in text and "laid onto A by the 12 frames" in text
     assert len(addresses) == 5 and all(address.startswith("data:image/") for address in addresses)
     for side in "ab":
-        poses = np.squeeze(rows(recording, f"{layout.WORLD}/{side}/poses", "Transform3D:translation"))
+        poses = np.squeeze(rows(recording, layout.poses(side), "Transform3D:translation"))
         np.testing.assert_allclose(np.float32(poses), np.float32(circle()[:, :3, 3]), atol=2e-6)
-        (points,) = rows(recording, f"{layout.WORLD}/{side}/model", "Points3D:positions")
+        (points,) = rows(recording, f"{layout.MODEL}/{side}", "Points3D:positions")
         assert len(points) == 24
     assert len(RrdReader(recording).blueprints()) == 1
 

@@ -37,7 +37,7 @@ def log_diagnosis(
     drawable = np.isfinite(lines).all(axis=(1, 2))
     for name in sorted(set(edges.verdict.tolist()) | set(COLOURS)):
         rows = np.flatnonzero((edges.verdict == name) & drawable)
-        kept = options.count(options.edge_lines, len(rows), BYTES_EACH, options.max_bytes("solver") / 2)
+        kept = options.count(shapes.MOST_LINES, len(rows), BYTES_EACH, options.max_bytes("solver") / 2)
         rows, available = rows[evenly(len(rows), kept)], len(rows)
         labels = [_label(graph, edges, int(row)) for row in rows]
         colour, radius = COLOURS.get(name, shapes.RESULT_COLOUR), RADII.get(name, -0.8)

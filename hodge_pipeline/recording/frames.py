@@ -19,6 +19,8 @@ CHUNK_BYTES = 4_000_000
 """Images go in chunks of this size: few enough to be quick, small enough for a viewer to fetch one."""
 IMAGE_PLANE_M = 0.25
 POINT_BYTES = 16
+MOST_POINTS = 300_000
+"""Of all frames' clouds together; more says little beside the fused model."""
 SIZED_FRAMES, MARGIN = 16, 1.1
 """Frames whose images are read to know how large all are, and what their mean is taken times: of red kitchen's frames
 the largest is 1.2 times the mean, and the mean of 16 is known to 3 %."""
@@ -49,11 +51,11 @@ def image_rows(frames: Sequence[Frame], options: RecordingOptions) -> tuple[Ints
     if not options.has_images:
         return np.zeros(0, np.int64), ()
     sizes = _sizes(frames)
-    wished = every = options.image_every if options.level == "normal" else 1
+    every = 1
     while every <= len(frames) and sizes[::every].sum() > options.max_bytes("images"):
         every += 1
     rows = np.arange(0, len(frames), every) if every <= len(frames) else np.arange(0)
-    if every == wished:
+    if every == 1:
         return rows, ()
     note = f"images of {len(rows)} of {len(frames)} frames, to stay under {options.max_megabytes:g} MB"
     return rows, (f"recording: {note} (recording.max_megabytes)",)
@@ -74,7 +76,7 @@ def log_clouds(
 ) -> tuple[str, ...]:
     """Log each frame's cloud in its camera's axes; gives notes of what was thinned."""
     total = int(clouds.offsets[-1])
-    kept = options.count(options.cloud_points, total, POINT_BYTES, options.max_bytes("clouds"))
+    kept = options.count(MOST_POINTS, total, POINT_BYTES, options.max_bytes("clouds"))
     if not options.has_images or not total or not kept:
         return ()
     sizes = np.diff(clouds.offsets)

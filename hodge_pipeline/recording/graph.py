@@ -17,9 +17,13 @@ from hodge_pipeline.types.arrays import evenly
 LINE_BYTES = 40
 """One edge of the film: two points, a colour, two list offsets."""
 LABEL_BYTES = 60
+FILM_STEPS = 60
+"""Inner iterations of one solve that are drawn; the scalars are kept for all."""
 STEP_LINES = 200
 """Iterations are left out of the film only where fewer lines than this would be left in each."""
 
+FRUSTA = 60
+"""Drawn along one trajectory."""
 TRAJECTORY_RADIUS, FRUSTUM_RADIUS, EDGE_RADIUS, CENTRE_RADIUS = -1.6, -0.5, -0.6, -2.0
 """Rerun takes a negative radius as points on the screen, so that lines stay legible at every distance."""
 
@@ -29,8 +33,7 @@ def log_poses(
     name: str,
     world_from_cam: Floats,
     frames: Sequence[Frame],
-    options: RecordingOptions,
-    is_scanner: bool = False,
+    is_scanner: bool,
 ) -> tuple[str, ...]:
     """Log a trajectory as a line, as shapes (`pose_lines`) and as transforms; gives notes of what was left out."""
     drawable = np.flatnonzero(shapes.is_drawable(world_from_cam))
@@ -41,7 +44,7 @@ def log_poses(
         path, colors=[colour], radii=[TRAJECTORY_RADIUS], labels=[name] * len(path), show_labels=False
     )
     stream.log(layout.trajectory(name), line, static=True)
-    picked = drawable[evenly(len(drawable), options.frusta)]
+    picked = drawable[evenly(len(drawable), FRUSTA)]
     lines = shapes.pose_lines(world_from_cam[picked], is_scanner)
     stream.log(layout.frusta(name), rr.LineStrips3D(lines, colors=[colour], radii=[FRUSTUM_RADIUS]), static=True)
     stream.send_columns(
@@ -68,12 +71,12 @@ def log_edges(
     """Log edges coloured by residual, and rejected pairs with the reason; gives notes of what was thinned."""
     residual_m = shapes.residuals_m(graph, world_from_cam)
     colours = shapes.residual_colours(residual_m, options.residual_scale_m)
-    kept = options.count(options.edge_lines, graph.edge_count, LINE_BYTES + LABEL_BYTES, max_bytes / 2)
+    kept = options.count(shapes.MOST_LINES, graph.edge_count, LINE_BYTES + LABEL_BYTES, max_bytes / 2)
     rows = evenly(graph.edge_count, kept)
     labels = [_label(graph, int(row), residual_m) for row in rows]
     _log_lines(stream, layout.edges(outer), world_from_cam, graph.edges[rows], colours[rows], labels)
     if rejected is not None:
-        kept = options.count(options.edge_lines, len(rejected.pairs), LINE_BYTES, max_bytes / 4)
+        kept = options.count(shapes.MOST_LINES, len(rejected.pairs), LINE_BYTES, max_bytes / 4)
         pairs = rejected.pairs[evenly(len(rejected.pairs), kept)]
         grey = np.full((len(pairs), 3), shapes.REJECTED_COLOUR, np.uint8)
         why = rejected.why[evenly(len(rejected.pairs), kept)]
@@ -106,7 +109,7 @@ def log_solution(
         notes += _log_film(stream, outer, graph, states, residuals, first_iteration, options, max_bytes / 2)
     colours = shapes.residual_colours(residuals[-1], options.residual_scale_m)
     colours[solution.weights == 0] = shapes.IGNORED_COLOUR
-    lines = evenly(graph.edge_count, options.count(options.edge_lines, graph.edge_count, LINE_BYTES, max_bytes / 4))
+    lines = evenly(graph.edge_count, options.count(shapes.MOST_LINES, graph.edge_count, LINE_BYTES, max_bytes / 4))
     final = solution.world_from_cam
     _log_lines(stream, layout.solved_edges(outer), final, graph.edges[lines], colours[lines], None)
     log_notes(stream, outer, solution.notes)
@@ -176,9 +179,9 @@ def _log_film(
     drawn = np.flatnonzero(np.all([shapes.is_drawable(poses) for poses in states], axis=0))
     has_ends = np.isin(graph.edges, drawn).all(axis=1)
     available = int(np.count_nonzero(has_ends))
-    steps = options.count(options.film_steps, len(states), STEP_LINES * LINE_BYTES, max_bytes)
+    steps = options.count(FILM_STEPS, len(states), STEP_LINES * LINE_BYTES, max_bytes)
     rows = evenly(len(states), max(steps, 2))
-    kept = options.count(options.edge_lines, available, LINE_BYTES * len(rows), max_bytes)
+    kept = options.count(shapes.MOST_LINES, available, LINE_BYTES * len(rows), max_bytes)
     lines = np.flatnonzero(has_ends)[evenly(available, kept)]
     indexes = iteration_columns(outer, len(states), first_iteration, rows)
     if len(lines):

@@ -53,18 +53,15 @@ def log_evaluation(
     stream: rr.RecordingStream,
     frames: Sequence[Frame],
     per_frame: Mapping[str, Floats],
-    bars: Mapping[str, Floats],
     tables: Mapping[str, str],
 ) -> None:
-    """Series over the frames (NaN where a frame has no score), bar charts, and tables in Markdown."""
+    """Series over the frames (NaN where a frame has no score), and tables in Markdown."""
     for name, values in per_frame.items():
         rows = np.flatnonzero(np.isfinite(values))
         if len(rows):
             indexes = frame_columns(frames, len(values), rows)
             scalars = rr.Scalars.columns(scalars=np.asarray(values, float)[rows])
             stream.send_columns(layout.under(layout.FRAME_PLOTS, name), indexes, scalars)
-    for name, values in bars.items():
-        stream.log(layout.under(layout.BARS, name), rr.BarChart(np.asarray(values, float)), static=True)
     text = "\n\n".join(f"## {title}\n\n{table}" for title, table in tables.items())
     log_markdown(stream, layout.SCORES, text or "No scores.")
 

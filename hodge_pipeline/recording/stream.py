@@ -16,6 +16,7 @@ from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import layout
 from hodge_pipeline.scene import UNIX_STAMP_S, has_real_stamps
 from hodge_pipeline.types import Floats, Frame, Ints
+from hodge_pipeline.types.output_files import draft_of
 
 APPLICATION = "hodge-pipeline"
 """By which the viewer keeps a layout that the user has changed."""
@@ -32,17 +33,12 @@ def open_stream(recording_id: str, application: str = APPLICATION) -> rr.Recordi
     return stream
 
 
-def partial_path(path: Path) -> Path:
-    """Where a part lies while it is written; a killed writer leaves it there."""
-    return path.with_name(f".{path.name.removesuffix(layout.PART_SUFFIX)}{layout.PARTIAL_SUFFIX}")
-
-
 @contextmanager
 def writing(
     path: Path, recording_id: str, blueprint: rr.blueprint.Blueprint | None = None, application: str = APPLICATION
 ) -> Iterator[rr.RecordingStream]:
     """A stream into this file, which appears under its name only when all is in it."""
-    partial = partial_path(path)
+    partial = draft_of(path)
     stream = open_stream(recording_id, application)
     stream.save(partial, default_blueprint=blueprint)
     try:
