@@ -8,13 +8,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import scene_view, without_panels
 from hodge_pipeline.recording.eye import Eye, look_from
 from hodge_pipeline.recording.graph import log_poses
 from hodge_pipeline.recording.results import log_model
-from hodge_pipeline.recording.stream import log_markdown, writing
+from hodge_pipeline.recording.stream import Part, log_markdown, writing
 from hodge_pipeline.types import Floats, Model
 
 APART = "/plots/apart_m"
@@ -34,9 +33,10 @@ def record_comparison(
     eye = look_from(poses[0], np.zeros((0, 3)), is_scanner)
     with writing(path, f"compare-{names[0]}-{names[1]}", _blueprint(names, eye)) as stream:
         for side, world_from_cam, model in zip("ab", poses, models, strict=True):
-            log_poses(stream, side, world_from_cam, (), is_scanner)
+            part = Part(stream, is_scanner=is_scanner)
+            log_poses(part, side, world_from_cam)
             if model is not None:
-                log_model(stream, model, RecordingOptions(), _model(side))
+                log_model(part, model, _model(side))
         if len(apart_m):
             times = [rr.TimeColumn(layout.FRAME, sequence=np.arange(len(apart_m)))]
             stream.send_columns(APART, times, rr.Scalars.columns(scalars=apart_m))

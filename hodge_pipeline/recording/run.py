@@ -30,6 +30,7 @@ from hodge_pipeline.types import CloudSet, Floats, Ints, Source
 from hodge_pipeline.types.input_files import read_input_text
 from hodge_pipeline.types.notes import notes_of
 from hodge_pipeline.types.ply import read_model
+from hodge_pipeline.types.text import markdown_table
 
 FILE = "recording.rrd"
 RECORDING = "recording"
@@ -226,8 +227,8 @@ def _record_evaluation(recorder: Recorder, source: Source, rounds: Sequence[Roun
                 if graph.kind == scores.graphs[-1].kind and len(graph.pairs):
                     per_frame[f"score/{name}"] = mean_at_frames(graph.pairs, scores_of_pairs, len(source.frames))
             rows = zip(scores.names, graph.mean_score, graph.mean_distance_m * 1000, strict=True)
-            lines = [f"| {name} | {score:.4f} | {distance:.2f} |" for name, score, distance in rows]
-            tables[f"Scores, {graph.kind} graph"] = "\n".join(["| poses | score | d, mm |", "|---|---|---|", *lines])
+            cells = [(name, f"{score:.4f}", f"{distance:.2f}") for name, score, distance in rows]
+            tables[f"Scores, {graph.kind} graph"] = markdown_table(("poses", "score", "d, mm"), cells)
     return recorder.evaluation(source.frames, per_frame=per_frame, tables=tables)
 
 
