@@ -266,7 +266,7 @@ def test_evenly_spread(available: int, kept: int) -> None:
         assert np.ptp(np.diff(picked)) <= 1
 
 
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 @given(st.floats(0.0005, 0.01))
 def test_images_stay_in_their_share(megabytes: float) -> None:
     frames = make_frames(20)
