@@ -29,10 +29,14 @@ class Picture:
     image: bytes
 
     @property
+    def media_type(self) -> str:
+        """`image/png` or `image/jpeg`."""
+        return "image/jpeg" if self.image.startswith(JPEG) else "image/png"
+
+    @property
     def address(self) -> Markup:
         """The picture as a data URI."""
-        kind = "jpeg" if self.image.startswith(JPEG) else "png"
-        return Markup(f"data:image/{kind};base64,{b64encode(self.image).decode()}")
+        return Markup(f"data:{self.media_type};base64,{b64encode(self.image).decode()}")
 
 
 @dataclass(frozen=True)
