@@ -99,7 +99,7 @@ def test_drift_is_taken_out_and_the_stamps_stay(refined: Path, drifted: Trajecto
 def test_the_report_shows_what_the_guard_measured(refined: Path) -> None:
     report = json.loads((refined / "report.json").read_text())
     names = {row["name"] for row in report["refinement"]["measures"]}
-    assert names == {"score of held-out edges", "edge chi2, mean"} and report["verdict"]["outcome"] == "improved"
+    assert {"score of held-out edges", "edge chi2, mean"} <= names and report["verdict"]["outcome"] == "improved"
     assert "Better than the poses given" in (refined / "report.html").read_text()
 
 

@@ -39,7 +39,7 @@ SNIFFED_BYTES = 1 << 16
 COLOUR_FOLDERS = ("image", "images", "color", "rgb")
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
 TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
-_NUMBER = re.compile(r"\D*(\d+)")
+_NUMBER = re.compile(r"\D*(\d{1,18})(?!\d)")
 _IMAGES = (".png", ".jpg", ".jpeg")
 
 
