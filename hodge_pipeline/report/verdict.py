@@ -43,6 +43,8 @@ REASONS = {
     "camera or object": "much of the image moves",
     "unheld": "what frames share lets them slide",
     "path loose": "the scans tell little of how far the scanner went",
+    "reader's doubt": "the reader assumes what no file tells",
+    "path scaled": "the path is of another size than the one given",
     "depth unit": "depth is probably not in metres",
 }
 """How a headline begins where the run says that its result may be wrong, whatever was measured, and why."""
@@ -111,7 +113,8 @@ def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, 
         refinement = report.refinement
         outcome = REFINEMENTS[refinement.outcome]
         if outcome == "improved" and worse:
-            return "mixed", f"{refinement.headline}, but {but}", f"{refinement.reason}."
+            good = f" ({min(better, key=lambda change: change.share).briefly})" if better else ""
+            return "mixed", f"{refinement.headline}{good}, but {but}", f"{refinement.reason}."
         return outcome, refinement.headline, f"{refinement.reason}."
     if not changes:
         return "not measured", "Not measured", report.unmeasured or NO_MEASURE
