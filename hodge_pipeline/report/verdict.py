@@ -43,7 +43,7 @@ REASONS = {
     "camera or object": "much of the image moves",
     "unheld": "what frames share lets them slide",
     "path loose": "the scans tell little of how far the scanner went",
-    "reader's doubt": "the reader assumes what no file tells",
+    "reader's doubt": "the camera is assumed and images do not confirm it",
     "path scaled": "the path is of another size than the one given",
     "depth unit": "depth is probably not in metres",
 }
