@@ -7,9 +7,11 @@ correspondences, as their information matrix has it, is at most (0.2 m)².
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from hodge_adapters.pose_graphs.pair_log import PairLogReader
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import root_from_vertex, spanning_forest
@@ -60,6 +62,15 @@ def right_edges(truth: PairTruth, edges: Ints, i_from_j: Floats) -> Bools:
     near = np.linalg.norm(left[:, :3, 3], axis=1) <= UNLISTED_M
     near &= np.linalg.norm(se3.so3_log(left[:, :3, :3]), axis=1) <= UNLISTED_RAD
     return np.where(listed, right, near & (truth.component[i] == truth.component[j]))
+
+
+def read_estimates(log: Path) -> tuple[ViewGraph, PairTruth, Bools]:
+    """The graph of a .log file, the truth that gt.log and gt.info beside it are, and where (E,) its edges are right."""
+    true = PairLogReader(information=log.with_name("gt.info")).open(log.with_name("gt.log")).graph
+    graph = PairLogReader().open(log).graph
+    assert true is not None and graph is not None
+    truth = PairTruth.from_graph(true)
+    return graph, truth, right_edges(truth, graph.edges, graph.i_from_j)
 
 
 def pose_recall(truth: PairTruth, world_from_vertex: Floats, piece: Ints) -> float:

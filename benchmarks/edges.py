@@ -21,10 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from edge_scores import PairTruth, area_under_roc, pose_recall, precision_and_recall, right_edges
+from edge_scores import PairTruth, area_under_roc, pose_recall, precision_and_recall, read_estimates
 from edges_peers import LEVER_M, Answer, Peer, installed_peers
 
-from hodge_adapters.pose_graphs.pair_log import PairLogReader
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -68,17 +67,12 @@ def row(name: str, call: Callable[[], tuple[Answer, Floats | None]], truth: Pair
 
 def scene(log: Path, peers: dict[str, Peer]) -> dict[str, Any]:
     """The table of one graph."""
-    folder = log.parent
-    true = PairLogReader(information=folder / "gt.info").open(folder / "gt.log").graph
-    graph = PairLogReader().open(log).graph
-    assert true is not None and graph is not None
-    truth = PairTruth.from_graph(true)
-    right = right_edges(truth, graph.edges, graph.i_from_j)
+    graph, truth, right = read_estimates(log)
     rows = [row("hodge diagnosis", lambda: diagnosis(graph), truth, right)]
     for name, peer in peers.items():
         rows.append(row(name, lambda peer=peer: (peer(graph), None), truth, right))
     rows.append(row("oracle", lambda: (oracle(graph, right), None), truth, right))
-    name = f"{folder.name.removesuffix('-evaluation')} {log.stem}"
+    name = f"{log.parent.name.removesuffix('-evaluation')} {log.stem}"
     return {
         "scene": name,
         "vertices": graph.vertex_count,

@@ -16,9 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.edge_scores import PairTruth, right_edges
+from benchmarks.edge_scores import read_estimates
 from benchmarks.simulated_edges import several
-from hodge_adapters.pose_graphs.pair_log import PairLogReader
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.types import Bools, Floats
 
@@ -57,10 +56,7 @@ def _real(folder: Path) -> list[tuple[Floats, Bools]]:
     for log in sorted(folder.rglob("*.log")):
         if log.stem == "gt" or not (log.parent / "gt.info").is_file():
             continue
-        true = PairLogReader(information=log.parent / "gt.info").open(log.parent / "gt.log").graph
-        graph = PairLogReader().open(log).graph
-        assert true is not None and graph is not None
-        right = right_edges(PairTruth.from_graph(true), graph.edges, graph.i_from_j)
+        graph, _, right = read_estimates(log)
         out.append((diagnose(graph).probability, right))
     return out
 

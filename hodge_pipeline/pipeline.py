@@ -1,4 +1,4 @@
-"""The method on one screen: start, then propose, register, judge and solve until consistent; refine, fuse."""
+"""The method on one screen: first poses; pairs proposed, registered, judged and solved, again and again; fusion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.run import Recording
 from hodge_pipeline.refine import verdict
-from hodge_pipeline.refine.poses import refine_poses
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.rounds.all_frames import pose_all_frames
 from hodge_pipeline.rounds.by_hand import edited_rounds
@@ -73,7 +72,7 @@ def compute(job: Job, recording: Recording) -> Computed:
         scores = score(job, work, rounds)
         recording.scores(scores)
         refined = verdict.finish(work, job.folder, rounds) if scene.is_given else None
-        poses = refine(work, rounds[-1], refined)
+        poses = final_poses(work, rounds[-1], refined)
     models = fuse_all(recipe.fusion, scene, poses, store, keys_only=job.again and rounds[-1].edited)
     recording.models(models)
     return Computed(scene, tuple(rounds), scores, refined, poses, models)
@@ -90,14 +89,14 @@ def proposed_rounds(work: Work, rounds: Sequence[Round]) -> Iterator[Registered]
 def consistent(work: Work, registered: Registered) -> Round:
     """The poses consistent with a round's edges: the verdict on each, their complex, ω on it, its parts, the solve."""
     judged = work.judge(registered)
-    graph, found = judged.graph(work.scene.first.vertex_ids), None
+    viewing_graph, energies = judged.graph(work.scene.first.vertex_ids), None
     try:
-        complex_ = work.recipe.complex.of(graph, work.scene.clouds, judged.start)
-        omega = one_form(graph, judged.start)
-        found = decompose(complex_, omega).energies(complex_.counts)
+        complex_ = work.recipe.complex.of(viewing_graph, work.scene.clouds, judged.start)
+        omega = one_form(viewing_graph, judged.start)
+        energies = decompose(complex_, omega).energies(complex_.counts)
     except GraphError as error:  # the poses do not depend on it
         work.steps.note(Note("no decomposition", detail=f"{judged.name}: without its decomposition: {error}"))
-    return work.solve(judged, found)
+    return work.solve(judged, energies)
 
 
 def measured(job: Job, scene: Scene) -> ViewGraph:
@@ -117,15 +116,8 @@ def score(job: Job, work: Work, rounds: list[Round]) -> ScoreTable | None:
     return score_rounds(work.scene.source, work.scene.clouds, rounds, work.scale, job.store, work.workers)
 
 
-def refine(work: Work, last: Round, refined: Refined | None) -> Floats:
-    """The final poses (N, 4, 4) of all frames: those that follow from the last round, or that its guard kept, refined
-    where the recipe says how.
-    """
-    scene, refiner = work.scene, work.recipe.refiner
-    if refined is None:
-        poses = pose_all_frames(scene, last.world_from_cam, work.steps, work.workers, work.scale)
-    else:
-        poses = refined.world_from_cam
-    if refiner is None:
-        return poses
-    return work.steps.step(refine_poses, refiner, scene.whole, poses, title="refine", total=len(poses))
+def final_poses(work: Work, last: Round, refined: Refined | None) -> Floats:
+    """The poses (N, 4, 4) of all frames: those that follow from the last round, or that its guard kept."""
+    if refined is not None:
+        return refined.world_from_cam
+    return pose_all_frames(work.scene, last.world_from_cam, work.steps, work.workers, work.scale)

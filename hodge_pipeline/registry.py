@@ -40,7 +40,6 @@ KINDS = {
         Kind("global_registration", stages.GlobalRegistrar, "find where one cloud lies in another, with no guess"),
         Kind("executors", stages.Executor, "where pairs are registered"),
         Kind("solvers", stages.ConsistencySolver, "make all poses consistent"),
-        Kind("refiners", stages.Refiner, "improve the poses after the solve"),
         Kind("fusion", stages.Fuser, "fuse all frames into one model"),
         Kind("models", stages.ModelReader, "open a model of posed images and tracked points, to be refined"),
         Kind("writers", stages.Writer, "write what another program reads"),

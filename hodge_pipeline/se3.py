@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.types import Bools, Floats
+from hodge_pipeline.types import Bools, Floats, Trajectory
 
 SMALL_ANGLE = 1e-4
+SAME_STAMP_S = 1e-6
 ARM_M = 1.0
 """Metres: a rotation counts as the displacement that it causes at this distance, about that of a room's walls."""
 
@@ -244,6 +245,27 @@ def fit_rigid(points_in_b: Floats, points_in_a: Floats, weights: Floats | None =
 def interpolate(world_from_a: Floats, world_from_b: Floats, share: Floats) -> Floats:
     """Motions (..., 4, 4) on the geodesic from a (share 0) to b (share 1), `a exp(share · log(a⁻¹ b))`."""
     return np.asarray(world_from_a @ exp(np.asarray(share)[..., None] * log(inverse(world_from_a) @ world_from_b)))
+
+
+def poses_at(trajectory: Trajectory, stamps_s: Floats, max_gap_s: float, near_s: float = 0.0) -> Floats:
+    """Poses (N, 4, 4) at the stamps, on the geodesic between the two around; NaN where one of these is farther than
+    `max_gap_s`, unless the other is within `near_s`. A pose at the stamp itself, to a microsecond, needs no neighbours.
+    """
+    poses, times = np.full((len(stamps_s), 4, 4), np.nan), trajectory.stamps_s
+    if not len(times):
+        return poses
+    after = np.clip(np.searchsorted(times, stamps_s), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    to_before, to_after = stamps_s - times[before], times[after] - stamps_s
+    nearest = np.where(np.abs(to_before) < np.abs(to_after), before, after)
+    exact = np.abs(times[nearest] - stamps_s) <= SAME_STAMP_S
+    between = ~exact & (before < after) & (to_before >= 0) & (to_after >= 0)
+    between &= (np.maximum(to_before, to_after) <= max_gap_s) | (np.minimum(to_before, to_after) <= near_s)
+    a, b = before[between], after[between]
+    poses[exact] = trajectory.world_from_cam[nearest[exact]]
+    share = to_before[between] / (times[b] - times[a])
+    poses[between] = interpolate(trajectory.world_from_cam[a], trajectory.world_from_cam[b], share)
+    return poses
 
 
 def spread_correction(

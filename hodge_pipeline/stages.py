@@ -186,14 +186,6 @@ class ConsistencySolver(Protocol):
 
 
 @runtime_checkable
-class Refiner(Protocol):
-    """Improves the poses of all frames after the solve."""
-
-    def refine(self, frames: Sequence[Frame], world_from_cam: Floats, advance: Advance = no_progress) -> Floats:
-        """Poses (N, 4, 4)."""
-
-
-@runtime_checkable
 class Fuser(Protocol):
     """Fuses the frames into one model."""
 

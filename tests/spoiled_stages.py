@@ -186,7 +186,7 @@ def some_inliers(found: Any, *_: Any) -> Any:
     return replace(found, inliers=max(found.inliers, 1), matches=max(found.matches, 1))
 
 
-# Fusers and refiners ------------------------------------------------------------------------------------------------
+# Fusers ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -215,22 +215,6 @@ class Fuser:
                 assert model.triangles is not None
                 return replace(model, triangles=model.triangles + 10)
         return model
-
-
-@dataclass(frozen=True)
-class Refiner:
-    how: str
-
-    def refine(self, frames: Any, world_from_cam: Floats, advance: Any = print) -> Floats:
-        advance(len(frames) - (self.how == "silent"))
-        match self.how:
-            case "in place":
-                world_from_cam[:, 0, 3] += 1e-9
-            case "random":
-                return world_from_cam @ se3.exp(np.full(6, 1e-9 * counted()))
-            case "worse":
-                return world_from_cam @ se3.exp(0.1 * np.random.default_rng(5).normal(size=(len(frames), 6)))
-        return world_from_cam.copy()
 
 
 # Executors ----------------------------------------------------------------------------------------------------------

@@ -69,6 +69,10 @@ def test_a_stage_by_name_has_its_defaults(tmp_path: Path) -> None:
             "start: {stage: odometry, registration: {stage: gicp, distances_m: []}}\n",
             "r.yaml:6: start.registration.distances_m:",
         ),
+        (
+            "source: {reader: tum, depth_scale: 1000}\n",
+            "r.yaml:6: source.depth_scale: unknown option (did you mean 'source.reader.depth_scale'?)",
+        ),
         ("given: {poses: file}\n", "r.yaml:6: given: unknown option (did you mean 'start'?)"),
         ("key_frames: {every: 3}\n", "r.yaml:6: key_frames: unknown option (did you mean 'start'?)"),
         ("odometry: {max_drift: 1}\n", "r.yaml:6: odometry: unknown option (did you mean 'start'?)"),

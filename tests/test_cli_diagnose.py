@@ -21,13 +21,13 @@ from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.energy import energy_rows
 from hodge_pipeline.errors import GraphError, HodgeError
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import frames_table
 from hodge_pipeline.report.diagnosis_plots import side_by_side as pieces_apart
 from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views, side_by_side
+from hodge_pipeline.report.energy import energy_rows
 from hodge_pipeline.types import PointCloud, ViewGraph
 from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject
 from synthetic import tiny_sequence  # noqa: F401 - a fixture

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from betti import betti_numbers, sparse_rank
 from complex_graphs import FIGURE_EIGHT, SQUARE, TRIANGLE, TWO_TRIANGLES, complete, graphs, torus_grid
 from hodge_pipeline.complex import cech
-from hodge_pipeline.complex.cech import clique_counts, flag_complex, nerve, orient_edges, voxel_occupancy
+from hodge_pipeline.complex.cech import clique_counts, flag_complex, nerve, orient_edges
 from hodge_pipeline.complex.coboundary import coboundary_0
+from hodge_pipeline.complex.occupancy import voxel_occupancy
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import CloudSet, Ints, PointCloud
 
@@ -101,17 +102,16 @@ def test_the_nerve_drops_a_triangle_whose_clouds_never_meet() -> None:
     )
     poses = np.broadcast_to(np.eye(4), (4, 4, 4)).copy()
     flag = flag_complex(complete(4), 4)
-    kept = nerve(flag, voxel_occupancy(clouds, poses, 1.0))
+    kept = nerve(flag, voxel_occupancy(clouds, poses, 1.0)[0])
     assert kept.simplices[2].tolist() == [[0, 1, 3], [0, 2, 3], [1, 2, 3]]
     assert kept.counts == (4, 6, 3)
     assert not (kept.coboundary(1) @ kept.coboundary(0)).toarray().any()
-    with pytest.raises(GraphError, match="must be positive"):
-        voxel_occupancy(clouds, poses, 0.0)
 
 
 def test_voxels_are_those_of_the_world() -> None:
     cloud = PointCloud(np.array([[0.2, 0.2, 0.2]], np.float32))
     poses = np.broadcast_to(np.eye(4), (3, 4, 4)).copy()
     poses[1, 0, 3], poses[2, 0, 3] = 0.5, 3.0
-    occupancy = voxel_occupancy(CloudSet.from_clouds([cloud, cloud, cloud]), poses, 1.0).toarray()
-    np.testing.assert_array_equal(occupancy, [[1, 0], [1, 0], [0, 1]])
+    occupancy, sizes = voxel_occupancy(CloudSet.from_clouds([cloud, cloud, cloud]), poses, 1.0)
+    np.testing.assert_array_equal(occupancy.toarray()[:, :2], [[1, 0], [1, 0], [0, 1]])
+    assert sizes.tolist() == [1, 1, 1] and occupancy.nnz == 3

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.edge_scores import PairTruth, area_under_roc, pose_recall, precision_and_recall, right_edges
-from hodge_adapters.pose_graphs.pair_log import PairLogReader
+from benchmarks.edge_scores import PairTruth, area_under_roc, pose_recall, precision_and_recall, read_estimates
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import UNTESTABLE
@@ -20,12 +19,7 @@ from hodge_pipeline.types import Bools, ViewGraph
 
 def estimates(data_dir: Path, scene: str, method: str) -> tuple[ViewGraph, PairTruth, Bools]:
     """A graph of real estimates, the truth, and which of its edges are right."""
-    folder = data_dir / "fragments/pair_estimates" / f"{scene}-evaluation"
-    true = PairLogReader(information=folder / "gt.info").open(folder / "gt.log").graph
-    graph = PairLogReader().open(folder / f"{method}.log").graph
-    assert true is not None and graph is not None
-    truth = PairTruth.from_graph(true)
-    return graph, truth, right_edges(truth, graph.edges, graph.i_from_j)
+    return read_estimates(data_dir / "fragments/pair_estimates" / f"{scene}-evaluation" / f"{method}.log")
 
 
 @pytest.mark.parametrize(

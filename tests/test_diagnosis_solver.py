@@ -12,8 +12,8 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import UNTESTABLE, WRONG
 from hodge_pipeline.diagnosis.robust import RobustSolver
-from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.rounds.one_round import Registered, judge_edges, solve_edges
+from hodge_pipeline.rounds.suggestions import suggest_pairs
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver, Step, no_progress
@@ -114,7 +114,7 @@ def test_an_edge_that_the_diagnosis_keeps_and_the_poses_refute_is_left_out(monke
     everything = np.ones(graph.edge_count, bool)
     verdict = np.full(graph.edge_count, "consistent")
     known = replace(diagnose(graph, QUICK), kept=everything, verdict=verdict)
-    monkeypatch.setattr("hodge_pipeline.diagnosis.robust.diagnose", lambda *_: known)
+    monkeypatch.setattr("hodge_pipeline.diagnosis.robust.backbone_or_diagnosis", lambda *_: known)
     solution = RobustSolver(diagnosis=QUICK).solve(graph, poses_on_a_ring(20))
     assert solution.weights[7] == 0 and (np.delete(solution.weights, 7) > 0).all()
     weighted = replace(graph, information=solution.weights[:, None, None] * graph.information)

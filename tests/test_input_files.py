@@ -33,6 +33,13 @@ def irregular(folder: Path) -> list[Path]:
     return [folder / "pipe", folder / "folder", folder / "link", Path("/dev/zero"), folder / "none", folder / "x\0y"]
 
 
+def test_text_in_utf_16_is_named(tmp_path: Path) -> None:
+    for order in ("utf-16-le", "utf-16-be"):
+        (tmp_path / "poses.txt").write_bytes("\ufeff1 2 3".encode(order))
+        with pytest.raises(OSError, match="is text in UTF-16, as PowerShell writes it: save it as UTF-8"):
+            read_input_text(tmp_path / "poses.txt", errors="replace")
+
+
 def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
     for path in irregular(tmp_path):
         for read in (open_input, read_input, read_input_text):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.association import interpolated_poses, nearest_pairs
+from hodge_adapters.association import nearest_pairs
 from hodge_adapters.images.camera_files import resized
 from hodge_adapters.tum import reader
 from hodge_adapters.tum.image_lists import StampedImages, read_pairs
@@ -158,6 +158,19 @@ def test_an_association_file_that_does_not_say_which_is_depth(folder: Path) -> N
         TumReader().open(folder)
 
 
+def test_stamps_and_names_that_no_clock_and_no_system_knows_are_left_out(folder: Path) -> None:
+    whole = len(TumReader().open(folder).frames)
+    with open(folder / "depth.txt", "a") as file:
+        file.write(f"1e308 depth/1.png\n99999999999999999999 depth/1.png\n12.0 {'a' * 300}.png\n13.0 {'a/' * 5000}\n")
+    with open(folder / "groundtruth.txt", "a") as file:
+        file.write(tum_line(1.0, np.eye(4)) + "1e308 0 0 0 0 0 0 1\n")
+    source = check_reader(TumReader(), folder)
+    assert len(source.frames) == whole
+    assert "depth.txt: 2 lines that are not `stamp file` left out: 5, 6" in source.notes
+    assert "depth.txt: 2 lines that name no file in the folder left out: 7, 8" in source.notes
+    assert any(note.startswith("groundtruth.txt: 1 lines that are no pose left out") for note in source.notes)
+
+
 def test_bad_lines_are_left_out_and_noted(folder: Path) -> None:
     with open(folder / "depth.txt", "a") as file:
         file.write("abc depth/1.png\n12.0\nnan depth/1.png\n10.0 depth/10.500000.png\n")
@@ -165,7 +178,7 @@ def test_bad_lines_are_left_out_and_noted(folder: Path) -> None:
     source = check_reader(TumReader(), folder)
     assert len(source.frames) == 3
     assert "depth.txt: 3 lines that are not `stamp file` left out: 5, 6, 7" in source.notes
-    assert "depth.txt: 3 lines that point out of the folder left out: 9, 10, 11" in source.notes
+    assert "depth.txt: 3 lines that name no file in the folder left out: 9, 10, 11" in source.notes
     assert "depth.txt: 1 lines with the stamp of an earlier one left out" in source.notes
     assert "1 depth images listed but not there left out: gone.png" in source.notes
     assert not any("secret" in str(file) for file in source.files)
@@ -261,7 +274,7 @@ def test_the_nearer_depth_gets_the_colour_image() -> None:
 
 def test_outside_the_trajectory_there_is_no_pose() -> None:
     trajectory = Trajectory(np.array([1.0, 2.0]), some_poses(2))
-    poses = interpolated_poses(trajectory, np.array([0.99, 1.0, 1.5, 2.0, 2.01]), 1.0)
+    poses = se3.poses_at(trajectory, np.array([0.99, 1.0, 1.5, 2.0, 2.01]), 1.0)
     assert np.isnan(poses[:, 0, 0]).tolist() == [True, False, False, False, True]
     np.testing.assert_allclose(poses[[1, 3]], trajectory.world_from_cam, atol=1e-12)
 
@@ -269,9 +282,9 @@ def test_outside_the_trajectory_there_is_no_pose() -> None:
 def test_a_pose_at_a_frames_own_stamp_is_its_truth_however_sparse_the_truth_is() -> None:
     trajectory = Trajectory(np.array([1.0, 2.0, 3.0]), some_poses(3))
     stamps_s = np.array([1.01, 1.5, 1.985, 3.01])
-    poses = interpolated_poses(trajectory, stamps_s, 0.1, 0.02)
+    poses = se3.poses_at(trajectory, stamps_s, 0.1, 0.02)
     assert np.isnan(poses[:, 0, 0]).tolist() == [False, True, False, True]
-    dense = interpolated_poses(trajectory, stamps_s[[0, 2]], 1.0)
+    dense = se3.poses_at(trajectory, stamps_s[[0, 2]], 1.0)
     np.testing.assert_array_equal(poses[[0, 2]], dense)
 
 

@@ -20,6 +20,7 @@ from hodge_adapters.colmap.writer import ColmapWriter
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.store.edge_table import read_edges
+from readers_data import write_colour
 from test_readers_colmap import synthetic
 from test_refine_colmap import FREE, disturbed, noisy
 
@@ -170,3 +171,16 @@ def test_without_a_scale_nothing_is_in_metres(tmp_path: Path, monkeypatch: pytes
     assert "residual_units" in names and not [name for name in names if name.endswith("_m")]
     edges, _ = read_edges(out / "edges.csv")
     assert len(edges.residual_m) and np.isfinite(edges.residual_m[edges.in_graph]).all()
+
+
+def test_a_refined_model_finds_images_and_database_of_the_model_that_it_was_made_of(tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(noisy(tmp_path / "project", database=True))
+    for image in model.images.values():
+        write_colour(tmp_path / "project/images" / image.name)
+    out = tmp_path / "runs/refined"
+    hodge_pipeline.refine_colmap(tmp_path / "project/model", out=out, overrides=FREE)
+    source = ColmapReader().open(out)
+    assert source.graph is not None and set(source.graph.source) == {"database"}
+    assert all(frame.read_colour for frame in source.frames) and not any("not there" in note for note in source.notes)
+    (out / "report.json").write_text("{")
+    assert not any(frame.read_colour for frame in ColmapReader().open(out).frames), "the model is read all the same"

@@ -16,7 +16,6 @@ from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.evaluation.trajectory import absolute_error, relative_error
 from hodge_pipeline.start.clouds import clouds as clouds_step
 from hodge_pipeline.start.given import gaps_between
-from hodge_pipeline.start.match_poses import poses_at
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.store.workspace import RUN
 from hodge_pipeline.types import Floats, Trajectory
@@ -100,7 +99,7 @@ def test_drift_is_taken_out_and_the_stamps_stay(refined: Path, drifted: Trajecto
 def test_the_report_shows_what_the_guard_measured(refined: Path) -> None:
     report = json.loads((refined / "report.json").read_text())
     names = {row["name"] for row in report["refinement"]["measures"]}
-    assert names == {"score of held-out edges", "edge chi2, mean"} and report["verdict"]["outcome"] == "improved"
+    assert {"score of held-out edges", "edge chi2, mean"} <= names and report["verdict"]["outcome"] == "improved"
     assert "Better than the poses given" in (refined / "report.html").read_text()
 
 
@@ -109,14 +108,13 @@ def test_errors_are_of_the_poses_in_the_file_as_evo_has_them(
 ) -> None:
     """A pose between the frames too, at stamps 4 ms from those of the truth, and one far from any true pose."""
     middle = (drifted.stamps_s[:-1] + drifted.stamps_s[1:]) / 2
-    between = poses_at(drifted, middle, 10.0)
+    between = se3.poses_at(drifted, middle, 10.0)
     stamps = np.concatenate([drifted.stamps_s, middle, [drifted.stamps_s[-1] + 1]])
     poses = np.concatenate([drifted.world_from_cam, between, drifted.world_from_cam[-1:]])
     order = np.argsort(stamps)
     write_tum(tmp_path / "slam.txt", Trajectory(stamps[order], poses[order]))
-    true = Trajectory(
-        np.sort(np.r_[truth.stamps_s, middle]) + 0.004, poses_at(truth, np.sort(np.r_[truth.stamps_s, middle]), 10.0)
-    )
+    moments = np.sort(np.r_[truth.stamps_s, middle])
+    true = Trajectory(moments + 0.004, se3.poses_at(truth, moments, 10.0))
     write_tum(tmp_path / "true.txt", true)
     found = refine(tmp_path / "slam.txt", sequence, tmp_path / "run", "--truth", str(tmp_path / "true.txt"))
     assert found.exit_code == 0, found.output

@@ -78,7 +78,7 @@ def test_a_largest_error_that_got_worse_is_named_too() -> None:
     assert verdict.headline.endswith(", but largest error 50 cm → 70 cm") and verdict.outcome == "mixed"
     refined = RefinementSummary("refined", "Better than the poses given", "clouds lie nearer")
     verdict = judge(replace(report, trajectories=rows, refinement=refined))
-    assert verdict.headline == "Better than the poses given, but largest error 50 cm → 70 cm"
+    assert verdict.headline == "Better than the poses given (ATE 50 cm → 40 cm), but largest error 50 cm → 70 cm"
 
 
 def test_tracks_that_contradict_each_other_are_said_first() -> None:
@@ -143,7 +143,14 @@ def test_a_path_in_doubt_says_so_first(report: Report) -> None:
     """Whatever fits better: clouds of an object that was followed fit each other."""
     verdict = judge(replace(report, notes=(Note("camera or object", 9, "20 frames, 1–9"),)))
     assert verdict.headline == "In doubt, since much of the image moves: improved against odometry"
+    doubts = (*report.notes, Note("camera or object", 10, "1–9, 12"), Note("depth unit", detail="its steps"))
+    headline = judge(replace(report, notes=doubts)).headline
+    reasons = "much of the image moves and depth is probably not in metres"
+    assert headline == f"In doubt, since {reasons}: improved against odometry"
     assert verdict.mark == "mixed"
+    doubt = Note("reader's doubt", detail="a camera of focal length 525 is assumed")
+    verdict = judge(replace(report, notes=(doubt,)))
+    assert verdict.headline == "In doubt, since the reader assumes what no file tells: improved against odometry"
 
 
 @pytest.mark.parametrize(

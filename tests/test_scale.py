@@ -58,7 +58,7 @@ def test_voxels_with_a_point_each_say_nothing_of_the_surfaces() -> None:
 def test_every_length_is_taken_times_the_factor_and_nothing_else() -> None:
     before = load_recipe("scans")
     after = scaled_recipe(before, 10.0)
-    assert after.clouds.voxel_m == pytest.approx(0.4) and after.clouds.normal_neighbours == 10
+    assert after.clouds.voxel_m == pytest.approx(0.4) and after.clouds.stride == before.clouds.stride
     assert after.start.registrar.voxel_m == pytest.approx(0.5)  # type: ignore[attr-defined]
     assert after.start.refine == InUnits(before.start.refine, 10.0)  # type: ignore[attr-defined]
     assert after.start.limits.max_rmse_m == pytest.approx(0.6)  # type: ignore[attr-defined]

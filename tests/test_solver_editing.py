@@ -6,10 +6,8 @@ from hypothesis import strategies as st
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.editing import GraphEditor
-from hodge_pipeline.solvers.linear import corrected, factorise
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Solution, ViewGraph
-from solver_graphs import laplacian
 
 
 def ring(seed: int = 0, noise: float = 0.1, count: int = 10) -> ViewGraph:
@@ -142,20 +140,6 @@ def test_edits_that_make_no_sense_are_one_line(edit, message):
 def test_the_solution_must_be_of_the_graph():
     with pytest.raises(GraphError, match="not of this graph"):
         GraphEditor(ring(), solve(ring(count=12)))
-
-
-def test_a_corrected_factor_is_that_of_the_changed_laplacian():
-    rng = np.random.default_rng(0)
-    tail = np.concatenate([np.arange(9), [0, 2, 9, 4]])
-    head = np.concatenate([np.arange(1, 10), [5, 8, 3, 7]])
-    weights = rng.uniform(1, 2, len(tail))
-    changed, new = np.array([3, 9, 11]), weights.copy()
-    new[changed] = [0.0, 5.0, 0.3]
-    factor = factorise(laplacian(tail, head, weights, 9))
-    ends = np.stack([tail, head], axis=1)[changed]
-    found = corrected(factor, ends, (new - weights)[changed])
-    rhs = rng.normal(size=(9, 3))
-    np.testing.assert_allclose(laplacian(tail, head, new, 9) @ found.solve(rhs), rhs, atol=1e-12)
 
 
 def noisy_grid(side: int) -> ViewGraph:

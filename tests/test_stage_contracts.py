@@ -63,7 +63,7 @@ def made(kind: str, name: str) -> Any:
     ("kind", "name", "what"),
     [
         (kind, name, what)
-        for kind in ("start", "edges", "registration", "global_registration", "executors", "refiners", "fusion")
+        for kind in ("start", "edges", "registration", "global_registration", "executors", "fusion")
         for name in own_stages(kind)
         for what in PROPERTIES[kind]
     ],

@@ -21,7 +21,6 @@ from spoiled_stages import (
     Fuser,
     NeedsFinite,
     Once,
-    Refiner,
     Spoiled,
     Start,
     Unhashable,
@@ -77,11 +76,6 @@ SPOILED = [
     ("executors", Once(), "left early", "opened again"),
     ("executors", Executor("gives up"), "a worker that dies", "a worker died once"),
     ("executors", Executor("kills silently"), "a block that kills", "must raise WorkerError"),
-    ("refiners", Changeable(), "is a stage", "can be changed"),
-    ("refiners", Refiner("in place"), "the same bits again", "changes the poses"),
-    ("refiners", Refiner("silent"), "no harm", "heard of 11 of 12"),
-    ("refiners", Refiner("random"), "the same bits again", "other bits"),
-    ("refiners", Refiner("worse"), "no harm", "off afterwards"),
     ("fusion", Changeable(), "is a stage", "can be changed"),
     ("fusion", Fuser("nowhere"), "surface", "off the wall"),
     ("fusion", Fuser("silent"), "surface", "heard of 0 of 6"),
@@ -165,7 +159,7 @@ def test_a_reader_of_models_that_breaks_its_contract_is_noticed(
 
 
 def test_each_property_has_a_stage_that_breaks_it() -> None:
-    for kind in ("edges", "registration", "global_registration", "executors", "refiners", "fusion", "start"):
+    for kind in ("edges", "registration", "global_registration", "executors", "fusion", "start"):
         assert {what for name, _, what, _ in SPOILED if name == kind} == {*testing.CHECKS[kind].properties}, kind
 
 

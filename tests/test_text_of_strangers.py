@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline.cli.console import ProgressBars, print_table
-from hodge_pipeline.cli.guard import guard_streams
+from hodge_pipeline.cli.guard import guard_streams, shown_error
 from hodge_pipeline.report.run_files import write_poses
 from hodge_pipeline.store.edge_table import read_edges, write_edges
 from hodge_pipeline.store.log import log, logging_to
@@ -104,3 +104,10 @@ def test_each_sequence_has_a_file_in_the_folder(tmp_path: Path) -> None:
     write_poses(out, Source("x", tmp_path, frames), np.tile(np.eye(4), (len(frames), 1, 1)))
     assert [entry.name for entry in tmp_path.iterdir()] == ["out"]
     assert len(list(out.glob("poses-*.tum"))) == len(set(names))
+
+
+def test_an_error_that_quotes_at_length_keeps_its_beginning_and_its_end() -> None:
+    text = "list.txt: " + "a" * 10_000_000 + ": give another name\x07"
+    found = shown_error(ValueError(text))
+    assert found.startswith("list.txt: aaa") and found.endswith("aaa: give another name\\x07") and len(found) < 1100
+    assert shown_error("short") == "short"

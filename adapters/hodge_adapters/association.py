@@ -1,11 +1,10 @@
-"""Which image belongs to which: by nearest stamp, and poses between the stamps of a trajectory."""
+"""Which image belongs to which, by nearest stamp."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hodge_pipeline import se3
-from hodge_pipeline.types import Floats, Ints, Trajectory
+from hodge_pipeline.types import Floats, Ints
 
 NEIGHBOURS = 4
 """How many stamps on each side are looked at; more would only matter where stamps crowd within the tolerance."""
@@ -32,25 +31,3 @@ def nearest_pairs(depth_stamps_s: Floats, colour_stamps_s: Floats, max_differenc
         if colour_of[row] < 0 and not used[column]:
             colour_of[row], used[column] = column, True
     return colour_of
-
-
-def interpolated_poses(trajectory: Trajectory, stamps_s: Floats, max_gap_s: float, near_s: float = 0.0) -> Floats:
-    """Poses (N, 4, 4) at the stamps, on the geodesic between the two neighbours; NaN where one is farther than
-    `max_gap_s`, unless the other is within `near_s`. A stamp of the trajectory itself needs no neighbours.
-    """
-    poses = np.full((len(stamps_s), 4, 4), np.nan)
-    times = trajectory.stamps_s
-    if not len(times):
-        return poses
-    after = np.clip(np.searchsorted(times, stamps_s), 0, len(times) - 1)
-    exact = times[after] == stamps_s
-    before = np.where(exact, after, np.maximum(after - 1, 0))
-    to_before, to_after = stamps_s - times[before], times[after] - stamps_s
-    between = (before < after) & (to_before >= 0) & (to_after >= 0)
-    both_near = np.maximum(to_before, to_after) <= max_gap_s
-    good = exact | (between & (both_near | (np.minimum(to_before, to_after) <= near_s)))
-    span = np.where(after > before, times[after] - times[before], 1.0)
-    share = to_before / span
-    a, b = trajectory.world_from_cam[before[good]], trajectory.world_from_cam[after[good]]
-    poses[good] = se3.interpolate(a, b, share[good])
-    return poses

@@ -15,6 +15,8 @@ from hodge_pipeline.types.input_files import beginning, read_input_text
 
 _DIGITS = re.compile(r"(\d+)")
 SNIFFED_BYTES = 4096
+MAX_NAME_BYTES, MAX_PATH = 255, 2000
+"""Bytes of a name in a folder, characters of a path below one: the system refuses longer ones."""
 SHOWN = 5
 """How many records a note names before it only counts them."""
 
@@ -88,14 +90,14 @@ def natural(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def inside(folder: Path, name: str) -> Path | None:
-    """The path of a file named in a list, or None for one that leaves the folder by `..` or an absolute path.
+    """The path of a file named in a list, or None for one that leaves the folder by `..` or an absolute path, or has a
+    longer name than file systems allow.
 
     Links inside the folder are the user's own and are followed.
     """
     pure = PurePosixPath(name.replace("\\", "/"))
-    if pure.is_absolute() or ".." in pure.parts:
-        return None
-    return folder / pure
+    too_long = len(name) > MAX_PATH or any(len(part.encode("utf-8", "replace")) > MAX_NAME_BYTES for part in pure.parts)
+    return None if pure.is_absolute() or ".." in pure.parts or too_long else folder / pure
 
 
 def write_text_atomically(path: Path, text: str) -> None:

@@ -12,7 +12,7 @@ from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.report.brief import COLUMNS, LABEL, LINES, at_most, labelled
 
 if TYPE_CHECKING:
-    from hodge_pipeline.diagnosis.energy import EnergyRow
+    from hodge_pipeline.report.energy import EnergyRow
     from hodge_pipeline.uses.diagnosed import Diagnosed
 
 SUGGESTED = 3
@@ -47,7 +47,7 @@ def _print(found: Diagnosed, out: Path | None, top: int | None, *, verbose: bool
 
 
 def _details(found: Diagnosed) -> Iterator[str]:
-    from hodge_pipeline.diagnosis.energy import CAVEAT, in_words
+    from hodge_pipeline.report.energy import CAVEAT, in_words
 
     for line in in_words(found.energy):
         yield from labelled("energy", line)
@@ -100,7 +100,7 @@ def _cells(found: Diagnosed, row: int) -> tuple[str, ...]:
 
 
 def _energy(row: EnergyRow) -> dict[str, Any]:
-    from hodge_pipeline.diagnosis.energy import PARTS
+    from hodge_pipeline.report.energy import PARTS
 
     rotation, translation = (dict(zip(PARTS, shares.tolist(), strict=True)) for shares in row.shares)
     return {

@@ -5,6 +5,9 @@ from __future__ import annotations
 import sys
 from typing import Any, TextIO
 
+LONGEST_ERROR = 1000
+"""Characters: longer ones quote a name or a value that no person wrote."""
+
 
 class Guarded:
     """A stream that shows control characters instead of sending them."""
@@ -28,6 +31,13 @@ def guard_streams() -> None:
 def unguarded(stream: TextIO) -> TextIO:
     """The stream for what moves the cursor by right, and shows its own texts."""
     return stream.stream if isinstance(stream, Guarded) else stream
+
+
+def shown_error(error: object) -> str:
+    """An error in one line that can be read: of what it quotes at length the beginning and the end."""
+    text = str(error)
+    cut = text if len(text) <= LONGEST_ERROR else f"{text[: LONGEST_ERROR // 2]} … {text[-LONGEST_ERROR // 2 :]}"
+    return shown(cut)
 
 
 def shown(text: str, *, lines: bool = False) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hodge_pipeline.cli import refine as refining
-from hodge_pipeline.cli.guard import guard_streams, shown
+from hodge_pipeline.cli.guard import guard_streams, shown_error
 from hodge_pipeline.cli.options import (
     Dask,
     Json,
@@ -357,7 +357,7 @@ def main() -> None:
     except OSError as error:
         if error.filename is None and error.errno is None:
             raise
-        print(f"error: {shown(str(error.filename or 'a file'))}: {error.strerror}", file=sys.stderr)
+        print(f"error: {shown_error(error.filename or 'a file')}: {error.strerror}", file=sys.stderr)
         sys.exit(1)
     except MemoryError:
         print("error: this needs more memory than there is: give less data, or free some", file=sys.stderr)
@@ -367,7 +367,7 @@ def main() -> None:
             raise
         from hodge_pipeline.registry import LIBRARIES
 
-        print(f"error: a library does not load ({shown(str(error))}): {LIBRARIES}", file=sys.stderr)
+        print(f"error: a library does not load ({shown_error(error)}): {LIBRARIES}", file=sys.stderr)
         sys.exit(1)
     except Exception as error:
         from hodge_pipeline.errors import HodgeError
@@ -376,7 +376,7 @@ def main() -> None:
         known = plugin_error(error) or error
         if not isinstance(known, HodgeError):
             raise
-        print(f"error: {shown(str(known))}", file=sys.stderr)
+        print(f"error: {shown_error(known)}", file=sys.stderr)
         sys.exit(known.exit_code)
 
 

@@ -19,10 +19,10 @@ A graph file (g2o, TORO, …) needs no frames: give it to `hodge solve`.
 Examples:
 
 \b
-  hodge refine trajectory CameraTrajectory.txt --frames rgbd_dataset_freiburg1_desk --out runs/desk
+  hodge refine trajectory CameraTrajectory.txt --frames DIR --out runs/desk
   hodge refine trajectory scene/trajectory.log --frames DIR --out runs/scene
   hodge refine colmap sparse/0 --database database.db --out runs/model
-  hodge refine colmap sparse --depth depth --depth-scale 1000 --out runs/metric
+  hodge refine colmap sparse --depth DIR --depth-scale 1000 --out runs/metric
 """
 
 group = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode=None)

@@ -22,6 +22,7 @@ from hodge_pipeline.store.workspace import RECIPE_FILE
 from hodge_pipeline.types import Source
 from hodge_pipeline.types.text import command
 
+COUNTED = ("pose", "edge", "piece")
 KNOWN_ENDINGS = (".tum", ".kitti", ".csv", ".log", ".json", ".ply")
 """Endings that say the format. `.txt` does not: many programs name their g2o files so."""
 
@@ -118,9 +119,9 @@ def _lines(
     solved: SolvedFile, summary: dict[str, Any], out: Path | None, run_folder: Path | None, *, verbose: bool
 ) -> list[str]:
     """The verdict, what was solved, what to heed, where it is: ten lines; `verbose`: with every note, whole."""
-    pieces = f"{summary['pieces']} piece{'s' * (summary['pieces'] != 1)}"
+    poses, edges, pieces = (f"{summary[f'{one}s']} {one}{'s' * (summary[f'{one}s'] != 1)}" for one in COUNTED)
     ignored = f", {summary['edges_ignored']} ignored" if summary["edges_ignored"] else ""
-    shape = f"{summary['dimension']}-D, {summary['poses']} poses, {summary['edges']} edges{ignored}, {pieces}"
+    shape = f"{summary['dimension']}-D, {poses}, {edges}{ignored}, {pieces}"
     lines = [*labelled("verdict", solved.headline), f"  - {solved.source.name}: {shape}"]
     if verbose:
         lines += [line for note in summary["notes"] for line in labelled("note", note)]

@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline.complex.coboundary import check_edges
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.types import CloudSet, Floats, Ints
+from hodge_pipeline.types import Floats, Ints
 
 CANDIDATES_AT_ONCE = 2_000_000
 SIMPLICES_AT_ONCE = 2_000
@@ -168,25 +168,6 @@ class _TriangleSearch:
         wanted = edges[row, 0] * self.count + new
         joined = self.keys[np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)] == wanted
         return np.concatenate([edges[row[joined]], new[joined, None]], axis=1)
-
-
-def voxel_occupancy(clouds: CloudSet, world_from_cam: Floats, voxel_m: float) -> csr_matrix:
-    """Which voxels of the world each cloud enters: (clouds, voxels) of 0 and 1; a cloud without points has none."""
-    if voxel_m <= 0:
-        raise GraphError(f"voxel_m is {voxel_m}: a voxel's side must be positive")
-    frame = np.repeat(np.arange(len(clouds)), clouds.sizes)
-    rotation, position = world_from_cam[:, :3, :3], world_from_cam[:, :3, 3]
-    cells = np.empty((len(frame), 3), np.int64)
-    for row in range(len(clouds)):
-        cut = slice(clouds.offsets[row], clouds.offsets[row + 1])
-        points_in_world = clouds.points[cut] @ rotation[row].T + position[row]
-        cells[cut] = np.floor(points_in_world / voxel_m)
-    _, voxel = np.unique(cells, axis=0, return_inverse=True)
-    voxel = voxel.ravel()
-    shape = (len(clouds), int(voxel.max(initial=-1)) + 1)
-    occupancy = csr_matrix((np.ones(len(frame), np.int32), (frame, voxel)), shape=shape)
-    occupancy.data[:] = 1
-    return occupancy
 
 
 def nerve(flag: SimplicialComplex, occupancy: csr_matrix) -> SimplicialComplex:

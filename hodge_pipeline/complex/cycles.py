@@ -55,6 +55,14 @@ class Loops:
         """The loop (N,) that each entry of `edge` belongs to."""
         return np.repeat(np.arange(len(self)), self.lengths)
 
+    def sums(self, of_edge: Floats | Bools) -> Floats:
+        """The sum (L,) of `of_edge (E,)` over the edges that each loop passes."""
+        return np.bincount(self.rows, of_edge[self.edge], len(self)).astype(float)
+
+    def sums_at_edges(self, of_loop: Floats | Bools, edge_count: int) -> Floats:
+        """The sum (E,) of `of_loop (L,)` over the loops that pass each edge."""
+        return np.bincount(self.edge, of_loop[self.rows], edge_count).astype(float)
+
     def incidence(self, edge_count: int) -> csr_matrix:
         """The loops as 1-chains, (L, E): how often each passes each edge, with sign."""
         values = self.sign.astype(float)

@@ -14,10 +14,10 @@ from hodge_pipeline.complex.cech import (
     flag_complex,
     nerve,
     orient_edges,
-    voxel_occupancy,
 )
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.decomposition import HodgeDecomposition, hodge_decomposition
+from hodge_pipeline.complex.occupancy import voxel_occupancy
 from hodge_pipeline.complex.one_form import centroids, residual_form, shifted
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import CloudSet, Floats, Ints, ViewGraph
@@ -40,7 +40,7 @@ class ComplexOptions:
     def of(self, graph: ViewGraph, clouds: CloudSet, world_from_cam: Floats) -> SimplicialComplex:
         """Vertices, edges, triangles of a graph under poses (V, 4, 4). Raises `GraphError` for too many triangles."""
         flag = flag_of(graph)
-        return nerve(flag, voxel_occupancy(clouds, world_from_cam, self.voxel_m)) if self.nerve else flag
+        return nerve(flag, voxel_occupancy(clouds, world_from_cam, self.voxel_m)[0]) if self.nerve else flag
 
 
 def flag_of(graph: ViewGraph) -> SimplicialComplex:

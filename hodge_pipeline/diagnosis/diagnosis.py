@@ -44,11 +44,16 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     """
     check_graph(graph)
     graph = replace(graph, dimension=2) if is_planar(graph) else graph
+    found = backbone_or_diagnosis(graph, options)
+    return found if isinstance(found, Diagnosis) else judged_on_backbone(graph, found)
+
+
+def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbone | Diagnosis:
+    """The backbone of a graph that has one, else the diagnosis that trusts no edge."""
     if (backbone := find_backbone(graph, options.trust)) is not None:
-        return judged_on_backbone(graph, backbone)
+        return backbone
     found = _by_cycles(graph, options)
-    backbone = lattice_backbone(graph, found, options)
-    return found if backbone is None else judged_on_backbone(graph, backbone)
+    return lattice_backbone(graph, found, options) or found
 
 
 def lattice_backbone(graph: ViewGraph, found: Diagnosis, options: DiagnosisOptions) -> Backbone | None:
@@ -72,10 +77,9 @@ def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
     cycles = _with_witnesses(cycles, fit.used, evidence)
     blame = share_blame(cycles, fit, evidence)
     unvouched = blame.unvouched & (agreeing >= LIKELIER_RIGHT)
-    untestable = evidence.in_no_listed_cycle | (blame.undecided >= 0) | unvouched
+    untestable = evidence.in_no_listed_cycle | blame.undecided | unvouched
     probability = np.where(untestable, np.nan, np.maximum(agreeing, blame.probability))
-    undecided = np.where(unvouched | (blame.probability > 0), blame.cycle, -1)
-    undecided = np.where(blame.undecided >= 0, blame.undecided, undecided)
+    undecided = np.where(unvouched | (blame.probability > 0) | blame.undecided, blame.cycle, -1)
     right = (probability >= CONSISTENT_FROM) & fit.used
     wrong = probability < WRONG_BELOW
     verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
@@ -101,9 +105,7 @@ def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
 
 def _with_witnesses(cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
     """The cycles, and more where none that closes passes an edge in use, though others in use close one over it."""
-    told = np.zeros(len(used), bool)
-    told[cycles.loops.select(np.flatnonzero(cycles.closes)).edge] = True
-    wanted = used & ~told & ~evidence.in_no_listed_cycle
+    wanted = used & (cycles.loops.sums_at_edges(cycles.closes, len(used)) == 0) & ~evidence.in_no_listed_cycle
     if not wanted.any():
         return cycles
     loops = with_cycles_of(used, cycles.loops, evidence.graph.edges, evidence.graph.vertex_count, wanted)

@@ -38,20 +38,18 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
     edges and (1 - q) f wrong ones, so q = (r - f) / (1 - f), and an edge between them is right with probability q / r.
     All are equal where neighbours are hardly more often joined than far pairs. Vertex rows are the order.
     """
-    gap = np.abs(edges[:, 1] - edges[:, 0])
-    bounds = _bounds(vertex_count)
-    place = np.searchsorted(bounds, gap, side="right") - 1
-    joined = np.bincount(np.maximum(place, 0), minlength=len(bounds) - 1)[: len(bounds) - 1]
+    place, bounds = _gap_classes(edges, vertex_count)
+    joined = np.bincount(place, minlength=len(bounds) - 1)[: len(bounds) - 1]
     pairs = np.array([_pairs(low, high, vertex_count) for low, high in zip(bounds[:-1], bounds[1:], strict=True)])
     rate = np.minimum(joined / np.maximum(pairs, 1), 1.0)
-    far = _far_rate(gap, vertex_count)
+    far = _far_rate(edges, vertex_count)
     # by odds, which work where most pairs are joined too, with a few more missing neighbours: it may be chance
     missed = 1 - rate[0] + DOUBTED / max(pairs[0], 1)
     if rate[0] * (1 - far) < LEAST_ODDS * far * missed or not joined.any():
         return np.full(len(edges), 0.5)
     right = np.maximum(rate - far, 0) / (1 - far)
     share = np.clip(right / np.maximum(rate, 1e-12), FLOOR, CEILING)
-    return np.asarray(share[np.maximum(place, 0)])
+    return np.asarray(share[place])
 
 
 def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
@@ -61,8 +59,7 @@ def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
     A triangle closes where its three edges are right, so that each gap's share is that of its triangles that close
     over what the other two edges let expect. All are equal where neighbours are hardly more often right.
     """
-    bounds = _bounds(vertex_count)
-    place = np.maximum(np.searchsorted(bounds, np.abs(edges[:, 1] - edges[:, 0]), side="right") - 1, 0)
+    place, bounds = _gap_classes(edges, vertex_count)
     triangles = np.flatnonzero(cycles.loops.lengths == 3)
     sides = place[cycles.loops.select(triangles).edge.reshape(-1, 3)]
     closing = np.bincount(sides.ravel(), np.repeat(cycles.closes[triangles], 3), len(bounds))
@@ -84,8 +81,7 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
     `usual` holds where no cycle passes. No share exceeds what the number of edges of a gap can support: of n
     edges none of which fails the next one is right with (n + 1) / (n + 2) (Laplace's rule of succession).
     """
-    bounds = _bounds(vertex_count)
-    place = np.maximum(np.searchsorted(bounds, np.abs(edges[:, 1] - edges[:, 0]), side="right") - 1, 0)
+    place, bounds = _gap_classes(edges, vertex_count)
     loops = cycles.loops.select(np.flatnonzero(~cycles.closes))
     row, entry = loops.rows, place[loops.edge]
     passes = np.bincount(place[cycles.loops.edge], minlength=len(bounds))
@@ -107,19 +103,22 @@ def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
     """Whether far pairs are joined so often that registration seems to have been tried on all pairs."""
     if len(edges) < LEAST_DEGREE / 2 * vertex_count:
         return False  # of few views the ends of any loop are a large share of the far pairs
-    return _far_rate(np.abs(edges[:, 1] - edges[:, 0]), vertex_count) >= TRIED_FROM
+    return _far_rate(edges, vertex_count) >= TRIED_FROM
 
 
-def _far_rate(gap: Ints, vertex_count: int) -> float:
+def _far_rate(edges: Ints, vertex_count: int) -> float:
     start = max(int(np.ceil(FAR_SHARE * vertex_count)), 2)
-    return float((gap >= start).sum() / max(_pairs(start, vertex_count, vertex_count), 1))
+    far = np.abs(edges[:, 1] - edges[:, 0]) >= start
+    return float(far.sum() / max(_pairs(start, vertex_count, vertex_count), 1))
 
 
-def _bounds(vertex_count: int) -> list[int]:
+def _gap_classes(edges: Ints, vertex_count: int) -> tuple[Ints, list[int]]:
+    """The class (E,) of each edge by its gap |i − j|, and the least gap of each class."""
     bounds = [1, 2, 3, 5]
     while bounds[-1] < vertex_count:
         bounds.append(2 * bounds[-1] - 1)
-    return bounds
+    place = np.searchsorted(bounds, np.abs(edges[:, 1] - edges[:, 0]), side="right") - 1
+    return np.maximum(place, 0), bounds
 
 
 def _pairs(low: int, high: int, count: int) -> int:

@@ -15,14 +15,13 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.short_cycles import GATE
 from hodge_pipeline.types import Bools, Floats, Ints
 
 SINGLE_VOTE_FROM = 0.3
 """The weight from which one edge, which no other confirms, may join two pieces."""
 PATIENCE = 0.7
 """Of the best score that a piece has: weaker merges wait, since more edges may then vote on their placement."""
-VOTES_AGREE = 30.0
-"""χ² over six dimensions of two votes: beyond it they do not agree. Generous, since tails are heavy."""
 HYPOTHESES = 24
 """Votes of a pair of pieces, the weightiest, that are tried as the answer."""
 MOST_PAIRS_TO_A_VOTE = 400
@@ -175,7 +174,7 @@ def agreement_of(evidence: Evidence, edge: Ints, motion: Floats, point: Floats, 
     turn_both = (turn[first] + turn[second]) * slack
     shift_both = (shift[first] + shift[second]) * slack + turn[first] * apart
     chi2 = angle**2 / turn_both + np.einsum("ni,ni->n", moved, moved) / shift_both
-    return np.asarray(np.maximum(0.0, 1 - chi2 / VOTES_AGREE))
+    return np.asarray(np.maximum(0.0, 1 - chi2 / GATE))
 
 
 def agreed_motions(votes: Votes, chosen: Ints, weight: Floats) -> Floats:

@@ -137,15 +137,14 @@ class _Errors:
 
     def __init__(self, loops: Loops, relative: Floats, error: Floats) -> None:
         self.loops, self.error = loops, error
-        self.row = loops.rows
-        self.ratio = error / np.sqrt(np.bincount(self.row, relative[loops.edge] ** 2, len(loops)))
+        self.ratio = error / np.sqrt(loops.sums(relative**2))
 
     def scale(self, gate: float, prior: Floats, fallback: float) -> float:
         """The scale at which half of the cycles that close have an error below the median of its distribution."""
         closes = (self.error > COPIES * gate) & (self.error < gate)
         if closes.sum() < FEWEST_CYCLES:
             return fallback
-        weight = np.exp(np.bincount(self.row, np.log(prior[self.loops.edge]), len(closes)))[closes]
+        weight = np.exp(self.loops.sums(np.log(prior)))[closes]
         order = np.argsort(self.ratio[closes])
         total = np.cumsum(weight[order])
         median = float(self.ratio[closes][order][np.searchsorted(total, total[-1] / 2)])

@@ -19,11 +19,10 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import squares_at_both_ends
 from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.robust_poses import UNSETTLED
 from hodge_pipeline.diagnosis.scene_model import SceneModel
 from hodge_pipeline.types import Bools, Floats, Ints
 
-GATE = 60.0
-"""χ² over six dimensions of an edge that agrees, while the poses are not settled."""
 PER_FOLD = 2.0
 """Nats for each e-fold of agreeing edges."""
 FAIR_SHARE, SHARE_SPREAD = 0.75, 0.35
@@ -93,7 +92,7 @@ class PlacementCriteria:
     def _agreeing(self, motion: Floats, moved: Floats) -> Floats:
         """From 1 down to 0 (V, V) how well the edge of each pair agrees, the first view still, the second moved."""
         edges, measured, noise = self.evidence.graph.edges, self.evidence.graph.i_from_j, self.evidence.noise
-        widest = np.minimum(np.sqrt(GATE) * noise.rotation_rad, np.pi)
+        widest = np.minimum(np.sqrt(UNSETTLED) * noise.rotation_rad, np.pi)
         alike = self.proposed.reshape(-1, 9) @ motion[:3, :3].ravel() > np.tile(1 + 2 * np.cos(widest), 2) - ROUNDING
         second, first = (np.flatnonzero(half) for half in np.split(alike, 2))
         row = np.concatenate([second, first])
@@ -104,7 +103,7 @@ class PlacementCriteria:
         chi2 = turned / noise.rotation_rad[row] ** 2 + shifted / noise.translation_m[row] ** 2
         out = np.zeros((len(moved), len(moved)))
         pairs = np.concatenate([edges[second], edges[first, ::-1]])
-        np.maximum.at(out, tuple(pairs.T), np.sqrt(np.maximum(0.0, 1 - chi2 / GATE)))
+        np.maximum.at(out, tuple(pairs.T), np.sqrt(np.maximum(0.0, 1 - chi2 / UNSETTLED)))
         return out
 
 

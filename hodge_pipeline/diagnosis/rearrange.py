@@ -133,12 +133,12 @@ def _moved(criteria: PlacementCriteria, now: _Now, proposals: Proposals, row: in
     then = np.where(movable[None, None], moved, now.layers)
     up = np.broadcast_to(now.up[proposals.stayer[row]], now.up.shape)
     held = criteria.model.upright.log_evidence(motion[:3, :3] @ poses[:, :3, :3], up) - now.upright
-    sets = [movable] if not movable[proposals.stayer[row]] else []
+    sets = [movable & ~movable[proposals.stayer[row]]]
     if criteria.usual:
         sets.append(_best_run(criteria, now, then, held, movable))
-    gains = [_gain(criteria, now.layers, then, held, inside) for inside in sets] or [0.0]
+    gains = [_gain(criteria, now.layers, then, held, inside) for inside in sets]
     best = int(np.argmax(gains))
-    return _Move(gains[best], sets[best] if sets else np.zeros(len(piece), bool), motion, int(home))
+    return _Move(gains[best], sets[best], motion, int(home))
 
 
 def _gain(criteria: PlacementCriteria, now: Floats, then: Floats, held: Floats, inside: Bools) -> float:

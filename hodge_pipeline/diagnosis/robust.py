@@ -17,11 +17,11 @@ from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import Loops, loop_products
 from hodge_pipeline.complex.judging import has_unit_information
-from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, diagnose, lattice_backbone
+from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.short_cycles import tree_loops
-from hodge_pipeline.solvers.backbone.trust import NONE, Backbone, find_backbone
+from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import check_choice, held_rows
@@ -59,10 +59,7 @@ def solve_robust(
     check_choice("objective", objective, ObjectiveName)
     start = None if start is None else np.asarray(start, float)
     check_graph(graph, start)
-    backbone = find_backbone(graph, diagnosis.trust)
-    if backbone is None:
-        found = diagnose(graph, replace(diagnosis, trust=NONE))
-        backbone = lattice_backbone(graph, found, diagnosis)
+    found = backbone_or_diagnosis(replace(graph, dimension=2) if is_planar(graph) else graph, diagnosis)
     fixed, unheld = held_rows(graph, start)
 
     def solved(chosen: ViewGraph, poses: Floats) -> Solution:
@@ -76,7 +73,7 @@ def solve_robust(
             certificate=certificate,
         )
 
-    final = _judged(graph, found, solved) if backbone is None else _on_backbone(graph, backbone, solved)
+    final = _judged(graph, found, solved) if isinstance(found, Diagnosis) else _on_backbone(graph, found, solved)
     metrics = {**final.metrics, "kept_edges": float((final.weights > 0).sum())}
     return replace(final, notes=(*unheld, *final.notes), metrics=metrics)
 

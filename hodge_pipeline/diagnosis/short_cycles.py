@@ -15,7 +15,7 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 LONGEST_ENTRIES = 5_000_000
 GATE = 30.0
-"""χ² over six dimensions of a cycle that closes."""
+"""χ² over six dimensions of a cycle that closes, and of two edges that agree. Generous, since tails are heavy."""
 
 
 def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
@@ -38,8 +38,7 @@ def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, 
     rows = np.flatnonzero(chosen)
     more = tree_loops(edges[rows], vertex_count)
     more = Loops(more.offsets, rows[more.edge], more.sign)
-    passes = np.add.reduceat(wanted[more.edge], more.offsets[:-1]) > 0 if len(more) else np.zeros(0, bool)
-    return _distinct(_joined([loops, more.select(np.flatnonzero(passes))]), len(edges))
+    return _distinct(_joined([loops, more.select(np.flatnonzero(more.sums(wanted)))]), len(edges))
 
 
 def cycle_errors(loops: Loops, i_from_j: Floats, products: Floats | None = None) -> tuple[Floats, Floats]:
@@ -127,9 +126,7 @@ def tree_loops(edges: Ints, vertex_count: int) -> Loops:
 
 def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
     """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
-    row = loops.rows
-    turn = np.bincount(row, noise.rotation_rad[loops.edge] ** 2, len(loops))
-    shift = np.bincount(row, noise.translation_m[loops.edge] ** 2, len(loops))
+    turn, shift = loops.sums(noise.rotation_rad**2), loops.sums(noise.translation_m**2)
     swing = turn * (reach_m * loops.lengths) ** 2 / 12
     chi2 = angle**2 / np.maximum(turn, 1e-300) + displacement_m**2 / np.maximum(shift + swing, 1e-300)
     return Cycles(loops, angle, displacement_m, chi2, chi2 < GATE)
@@ -148,11 +145,8 @@ def usual_share(cycles: Cycles) -> float:
 
 def closing_support(cycles: Cycles, prior: Floats) -> Floats:
     """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
-    row, edge = cycles.loops.rows, cycles.loops.edge
-    total = np.bincount(row, np.log(prior[edge]), len(cycles.loops))
-    others = np.exp(total[row] - np.log(prior[edge]))
-    strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)[row]
-    return np.bincount(edge, strength * others, len(prior)).astype(float)
+    strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)
+    return cycles.loops.sums_at_edges(strength * np.exp(cycles.loops.sums(np.log(prior))), len(prior)) / prior
 
 
 def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
@@ -161,7 +155,7 @@ def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
     loops = cycles.loops.select(wanted)
     row, edge = loops.rows, loops.edge
     logs = np.log(np.clip(np.nan_to_num(probability, nan=0.5), 1e-3, 1.0))
-    others = np.bincount(row, logs[edge], len(loops))[row] - logs[edge]
+    others = loops.sums(logs)[row] - logs[edge]
     order = np.lexsort((row, -others, edge))
     ranked = edge[order]
     rank = np.arange(len(order)) - np.searchsorted(ranked, ranked)

@@ -84,8 +84,7 @@ def reasons(
     """
     count = graph.edge_count
     passing = np.bincount(cycles.loops.edge, minlength=count)
-    closing = np.repeat(cycles.closes, cycles.loops.lengths)
-    closed = np.bincount(cycles.loops.edge, closing, count).astype(np.int64)
+    closed = cycles.loops.sums_at_edges(cycles.closes, count).astype(np.int64)
     sound = _sound(cycles, (verdict == CONSISTENT) | (verdict == UNTESTABLE))
     in_loop = _in_loop(graph, (passing == 0) & (verdict == UNTESTABLE))
     lines = []
@@ -119,10 +118,8 @@ def _in_loop(graph: ViewGraph, wanted: Bools) -> Bools:
 def _sound(cycles: Cycles, kept: Bools) -> Ints:
     """How many cycles (E,) close over an edge of which all other edges are kept."""
     loops = cycles.loops
-    row = loops.rows
-    left_out = np.bincount(row, ~kept[loops.edge], len(loops))
-    others = left_out[row] - ~kept[loops.edge]
-    return np.bincount(loops.edge, cycles.closes[row] & (others == 0), len(kept)).astype(np.int64)
+    others = loops.sums(~kept)[loops.rows] - ~kept[loops.edge]
+    return np.bincount(loops.edge, cycles.closes[loops.rows] & (others == 0), len(kept)).astype(np.int64)
 
 
 def _over_what(closed: int, sound: int) -> str:

@@ -103,7 +103,9 @@ def length(metres: float, unit_of_m: float | None = None, floor_m: float = 0.0) 
     size_m = abs(metres if unit_of_m is None else unit_of_m)
     if size_m < 0.025:
         return f"{metres * 1000:.3g} mm"
-    return f"{metres * 100:.3g} cm" if size_m < 1 else f"{metres:.3g} m"
+    if size_m < 1:
+        return f"{metres * 100:.3g} cm"
+    return f"{metres:.3g} m" if size_m < 999.5 else f"{metres / 1000:.3g} km"
 
 
 def angle(degrees: float, floor_deg: float = 0.0) -> str:

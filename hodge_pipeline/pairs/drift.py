@@ -13,6 +13,9 @@ from hodge_pipeline.pairs.candidates import usable_rows
 from hodge_pipeline.pairs.overlap import pairwise_iou
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
 
+DRIFT_SHARE = 0.05
+"""Of the length of the path, where a turn counts as the distance by which the scene moves: odometry of RGB-D frames
+drifts by 1 to 5 %, of lidar by less."""
 OCTAVES = 8
 SAMPLED_FRAMES = 50
 NOTHING = np.zeros((0, 2), np.int64)
@@ -26,13 +29,6 @@ class DriftEdges:
     ones after a long path.
     """
 
-    drift_share: float = Field(
-        default=0.05,
-        gt=0,
-        lt=1,
-        description="drift over the length of the path, where a turn counts as the distance by which the scene "
-        "moves; odometry of RGB-D frames drifts by 1 to 5 %, of lidar by less",
-    )
     min_iou: float = Field(
         default=0.2, ge=0, lt=1, description="share in [0, 1): a pair's IoU in such voxels exceeds it"
     )
@@ -72,11 +68,11 @@ class DriftEdges:
             voxel_m = self.voxel_m * 2**octave
             iou = pairwise_iou(clouds.read(rows), poses, voxel_m, above=self.min_iou).tocoo()
             i, j = iou.row.astype(np.int64), iou.col.astype(np.int64)
-            drift_m = self.drift_share * (way_m[j] - way_m[i])
+            drift_m = DRIFT_SHARE * (way_m[j] - way_m[i])
             mine = (j - i > self.reach) & (drift_m <= voxel_m) & ((drift_m > voxel_m / 2) | (octave == 0))
             pairs.append(np.stack([i, j], axis=1)[mine])
             overlap.append(iou.data[mine])
-            if self.drift_share * way_m[-1] <= voxel_m:
+            if DRIFT_SHARE * way_m[-1] <= voxel_m:
                 break
         every, scores = np.concatenate(pairs), np.concatenate(overlap)
         kept = best_of_each(every, scores, self.per_frame, self.reach)

@@ -9,56 +9,14 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.sparse import csr_matrix
 
-from hodge_pipeline import se3
-from hodge_pipeline.errors import GraphError
+from hodge_pipeline.complex.occupancy import voxel_occupancy
 from hodge_pipeline.pairs.candidates import usable_rows
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, PointCloud
 
-AXIS_BITS = 21
 BLOCK_ENTRIES = 4_000_000
 """Bound on the entries of one block of the product: about 50 MB."""
 FRAMES_OF_A_PLACE, DIRECTIONS = 16, 4
 """Nine edges a frame are kept in the end: 16 of each place leave a choice."""
-
-
-def voxels(points_in_world: Floats, voxel_m: float, origin: Ints) -> Ints:
-    """The distinct voxels that points (N, 3) lie in, one int64 key each, ascending.
-
-    The lattice is fixed to the world's origin: voxel (a, b, c) is [a, a + 1) x … times `voxel_m`, whatever the
-    `origin` (3,) in voxels that the keys count from. `GraphError` where points are a million voxels from it.
-    """
-    cells = np.floor(points_in_world / voxel_m).astype(np.int64) - origin + (1 << (AXIS_BITS - 1))
-    if len(cells) and (cells.min() < 0 or cells.max() >= 1 << AXIS_BITS):
-        raise GraphError(
-            f"the clouds spread over more than {1 << AXIS_BITS} voxels of {voxel_m} m: the poses have diverged, "
-            "or voxel_m is too small for this scene"
-        )
-    return np.unique((cells[:, 0] << 2 * AXIS_BITS) | (cells[:, 1] << AXIS_BITS) | cells[:, 2])
-
-
-def incidence(
-    clouds: Iterable[PointCloud], world_from_cam: Floats, voxel_m: float, partners: Ints | None = None
-) -> tuple[csr_matrix, Ints]:
-    """The CSR matrix (N frames, M voxels) of int32, 1 where a frame has a point in a voxel that one of the `partners`
-    (all frames where None are named) has a point in; and in how many voxels (N,) each frame has points at all.
-
-    The row of a frame without points, or with a pose that is not finite, is empty.
-    """
-    finite = np.asarray(np.isfinite(world_from_cam).all(axis=(1, 2)))
-    origin = np.floor(world_from_cam[finite][:1, :3, 3].sum(axis=0) / voxel_m).astype(np.int64)
-    nothing = np.zeros(0, np.int64)
-    keys = [
-        voxels(se3.transform(pose, cloud.points_in_cam.astype(float)), voxel_m, origin) if use else nothing
-        for cloud, pose, use in zip(clouds, world_from_cam, finite, strict=True)
-    ]
-    named = keys if partners is None else [keys[row] for row in partners]
-    names = np.append(np.unique(np.concatenate([nothing, *named])), np.iinfo(np.int64).max)  # above every key
-    places = ((np.searchsorted(names, own), own) for own in keys)
-    columns = [place[names[place] == own].astype(np.int32) for place, own in places]
-    rows = np.concatenate([[0], np.cumsum([len(own) for own in columns])])
-    entries = np.concatenate([np.zeros(0, np.int32), *columns])
-    matrix = csr_matrix((np.ones(len(entries), np.int32), entries, rows), shape=(len(keys), len(names)))
-    return matrix, np.array([len(own) for own in keys], np.int64)
 
 
 def _blocks(count: int) -> Iterator[slice]:
@@ -75,12 +33,12 @@ def pairwise_iou(
 ) -> csr_matrix:
     """The CSR matrix (N, N) of the intersection over union of all pairs i < j, where it exceeds `above`.
 
-    |A ∩ B| of all pairs is one sparse product of the frames-by-voxels incidence with its transpose, made in blocks
+    |A ∩ B| of all pairs is one sparse product of the frames-by-voxels occupancy with its transpose, made in blocks
     of rows, so that memory holds the answer and one block; |A ∪ B| = |A| + |B| − |A ∩ B|. The clouds are voxelised
     in the world frame under the poses (N, 4, 4), on the lattice through the world's origin. Where `partners (R,)` are
     named, only pairs with one of them.
     """
-    seen, sizes = incidence(clouds, world_from_cam, voxel_m, partners)
+    seen, sizes = voxel_occupancy(clouds, world_from_cam, voxel_m, partners)
     count = len(sizes)
     partners = np.arange(count) if partners is None else partners
     is_partner = np.isin(np.arange(count), partners)

@@ -13,8 +13,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.occupancy import voxels
 from hodge_pipeline.pairs.drift import displacement_m, median_range_m, path_length_m
-from hodge_pipeline.pairs.overlap import voxels
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import PreparedClouds
 from hodge_pipeline.stages import Advance, Registrar, no_progress
@@ -30,6 +30,8 @@ REACH_RANGES = 2.0
 VIEWS_APART, COMPARED = 3, 12
 """Key frames between those of before that a view is compared with, whose motions err apart, and how many: the
 nearest."""
+DRIFT_SHARE = 0.03
+"""Of the path since the last place known, what odometry may be off by."""
 VOXEL_RANGES = 0.1
 """Median ranges: the least side of the voxels in which two views share space, .2 m in a room."""
 
@@ -40,9 +42,6 @@ class Revisits:
 
     every_m: float = Field(
         default=1.0, gt=0, description="metres of the path, a turn as the arc at the scene, between two attempts"
-    )
-    drift_share: float = Field(
-        default=0.03, gt=0, lt=1, description="of that path, what odometry may be off by since the last place known"
     )
     most_m: float = Field(
         default=1.5, gt=0, description="metres that a place may be off at most: rooms that look alike may lie near"
@@ -129,7 +128,7 @@ class _Path:
         options = self._options
         before = int(np.searchsorted(self._at_m, self._at_m[row] - LOOP_RANGES * self._range_m))
         way_m = self._ways(row, options.longest_way_m)[:before]
-        allowed_m = np.minimum(options.agree_m + options.drift_share * way_m, options.most_m)
+        allowed_m = np.minimum(options.agree_m + DRIFT_SHARE * way_m, options.most_m)
         shift_m = np.linalg.norm(self._poses[:before, :3, 3] - self._poses[row, :3, 3], axis=1)
         usable = np.flatnonzero(
             (shift_m < REACH_RANGES * self._range_m) & np.isfinite(way_m) & self._has_points[:before]

@@ -38,7 +38,7 @@ def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | 
     for key in data:
         if key not in known:
             here = (*keys, key)
-            suggestion = registry.suggestion(key, list(known))
+            suggestion = _further_in((*keys, key), data, known) or registry.suggestion(key, list(known))
             raise RecipeError(f"{where(here)}: {_dotted(here)}: unknown option{suggestion}", here)
     if isinstance(data.get("seed"), int):
         seed = data["seed"]
@@ -49,6 +49,17 @@ def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | 
         return cls(**values)
     except ValidationError as error:
         raise _first_error(error, where, keys, known) from error
+
+
+def _further_in(keys: Keys, data: Mapping[str, Any], known: Mapping[str, Any]) -> str:
+    """Where a stage of this section has an option of that name, as a suggestion."""
+    for name, annotation in known.items():
+        kind = next(filter(None, map(registry.kind_of, (annotation, *get_args(annotation)))), None)
+        stage = data[name].get("stage") if isinstance(data.get(name), Mapping) else data.get(name)
+        cls = registry.load(kind.name, stage) if kind and stage in registry.names(kind.name) else None
+        if cls and any(field.name == keys[-1] for field in dataclasses.fields(cls)):
+            return f" (did you mean '{_dotted((*keys[:-1], name, keys[-1]))}'?)"
+    return ""
 
 
 def bind_known(

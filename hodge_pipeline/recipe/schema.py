@@ -25,7 +25,6 @@ from hodge_pipeline.stages import (
     Executor,
     FrameReader,
     Fuser,
-    Refiner,
     Registrar,
     Start,
 )
@@ -103,7 +102,6 @@ class Recipe:
         "are reported alone",
     )
     suggestions: SuggestionOptions = SuggestionOptions()
-    refiner: Refiner | None = Field(default=None, description="improves the poses of all frames after the last solve")
     fusion: tuple[Fuser, ...] = Field(default=(), description="each makes one model from the final poses")
     evaluation: EvaluationOptions = EvaluationOptions()
     recording: RecordingOptions = RecordingOptions()

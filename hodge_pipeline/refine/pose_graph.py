@@ -24,6 +24,8 @@ from hodge_pipeline.sources.unknown import without_frames
 from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, ViewGraph
 
 RUN_GRAPH = "graph.g2o"
+ROUNDING = 1e-15
+"""Of the cost before: so much is left of one that vanishes."""
 GRAPH_WRITERS = ("g2o", "open3d_pose_graph")
 """Writers that take the poses by the rows of the vertices."""
 OBJECTIVES = {"full": "chi2", "isotropic": "F"}
@@ -76,6 +78,7 @@ class SolvedFile:
         """What the solve did to its own objective: a file of edges has nothing else to measure poses by."""
         summary = self.summary()
         before, after, name = summary["cost_before"], summary["cost_after"], OBJECTIVES[summary["objective"]]
+        after = after if after > ROUNDING * max(before or 0.0, 1.0) else 0.0
         fell = f"{name} {after:.6g}" if before is None else f"{name} {before:.6g} → {after:.6g}"
         if not self.doubt and summary["edges_ignored"] == summary["edges"]:
             return "Nothing to solve: no edge joins two vertices with information, so every pose is as it was"

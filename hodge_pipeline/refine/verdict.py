@@ -12,8 +12,10 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
+from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.pairs.held_out import held_out_pairs
 from hodge_pipeline.refine.guard import Decision, Measure, decide
+from hodge_pipeline.refine.image_steps import MOST_STEPS, step_errors
 from hodge_pipeline.refine.uncertainty import change, mean_chi2
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.scene import KeyFrames, Round
@@ -32,6 +34,13 @@ KNOTS_APART = (16, 8, 4, 2, 1)
 """Key frames: between two knots of the correction the steps are those given, which may be better than registered ones.
 The widest spacing is kept that fits the held-out pairs as well as the best."""
 
+STEP_TOLERANCE, STEP_TOLERANCE_MM, ROUGHER = 1.0, 5.0, 0.1
+"""Registered steps may be rougher than a visual odometry's and yet drift less, which is told from the third on, a share
+as the first is; steps twice as far from those of images, and by more than the second in a room, are of other poses."""
+FEWEST_STEPS = 6
+TOLD_SIZE, LARGEST_SIZE, SIZE_LEAVES = 0.005, 0.1, 0.5
+"""The share by which a path grows or shrinks from which on that is told, or refused, and the share of the movement that
+it then leaves: drift bends a path, and focal lengths are known to a few per cent."""
 LEAST_JOINED = 0.2
 """Of the key frames: the least that overlap with another one where the given poses are of these frames."""
 
@@ -69,8 +78,12 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
     after, measures = _held_out(work, rounds, key_frames)
     measures.append(chi2_measure(*chi2))
-    solution = replace(last.solution, world_from_cam=after)
-    return decide(measures, change(last.graph, solution, before), force=work.recipe.guard.force), after
+    moved = change(last.graph, replace(last.solution, world_from_cam=after), before)
+    decision = decide(measures, moved, force=work.recipe.guard.force)
+    if decision.outcome == "refined":  # by clouds, which a sensor may warp alike in every frame
+        measures += [*_images(work, key_frames, after), *_size(work, before, after)]
+        decision = decide(measures, moved, force=work.recipe.guard.force)
+    return decision, after
 
 
 def _nothing(last: Round) -> str:
@@ -126,6 +139,41 @@ def _held_out(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     work.steps.note(Note("held out", len(pairs), f"{apart}, the correction at every {KNOTS_APART[row - 1]}. key frame"))
     name = "score of held-out edges"
     return found[row - 1], [Measure(name, float(mean[0]), float(mean[1]), "higher", tolerance, is_held_out=True)]
+
+
+def _images(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]:
+    """How far steps from key frame to key frame lie from those that images show; empty where there are none."""
+    sequence = key_frames.sequence[key_frames.rows]
+    firsts = np.flatnonzero(sequence[1:] == sequence[:-1])
+    firsts = firsts[np.unique(np.linspace(0, len(firsts) - 1, min(MOST_STEPS, len(firsts))).round().astype(int))]
+    poses, source = np.stack([key_frames.world_from_key, after]), work.scene.source
+    if not len(firsts) or not all(frame.read_colour and frame.read_depth for frame in source.frames):
+        return []
+    pairs, scale = np.column_stack([firsts, firsts + 1]), float(work.recipe.scale)
+    found = work.steps.step(step_errors, source, pairs, poses, scale, title="guard: images", total=len(pairs))
+    before_mm, after_mm = found.off_m[:, np.isfinite(found.off_m).all(axis=0)] * 1000
+    if len(before_mm) < FEWEST_STEPS:
+        return []
+    error_mm = float((after_mm - before_mm).std() / np.sqrt(len(before_mm)))
+    mean = float(before_mm.mean()), float(after_mm.mean())
+    if mean[1] > (1 + ROUGHER) * mean[0] + error_mm:
+        work.steps.note(Note("rougher", detail=f"{mean[1]:.3g} mm off, before {mean[0]:.3g} mm"))
+    tolerance_mm = max(SIGMAS * error_mm, STEP_TOLERANCE * mean[0], STEP_TOLERANCE_MM * scale)
+    return [Measure("steps off those of images", *mean, tolerance=tolerance_mm, unit="mm")]
+
+
+def _size(work: Work, before: Floats, after: Floats) -> list[Measure]:
+    """By what share the path (K, 4, 4) became larger or smaller; empty where poses moved mostly in other ways."""
+    if len(before) < 3:
+        return []
+    spreads = [float(np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0))) for poses in (before, after)]
+    left = [absolute_error(before, after, with_scale=scaled).rmse_m for scaled in (False, True)]
+    factor = spreads[1] / spreads[0] if spreads[0] > 0 else 1.0
+    moved = left[0] * 1000 > STEP_TOLERANCE_MM * float(work.recipe.scale)
+    if not (moved and abs(factor - 1) > TOLD_SIZE and left[1] <= SIZE_LEAVES * left[0]):
+        return []
+    work.steps.note(Note("path scaled", detail=f"{factor:.3g}"))
+    return [Measure("change of the path's size", 0.0, abs(factor - 1), tolerance=LARGEST_SIZE)]
 
 
 def first_as_good(scores: Floats) -> int:

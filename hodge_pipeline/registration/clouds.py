@@ -19,6 +19,8 @@ from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats32, Frame, Landm
 
 FRAMES_IN_BLOCK = 16
 MIN_POINTS_FOR_NORMALS = 5
+NORMAL_NEIGHBOURS = 10
+"""In the plane fit of a normal: as in the paper."""
 MANY_POINTS = 5_000_000
 LISTED_NOTES = 5
 MAP_AWAY = 10.0
@@ -51,9 +53,6 @@ class CloudOptions:
     )
     voxel_m: float = Field(
         default=0.03, gt=0, description="Metres; one averaged point per voxel. 0.03 as in the paper."
-    )
-    normal_neighbours: int = Field(
-        default=10, ge=5, description="Points in the plane fit of a normal. 10 as in the paper."
     )
     colours: bool = Field(default=True, description="Whether colours are read too; the coloured registrars need them.")
     landmarks: int = Field(
@@ -125,7 +124,7 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     samples = _read_samples(frame, options)
     points, colours = voxel_means(samples.points_in_cam, samples.colours, options.voxel_m)
     landmarks = _landmarks(frame, options)
-    cloud = PointCloud(points, _normals(points, options.normal_neighbours), colours, landmarks)
+    cloud = PointCloud(points, _normals(points), colours, landmarks)
     odd = samples.odd
     if not len(points):
         odd = Oddity(frame.frame_id, "no valid measurement in range, its cloud is empty", samples.why_none)
@@ -309,11 +308,11 @@ def _ranges(cloud: PointCloud) -> Floats32:
         return np.asarray(np.linalg.norm(np.asarray(cloud.points_in_cam, np.float32), axis=1))
 
 
-def _normals(points: Floats32, neighbours: int) -> Floats32:
+def _normals(points: Floats32) -> Floats32:
     if len(points) < MIN_POINTS_FOR_NORMALS:
         return np.zeros((len(points), 3), np.float32)
     cloud = small_gicp.PointCloud(points.astype(np.float64))
-    small_gicp.estimate_normals(cloud, small_gicp.KdTree(cloud), min(neighbours, len(points)))
+    small_gicp.estimate_normals(cloud, small_gicp.KdTree(cloud), min(NORMAL_NEIGHBOURS, len(points)))
     normals = np.asarray(cloud.normals())[:, :3]
     away = np.einsum("ij,ij->i", normals, points) > 0
     return np.where(away[:, None], -normals, normals).astype(np.float32)

@@ -21,6 +21,9 @@ from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
 STEPS_IN_BLOCK = 32
 WARM_UP_STEPS = 2
+SURE_FITNESS = 0.7
+"""Below it a second registration starts from no motion, and the fitter one is kept; over a hole in the recording (a
+step ten times as long as usual) it must be reached, or tracking is lost."""
 REACHES_APART = 4.0
 """What nothing joins begins so many reaches of a cloud apart: two clouds that face each other do not meet."""
 
@@ -30,13 +33,6 @@ class OdometryOptions:
     """How the first poses are found."""
 
     registration: Registrar = Field(default=Gicp(), description="how two consecutive frames are registered")
-    sure_fitness: float = Field(
-        default=0.7,
-        ge=0,
-        le=1,
-        description="below it a second registration starts from no motion, and the fitter one is kept; over a hole in "
-        "the recording (a step ten times as long as usual) it must be reached, or tracking is lost",
-    )
     min_fitness: float = Field(
         default=0.3,
         ge=0,
@@ -95,7 +91,7 @@ def odometry(
         advance(len(result.pairs))
     steps = Edges.joined([results[number] for number in range(len(blocks))])
     gap = over_gap(steps.pairs, sequences, stamps_s)
-    lost = ~(steps.fitness >= np.where(gap, max(options.sure_fitness, options.min_fitness), options.min_fitness))
+    lost = ~(steps.fitness >= np.where(gap, max(SURE_FITNESS, options.min_fitness), options.min_fitness))
     poses = chained(len(sizes), sequences, steps, REACHES_APART * clouds.reach_m)
     notes = tuple(
         f"tracking was lost between rows {i} and {j} ({'a hole in the recording, ' if hole else ''}fitness "
@@ -122,7 +118,7 @@ def _run_block(folder: Path, options: OdometryOptions, block: _Block) -> Edges:
     velocity, found = np.zeros(6), []
     for (i, j), duration in zip(_steps(block.rows), durations, strict=True):
         step = options.registration.register(prepared[i], prepared[j], se3.exp(velocity * duration))
-        if step.fitness < options.sure_fitness:
+        if step.fitness < SURE_FITNESS:
             step = max(step, options.registration.register(prepared[i], prepared[j], np.eye(4)), key=_fitness)
         if step.fitness < options.min_fitness:
             step = Registration(se3.exp(velocity * duration), np.zeros((6, 6)), step.fitness, step.rmse_m, 0, 0, False)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.complex.components import in_runs
-from hodge_pipeline.diagnosis.energy import CAVEAT, PARTS, SHARE_CAVEAT, EnergyRow
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.suggestions import Suggestions
 from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle, ranked
 from hodge_pipeline.report.document import Banner, Document, Mark, Picture, Section, Table
+from hodge_pipeline.report.energy import CAVEAT, PARTS, SHARE_CAVEAT, EnergyRow
 from hodge_pipeline.report.tables import number
+from hodge_pipeline.rounds.suggestions import Suggestions
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 LISTED = 20

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from hodge_pipeline.diagnosis.energy import ALL_EDGES, PARTS, EnergyRow
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.report.document import Picture
+from hodge_pipeline.report.energy import ALL_EDGES, PARTS, EnergyRow
 from hodge_pipeline.report.painting import flattest_plane, painted
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 

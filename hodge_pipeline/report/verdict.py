@@ -38,15 +38,16 @@ REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",
 }  # fmt: skip
-DOUBTS = {
-    "unsettled": "Not settled",
-    "camera or object": "In doubt, since much of the image moves",
-    "unheld": "In doubt, since what frames share lets them slide",
-    "path loose": "In doubt, since the scans tell little of how far the scanner went",
-    "depth unit": "In doubt, since depth is probably not in metres",
-    "other scale": "In another scale than the truth",
+DOUBTS = {"unsettled": "not settled", "other scale": "in another scale than the truth"}
+REASONS = {
+    "camera or object": "much of the image moves",
+    "unheld": "what frames share lets them slide",
+    "path loose": "the scans tell little of how far the scanner went",
+    "reader's doubt": "the reader assumes what no file tells",
+    "path scaled": "the path is of another size than the one given",
+    "depth unit": "depth is probably not in metres",
 }
-"""How a headline begins where the run says that its result may be wrong, whatever was measured."""
+"""How a headline begins where the run says that its result may be wrong, whatever was measured, and why."""
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 
 
@@ -96,7 +97,9 @@ def judge(report: Report) -> Verdict:
         all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
     told = (*_unsettled(report), *_other_scale(report), *report.notes)
+    reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS)
     doubts = [DOUBTS[note.kind] for note in told if note.kind in DOUBTS]
+    doubts += [f"in doubt, since {reasons}"] if reasons else []
     doubts += [report.refinement.doubt] if report.refinement and report.refinement.doubt else []
     headline = capital(": ".join(f"{text[:1].lower()}{text[1:]}" for text in (*doubts, headline)))
     return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason, bool(doubts))
@@ -110,7 +113,8 @@ def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, 
         refinement = report.refinement
         outcome = REFINEMENTS[refinement.outcome]
         if outcome == "improved" and worse:
-            return "mixed", f"{refinement.headline}, but {but}", f"{refinement.reason}."
+            good = f" ({min(better, key=lambda change: change.share).briefly})" if better else ""
+            return "mixed", f"{refinement.headline}{good}, but {but}", f"{refinement.reason}."
         return outcome, refinement.headline, f"{refinement.reason}."
     if not changes:
         return "not measured", "Not measured", report.unmeasured or NO_MEASURE

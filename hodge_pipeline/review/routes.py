@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import pair_names
 from hodge_pipeline.report.document import JPEG, Picture
@@ -22,6 +21,7 @@ from hodge_pipeline.review.front import Answer, Route, Site
 from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.session import MODES, Session
+from hodge_pipeline.rounds.suggestions import suggest_pairs
 from hodge_pipeline.stages import Advance
 from hodge_pipeline.types.input_files import read_input
 from hodge_pipeline.types.notes import Note

@@ -10,10 +10,10 @@ import numpy as np
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions, SuggestionOptions
 from hodge_pipeline.diagnosis.result import UNTESTABLE
-from hodge_pipeline.diagnosis.suggestions import suggest_pairs
 from hodge_pipeline.pairs.held_out import held_out_pairs
 from hodge_pipeline.rounds.more import Placed, register_more
 from hodge_pipeline.rounds.one_round import Registered, Work
+from hodge_pipeline.rounds.suggestions import suggest_pairs
 from hodge_pipeline.scene import Round
 from hodge_pipeline.stages import Step
 from hodge_pipeline.start.unordered.pieces import laid_apart

@@ -19,7 +19,7 @@ from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.minimise import descend_isotropic, full_objective, here, metrics_of, minimise
 from hodge_pipeline.solvers.newton import Descent, Limits, descend, still_to_come
 from hodge_pipeline.solvers.priors import PER_EDGE
-from hodge_pipeline.solvers.problem import make_problem, reweighted
+from hodge_pipeline.solvers.problem import make_problem
 from hodge_pipeline.solvers.setup import Setup, check_choice, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
@@ -49,7 +49,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Base:
-    """The set-up of some edges with their factors, which later solves with other weights start from."""
+    """The set-up of some edges, which later solves with other weights start from."""
 
     graph: ViewGraph
     rows: Ints
@@ -70,8 +70,8 @@ class GraphEditor:
         editor.undo()
 
     Edges are named by their rows. A solve after an edit begins at the present poses, near the edges that changed, and
-    ends there if those farther off have nothing to win; else it goes on with the factors of the first solve, corrected
-    for the edges that changed. Where pieces part or join, or edges are new, the graph is set up again.
+    ends there if those farther off have nothing to win. Where pieces part or join, or edges are new, the graph is set
+    up again.
 
     The graph's fixed vertices stay where the solution has them; without a solution they have no such place, and a note
     says so.
@@ -165,9 +165,12 @@ class GraphEditor:
         if self._objective == "full" and len(changed := np.flatnonzero(scale[base.rows] != 1)):
             information = information.copy()
             information[changed] *= scale[base.rows[changed], None, None]
+        problem, own = base.setup.problem, scale[base.used]
+        if (own != 1).any():
+            problem = replace(problem, kappa=own * problem.kappa, tau=own * problem.tau)
         setup = replace(
             base.setup.started(self._state.solution.world_from_cam),
-            problem=reweighted(base.setup.problem, scale[base.used]),
+            problem=problem,
             weights=replace(weights, information=information),
         )
         full = self._full(setup)

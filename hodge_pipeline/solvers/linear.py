@@ -11,7 +11,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, by_columns, eliminate
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Floats
 
 MINIMUM_DEGREE_TO = 300_000
 """Above this many vertices SuperLU's minimum degree costs more than the fill that it saves on chain-like graphs."""
@@ -68,31 +68,6 @@ def factorise_blocks(plan: Elimination, matrix: bsr_matrix, single: bool = False
     except np.linalg.LinAlgError as error:
         raise GraphError(_singular(matrix.shape[0])) from error
     return Factor(int(matrix.shape[0]), found.solve)
-
-
-def corrected(factor: Factor, ends: Ints, change: Floats) -> Factor:
-    """The factor of a graph Laplacian whose edges `ends (k, 2)` weigh `change (k,)` more: Woodbury's formula.
-
-    Positions beyond the factor's size are pinned. The new matrix must not be singular.
-    """
-    if not len(ends):
-        return factor
-    columns = np.zeros((factor.size + 1, len(ends)))
-    place = np.minimum(ends, factor.size)
-    each = np.arange(len(ends))
-    columns[place[:, 0], each] += 1.0
-    columns[place[:, 1], each] -= 1.0
-    solved = factor.solve(columns[:-1])
-    padded = np.vstack([solved, np.zeros(len(ends))])
-    capacitance = np.eye(len(ends)) + change[:, None] * (padded[place[:, 0]] - padded[place[:, 1]])
-    weighted = np.linalg.solve(capacitance.T, solved.T).T * change
-
-    def solve(rhs: Floats) -> Floats:
-        first = factor.solve(rhs)
-        padded = np.concatenate([first, np.zeros_like(first[:1])])
-        return np.asarray(first - weighted @ (padded[place[:, 0]] - padded[place[:, 1]]))
-
-    return Factor(factor.size, solve)
 
 
 def fill_reducing_order(laplacian: csc_matrix | csr_matrix) -> Ordering:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass as plain_dataclass
-
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
-from scipy.sparse import csr_matrix
 
 from hodge_pipeline.complex.checks import NO_EDGES, check_graph, orthonormal, refuse_priors
 from hodge_pipeline.complex.coboundary import coboundary_0
@@ -23,13 +20,6 @@ from hodge_pipeline.solvers.potential import (
     unconverged_notes,
 )
 from hodge_pipeline.types import Bools, Floats, Solution, SolverIteration, ViewGraph
-
-
-@plain_dataclass(frozen=True)
-class _Problem(CentredProblem):
-    """With the coboundary of its graph."""
-
-    d0: csr_matrix
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -94,27 +84,26 @@ class PoissonSolver:
             ),
         )
 
-    def _iterate(self, problem: _Problem, around_loops: AroundLoops) -> tuple[SolverIteration, ...]:
+    def _iterate(self, problem: CentredProblem, around_loops: AroundLoops) -> tuple[SolverIteration, ...]:
         if len(problem.edges) == 0:
             return ()
         ones = np.ones(len(problem.edges))
-        potential = problem.poisson(problem.d0, ones)
+        potential = problem.poisson(coboundary_0(problem.edges, len(problem.component)), ones)
         return iterate(problem, self.log, potential, ones, around_loops, self.inner_iterations, self.tolerance)
 
-    def _convergence_notes(self, problem: _Problem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
+    def _convergence_notes(self, problem: CentredProblem, history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
         if not history:
             return (NO_EDGES,)
         return (*problem.half_turn_notes(self.log), *unconverged_notes(history))
 
 
-def _problem(graph: ViewGraph, used: Bools, world_from_cam: Floats) -> _Problem:
+def _problem(graph: ViewGraph, used: Bools, world_from_cam: Floats) -> CentredProblem:
     edges = graph.edges[used]
     component = connected_components(edges, graph.vertex_count)
     offset = centroids(world_from_cam, component)
-    return _Problem(
+    return CentredProblem(
         edges=edges,
         i_from_j=orthonormal(graph.i_from_j[used]),
-        d0=coboundary_0(edges, graph.vertex_count),
         component=component,
         fixed=graph.fixed,
         start=orthonormal(shifted(world_from_cam, -offset)),

@@ -55,12 +55,38 @@ class CentredProblem:
         return out
 
     def moved(self, poses: Floats, correction: Floats, log: Logarithm) -> Floats:
-        """`exp(f_k) T_k` (V, 4, 4), with the held vertices at their start; see `moved`."""
-        return moved(poses, correction, self.start, self.component, self.fixed, log)
+        """`exp(f_k) T_k` (V, 4, 4), then each component without a fixed vertex as one body, so that its first vertex is
+        at its start exactly, as the fixed vertices are.
+        """
+        motion = se3.pairing_exp(correction) if log == "pairing" else se3.exp(correction)
+        out = motion @ poses
+        first = np.unique(self.component, return_index=True)[1]
+        body = np.asarray(self.start[first] @ se3.inverse(out[first]))
+        body[self.component[self.fixed]] = np.eye(4)
+        out = np.asarray(body[self.component] @ out)
+        held = pinned_vertices(self.component, self.fixed)
+        out[held] = self.start[held]
+        return out
 
     def poisson(self, d0: csr_matrix, weights: Floats) -> Callable[[Floats], Floats]:
-        """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω` (Eq. (7)); see `poisson`."""
-        return poisson(d0, weights, self.component, self.fixed)
+        """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω` (Eq. (7)).
+
+        f is 0 at the fixed vertices, and of mean zero on each component that has none. The Laplacian is factorised
+        once; six right-hand sides are solved at a time.
+        """
+        held = pinned_vertices(self.component, self.fixed)
+        factor = factorise(grounded_laplacian(d0, weights, held))
+        count = np.bincount(self.component)[:, None].astype(float)
+        count[self.component[self.fixed]] = np.inf
+
+        def solve(omega: Floats) -> Floats:
+            divergence = d0.T @ (weights[:, None] * omega)
+            f = np.zeros_like(divergence)
+            f[~held] = factor.solve(divergence[~held])
+            sums = np.stack([np.bincount(self.component, column) for column in f.T], axis=1)
+            return np.asarray(f - (sums / count)[self.component])
+
+        return solve
 
     def half_turn_notes(self, log: Logarithm) -> tuple[str, ...]:
         """How many edges disagree with the start so much that their ω is ambiguous."""
@@ -121,39 +147,3 @@ def unconverged_notes(history: tuple[SolverIteration, ...]) -> tuple[str, ...]:
     if step <= STILL_MOVING:
         return ()
     return (f"not converged: step {len(history)} still moved the poses by {step:.2g}: more inner_iterations",)
-
-
-def poisson(d0: csr_matrix, weights: Floats, component: Ints, fixed: Ints) -> Callable[[Floats], Floats]:
-    """From ω (edges of d0, 6) to f (V, 6), `d0ᵀ W d0 f = d0ᵀ W ω` (Eq. (7)).
-
-    f is 0 at the fixed vertices (rows), and of mean zero on each component (V,) that has none.
-    The Laplacian is factorised once; six right-hand sides are solved at a time.
-    """
-    gauge = pinned_vertices(component, fixed)
-    factor = factorise(grounded_laplacian(d0, weights, gauge))
-    count = np.bincount(component)[:, None].astype(float)
-    count[component[fixed]] = np.inf
-
-    def solve(omega: Floats) -> Floats:
-        divergence = d0.T @ (weights[:, None] * omega)
-        f = np.zeros_like(divergence)
-        f[~gauge] = factor.solve(divergence[~gauge])
-        sums = np.stack([np.bincount(component, column) for column in f.T], axis=1)
-        return np.asarray(f - (sums / count)[component])
-
-    return solve
-
-
-def moved(poses: Floats, correction: Floats, start: Floats, component: Ints, fixed: Ints, log: Logarithm) -> Floats:
-    """`exp(f_k) T_k` (V, 4, 4), then each component without a fixed vertex as one body, so that its first vertex is at
-    its start exactly, as the fixed vertices (rows) are.
-    """
-    motion = se3.pairing_exp(correction) if log == "pairing" else se3.exp(correction)
-    out = motion @ poses
-    _, first = np.unique(component, return_index=True)
-    body = np.asarray(start[first] @ se3.inverse(out[first]))
-    body[component[fixed]] = np.eye(4)
-    out = np.asarray(body[component] @ out)
-    gauge = pinned_vertices(component, fixed)
-    out[gauge] = start[gauge]
-    return out

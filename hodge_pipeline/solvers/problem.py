@@ -7,7 +7,7 @@ components, so that a planar graph is solved as one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,14 +17,12 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from hodge_pipeline.solvers.backends import BackendName, choose, laplacian_factor
 from hodge_pipeline.solvers.elimination import Elimination
 from hodge_pipeline.solvers.iterative import IterativeSolver
-from hodge_pipeline.solvers.linear import Factor, corrected
+from hodge_pipeline.solvers.linear import Factor
 from hodge_pipeline.solvers.multigrid import Preconditioning
 from hodge_pipeline.solvers.rotations import exponential
 from hodge_pipeline.types import Bools, Floats, Ints
 
 SAME_RATIO = 1e-13
-MOST_CORRECTIONS = 32
-"""Edges whose weights a factor follows by a low-rank correction; a new one costs about as much as this many solves."""
 
 CHUNK = 1 << 12
 """Edges whose blocks are made at a time: they stay in the cache, and memory never holds those of all edges."""
@@ -157,26 +155,14 @@ class Structure:
 
 
 @dataclass(frozen=True)
-class Factors:
-    """The Laplacians of κ and of τ, factorised."""
-
-    rotation: Factor
-    translation: Factor
-
-
-@dataclass(frozen=True)
 class Problem:
-    """Edges and weights of one pose graph: `rotations (E, d, d)`, `translations (E, d)` of i_from_j, κ and τ (E,).
-
-    `factors`: where they are known already.
-    """
+    """Edges and weights of one pose graph: `rotations (E, d, d)`, `translations (E, d)` of i_from_j, κ and τ (E,)."""
 
     structure: Structure
     rotations: Floats
     translations: Floats
     kappa: Floats
     tau: Floats
-    factors: Factors | None = None
 
     @property
     def order(self) -> Ints:
@@ -216,15 +202,11 @@ class Problem:
     @cached_property
     def rotation_factor(self) -> Factor:
         """The scalar Laplacian of κ, factorised once."""
-        if self.factors is not None:
-            return self.factors.rotation
         return self.structure.factor(self.kappa)
 
     @cached_property
     def translation_factor(self) -> Factor:
         """The scalar Laplacian of τ, factorised once: that of κ, where every edge has the same ratio of the two."""
-        if self.factors is not None:
-            return self.factors.translation
         counted = (self.tau > 0) | (self.kappa > 0)
         with np.errstate(divide="ignore"):  # a kappa of 0 has an infinite ratio, which no other is near
             ratio = self.tau[counted] / self.kappa[counted]
@@ -246,22 +228,6 @@ class Problem:
 def _indicator(vertices: Ints, count: int) -> csc_matrix:
     edges = len(vertices)
     return csc_matrix((np.ones(edges), vertices, np.arange(edges + 1)), shape=(count, edges))
-
-
-def reweighted(problem: Problem, scale: Floats) -> Problem:
-    """The problem with its weights times `scale (E,)`, 0 allowed while the edges left keep the vertices together.
-
-    Where few differ from 1, its factors are corrected and not made again.
-    """
-    changed = np.flatnonzero(scale != 1)
-    new = replace(problem, kappa=scale * problem.kappa, tau=scale * problem.tau, factors=None)
-    if len(changed) > MOST_CORRECTIONS or problem.structure.precondition is not None:
-        return new
-    change = scale[changed] - 1
-    ends = np.stack([problem.tail[changed], problem.head[changed]], axis=1)
-    rotation = corrected(problem.rotation_factor, ends, change * problem.kappa[changed])
-    translation = corrected(problem.translation_factor, ends, change * problem.tau[changed])
-    return replace(new, factors=Factors(rotation, translation))
 
 
 def make_problem(

@@ -14,8 +14,9 @@ from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.notes import Note
 
 SAMPLED_FRAMES = 8
-PLAUSIBLE_DEPTH_M = (0.1, 30.0)
-"""The median depth of a scene; outside, the scale is probably wrong."""
+PLAUSIBLE_DEPTH_M = (0.25, 30.0)
+"""The median depth of a scene; outside, the scale is probably wrong. Few depth cameras see anything nearer (L515 .25 m,
+D435 .28, Kinect .4)."""
 NEAR_M, FAR_M = 1.3, 10.0
 """Where the depth of a room, in millimetres but read as TUM's 5000 to the metre, ends: 6.5 m. As far as depth cameras
 for rooms are specified to see: RealSense D435; Kinect and Xtion 4 to 8."""

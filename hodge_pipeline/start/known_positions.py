@@ -15,7 +15,6 @@ from hodge_pipeline.scene import KeyFrames, Scene, has_real_stamps, sequences_of
 from hodge_pipeline.solvers.positions import Fixes
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import Steps
-from hodge_pipeline.start.match_poses import poses_at
 from hodge_pipeline.types import Bools, Floats, Frame, Ints, Positions, Source, Trajectory, Words
 from hodge_pipeline.types.notes import Note, notes_of
 
@@ -136,7 +135,7 @@ def _at_stamps(stamps_s: Floats, source: Source, keys: KeyFrames, max_gap_s: flo
         own = np.array([source.frames[row].stamp_s for row in rows])
         if not len(rows) or (np.diff(own) <= 0).any():
             continue
-        at = poses_at(Trajectory(own, keys.first[rows]), stamps_s, gap_s)
+        at = se3.poses_at(Trajectory(own, keys.first[rows]), stamps_s, gap_s)
         known = np.isfinite(at).all(axis=(1, 2)) & (frame < 0)
         poses[known] = at[known]
         frame[known] = rows[np.abs(own[:, None] - stamps_s[known]).argmin(axis=0)]

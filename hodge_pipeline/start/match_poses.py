@@ -15,7 +15,6 @@ from hodge_pipeline.sources.inspect import guess_reader, guesses
 from hodge_pipeline.types import Floats, Frame, Trajectory, number_of
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
-SAME_STAMP_S = 1e-6
 LIKELY_SHARE = 0.5
 """Of the frames: fewer numbers in common may be a coincidence, since small numbers occur in every sequence."""
 
@@ -99,7 +98,7 @@ def _matched(how: str, trajectory: Trajectory, frames: Sequence[Frame], max_gap_
 
 def _by_stamp(trajectory: Trajectory, frames: Sequence[Frame], max_gap_s: float) -> Matched:
     stamps = np.array([frame.stamp_s for frame in frames], float)
-    return Matched(stamps, trajectory.stamps_s, poses_at(trajectory, stamps, max_gap_s), "stamp")
+    return Matched(stamps, trajectory.stamps_s, se3.poses_at(trajectory, stamps, max_gap_s), "stamp")
 
 
 def _by_number(trajectory: Trajectory, frames: Sequence[Frame]) -> Matched | None:
@@ -108,7 +107,7 @@ def _by_number(trajectory: Trajectory, frames: Sequence[Frame]) -> Matched | Non
     if numbers.dtype.kind not in "iu" or not whole or (np.diff(numbers) <= 0).any():
         return None
     numbers = numbers.astype(float)
-    return Matched(numbers, trajectory.stamps_s, poses_at(trajectory, numbers, 0.0), "number")
+    return Matched(numbers, trajectory.stamps_s, se3.poses_at(trajectory, numbers, 0.0), "number")
 
 
 def _by_row(trajectory: Trajectory, frames: Sequence[Frame]) -> Matched | None:
@@ -116,31 +115,6 @@ def _by_row(trajectory: Trajectory, frames: Sequence[Frame]) -> Matched | None:
         return None
     rows = np.arange(len(frames), dtype=float)
     return Matched(rows, rows, trajectory.world_from_cam, "row")
-
-
-def poses_at(trajectory: Trajectory, stamps_s: Floats, max_gap_s: float) -> Floats:
-    """Poses (N, 4, 4) at the stamps, on the geodesic between the two around; NaN where one is farther than the gap.
-
-    A pose at the stamp itself, to a microsecond, needs no neighbours.
-    """
-    poses = np.full((len(stamps_s), 4, 4), np.nan)
-    times = trajectory.stamps_s
-    after = np.clip(np.searchsorted(times, stamps_s), 0, len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(times[before] - stamps_s) < np.abs(times[after] - stamps_s), before, after)
-    exact = np.abs(times[nearest] - stamps_s) <= SAME_STAMP_S
-    poses[exact] = trajectory.world_from_cam[nearest[exact]]
-    to_before, to_after = stamps_s - times[before], times[after] - stamps_s
-    between = (
-        ~exact & (before < after) & (to_before >= 0) & (to_after >= 0) & (np.maximum(to_before, to_after) <= max_gap_s)
-    )
-    span = np.where(after > before, times[after] - times[before], 1.0)
-    poses[between] = se3.interpolate(
-        trajectory.world_from_cam[before[between]],
-        trajectory.world_from_cam[after[between]],
-        (to_before / span)[between],
-    )
-    return poses
 
 
 def _ranges(trajectory: Trajectory, frames: Sequence[Frame]) -> str:

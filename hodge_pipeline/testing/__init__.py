@@ -13,7 +13,6 @@ from hodge_pipeline.testing.fusers import check_fuser
 from hodge_pipeline.testing.global_registrars import check_global_registrar
 from hodge_pipeline.testing.models import check_model_reader
 from hodge_pipeline.testing.readers import check_frames, check_reader, check_trajectory, check_view_graph
-from hodge_pipeline.testing.refiners import check_refiner
 from hodge_pipeline.testing.registrars import check_registrar
 from hodge_pipeline.testing.solvers import check_solver
 from hodge_pipeline.testing.starts import check_start
@@ -27,7 +26,6 @@ CHECKS: Mapping[str, Callable[..., Any]] = {
     "global_registration": check_global_registrar,
     "executors": check_executor,
     "solvers": check_solver,
-    "refiners": check_refiner,
     "fusion": check_fuser,
     "models": check_model_reader,
     "writers": check_writer,
@@ -37,6 +35,6 @@ CHECKS: Mapping[str, Callable[..., Any]] = {
 
 __all__ = [
     "CHECKS", "check_edge_builder", "check_executor", "check_frames", "check_fuser", "check_global_registrar",
-    "check_model_reader", "check_reader", "check_refiner", "check_registrar", "check_rewriter", "check_solver",
+    "check_model_reader", "check_reader", "check_registrar", "check_rewriter", "check_solver",
     "check_start", "check_trajectory", "check_view_graph", "check_writer",
 ]  # fmt: skip

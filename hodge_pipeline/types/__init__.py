@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import mmap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +15,9 @@ from hodge_pipeline.types.arrays import Floats as Floats
 from hodge_pipeline.types.arrays import Floats32 as Floats32
 from hodge_pipeline.types.arrays import Ints as Ints
 from hodge_pipeline.types.arrays import Words as Words
+from hodge_pipeline.types.clouds import CloudSet as CloudSet
+from hodge_pipeline.types.clouds import Landmarks as Landmarks
+from hodge_pipeline.types.clouds import PointCloud as PointCloud
 from hodge_pipeline.types.edges import Edges as Edges
 from hodge_pipeline.types.edges import Priors as Priors
 from hodge_pipeline.types.edges import Registration as Registration
@@ -68,45 +68,6 @@ class EncodedImage:
     contents: bytes
     media_type: str
     units_per_metre: float | None = None
-
-
-@dataclass(frozen=True)
-class Landmarks:
-    """What a frame's image can be recognised by: `points_in_cam (n, 3)` metres, SIFT `descriptors (n, 128)` bytes, and
-    `pixel_rad (n,)`, the angle that a pixel of the image covers, by which each may be off sideways.
-    """
-
-    points_in_cam: Floats32
-    descriptors: Bytes
-    pixel_rad: Floats32
-
-    def __len__(self) -> int:
-        return len(self.points_in_cam)
-
-    @classmethod
-    def none(cls) -> Landmarks:
-        """No landmark."""
-        return cls(np.zeros((0, 3), np.float32), np.zeros((0, 128), np.uint8), np.zeros(0, np.float32))
-
-
-@dataclass(frozen=True)
-class PointCloud:
-    """Points of one frame, in its camera's axes: `points_in_cam (N, 3)` metres, unit normals, 8-bit RGB.
-
-    `landmarks` are other points, of the frame's image; None where nobody asked for them. `times_s (N,)` is when each
-    point was measured, seconds after the first, by a scanner that turns while it moves; None where nobody says.
-    `no_numbers` is how many more points the reader left out, whose coordinates are no numbers.
-    """
-
-    points_in_cam: Floats32
-    normals_in_cam: Floats32 | None = None
-    colours: Bytes | None = None
-    landmarks: Landmarks | None = None
-    times_s: Floats32 | None = None
-    no_numbers: int = 0
-
-    def __len__(self) -> int:
-        return len(self.points_in_cam)
 
 
 @dataclass(frozen=True)
@@ -283,120 +244,3 @@ class PositionPriors:
 
     positions: Floats
     covariances: Floats
-
-
-CLOUDS_AT_ONCE = 256
-"""Read one after another before their memory is given back: 15 to 60 MB."""
-
-
-class CloudSet(Sequence[PointCloud]):
-    """The down-sampled cloud of every frame, as memory-mapped columns: opening one costs no copy.
-
-    `offsets (N + 1,)` cut `points (P, 3)`, `normals (P, 3)`, `colours (P, 3)` into frames; an empty slice is a frame
-    without a valid measurement. `marks (N + 1,)` cut the landmarks' `mark_points (Q, 3)`, `mark_descriptors (Q, 128)`
-    and `mark_pixel_rad (Q,)` likewise. `folder` is where the columns lie, which worker processes open; None of what is
-    in memory.
-    """
-
-    FILES = ("offsets", "points", "normals", "colours", "marks", "mark_points", "mark_descriptors", "mark_pixel_rad")
-
-    def __init__(
-        self,
-        offsets: Ints,
-        points: Floats32,
-        normals: Floats32,
-        colours: Bytes,
-        marks: Ints,
-        mark_points: Floats32,
-        mark_descriptors: Bytes,
-        mark_pixel_rad: Floats32,
-        folder: Path | None = None,
-    ) -> None:
-        self.folder = folder
-        self.offsets, self.points, self.normals, self.colours = offsets, points, normals, colours
-        self.marks, self.mark_points, self.mark_descriptors = marks, mark_points, mark_descriptors
-        self.mark_pixel_rad = mark_pixel_rad
-
-    @classmethod
-    def open(cls, folder: Path) -> CloudSet:
-        """The clouds that `save` wrote to this folder, mapped read-only."""
-        return cls(**{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in cls.FILES}, folder=folder)
-
-    def with_landmarks(self, landmarks: Sequence[Landmarks]) -> CloudSet:
-        """The same clouds with these landmarks (N)."""
-        of_none = PointCloud(np.zeros((0, 3), np.float32))
-        marks = CloudSet.from_clouds([replace(of_none, landmarks=one) for one in landmarks])
-        of_marks = (marks.marks, marks.mark_points, marks.mark_descriptors, marks.mark_pixel_rad)
-        return CloudSet(self.offsets, self.points, self.normals, self.colours, *of_marks)
-
-    @classmethod
-    def from_clouds(cls, clouds: Sequence[PointCloud]) -> CloudSet:
-        """One set of these clouds, in order; missing normals and colours become zeros, missing landmarks none."""
-        empty = np.zeros((0, 3), np.float32)
-        normals = [np.zeros((len(c), 3)) if c.normals_in_cam is None else c.normals_in_cam for c in clouds]
-        colours = [np.zeros((len(c), 3)) if c.colours is None else c.colours for c in clouds]
-        landmarks = [Landmarks.none() if c.landmarks is None else c.landmarks for c in clouds]
-        return cls(
-            _offsets([len(cloud) for cloud in clouds]),
-            np.concatenate([empty, *(c.points_in_cam for c in clouds)]).astype(np.float32),
-            np.concatenate([empty, *normals]).astype(np.float32),
-            np.concatenate([empty, *colours]).astype(np.uint8),
-            _offsets([len(one) for one in landmarks]),
-            np.concatenate([empty, *(one.points_in_cam for one in landmarks)]).astype(np.float32),
-            np.concatenate([Landmarks.none().descriptors, *(one.descriptors for one in landmarks)]),
-            np.concatenate([Landmarks.none().pixel_rad, *(one.pixel_rad for one in landmarks)]).astype(np.float32),
-        )
-
-    def save(self, folder: Path) -> None:
-        """Write the columns into a folder that exists, one `.npy` each."""
-        for name in self.FILES:
-            with (folder / f"{name}.npy").open("wb") as file:
-                # Not numpy's own writing to files: on a disk that fills up its last bytes are lost without an error.
-                np.save(cast(Any, SimpleNamespace(write=file.write)), getattr(self, name))
-
-    def __len__(self) -> int:
-        return len(self.offsets) - 1
-
-    def __repr__(self) -> str:
-        return f"CloudSet({len(self)} clouds, {int(self.offsets[-1])} points)"
-
-    def __getitem__(self, row: int) -> PointCloud:  # type: ignore[override]
-        """The cloud of one frame (a view, not a copy)."""
-        if not -len(self) <= row < len(self):
-            raise IndexError(row)
-        row %= len(self)
-        cut = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
-        own = slice(int(self.marks[row]), int(self.marks[row + 1]))
-        landmarks = Landmarks(self.mark_points[own], self.mark_descriptors[own], self.mark_pixel_rad[own])
-        return PointCloud(self.points[cut], self.normals[cut], self.colours[cut], landmarks)
-
-    def __iter__(self) -> Iterator[PointCloud]:
-        return self.read(range(len(self)))
-
-    def read(self, rows: Iterable[int]) -> Iterator[PointCloud]:
-        """The clouds of these rows one after another; the memory of those before is given back."""
-        for number, row in enumerate(rows, start=1):
-            yield self[row]
-            if number % CLOUDS_AT_ONCE == 0:
-                self.forget()
-
-    def forget(self) -> None:
-        """Give back the memory of what was read of the files; it is read again when it is needed."""
-        for name in self.FILES:
-            column = getattr(self, name)
-            if isinstance(column, np.memmap) and hasattr(mmap, "MADV_DONTNEED"):
-                column._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
-
-    @property
-    def sizes(self) -> Ints:
-        """Points of each cloud, (N,)."""
-        return np.diff(self.offsets)
-
-    @property
-    def reach_m(self) -> float:
-        """How far the farthest point of any cloud is from its camera; 1 where there is none."""
-        return max((float(np.linalg.norm(c.points_in_cam, axis=1).max()) for c in self if len(c)), default=0.0) or 1.0
-
-
-def _offsets(sizes: Sequence[int]) -> Ints:
-    return np.concatenate([[0], np.cumsum(np.array(sizes, np.int64))]).astype(np.int64)

@@ -13,6 +13,7 @@ MAX_WHOLE_BYTES = 1 << 31
 """What is read whole is no longer: 2 GiB of text are 20 million edges, or a model of 10,000 images with its tracks."""
 _LFS_HEAD, _LFS_BYTES = b"version https://git-lfs", 1024
 """What stands in a working tree in the place of a file that Git LFS keeps elsewhere; pointers are shorter."""
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _KINDS = {
     stat.S_IFDIR: (errno.EISDIR, "a folder"),
     stat.S_IFIFO: (errno.EINVAL, "a pipe"),
@@ -55,9 +56,13 @@ def read_input(path: Path, limit: int = MAX_WHOLE_BYTES) -> bytes:
 def read_input_text(path: Path, limit: int = MAX_WHOLE_BYTES, *, errors: str = "strict") -> str:
     """The text of a UTF-8 file, with or without a byte-order mark, its line ends as one newline each.
 
-    Raises `OSError` as `read_input` does, `UnicodeDecodeError` unless `errors` is another way to treat wrong bytes.
+    Raises `OSError` as `read_input` does and for UTF-16, `UnicodeDecodeError` unless `errors` is another way to treat
+    wrong bytes.
     """
-    return TextIOWrapper(BytesIO(read_input(path, limit)), encoding="utf-8-sig", errors=errors).read()
+    contents = read_input(path, limit)
+    if contents.startswith(_UTF_16):
+        raise OSError(errno.EILSEQ, "is text in UTF-16, as PowerShell writes it: save it as UTF-8", str(path))
+    return TextIOWrapper(BytesIO(contents), encoding="utf-8-sig", errors=errors).read()
 
 
 def beginning(path: Path, size: int) -> bytes:

@@ -25,10 +25,13 @@ DOUBTS = {
     "frames out.",
     "unheld": "The path may slide: at {count} of {detail} what both frames see, such as a bare wall, does not hold "
     "the camera in every direction, and no other edge tests the step.",
+    "reader's doubt": "{detail}",
     "depth unit": "Depth is probably not in metres: {detail}.",
     "other scale": "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
     "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not "
     "of the camera.",
+    "path scaled": "The refined path is {detail} times as large as the one given: depth and the given poses are of two "
+    "scales, or depth is warped, and nothing here tells which is right.",
     "path loose": "The length of the path is in doubt: {count} of {detail} sweeps tell little of how far the "
     "scanner went, as on a bare field, and it goes on as before there. Known positions (positions.path) would "
     "hold it.",
@@ -43,7 +46,6 @@ LOOKS = {
     "single frame": "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
     "scale": "{detail}",
-    "reader's doubt": "{detail}",
     "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "
     "{detail}",
     "depth range": "{detail}: is the depth scale right (source.reader.depth_scale)?",
@@ -75,6 +77,8 @@ LOOKS = {
     "edit lost": "edits without effect, since the last round has no such edge: {detail}",
     "edit rejected": "{detail}",
     "nothing held out": "no overlapping pair was left to judge the result by: only the edges' own chi2 does",
+    "rougher": "the steps from key frame to key frame are rougher than those given: from those that images show they "
+    "are {detail}",
     "other format": "poses are not written back into {detail}: refined.tum holds them",
     "alone": "{count} of {detail} frames have no edge at all: they keep the pose they started with.",
     "wrong": "{count} of the edges used are judged wrong, {detail}: hodge diagnose shows them.",

@@ -11,10 +11,8 @@ import numpy as np
 
 from hodge_pipeline import registry
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.energy import EnergyRow, energy_rows
 from hodge_pipeline.diagnosis.options import DiagnosisOptions, SuggestionOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.diagnosis.wording import advice, ranked
 from hodge_pipeline.pairs.edits import EDGES, joining, pair_names, read_history
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
@@ -23,8 +21,10 @@ from hodge_pipeline.report.diagnosis_page import PageContents, document
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
 from hodge_pipeline.report.document import render
 from hodge_pipeline.report.edge_pictures import edge_pictures
+from hodge_pipeline.report.energy import EnergyRow, energy_rows
 from hodge_pipeline.report.solved import SOLVED
 from hodge_pipeline.report.verdict import NOTHING_MOVED_M
+from hodge_pipeline.rounds.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.start.unordered.pieces import laid_apart

@@ -7,12 +7,14 @@ from itertools import islice
 from pathlib import Path
 
 from hodge_adapters.colmap.check import image_count
+from hodge_adapters.json_files import read_json
 from hodge_adapters.text_rows import counted
 from hodge_pipeline.errors import SourceError
 
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
 PARENTS = 3
 LOOKED_AT = 60
+IMAGE_FOLDERS = ("images", "image", "rgb", "color")
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 
 
@@ -60,14 +62,36 @@ def find_folder(model: Path, given: str, usual: Sequence[str]) -> Path | None:
         if found is None:
             raise SourceError(f"{model / given}: no such folder: give one that is there, or auto")
         return found
-    above = [model, *model.absolute().parents[:PARENTS]]
-    return next((place / name for place in above for name in usual if (place / name).is_dir()), None)
+    return next((place / name for place in _above(model) for name in usual if (place / name).is_dir()), None)
 
 
 def find_database(model: Path) -> Path | None:
-    """The database beside or above the model."""
-    above = [model, *model.absolute().parents[:PARENTS]]
-    return next((place / "database.db" for place in above if (place / "database.db").is_file()), None)
+    """The database beside or above the model, or above the one that it was refined from."""
+    places = [*_above(model), *_above_original(model)]
+    return next((place / "database.db" for place in places if (place / "database.db").is_file()), None)
+
+
+def find_images(model: Path, given: str) -> Path | None:
+    """The folder of the colour images: of a refined model that of the model that it was refined from."""
+    found = find_folder(model, given, IMAGE_FOLDERS)
+    places = _above_original(model) if found is None and given == "auto" else []
+    return found or next((place / name for place in places for name in IMAGE_FOLDERS if (place / name).is_dir()), None)
+
+
+def _above(model: Path) -> list[Path]:
+    return [model, *model.absolute().parents[:PARENTS]]
+
+
+def _above_original(model: Path) -> list[Path]:
+    """The places beside and above the model that this one was refined from, as the report of its folder names it."""
+    folder = model.absolute().parent.parent
+    if not (folder / "refinement").is_dir():
+        return []
+    try:
+        path = Path(read_json(folder / "report.json")["source"]["path"])
+    except (SourceError, KeyError, TypeError):  # the model is whole without its report
+        return []
+    return _above(path)
 
 
 def find_models(path: Path) -> list[Path]:

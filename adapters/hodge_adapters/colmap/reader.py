@@ -27,6 +27,7 @@ from hodge_adapters.colmap.edges import Pair, covisible_pairs, measured_graph
 from hodge_adapters.colmap.files import (
     find_database,
     find_folder,
+    find_images,
     find_model,
     find_models,
     largest_model,
@@ -41,7 +42,6 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import EncodedImage, Floats, Frame, ImageFile, Source, Trajectory, ViewGraph
 
-IMAGE_FOLDERS = ("images", "image", "rgb", "color")
 STEREO_FOLDERS = ("stereo/depth_maps", "dense/stereo/depth_maps", "dense/0/stereo/depth_maps")
 SENSOR_FOLDERS = ("depth", "depths", "depth_images")
 
@@ -121,7 +121,7 @@ class ColmapReader:
     def source_of(self, path: Path, folder: Path, model: Model) -> Source:
         """The source that a model of this folder is, with what lies beside it; `path` is what the user gave."""
         notes = list(model.notes)
-        colour_folder = find_folder(folder, self.images, IMAGE_FOLDERS)
+        colour_folder = find_images(folder, self.images)
         depths = self._depths(folder, colour_folder, model)
         readable = {row: file for row, file in enumerate(depths) if file}
         if self.depth != "none" and 0 < len(readable) < len(depths):

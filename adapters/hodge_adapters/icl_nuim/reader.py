@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.association import interpolated_poses
 from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
@@ -25,6 +24,7 @@ from hodge_adapters.trajectories.log import read_log_file
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs
 from hodge_adapters.tum.reader import frame_ids
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, Source
@@ -39,7 +39,7 @@ SNIFFED_BYTES = 1 << 16
 COLOUR_FOLDERS = ("image", "images", "color", "rgb")
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
 TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
-_NUMBER = re.compile(r"\D*(\d+)")
+_NUMBER = re.compile(r"\D*(\d{1,18})(?!\d)")
 _IMAGES = (".png", ".jpg", ".jpeg")
 
 
@@ -126,7 +126,7 @@ class IclNuimReader:
             parsed = parse_tum(truth)
             trajectory = parsed.trajectory
             notes.extend(parsed.notes)
-            poses = interpolated_poses(trajectory, listing.stamps_s, MAX_GAP_FRAMES)
+            poses = se3.poses_at(trajectory, listing.stamps_s, MAX_GAP_FRAMES)
         without = int(np.isnan(poses[:, 0, 0]).sum())
         if without:
             notes.append(f"{without} of {len(poses)} frames have no truth")

@@ -63,7 +63,7 @@ def fitting(
 def assumed_camera_doubts(
     taken: Intrinsics, depth: Sequence[Path], colour: Sequence[Path | None], stamps_s: Floats, units_per_metre: float
 ) -> tuple[str, ...]:
-    """A doubt where frames agree better under another focal length than under that of a camera only assumed.
+    """A doubt unless frames agree best under the focal length of a camera that is only assumed, or one near to it.
 
     Raises `SourceError`, with the focal length that images tell, where they have another shape than that camera's.
     """
@@ -79,9 +79,9 @@ def assumed_camera_doubts(
             f"{depth[0].parent}: images of {size[0]}x{size[1]}, but intrinsics of {width}x{height}{fits}: {remedy}"
         )
     mine = taken.fx * size[0] / width
-    if told is None or abs(told / mine - 1) < OTHER_FOCAL:
+    if told is not None and abs(told / mine - 1) < OTHER_FOCAL:
         return ()
-    return (f"a camera of focal length {mine:g} is assumed{fits}: {remedy}",)
+    return (f"a camera of focal length {mine:g} is assumed{fits or ', which the images do not test'}: {remedy}",)
 
 
 def focal_px(

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hodge_adapters.association import interpolated_poses
 from hodge_adapters.mcap.recording import Recording
 from hodge_adapters.mcap.topics import named_topic
 from hodge_adapters.text_rows import listed
+from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Trajectory
 
 
@@ -70,7 +70,7 @@ def _from_topic(
     topic = recording.poses[name]
     body = options.child or topic.child
     trajectory = topic.poses.trajectory()
-    of_frames = interpolated_poses(trajectory, stamps_s, options.max_gap_s)
+    of_frames = se3.poses_at(trajectory, stamps_s, options.max_gap_s)
     if not len(stamps_s):
         notes.append(f"trajectory of {body or 'what it moves'} in {topic.frame or 'its world'} from {name}")
         return Poses(of_frames, trajectory)

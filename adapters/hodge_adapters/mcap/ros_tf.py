@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hodge_adapters.association import interpolated_poses
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Trajectory
 
@@ -104,7 +103,7 @@ class TransformTree:
             if self._holds_always(frame):
                 product = np.asarray(link.world_from_cam[-1] @ product)
             else:
-                product = np.asarray(interpolated_poses(link, stamps_s, self._max_gap_s) @ product)
+                product = np.asarray(se3.poses_at(link, stamps_s, self._max_gap_s) @ product)
         return product
 
     def _holds_always(self, frame: str) -> bool:

@@ -18,7 +18,7 @@ from hodge_pipeline.types import Floats
 
 SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 
-FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)$", re.IGNORECASE)
+FRAME_FILE = re.compile(r"frame-(\d{1,18})\.(color|depth|pose)\.(png|jpg|jpeg|txt)$", re.IGNORECASE)
 _SEQUENCE = re.compile(r"(?:seq|sequence)-?(\d+)$", re.IGNORECASE)
 _PACKED = re.compile(r"(?:seq|sequence)-?(\d+)\.zip$", re.IGNORECASE)
 

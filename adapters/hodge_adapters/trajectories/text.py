@@ -25,6 +25,14 @@ _QUATERNION = re.compile(r"\bq_?([wx])\b", re.IGNORECASE)
 UNITS = (("nanoseconds", 1e17, 1e9), ("microseconds", 1e14, 1e6), ("milliseconds", 1e11, 1e3))
 """What all stamps from so much on count, and how many make a second: as seconds 1e11 is the year 5138."""
 
+LATEST_STAMP = 2.0**62
+"""The year 2116 in nanoseconds: no clock says more, and every whole number below it is a frame's or a vertex's."""
+
+
+def is_stamp(value: float) -> bool:
+    """Whether a number can be a time or a frame's number, in whatever unit."""
+    return abs(value) < LATEST_STAMP  # which NaN is not
+
 
 def unit_of(stamps: Floats) -> tuple[str, float]:
     """What the stamps of one file count, and how many make a second: ORB-SLAM3, among others, writes nanoseconds since
@@ -149,7 +157,7 @@ def _tum_table(rows: Sequence[Row]) -> tuple[Floats, list[Row]]:
     bad: list[Row] = []
     for row in rows:
         values = to_floats(row.fields) or []
-        sound = len(values) in COLUMNS and all(map(math.isfinite, values))
+        sound = len(values) in COLUMNS and is_stamp(values[0]) and all(map(math.isfinite, values))
         if sound and 1e-100 < math.hypot(*values[4:8]) < 1e100:  # beyond these the square is no normal number
             good.append(values[:8])
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 
 from hodge_adapters.association import nearest_pairs
 from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
-from hodge_adapters.trajectories.text import in_seconds
+from hodge_adapters.trajectories.text import in_seconds, is_stamp
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Ints
 
@@ -170,7 +169,7 @@ def _from_association(path: Path, notes: list[str]) -> StampedImages:
 
 def _left_out(name: str, expected: str, unreadable: list[int], outside: list[int]) -> list[str]:
     """A line for each reason why lines were left out."""
-    reasons = ((f"that are not {expected}", unreadable), ("that point out of the folder", outside))
+    reasons = ((f"that are not {expected}", unreadable), ("that name no file in the folder", outside))
     return [f"{name}: {len(lines)} lines {why} left out: {listed(lines)}" for why, lines in reasons if lines]
 
 
@@ -187,7 +186,7 @@ def _depth_column(rows: list[Row], path: Path) -> int:
 
 def _stamp(row: Row, column: int) -> float | None:
     values = to_floats(row.fields[column : column + 1])
-    return values[0] if values and math.isfinite(values[0]) else None
+    return values[0] if values and is_stamp(values[0]) else None
 
 
 def _in_order(stamps: Floats, name: str, notes: list[str]) -> tuple[Floats, list[int], Ints]:

@@ -13,13 +13,13 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.association import interpolated_poses
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.fitted_camera import assumed_camera_doubts, fitting
 from hodge_adapters.images.frames import Lens, image_frame
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs, stamped_images
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Source, Trajectory
@@ -224,7 +224,7 @@ class TumReader:
         stamps_s = listing.stamps_s
         if trajectory is None:
             return np.full((len(stamps_s), 4, 4), np.nan)
-        poses = interpolated_poses(trajectory, stamps_s, self.max_gap_s, self.max_difference_s)
+        poses = se3.poses_at(trajectory, stamps_s, self.max_gap_s, self.max_difference_s)
         if listing.runs.any() and self.truth_match == "stamp":
             poses[listing.runs > 0] = np.nan
             notes.append("the truth is taken for the frames before the clock jumps back alone")
