@@ -244,6 +244,28 @@ def test_groups_of_wrong_loops_do_not_outvote_the_backbone_of_a_lattice() -> Non
     assert lattice_backbone(made.graph, replace(found, kept=made.right | ~steps), DiagnosisOptions()) is None
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_no_cycle_is_needed_for_a_chain_that_hangs_by_one_end_and_wrong_loops(dimension: int) -> None:
+    """As in a parking garage, of whose lattice the first and the last vertices are no part."""
+    made = drive(seed=1, count=300, dimension=dimension, world="room", loops=600, wrong=0.0)
+    rng, count = np.random.default_rng(1), 24
+    inside = (made.graph.edges < 200).all(axis=1) | (np.diff(made.graph.edges, axis=1)[:, 0] == 1)
+    graph = made.graph.select(np.flatnonzero(inside))
+    twist = np.zeros((count, 6))
+    ends = np.stack([rng.integers(0, 190, count), rng.integers(210, 300, count)], axis=1)
+    twist[:, 2], twist[:, 3:5] = rng.uniform(-np.pi, np.pi, count), rng.uniform(-30, 30, (count, 2))
+    spoiled = ViewGraph.from_edges(
+        graph.vertex_ids,
+        np.concatenate([graph.edges, ends]),
+        np.concatenate([graph.i_from_j, se3.exp(twist)]),
+        np.concatenate([graph.information, np.repeat(graph.information[-1:], count, axis=0)]),
+        dimension=graph.dimension,
+    )
+    found = diagnose(spoiled, DiagnosisOptions(trust="none"))
+    assert found.kept[: graph.edge_count].all()
+    assert made.error_m(found.world_from_cam) < 0.5  # 14 m where the lattice grows by single edges alone
+
+
 def test_wrong_loops_between_ends_that_are_near_along_the_path_are_left_out() -> None:
     """As of places that a front end takes for the same because it has just left them."""
     made = drive(world="town", count=800, loops=40, wrong=0.0)

@@ -21,6 +21,8 @@ from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment, Proposals, align
 from hodge_pipeline.diagnosis.rearrange import best_arrangement
 from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, LARGE, TWICE, Fit, chi2_at, fit
+from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
+from hodge_pipeline.solvers.backbone.trust import COVERED, FEWEST_STEPS
 from hodge_pipeline.types import Bools, Floats, Ints
 
 PRIOR_SHARE = 0.25
@@ -66,7 +68,24 @@ def _mended(evidence: Evidence, grown: Alignment) -> Fit:
     if not best.used.all() and graph.vertex_count <= SMALL:
         # an error that is spread over a loop in annealing can put all of its edges out of use
         best = max(best, fit(evidence, grown, TWICE), key=_used)
+    if not best.used.all() and (ordered := _in_order(evidence)) is not None:
+        roughly = fit(evidence, ordered, ANNEALED, rough=True)
+        best = max(best, fit(evidence, roughly, (GATE,)), key=_used)
     return mend(evidence, best)
+
+
+def _in_order(evidence: Evidence) -> Alignment | None:
+    """The alignment that begins with the paths of consecutive edges; None where these are too few for a sequence. Where
+    a chain hangs by one end and by wrong edges, no cycle tells that it is these.
+    """
+    graph = evidence.graph
+    steps = sequential_edges(graph)
+    if steps.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count):
+        return None
+    chain = make_chain(graph, linear_forest(graph.edges, graph.vertex_count, steps))
+    piece, poses = np.empty(chain.size, np.int64), np.empty((chain.size, 4, 4))
+    piece[chain.order], poses[chain.order] = chain.path, chain.poses
+    return align(evidence, Alignment(piece, poses))
 
 
 def _used(found: Fit) -> int:

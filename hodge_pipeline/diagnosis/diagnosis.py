@@ -27,6 +27,7 @@ from hodge_pipeline.diagnosis.result import (
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors, judge_cycles, with_cycles_of, witnesses
 from hodge_pipeline.diagnosis.wording import reasons
+from hodge_pipeline.solvers.backbone.chain import sequential_edges
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
 from hodge_pipeline.types import Bools, Floats, ViewGraph
@@ -58,9 +59,9 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
 
 def lattice_backbone(graph: ViewGraph, found: Diagnosis, options: DiagnosisOptions) -> Backbone | None:
     """The backbone of a large lattice where edges of more places speak for it than for what `found` keeps. None
-    elsewhere, and where no edge is left out.
+    elsewhere, and where no consecutive edge is left out.
     """
-    if options.trust != AUTO or found.kept.all():
+    if options.trust != AUTO or found.kept[sequential_edges(graph)].all():
         return None
     backbone = find_backbone(graph, lattice=True)
     if backbone is None or not backbone.found.confirmed:

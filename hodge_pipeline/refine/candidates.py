@@ -64,11 +64,6 @@ class Found:
         """The row of the candidate with the lowest cost."""
         return best(self.costs)
 
-    @property
-    def with_depth(self) -> bool:
-        """Whether edges by depth took part in the solve."""
-        return self.solved is not None and bool((self.solved.kept & (self.solved.graph.source == "depth")).any())
-
 
 class _Weighing:
     """The candidates so far; each new one is a step, and one whose adjustment fails is a note."""

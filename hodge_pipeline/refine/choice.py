@@ -9,18 +9,20 @@ import numpy as np
 
 from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import absolute_error
-from hodge_pipeline.refine.candidates import CONSISTENT, Found
+from hodge_pipeline.refine.candidates import Found
 from hodge_pipeline.refine.guard import Measure
-from hodge_pipeline.refine.judge import LEAST_CAP_PX
+from hodge_pipeline.refine.judge import LEAST_CAP_PX, best
 from hodge_pipeline.stages import Step, Steps, TrackedModel
 from hodge_pipeline.types import Floats
 
 FINEST_PX = 0.01
 """Mean error: no keypoint is located better, so less of it is no better model."""
 LEAST_GAIN = 0.01
-"""Of the cost: less is what an adjustment gains by fitting the noise of the keypoints."""
+"""Of the cost per degree of freedom: less is what a lens that does not quite fit gives."""
 CLEAR_GAIN = 0.5
 """Of the cost: half of it is more than any way to weigh observations; below it observations held out decide as well."""
+LONG_TRACKS = 3.0
+"""Images in the mean: points in fewer take more than half of the numbers, and poses can fit what is left over."""
 LEAST_MOVE, GAIN_TO_MOVE = 1e-3, 0.2
 """Of the extent of the cameras: poses that move by more need a gain of a fifth, since a lens that does not quite fit
 moves them by as much and gains a few per cent. It puts no image off by most of its observations: a candidate that mends
@@ -50,8 +52,7 @@ def choose(found: Found, distances_m: Floats, seed: int, steps: Steps, *, force:
     merging = _merging(found)
     at = _best(found, merging, distances_m)
     reason = "no candidate costs less" if at == 0 else ""
-    by_depth = found.with_depth and found.candidates[at].name == CONSISTENT and _fits_depth(distances_m[[0, at]])
-    if at and not merging[at] and not by_depth and not _fits_positions(found, 0, at):
+    if at and not merging[at] and _by_depth(distances_m, 0, at) <= 0 and not _fits_positions(found, 0, at):
         reason = _reason_to_keep(found, at, seed, steps)
     if not reason:
         return Choice(at, "")
@@ -61,29 +62,27 @@ def choose(found: Found, distances_m: Floats, seed: int, steps: Steps, *, force:
 
 
 def _best(found: Found, merging: Sequence[bool], distances_m: Floats) -> int:
-    """The lowest cost, or a little more where further measurements took part: points that matches merged, depth whose
-    pairs held out fit no worse, or known positions that fit clearly better.
+    """The lowest cost of those that fit the depth of pairs held out no worse than the input, or a little more where
+    further measurements took part: points that matches merged, or depth or known positions that fit clearly better.
     """
-    at = found.best
-    for row, candidate in enumerate(found.candidates):
+    rows = [row for row in range(len(found.costs)) if _by_depth(distances_m, 0, row) >= 0]
+    at = rows[best([found.costs[row] for row in rows])]
+    for row in rows:
         if _per_freedom(found, row) > (1 + MERGE_LOSS) * _per_freedom(found, at):
             continue
-        with_depth = found.with_depth and candidate.name == CONSISTENT
-        if (
-            merging[row] > merging[at]
-            or (with_depth and _fits_depth(distances_m[[0, row]]))
-            or _fits_positions(found, at, row)
-        ):
+        if merging[row] > merging[at] or _by_depth(distances_m, at, row) > 0 or _fits_positions(found, at, row):
             at = row
     return at
 
 
-def _per_freedom(found: Found, row: int) -> float:
-    """The cost as it would be were nothing fitted: fewer points have less to fit noise with."""
+def _per_freedom(found: Found, row: int, *, poses: bool = True) -> float:
+    """The cost as it would be were nothing fitted: fewer points have less to fit noise with. Infinite where nothing
+    is left over. Without `poses` as of poses that were measured by other means.
+    """
     model, cost = found.candidates[row].model, found.costs[row]
     numbers = 2.0 * len(model.quality.errors_px)
-    fitted = 3.0 * model.quality.points + 6.0 * len(model.body_names)
-    return cost.px * float(np.sqrt(numbers / max(numbers - fitted, 1.0)))
+    left = numbers - 3.0 * model.quality.points - 6.0 * len(model.body_names) * poses
+    return cost.px * float(np.sqrt(numbers / left)) if left > 0 else float("inf")
 
 
 def _fits_positions(found: Found, before: int, after: int) -> bool:
@@ -92,9 +91,12 @@ def _fits_positions(found: Found, before: int, after: int) -> bool:
     return bool(off[after] < (1 - GAIN_TO_MOVE) * off[before])
 
 
-def _fits_depth(distances_m: Floats) -> bool:
-    """Whether the pairs held out, before and after (2, H), fit better than by chance."""
-    return bool(distances_m.size) and held_out_score(distances_m).is_better
+def _by_depth(distances_m: Floats, before: int, after: int) -> int:
+    """1 where one candidate fits the pairs held out (K, H) clearly better than another, -1 where worse, else 0."""
+    if not np.isfinite(distances_m[[before, after]]).all(axis=0).any():
+        return 0
+    score = held_out_score(distances_m[[before, after]])
+    return int(score.is_better) - int(score.is_worse)
 
 
 def _merging(found: Found) -> Sequence[bool]:
@@ -114,10 +116,11 @@ def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
         return f"observations fit to {before.px:.2g} px, better than any keypoint is located"
     if after.doubt:
         return "no candidate fits the tracks: mend matches or cameras (--refine focal), or --force the best one"
-    gain = 1.0 - after.px / before.px
-    if gain < LEAST_GAIN:
-        return f"the best candidate gains {gain:.2%} of the mean error, less than its noise"
-    if gain >= CLEAR_GAIN:
+    gain = 1.0 - _per_freedom(found, at) / _per_freedom(found, 0, poses=False)
+    if not gain >= LEAST_GAIN:
+        fitted = f"{before.px:.4g} -> {after.px:.4g} px"
+        return f"the best candidate's gain ({fitted}) is what so many poses gain by fitting noise"
+    if gain >= CLEAR_GAIN and start.quality.mean_track_length >= LONG_TRACKS:
         return ""
     moved = absolute_error(model.world_from_body, start.world_from_body, with_scale=True).rmse_m
     extent = float(np.linalg.norm(np.ptp(start.world_from_body[:, :3, 3], axis=0)))
@@ -126,6 +129,10 @@ def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
     if share > LEAST_MOVE and gain < GAIN_TO_MOVE and not mends and not start.moves_intrinsics:
         return f"the best candidate gains {gain:.1%} of the mean error and moves cameras by {share:.2%} of their extent"
     errors = steps.step(held_out_errors, start, model, seed, title="observations held out").errors_px
+    if not errors.size and gain < CLEAR_GAIN and model.quality.points == start.quality.points:
+        return (
+            f"the best candidate gains {gain:.1%} of the mean error, and tracks are too short to hold any of them out"
+        )
     if not errors.size:
         return ""
     medians, capped = np.median(errors, axis=1), np.minimum(errors, LEAST_CAP_PX).mean(axis=1)

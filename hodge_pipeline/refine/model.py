@@ -121,7 +121,7 @@ def _refine(
 ) -> RefinedModel:
     is_metric = all(scale.is_observable for scale in scales)
     found = weigh(inputs, start, options, steps, workers, is_metric)
-    distances_m = held_out_distances(found.depth, _image_poses([one.model for one in found.candidates]), workers)
+    distances_m = held_out_distances(found.depth, _metric_poses(found), workers)
     choice = choose(found, distances_m, options.seed, steps, force=force)
     at, chosen = choice.row, found.candidates[choice.row].model
     in_world = start.known_positions is not None
@@ -185,8 +185,16 @@ def _in_the_scale_of(start: TrackedModel, model: TrackedModel) -> TrackedModel:
     return model.scaled(align(model.world_from_body, start.world_from_body, with_scale=True).scale)
 
 
-def _image_poses(models: Sequence[TrackedModel]) -> Floats:
-    return np.array([[frame.world_from_cam for frame in model.frames] for model in models])
+def _metric_poses(found: Found) -> Floats:
+    """Image poses (K, N, 4, 4) of the candidates, each in metres by its own depth: bundle adjustment leaves the size
+    of a model free, and a better one of another size fits no cloud.
+    """
+    models = [candidate.model for candidate in found.candidates]
+    poses = np.array([[frame.world_from_cam for frame in model.frames] for model in models])
+    if len(found.depth.held_out):
+        for own, model in zip(poses, models, strict=True):
+            own[:, :3, 3] *= metric_scale(model.depth_ratios()).metres_per_unit
+    return poses
 
 
 def _measures(

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, places_along
+from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, root, shifted, without_run
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -55,16 +55,10 @@ class Testimony:
     explained: Floats
     away: Floats
     used: Bools
-    ends: Floats
-
-    @classmethod
-    def of(cls, chain: Chain, linear: Linear, explained: Floats, away: Floats, used: Bools) -> Testimony:
-        """At the poses of the bare chain."""
-        return cls(chain, linear, explained, away, used, places_along(chain))
 
     def testimonies(self) -> float:
         """How many there are, of which the best is taken: a place makes one."""
-        return float((1 / loops_at_place(self.ends)).sum())
+        return float((1 / loops_at_place(self.chain.places)).sum())
 
     def displaced(self, loop: Ints) -> Floats:
         """The motion (K, 4, 4) of the world beyond a break that each of these loops asks for."""
@@ -106,9 +100,9 @@ class Testimony:
         rows = among[left]
         if not len(rows):
             return
-        near = cKDTree(self.ends[rows]).query(self.ends[rows], k=min(4 * NEIGHBOURS, len(rows)))[1]
+        near = cKDTree(self.chain.places[rows]).query(self.chain.places[rows], k=min(4 * NEIGHBOURS, len(rows)))[1]
         near = near.reshape(len(rows), -1)
-        apart = np.abs(self.ends[rows[near]] - self.ends[rows][:, None]).max(axis=2) >= 1.0
+        apart = np.abs(self.chain.places[rows[near]] - self.chain.places[rows][:, None]).max(axis=2) >= 1.0
         same = ~apart & (near != np.arange(len(rows))[:, None])
         potential = np.zeros(len(rows))
         for kind in (apart, same):
@@ -137,8 +131,8 @@ class Testimony:
         gain = np.logaddexp(np.log(share) + factor, np.log1p(-share)) - self.explained[rows]
         for alike in (agrees, ~agrees):
             if alike.any():
-                gain[alike] /= loops_at_place(self.ends[rows[alike]])
-        gain[np.abs(self.ends[rows] - self.ends[seed]).max(axis=1) < 1.0] = 0.0
+                gain[alike] /= loops_at_place(self.chain.places[rows[alike]])
+        gain[np.abs(self.chain.places[rows] - self.chain.places[seed]).max(axis=1) < 1.0] = 0.0
         return np.asarray(np.where(self.used[rows], np.minimum(gain, 0.0), gain))
 
 
@@ -290,7 +284,7 @@ def strained_break(fit: Fit, usual: Usual) -> Break | None:
         motion=motion,
         covariance=chain.carried(se3.inverse(turned), prior),
     )
-    told = Testimony.of(others, linearise(others, poses), log_density, np.zeros(len(low)), np.zeros(len(low), bool))
+    told = Testimony(others, linearise(others, poses), log_density, np.zeros(len(low)), np.zeros(len(low), bool))
     owner = np.repeat(strained, (high - low)[strained])
     first = np.cumsum((high - low)[strained]) - (high - low)[strained]
     at = low[owner] + 1 + np.arange(len(owner)) - np.repeat(first, (high - low)[strained])

@@ -79,7 +79,7 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     scaled = found.scales.applied(chain)
     linear, (right, wrong) = linearise(scaled, chain.poses), found.judged.log_density
     shares = np.log(mixture(found.judged.log_density)[0])
-    told = Testimony.of(scaled, linear, np.logaddexp(shares[0] + right - wrong, shares[1]), wrong, found.used)
+    told = Testimony(scaled, linear, np.logaddexp(shares[0] + right - wrong, shares[1]), wrong, found.used)
     usual, least, fold = Usual.of(chain), by_chance(len(right)), np.log(max(told.testimonies(), 1))
     agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
@@ -107,7 +107,7 @@ def joined(chain: Chain) -> Chain:
         wrong = Wrong.of(chain, poses)
         scaled = learn_scales(chain, poses, wrong)[0].applied(chain)
         linear, none = linearise(scaled, poses), np.zeros(len(chain.ends))
-        told = Testimony.of(scaled, linear, none, wrong.log_density(scaled, poses), none > 0)
+        told = Testimony(scaled, linear, none, wrong.log_density(scaled, poses), none > 0)
         pairs = chain.path[chain.ends]
         best, found = BY_CHANCE + float(np.log(len(pairs))), None
         for low, high in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).tolist():

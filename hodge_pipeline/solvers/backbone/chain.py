@@ -15,6 +15,11 @@ from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.solvers.weights import PLANAR_AXES
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
+PLACE = 4.0
+"""Loops of which the steps between their ends vary less than so many loops do are of one place."""
+STEPS_OF_PLACE, FEWEST_PLACES = 20, 50
+"""Steps that a place has at the least, however large the errors of steps are; places that a path has, however small."""
+
 
 @dataclass(frozen=True)
 class Chain:
@@ -61,6 +66,17 @@ class Chain:
             before = before @ self.step[row] if inner[row] else self.step[row]
             out[row] = before
         return out
+
+    @cached_property
+    def places(self) -> Floats:
+        """Where the ends of each loop (M, 2) lie along the chain, in places: of one place are loops both ends of which
+        lie within 1. These are one testimony, however many agree, since a place may be mistaken for another.
+        """
+        own = np.median(np.einsum("mii->mi", self.covariance), axis=0)
+        steps = np.where(self.bridged[:, None], 0.0, np.einsum("nii->ni", self.step_covariance))
+        longest = max(STEPS_OF_PLACE, self.size / FEWEST_PLACES)
+        along = np.clip((steps / own).mean(axis=1) / PLACE, 1 / longest, 1 / STEPS_OF_PLACE)
+        return np.asarray(np.cumsum(along)[self.ends])
 
     def with_loops(self, rows: Ints, ends: Ints) -> Chain:
         """The chain with these of its loops alone, between other ends (K, 2)."""
@@ -205,23 +221,6 @@ def _walk(edges: Ints, count: int, rows: Ints) -> tuple[Ints, Ints, Ints]:
     path = np.argsort(np.argsort(begins))[component]
     order = np.lexsort((forest.depth, path))
     return order, np.append(rows, -1)[forest.parent_edge[order]], path[order]
-
-
-PLACE = 4.0
-"""Loops of which the steps between their ends vary less than so many loops do are of one place."""
-STEPS_OF_PLACE, FEWEST_PLACES = 20, 50
-"""Steps that a place has at the least, however large the errors of steps are; places that a path has, however small."""
-
-
-def places_along(chain: Chain) -> Floats:
-    """Where the ends of each loop (M, 2) lie along the chain, in places: of one place are loops both ends of which lie
-    within 1. These are one testimony, however many agree, since a place may be mistaken for another.
-    """
-    own = np.median(np.einsum("mii->mi", chain.covariance), axis=0)
-    steps = np.where(chain.bridged[:, None], 0.0, np.einsum("nii->ni", chain.step_covariance))
-    longest = max(STEPS_OF_PLACE, chain.size / FEWEST_PLACES)
-    along = np.clip((steps / own).mean(axis=1) / PLACE, 1 / longest, 1 / STEPS_OF_PLACE)
-    return np.asarray(np.cumsum(along)[chain.ends])
 
 
 def loops_at_place(ends: Floats) -> Floats:

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place, places_along
+from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, Scales, Wrong, learn_scales, mixture, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, linearise, root, settled, without
 from hodge_pipeline.solvers.backbone.polish import polished
@@ -76,7 +76,7 @@ def crowded(chain: Chain, factor: Floats) -> list[Bools]:
     """The loops (M,) of each of the `MOST_PLACES` places at which most loops lie, two at least, that a factor (M,) > 0
     speaks for.
     """
-    told, ends = factor > 0, places_along(chain)
+    told, ends = factor > 0, chain.places
     rows = np.flatnonzero(told)
     count, first = loops_at_place(ends[rows]), one_of_each_place(ends[rows])
     first = first[np.argsort(-count[first], kind="stable")][:MOST_PLACES]
@@ -101,7 +101,7 @@ def _inferred(
     """The loops judged, at first at the poses that those which are `used (M,)` lead to."""
     chain = start.chain
     linear, limit, used = start, np.log(max(len(always), 1)), used | always
-    ends = places_along(chain)
+    ends = chain.places
     best, top, seen = (alone, start), -np.inf, b""
     for number in range(ROUNDS):
         rows = np.flatnonzero(used)
@@ -190,7 +190,7 @@ def _of_right_places(
     """
     if not used.any() or (judged.factor[used] - np.log(len(used))).sum() <= by_chance(len(used)):
         return used, False
-    chain, ends, rows = start.chain, places_along(start.chain), np.flatnonzero(used)
+    chain, ends, rows = start.chain, start.chain.places, np.flatnonzero(used)
     first = one_of_each_place(ends[rows])
     chosen, size = rows[first], loops_at_place(ends[rows])[first]
     away = ends[cKDTree(ends[chosen]).query(ends, p=np.inf)[0] > 1.0]

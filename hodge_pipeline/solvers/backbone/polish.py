@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hodge_pipeline.solvers.backbone.chain import loops_at_place, places_along
+from hodge_pipeline.solvers.backbone.chain import loops_at_place
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, settled
 from hodge_pipeline.types import Floats, Ints
@@ -33,7 +33,7 @@ def polished(rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
     reduced = Reduced.of(chain, rows)
     chain = replace(chain, step_covariance=LOCAL**2 * chain.step_covariance)
     wide = np.ones(count)
-    wide[rows] = loops_at_place(places_along(chain)[rows]) ** CROWDED_POWER
+    wide[rows] = loops_at_place(chain.places[rows]) ** CROWDED_POWER
     chain = replace(chain, covariance=chain.covariance * wide[:, None, None])
     weights = np.ones(count)
     for _ in range(ROUNDS):

@@ -14,7 +14,6 @@ from hodge_pipeline.solvers.backbone.chain import (
     linear_forest,
     make_chain,
     one_of_each_place,
-    places_along,
     sequential_edges,
 )
 from hodge_pipeline.solvers.backbone.inference import Inferred
@@ -69,12 +68,12 @@ class Backbone:
         return replace(graph, information=information).select(np.flatnonzero(self.used))
 
     def places(self, edges: Bools) -> int:
-        """How many places these edges (E,) join: those of one place are one testimony, as `places_along` has it."""
+        """How many places these edges (E,) join: those of one place are one testimony, as `Chain.places` has it."""
         chain = self.found.scales.applied(self.chain)
         at = np.flatnonzero(chain.step_edge >= 0)
         ends = np.concatenate([chain.ends, np.stack([at - 1, at], axis=1)])
         chosen = edges[np.concatenate([chain.loop_edge, chain.step_edge[at]])]
-        return len(one_of_each_place(places_along(replace(chain, ends=ends))[chosen]))
+        return len(one_of_each_place(replace(chain, ends=ends).places[chosen]))
 
     @property
     def note(self) -> str:

@@ -1,0 +1,90 @@
+"""Which candidate of a refined model is kept: what tracks gain by fitting noise, and what depth held out says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from hodge_pipeline import se3
+from hodge_pipeline.refine.candidates import Candidate, Found
+from hodge_pipeline.refine.choice import choose
+from hodge_pipeline.refine.judge import costs
+from hodge_pipeline.refine.model import _metric_poses
+from hodge_pipeline.types import Floats, ModelQuality
+from test_refine_judge import flat, quality
+
+NO_STEPS: Any = None
+"""Nothing is to be computed."""
+
+
+@dataclass
+class Model:
+    """As much of a model as a choice asks for: ten bodies in a row, moved by a tenth of their extent."""
+
+    quality: ModelQuality
+    moved: float = 0.0
+    ratio: float = 1.0
+    body_names = tuple("abcdefghij")
+    known_positions = None
+    moves_intrinsics = False
+
+    @property
+    def world_from_body(self) -> Floats:
+        positions = np.outer(np.arange(10.0), [1.0, 0.0, 0.0]) + self.moved * np.eye(3)[np.arange(10) % 3]
+        return se3.from_parts(np.broadcast_to(np.eye(3), (10, 3, 3)), positions)
+
+    @property
+    def frames(self) -> list[SimpleNamespace]:
+        return [SimpleNamespace(world_from_cam=pose) for pose in self.world_from_body]
+
+    def merged(self) -> Model:
+        return self
+
+    def depth_ratios(self) -> list[Floats]:
+        return [np.full(20, self.ratio) for _ in range(10)]
+
+
+def found(before_px: float, after_px: float, points: int = 40, ratio: float = 1.0) -> Found:
+    """The input and its bundle adjustment: 400 observations in ten images, of so many points."""
+    parts = [
+        replace(quality(flat(px, images=10, count=40)), points=points, mean_track_length=400 / points)
+        for px in (before_px, after_px)
+    ]
+    models = [Model(parts[0]), Model(parts[1], moved=0.9, ratio=ratio)]
+    inputs, *costly = costs(parts[:1], parts)
+    held_out = SimpleNamespace(held_out=np.zeros((8, 2), np.int64))
+    candidates: Any = [Candidate(name, model) for name, model in zip(("as given", "bundle"), models, strict=True)]
+    depth: Any = held_out
+    return Found(inputs, candidates, costly, None, depth, ())
+
+
+def apart(before_m: float, after_m: float) -> Floats:
+    """Eight pairs held out, so far apart."""
+    return np.array([[before_m], [after_m]]) + np.linspace(0.0, 0.002, 8)
+
+
+def test_depth_held_out_refuses_what_tracks_alone_prefer() -> None:
+    candidates = found(1.0, 0.3)
+    assert choose(candidates, np.zeros((2, 0)), 0, NO_STEPS).row == 1
+    assert choose(candidates, apart(0.01, 0.04), 0, NO_STEPS).row == 0
+
+
+def test_depth_held_out_speaks_for_any_candidate() -> None:
+    candidates = found(1.0, 0.9)
+    assert "moves cameras" in choose(candidates, np.zeros((2, 0)), 0, NO_STEPS).reason
+    assert choose(candidates, apart(0.04, 0.01), 0, NO_STEPS).row == 1
+
+
+def test_what_poses_gain_by_fitting_noise_is_no_gain() -> None:
+    """Of 800 numbers 230 points leave 110, ten poses 50 of those: noise alone shrinks by a third."""
+    choice = choose(found(1.0, 0.7, points=230), np.zeros((2, 0)), 0, NO_STEPS)
+    assert choice.row == 0 and "fitting noise" in choice.reason
+
+
+def test_candidates_are_laid_on_the_clouds_in_metres_each_by_its_own_depth() -> None:
+    before, after = _metric_poses(found(1.0, 0.9, ratio=2.0))
+    np.testing.assert_allclose(np.ptp(before[:, 0, 3]), 9.0)
+    np.testing.assert_allclose(np.ptp(after[:, 0, 3]), 18.0)
