@@ -22,11 +22,12 @@ from hodge_pipeline.report.notebook import as_html
 from hodge_pipeline.rounds.all_frames import pose_frames
 from hodge_pipeline.rounds.one_round import solve_edges
 from hodge_pipeline.scene import KeyFrames, Round, Scene, given_poses, true_poses
-from hodge_pipeline.sources.inspect import guess_reader
-from hodge_pipeline.stages import Step
+from hodge_pipeline.sources.opening import open_with_reader
+from hodge_pipeline.stages import FrameReader, Step
 from hodge_pipeline.store.store import stored, stored_clouds
 from hodge_pipeline.store.workspace import OLD_KEY_FILE, RECIPE_FILE, RUN, is_run_folder
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, Source
+from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import command
 
 
@@ -175,8 +176,9 @@ class Run:
         Frames have their colour images where the source is still what it was; else a note says why not.
         """
         row_of = {int(row): number for number, row in enumerate(self.key_frames.rows)}
-        opened, complaint = self._frames_with_images()
+        opened, _, complaint = self.reopened()
         own = self.source.frames
+        with_images = own if opened is None else opened.frames
         frames = tuple(
             replace(
                 frame,
@@ -185,9 +187,9 @@ class Run:
                 read_colour=seen.read_colour,
                 read_points=partial(self.clouds.__getitem__, row_of[row]) if row in row_of else None,
             )
-            for row, (frame, seen, pose) in enumerate(zip(own, opened or own, self.poses, strict=True))
+            for row, (frame, seen, pose) in enumerate(zip(own, with_images, self.poses, strict=True))
         )
-        notes = (*self.source.notes, *complaint)
+        notes = (*self.source.notes, *map(str, complaint))
         return replace(self.source, frames=frames, path=self.folder, graph=self.result.graph, notes=notes)
 
     @property
@@ -203,26 +205,27 @@ class Run:
         return replace(scaled_recipe(recipe, scale), scale=scale)
 
     @property
-    def options_left_out(self) -> tuple[str, ...]:
-        """What is in the folder's recipe and unknown here, one line each: only running it again needs it."""
-        return recipe_of_run(self.folder / RECIPE_FILE)[1]
+    def options_left_out(self) -> tuple[Note, ...]:
+        """What is in the folder's recipe and unknown here, a note each: only running it again needs it."""
+        return tuple(Note("option unknown", detail=line) for line in recipe_of_run(self.folder / RECIPE_FILE)[1])
 
-    def key_frames_with_images(self) -> tuple[Sequence[Frame], tuple[str, ...]]:
-        """The key frames as their source has them, none where it has gone or has others by now, and a line why."""
-        frames, complaint = self._frames_with_images()
-        return tuple(frames[row] for row in self.key_frames.rows) if frames else (), complaint
+    def key_frames_with_images(self) -> tuple[Sequence[Frame], tuple[Note, ...]]:
+        """The key frames as their source has them, none where it has gone or has others by now, and a note why."""
+        opened, _, complaint = self.reopened()
+        return () if opened is None else tuple(opened.frames[row] for row in self.key_frames.rows), complaint
 
-    def _frames_with_images(self) -> tuple[Sequence[Frame], tuple[str, ...]]:
+    def reopened(self) -> tuple[Source | None, FrameReader | None, tuple[Note, ...]]:
+        """The source with its images, and its reader; none where it has gone or has other frames by now, and why."""
         path, reader = self.recipe.source.path, self.recipe.source.reader
         if path is None:
-            return (), ()
+            return None, None, ()
         try:
-            frames = (reader or guess_reader(path)).open(path).frames
+            opened, reader = open_with_reader(path, reader)
         except (HodgeError, OSError) as error:
-            return (), (f"without colour images: {error}",)
-        if [frame.frame_id for frame in frames] != [frame.frame_id for frame in self.source.frames]:
-            return (), (f"without colour images: {path} has other frames by now",)
-        return frames, ()
+            return None, None, (Note("without images", detail=str(error)),)
+        if [frame.frame_id for frame in opened.frames] != [frame.frame_id for frame in self.source.frames]:
+            return None, None, (Note("without images", detail=f"{path}: holds other frames by now"),)
+        return opened, reader, ()
 
     def show(self, width: int = 960, height: int = 540) -> Any:
         """The recording in a Rerun viewer in a notebook's cell, in pixels (extra `notebook`); elsewhere `hodge view`.

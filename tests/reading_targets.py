@@ -229,6 +229,22 @@ def ply(ascii: bool) -> Callable[[Path], Path]:
     return make
 
 
+def uos(folder: Path) -> Path:
+    (folder / "scan000.3d").write_text("2 x 1\n1 2 3\n4 5 6\n")
+    (folder / "scan000.pose").write_text("0 0 100\n0 90 0\n")
+    return folder
+
+
+def vtk(kind: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        points = b"1 2 3 4 5 6" if kind == "ASCII" else struct.pack(">6f", *range(6))
+        head = f"# vtk DataFile Version 3.0\nmade\n{kind}\nDATASET POLYDATA\nPOINTS 2 float\n"
+        (folder / "a.vtk").write_bytes(head.encode() + points + b"\nVERTICES 1 3\n2 0 1\n")
+        return folder
+
+    return make
+
+
 def las(folder: Path) -> Path:
     write_las(folder / "a.las", FAR + ROOM)
     return folder
@@ -331,4 +347,7 @@ TARGETS: dict[str, Target] = {
     "las": Target(CloudFolderReader(), las),
     "e57": Target(CloudFolderReader(), lambda folder: write_e57(folder / "a.e57", some_poses(2))),
     "toro": Target(ToroReader(), toro),
+    "uos": Target(CloudFolderReader(), uos),
+    "vtk_ascii": Target(CloudFolderReader(), vtk("ASCII")),
+    "vtk_binary": Target(CloudFolderReader(), vtk("BINARY")),
 }

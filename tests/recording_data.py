@@ -113,5 +113,5 @@ def record_all(recorder: Recorder) -> None:
     recorder.edges(1, graph, start)
     recorder.solution(1, graph, start, solution, frames)
     recorder.model(Model("m", np.float32(np.random.default_rng(0).uniform(-2, 2, (500, 3)))))
-    recorder.evaluation(frames, per_frame={"ATE m": np.arange(12.0)}, bars={"b": np.arange(3.0)}, tables={"t": "x"})
+    recorder.evaluation(frames, per_frame={"ATE m": np.arange(12.0)}, tables={"t": "x"})
     recorder.text("a: 1", ["one", "warning: two"])

@@ -2,41 +2,48 @@
 
 from __future__ import annotations
 
-import json
-import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from hodge_pipeline import registry, se3
+from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import layout
-from hodge_pipeline.report.compared import write_comparison
-from hodge_pipeline.report.comparison import compare, tables
 from hodge_pipeline.report.contents import Report, SourceSummary
-from hodge_pipeline.report.write import write_report
-from hodge_pipeline.types import Floats, Model, Source, Trajectory
+from hodge_pipeline.run_folder import Ending, Run
+from hodge_pipeline.scene import KeyFrames
+from hodge_pipeline.types import CloudSet, Floats, Frame, Model, Source
 from hodge_pipeline.types.ply import model_parts
+from hodge_pipeline.uses.compared import compare, tables, write_comparison
 from recording_data import circle, rows
 from report_data import read_page
 
 MOVED = se3.exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -0.5]))
 
 
-def make_run(folder: Path, poses: Floats, recipe: str = "seed: 0\n", first_stamp: float = 100.0) -> Path:
+def make_run(folder: Path, poses: Floats, recipe: str = "seed: 0\n", first: float = 100.0, name: str = "s") -> Run:
+    """A run that ended at these poses, its frames a second apart from the first one."""
     folder.mkdir()
-    stamps = first_stamp + np.arange(len(poses))
-    source = Source("s", folder, trajectory=Trajectory(stamps, poses))
-    registry.load("writers", "tum")().write(folder / "poses.tum", source)
     (folder / "recipe.yaml").write_text(recipe)
-    write_report(folder, Report(folder.name, SourceSummary("s", "x", len(poses))))
     points = se3.transform(poses, np.array([[0, 0, 1.0], [0.1, 0, 1.0]])).reshape(-1, 3).astype(np.float32)
     model = Model("cloud", points, colours=np.full((len(points), 3), 99, np.uint8))
     (folder / "cloud.ply").write_bytes(b"".join(model_parts(model)))
-    return folder
+    frames = tuple(Frame(row, first + row) for row in range(len(poses)))
+    source = Source(name, folder, frames)
+    return Run(
+        folder=folder,
+        source=source,
+        key_frames=KeyFrames.all_of(source, poses),
+        clouds=CloudSet.from_clouds([]),
+        rounds=(),
+        poses=poses,
+        models={"cloud": folder / "cloud.ply"},
+        ending=Ending(poses, Report(folder.name, SourceSummary(name, "x", len(poses))), None),
+    )
 
 
 def test_a_run_moved_as_one_body_is_the_same_run(tmp_path: Path) -> None:
@@ -71,10 +78,7 @@ def test_numbers_of_frames_in_other_sources_are_no_shared_frames(tmp_path: Path)
     """Scans have no clock: the fifth of a street is not the fifth of a room."""
     a, b = make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", circle()[:9])
     assert len(compare(a, b).apart_m) == 9, "the same source by its name"
-    report = json.loads((b / "report.json").read_text())
-    report["source"]["name"] = "street"
-    (b / "report.json").write_text(json.dumps(report))
-    assert not len(compare(a, b).apart_m)
+    assert not len(compare(a, make_run(tmp_path / "c", circle()[:9], name="street")).apart_m)
 
 
 def test_page_and_recording(tmp_path: Path) -> None:
@@ -85,33 +89,36 @@ def test_page_and_recording(tmp_path: Path) -> None:
     assert "a and b" in text and "laid onto A by the 12 frames" in text
     assert len(addresses) == 5 and all(address.startswith("data:image/") for address in addresses)
     for side in "ab":
-        poses = np.squeeze(rows(recording, f"{layout.WORLD}/{side}/poses", "Transform3D:translation"))
+        poses = np.squeeze(rows(recording, layout.poses(side), "Transform3D:translation"))
         np.testing.assert_allclose(np.float32(poses), np.float32(circle()[:, :3, 3]), atol=2e-6)
-        (points,) = rows(recording, f"{layout.WORLD}/{side}/model", "Points3D:positions")
+        (points,) = rows(recording, f"{layout.MODEL}/{side}", "Points3D:positions")
         assert len(points) == 24
     assert len(RrdReader(recording).blueprints()) == 1
 
 
 def test_runs_that_share_no_frame(tmp_path: Path) -> None:
-    a, b = make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", circle(), first_stamp=900.0)
+    a, b = make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", circle(), first=900.0)
     found = compare(a, b)
     assert not len(found.apart_m)
     page, _ = write_comparison(tmp_path / "out", found)
     assert "share too few frames" in page.read_text("utf-8")
 
 
-def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+def test_frames_without_a_pose_are_not_shared(tmp_path: Path) -> None:
+    poses = circle()
+    poses[3] = np.nan
+    found = compare(make_run(tmp_path / "a", poses), make_run(tmp_path / "b", circle()))
+    assert len(found.apart_m) == 11 and np.isfinite(found.apart_m).all()
+
+
+def test_a_run_that_has_not_ended_is_one_line(tmp_path: Path) -> None:
     run = make_run(tmp_path / "a", circle())
-    with pytest.raises(WorkspaceError, match="holds no report.json"):
-        compare(run, tmp_path)
-    (run / "report.json").write_text("{")
-    with pytest.raises(WorkspaceError, match="cannot be read"):
-        compare(run, run)
-    shutil.rmtree(run)
+    with pytest.raises(WorkspaceError, match="not finished"):
+        compare(run, replace(run, ending=None))
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    a, b = make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", circle())
-    app(["compare", str(a), str(b), "--out", str(tmp_path / "out")], standalone_mode=False)
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = {run.folder: run for run in (make_run(tmp_path / "a", circle()), make_run(tmp_path / "b", circle()))}
+    monkeypatch.setattr(Run, "load", runs.__getitem__)
+    app(["compare", *map(str, runs), "--out", str(tmp_path / "out")], standalone_mode=False)
     assert "compare.html" in capsys.readouterr().out.replace("\n", "")
-    assert json.loads((a / "report.json").read_text())["title"] == "a"

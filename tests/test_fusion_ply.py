@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from hodge_adapters.clouds.ply import read_ply as read_points
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.store.artifacts import write_atomically
 from hodge_pipeline.types import Model
+from hodge_pipeline.types.output_files import replacing
 from hodge_pipeline.types.ply import model_parts, read_model
 
 
@@ -30,7 +30,8 @@ def model_of(count: int, normals: bool = True, colours: bool = True, triangles: 
 
 
 def write_ply(path: Path, model: Model) -> None:
-    write_atomically(path, lambda stream: stream.writelines(model_parts(model)))
+    with replacing(path) as file:
+        file.writelines(model_parts(model))
 
 
 def assert_same(a: Model, b: Model) -> None:

@@ -13,6 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.registration.consensus import rigid_consensus
 from hodge_pipeline.registration.global_evidence import (
+    STREET_SCALE,
     depth_view,
     free_directions,
     free_space,
@@ -205,6 +206,17 @@ def test_a_scanner_saw_through_what_stands_before_its_walls() -> None:
     moved = hall(5.0) + np.array([2.0, 0.0, 0.0])
     assert 0.15 < free_space(view, moved).violation < 0.5  # one wall of four, and the ends of two
     assert not np.isfinite(view.nearest_m[:3]).any()  # nothing was measured overhead: it accuses nobody
+
+
+def test_vehicles_that_drove_on_refute_no_street() -> None:
+    ahead = np.stack([np.full(600, 12.0), *np.random.default_rng(0).uniform(-2, 2, (2, 600))], axis=1)
+    aside = ahead @ se3.so3_exp(np.array([[0, 0, np.pi / 4]]))[0].T
+    now = np.concatenate([10 * hall(5.0)[::8], ahead, aside])
+    view = panorama(10 * hall(5.0))
+    assert free_space(view, now, STREET_SCALE).violation == 0.0
+    assert free_space(view, now, 0.9 * STREET_SCALE).violation > 0.09  # of two equal rooms furniture tells
+    assert free_space(view, 6 * hall(5.0)[::8], STREET_SCALE).violation == 1.0  # another place
+    assert free_space(view, ahead, STREET_SCALE).violation == 1.0  # nothing but a vehicle in common: no proof
 
 
 def test_a_scanner_saw_through_nothing_below_its_lowest_beam() -> None:

@@ -64,6 +64,14 @@ def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
     assert command == "hodge run tum --source in --set source.reader.depth_scale=1000 --out runs/in"
 
 
+def test_a_recording_of_point_clouds_gets_the_recipe_of_clouds() -> None:
+    facts = {"frames": 3, "frames with depth": 0, "frames with points": 3, "formats": [{"reader": "mcap"}]}
+    assert next_command(Path("a.mcap"), facts, None) == "hodge run mcap_clouds --source a.mcap --out runs/a"
+    images = {**facts, "frames with depth": 3, "frames with points": 0}
+    assert next_command(Path("a.mcap"), images, None) == "hodge run mcap --source a.mcap --out runs/a"
+    assert next_command(Path("a.mcap"), {**facts, "scanner": "spins"}, None).startswith("hodge run lidar ")
+
+
 def test_posed_scans_of_an_e57_start_from_their_poses() -> None:
     facts = {"frames": 3, "frames with depth": 0, "frames with a pose": 3, "formats": [{"reader": "clouds"}]}
     model = {"frames": 7, "frames with depth": 0, "formats": [{"reader": "colmap"}]}

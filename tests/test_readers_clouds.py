@@ -336,13 +336,13 @@ def test_tables_of_points_are_read(tmp_path: Path, name: str, head: str, separat
 
 def test_tables_of_something_else_are_no_scans_and_told(tmp_path: Path) -> None:
     (tmp_path / "gps.csv").write_text("stamp,x,y,z\n0,1,2,3\n")
-    (tmp_path / "scan.3d").write_text("1 2 3\n")
-    with pytest.raises(SourceError, match="1 files are scans of another format, left out: scan.3d: convert to PLY"):
+    (tmp_path / "scan.pts").write_text("1 2 3\n")
+    with pytest.raises(SourceError, match="1 files are scans of another format, left out: scan.pts: convert to PLY"):
         CloudFolderReader().open(tmp_path)
     (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n")
     source = CloudFolderReader().open(tmp_path)
     assert [frame.frame_id for frame in source.frames] == ["a.csv"]
-    assert "2 files are scans of another format, left out: gps.csv, scan.3d" in source.notes[0]
+    assert "2 files are scans of another format, left out: gps.csv, scan.pts" in source.notes[0]
     (tmp_path / "a.csv").write_text("x,y,z\n1,2\n")
     with pytest.raises(SourceError, match=r"a\.csv: its points are no rows of 3 numbers|a\.csv: says 1 points"):
         CloudFolderReader().open(tmp_path).frames[0].read_points()

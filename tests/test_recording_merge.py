@@ -1,9 +1,7 @@
-"""Parts merged into one recording: whole, replaced, cut off, damaged, left by a killed writer; and what opens."""
+"""Parts merged into one recording: whole, replaced, empty; and what opens."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,25 +12,10 @@ from rerun.chunk import RrdReader
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import binary, layout, shapes, stream
 from hodge_pipeline.recording.eye import look_at
-from hodge_pipeline.recording.merge import contents_of, find_parts, merge
+from hodge_pipeline.recording.merge import contents_of, find_parts
 from hodge_pipeline.types import CloudSet
-from recording_data import circle, make_frames, record, record_all, ring_graph, rows
+from recording_data import circle, make_frames, record, record_all, rows
 from tools.recording_pictures import picture
-
-KILLED_WRITER = """
-import os, sys
-from pathlib import Path
-import rerun as rr
-from hodge_pipeline.recording import layout, stream
-path = stream.partial_path(Path(sys.argv[1]))
-killed = stream.open_stream("run-1")
-killed.save(path)
-for row in range(5):
-    killed.set_time(layout.STORY, duration=float(row))
-    killed.log("/killed", rr.Scalars(row))
-killed.flush()
-os._exit(9)
-"""
 
 
 def verify(path: Path, scratch: Path) -> None:
@@ -42,13 +25,14 @@ def verify(path: Path, scratch: Path) -> None:
 def test_one_verified_file_with_a_blueprint(tmp_path: Path) -> None:
     recorder = record(tmp_path / "parts")
     record_all(recorder)
-    merged = recorder.finish(tmp_path / "recording.rrd")
-    assert merged is not None and merged.notes == () and len(find_parts(tmp_path / "parts")) == 9
-    verify(merged.path, tmp_path)
-    reader = RrdReader(merged.path)
+    merged = tmp_path / "recording.rrd"
+    recorder.finish(merged)
+    assert len(find_parts(tmp_path / "parts")) == 9
+    verify(merged, tmp_path)
+    reader = RrdReader(merged)
     assert [entry.recording_id for entry in reader.recordings()] == ["run-1"]
     assert len(reader.blueprints()) == 1
-    assert not [path for path in tmp_path.rglob("*") if layout.PARTIAL_SUFFIX in path.name]
+    assert not list(tmp_path.rglob(".*"))
 
 
 def test_the_camera_moves_along_the_best_trajectory(tmp_path: Path) -> None:
@@ -85,36 +69,6 @@ def test_a_failed_stage_leaves_the_part_before_it(tmp_path: Path) -> None:
     assert len(rows(tmp_path / "002-poses-truth.rrd", layout.poses("truth"), layout.FRAME)) == 5
 
 
-def test_damaged_parts_do_not_take_the_others_with_them(tmp_path: Path) -> None:
-    recorder = record(tmp_path / "parts")
-    record_all(recorder)
-    cut, junk = tmp_path / "parts/011-solution-1.rrd", tmp_path / "parts/900-model.rrd"
-    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size * 2 // 3])
-    junk.write_bytes(b"not a recording")
-    merged = recorder.finish(tmp_path / "recording.rrd")
-    assert merged is not None
-    assert merged.notes == (
-        "recording: 011-solution-1.rrd is cut off: what could be read of it is shown",
-        "recording: 900-model.rrd is damaged and left out: record that stage again",
-    )
-    verify(merged.path, tmp_path)
-    assert len(rows(merged.path, layout.COLOUR, layout.FRAME)) == 12
-    assert rows(merged.path, layout.under(layout.SOLVER_PLOTS, "residual_mean_m"), "Scalars:scalars")
-    assert set(merged.notes) <= {row[0] for row in rows(merged.path, layout.LOG, "TextLog:text") if row}
-
-
-def test_rows_of_a_killed_writer_are_kept_until_its_stage_is_done(tmp_path: Path) -> None:
-    part = tmp_path / "parts/020-edges-2.rrd"
-    part.parent.mkdir()
-    killed = subprocess.run([sys.executable, "-c", KILLED_WRITER, str(part)], check=False)
-    assert killed.returncode == 9 and not part.exists()
-    merged = merge(find_parts(part.parent), tmp_path / "mended.rrd", "run-1")
-    assert [row[0] for row in rows(merged.path, "/killed", "Scalars:scalars")] == [0, 1, 2, 3, 4]
-    verify(merged.path, tmp_path)
-    record(part.parent).edges(2, ring_graph(circle()), circle())
-    assert [path.name for path in find_parts(part.parent)] == [part.name]
-
-
 def test_the_eye_is_above_and_behind_the_cameras(tmp_path: Path) -> None:
     """Cameras all look along +z with y down, so up is −y and behind is −z."""
     poses = np.stack([np.eye(4)] * 4)
@@ -133,11 +87,10 @@ def test_stages_without_anything_to_show(tmp_path: Path) -> None:
     recorder.frames("nothing", [])
     recorder.clouds([], CloudSet.from_clouds([]))
     recorder.poses("truth", np.zeros((0, 4, 4)))
-    recorder.evaluation((), {}, {}, {})
+    recorder.evaluation((), {}, {})
     recorder.text("", [])
-    merged = recorder.finish(tmp_path / "recording.rrd")
-    assert merged is not None and merged.notes == ()
-    verify(merged.path, tmp_path)
+    recorder.finish(tmp_path / "recording.rrd")
+    verify(tmp_path / "recording.rrd", tmp_path)
 
 
 @pytest.mark.slow

@@ -154,7 +154,7 @@ def test_a_run_of_other_versions_or_of_a_source_that_is_gone_is_recorded_all_the
     monkeypatch.setattr(store_module, "versions", lambda: {"open3d": "0.1"})
     log = Log()
     path, is_whole = record_again(folder, {}, log)
-    assert is_whole and any(f"recorded without images: {source}" in said for said in log.said)
+    assert is_whole and any(f"without images: {source}" in said for said in log.said)
     found = entities(path)
     assert layout.COLOUR not in found and {layout.CLOUD, layout.MODEL, layout.solved_edges(2)} <= found
 

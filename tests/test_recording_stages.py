@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rerun.chunk import RrdReader
 
 from hodge_pipeline import se3
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import Contents
 from hodge_pipeline.recording.curl import triangle_curl_m
 from hodge_pipeline.recording.growth import first_frame
-from hodge_pipeline.recording.merge import contents_of, eyes, find_parts, with_entities
+from hodge_pipeline.recording.merge import contents_of, eyes, find_parts, readers_of, with_entities
 from hodge_pipeline.recording.recorder import Recorder
 from hodge_pipeline.recording.registration import chosen_pairs, moved_m
 from hodge_pipeline.types import CloudSet, Edges, Frame, Model, PointCloud, ViewGraph
@@ -67,7 +66,7 @@ def test_registration_reads_back_with_the_clouds_of_chosen_pairs(tmp_path: Path)
     np.testing.assert_array_equal(np.float32(after), np.float32(moved))
     (before,) = rows(part, f"{pair}/before", "Points3D:positions")
     np.testing.assert_array_equal(np.float32(before), seen[4].points_in_cam)
-    readers = [(path, RrdReader(path)) for path in find_parts(tmp_path)]
+    readers = readers_of(find_parts(tmp_path)).values()
     assert with_entities(Contents(), readers).pairs == ("least_fitness", "moved_most", "rejected")
 
 
@@ -162,7 +161,7 @@ def test_what_is_not_there_has_no_view_and_a_scanner_is_no_camera(tmp_path: Path
         recorder = Recorder(folder, "run-1", is_scanner=scanner)
         recorder.frames("scans", [Frame(row, float(row)) for row in range(4)])
         recorder.poses("odometry", poses)
-        readers = [(path, RrdReader(path)) for path in find_parts(folder)]
+        readers = readers_of(find_parts(folder)).values()
         contents = with_entities(contents_of(find_parts(folder)), readers)
         assert contents.is_scanner == scanner and contents.holds(layout.CAMERA) and not contents.holds(layout.COLOUR)
         eye = eyes(contents, readers).graph

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.types.input_files import beginning, read_input_text
+from hodge_pipeline.types.output_files import replacing
 
 _DIGITS = re.compile(r"(\d+)")
 SNIFFED_BYTES = 4096
@@ -114,16 +115,8 @@ def write_bytes_atomically(path: Path, contents: bytes) -> None:
 @contextmanager
 def opened_atomically(path: Path) -> Iterator[IO[bytes]]:
     """A file to be written, which takes its name once the body ends well. Raises `WorkspaceError`."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
+        with replacing(path) as file:
             yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise not_written(path, error) from error
-        raise
+    except OSError as error:
+        raise not_written(path, error) from error

@@ -15,8 +15,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.report import raster
-from hodge_pipeline.store.artifacts import write_atomically
 from hodge_pipeline.types import Camera, Floats, Frame
+from hodge_pipeline.types.output_files import replacing
 
 STRIDE = 3  # pixels: 34 000 points of a VGA frame, which fill nearly all pixels of the pictures
 MAX_RANGE_M = 5.0
@@ -49,7 +49,8 @@ def draw_comparison(path: Path, frames: Sequence[Frame], pose_sets: Mapping[str,
             axis.set(xticks=[], yticks=[], ylabel=name if column == 0 else "", title=title if row == 0 else "")
     figure.tight_layout(pad=0.4)
     try:
-        write_atomically(path, lambda stream: figure.savefig(stream, format="png", dpi=110))
+        with replacing(path) as file:
+            figure.savefig(file, format="png", dpi=110)
     finally:
         plt.close(figure)
 

@@ -42,6 +42,8 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings
     if name == "colmap" and not facts["frames with depth"]:  # images alone are nothing to register
         return command("hodge", "refine", "colmap", path, "--out", f"runs/{path.stem}")
     recipe = "lidar" if facts.get("scanner") and not reader else {"clouds": "scans"}.get(name, name)
+    if recipe == "mcap" and facts.get("frames with points") == facts["frames"]:
+        recipe = "mcap_clouds"
     if path.suffix.lower() == ".e57" and facts["frames with a pose"] == facts["frames"]:
         options += ["--set", "start=given"]  # the surveyor's poses, which keep the scans in his world
     if recipe in recipe_names():

@@ -59,11 +59,11 @@ def view(run_folder: Path, *, web: bool) -> None:
 
 def compare(first: Path, second: Path, out: Path | None) -> None:
     """Print two runs side by side, and write their comparison as a page and as a recording."""
-    from hodge_pipeline.report.compared import write_comparison
-    from hodge_pipeline.report.comparison import compare as compare_runs
-    from hodge_pipeline.report.comparison import tables
+    from hodge_pipeline.run_folder import Run
+    from hodge_pipeline.uses.compared import compare as compare_runs
+    from hodge_pipeline.uses.compared import tables, write_comparison
 
-    comparison = compare_runs(first, second)
+    comparison = compare_runs(Run.load(first), Run.load(second))
     folder = second if out is None else out
     written = write_comparison(folder, comparison)
     for table in tables(comparison):

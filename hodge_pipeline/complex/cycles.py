@@ -92,7 +92,7 @@ def spanning_forest(edges: Ints, vertex_count: int, roots: Ints | None = None) -
     parent = _breadth_first_parents(edges, roots, vertex_count)
     child = np.flatnonzero(parent >= 0)
     parent_edge = np.full(vertex_count, -1, np.int64)
-    parent_edge[child] = _edge_between(edges, vertex_count, parent[child], child)
+    parent_edge[child] = edge_between(edges, vertex_count, parent[child], child)
     sign = np.ones(vertex_count, np.int64)
     sign[child] = np.where(edges[parent_edge[child], 1] == child, 1, -1)
     in_tree = np.zeros(len(edges), bool)
@@ -112,7 +112,8 @@ def _breadth_first_parents(edges: Ints, roots: Ints, vertex_count: int) -> Ints:
     return parents
 
 
-def _edge_between(edges: Ints, vertex_count: int, a: Ints, b: Ints) -> Ints:
+def edge_between(edges: Ints, vertex_count: int, a: Ints, b: Ints) -> Ints:
+    """The row (N,) of the first edge between vertices a and b (N,), in either direction; each pair must have one."""
     key = edges.min(axis=1) * vertex_count + edges.max(axis=1)
     keys, first = np.unique(key, return_index=True)
     wanted = np.minimum(a, b) * vertex_count + np.maximum(a, b)

@@ -18,7 +18,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, DistanceBlock, block_distances
 from hodge_pipeline.pairs.overlap import pairwise_iou
-from hodge_pipeline.stages import Advance, Workers, no_progress
+from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, PointCloud
 
 GraphKind: TypeAlias = Literal["distance", "iou"]
@@ -96,7 +96,6 @@ def edge_distances(
     pairs: Ints,
     world_from_cam: Floats,
     workers: Workers,
-    advance: Advance = no_progress,
     *,
     scale: float = 1.0,
 ) -> Floats:
@@ -104,8 +103,8 @@ def edge_distances(
 
     `d_ij` is the mean |n·(p − q)| over the points p of cloud j whose nearest neighbour q in cloud i is within 0.1 m, n
     the normal of cloud i; 0.1 m when there is none, NaN where a pose is not finite. `clouds_folder` is what
-    `CloudSet.save` wrote. Several sets at once share the search trees. `advance` counts pairs. The 0.1 m
-    are taken times `scale`. Of many pairs some points of each are measured, evenly strided.
+    `CloudSet.save` wrote. Several sets at once share the search trees. The 0.1 m are taken
+    times `scale`. Of many pairs some points of each are measured, evenly strided.
     """
     poses = world_from_cam.reshape(-1, *world_from_cam.shape[-3:])
     distances = np.full((len(poses), len(pairs)), np.nan)
@@ -115,7 +114,6 @@ def edge_distances(
     blocks = [DistanceBlock(clouds_folder, pairs[cut], _relative(poses, pairs[cut]), points, scale) for cut in cuts]
     for block, found in workers.map(block_distances, blocks):
         distances[:, cuts[block]] = found
-        advance(len(cuts[block]))
     return distances.reshape(*world_from_cam.shape[:-3], len(pairs))
 
 
@@ -187,7 +185,6 @@ def score_table(
     pose_sets: Mapping[str, Floats],
     reference: str,
     workers: Workers,
-    advance: Advance = no_progress,
     *,
     kinds: tuple[GraphKind, ...] = GRAPH_KINDS,
     scale: float = 1.0,
@@ -204,7 +201,7 @@ def score_table(
     graphs = [some_of(evaluation_pairs(clouds, pose_sets[reference], kind, scale), MOST_PAIRS) for kind in kinds]
     union, rank = np.unique(np.concatenate(graphs), axis=0, return_inverse=True)
     poses = np.stack(list(pose_sets.values()))
-    distances = edge_distances(clouds_folder, union, poses, workers, advance, scale=scale)
+    distances = edge_distances(clouds_folder, union, poses, workers, scale=scale)
     columns = np.split(rank.reshape(-1), np.cumsum([len(pairs) for pairs in graphs])[:-1])
     scored = (
         GraphScores(kind, pairs, distances[:, c], scale) for kind, pairs, c in zip(kinds, graphs, columns, strict=True)

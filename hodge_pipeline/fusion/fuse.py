@@ -9,9 +9,9 @@ import numpy as np
 
 from hodge_pipeline.scene import KeyFrames, Scene
 from hodge_pipeline.stages import Fuser, Step, Steps
-from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Bools, Floats, Source
 from hodge_pipeline.types.notes import Note, notes_of
+from hodge_pipeline.types.output_files import replacing
 from hodge_pipeline.types.ply import model_parts
 
 
@@ -41,7 +41,8 @@ def fuse(fuser: Fuser, source: Source, world_from_cam: Floats, *, step: Step) ->
     """Step: the PLY file of the model; frames whose pose is not finite, such as a scan in other units, are left out."""
     model = fuser.fuse(source.frames, world_from_cam, step.advance)
     path = step.folder / f"{model.name}.ply"
-    artifacts.write_atomically(path, lambda stream: stream.writelines(model_parts(model)))
+    with replacing(path) as file:
+        file.writelines(model_parts(model))
     step.note(*notes_of("fuser", model.notes))
     return path
 

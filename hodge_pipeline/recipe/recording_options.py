@@ -19,8 +19,8 @@ class RecordingOptions:
 
     level: Level = Field(
         default="normal",
-        description="off: no recording; summary: no images, clouds or solver film; normal: all, thinned to the counts "
-        "below; full: all, thinned only where max_megabytes asks for it",
+        description="off: no recording; summary: no images, clouds or solver film; normal: all, thinned to what a "
+        "viewer shows with ease; full: all, thinned only where max_megabytes asks for it",
     )
     max_megabytes: float = Field(
         default=100.0,
@@ -28,19 +28,6 @@ class RecordingOptions:
         description="10^6 bytes: bound on the file; 85 % of it for images, the rest for clouds, model and solver; 100 "
         "holds 650 VGA colour and depth images",
     )
-    image_every: int = Field(default=1, ge=1, description="frames: record every n-th frame's images")
-    cloud_points: int = Field(
-        default=300_000,
-        ge=0,
-        description="points of all frames' clouds together; more says little beside the fused model",
-    )
-    edge_lines: int = Field(
-        default=20_000, ge=1, description="lines in one picture of the graph; more is a solid block"
-    )
-    film_steps: int = Field(
-        default=60, ge=2, description="inner iterations of one solve that are drawn; the scalars are kept for all"
-    )
-    frusta: int = Field(default=60, ge=0, description="camera frusta drawn along one trajectory")
     residual_scale_m: float = Field(
         default=0.05,
         gt=0,

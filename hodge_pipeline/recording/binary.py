@@ -1,4 +1,4 @@
-"""Run the `rerun` binary (repair of truncated files, screenshots, viewer) with its telemetry off."""
+"""Run the `rerun` binary (viewer, screenshots) with its telemetry off."""
 
 from __future__ import annotations
 

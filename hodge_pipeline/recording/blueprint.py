@@ -8,6 +8,7 @@ import rerun.blueprint as rrb
 
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.eye import Eye, Eyes
+from hodge_pipeline.types.text import markdown_table
 
 BACKGROUND = (24, 26, 32)
 COLOUR_NAMES = {"truth": "green", "odometry": "orange", "start": "violet"}
@@ -237,14 +238,13 @@ def _text_tab() -> rrb.Horizontal:
 
 def legend(contents: Contents) -> str:
     """What the colours mean, as Markdown."""
-    lines = ["| colour | what |", "|---|---|"]
-    lines += [f"| white | the result, {contents.trajectory.replace('_', ' ')} |"] if contents.last_solution else []
-    lines += [f"| {colour} | {name} |" for name, colour in COLOUR_NAMES.items() if name in contents.trajectories]
+    rows = [("white", f"the result, {contents.trajectory.replace('_', ' ')}")] if contents.last_solution else []
+    rows += [(colour, name) for name, colour in COLOUR_NAMES.items() if name in contents.trajectories]
     if "diagnosis" in contents.stages:
-        lines += [
-            "| blue, grey, amber, magenta | in the diagnosis: an edge that is consistent, untestable, suspect, wrong |"
+        rows += [
+            ("blue, grey, amber, magenta", "in the diagnosis: an edge that is consistent, untestable, suspect, wrong")
         ]
     if contents.last_graph or contents.last_solution:
-        lines += ["| blue to yellow | an edge: the brighter, the larger its residual |"]
-        lines += ["| magenta | an edge that the solver ignored |", "| grey | a candidate pair that became no edge |"]
-    return "\n".join(lines)
+        rows += [("blue to yellow", "an edge: the brighter, the larger its residual")]
+        rows += [("magenta", "an edge that the solver ignored"), ("grey", "a candidate pair that became no edge")]
+    return markdown_table(("colour", "what"), rows)

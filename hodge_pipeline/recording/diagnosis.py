@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
-from hodge_pipeline.recording.stream import log_markdown, log_notes
+from hodge_pipeline.recording.stream import Part, log_markdown
 from hodge_pipeline.types import Edges, Floats, ViewGraph
-from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.text import markdown_table
 
 COLOURS = {
     "consistent": (60, 115, 225),
@@ -23,44 +22,34 @@ BYTES_EACH = 160
 LISTED = 40
 
 
-def log_diagnosis(
-    stream: rr.RecordingStream,
-    graph: ViewGraph,
-    world_from_cam: Floats,
-    edges: Edges,
-    options: RecordingOptions,
-) -> tuple[str, ...]:
-    """Log the edges by verdict, with probability and reason as label; gives notes of what was thinned."""
-    notes: tuple[str, ...] = ()
-    log_markdown(stream, layout.DIAGNOSIS, summary(graph, edges))
+def log_diagnosis(part: Part, graph: ViewGraph, world_from_cam: Floats, edges: Edges) -> None:
+    """Log the edges by verdict, with probability and reason as label."""
+    log_markdown(part.stream, layout.DIAGNOSIS, summary(graph, edges))
     lines = shapes.segments(world_from_cam, graph.edges)
     drawable = np.isfinite(lines).all(axis=(1, 2))
     for name in sorted(set(edges.verdict.tolist()) | set(COLOURS)):
         rows = np.flatnonzero((edges.verdict == name) & drawable)
-        kept = options.count(options.edge_lines, len(rows), BYTES_EACH, options.max_bytes("solver") / 2)
-        rows, available = rows[evenly(len(rows), kept)], len(rows)
+        max_bytes, what = part.options.max_bytes("solver") / 2, f"edges called {name} drawn"
+        rows = rows[part.some(len(rows), shapes.MOST_LINES, BYTES_EACH, max_bytes, what)]
         labels = [_label(graph, edges, int(row)) for row in rows]
         colour, radius = COLOURS.get(name, shapes.RESULT_COLOUR), RADII.get(name, -0.8)
         strips = rr.LineStrips3D(lines[rows], colors=[colour], radii=[radius], labels=labels, show_labels=False)
-        stream.log(layout.verdict(name), strips, static=True)
-        if kept < available:
-            notes += (f"recording: {kept} of {available} edges called {name} drawn",)
-    log_notes(stream, 0, notes)
-    return notes
+        part.stream.log(layout.verdict(name), strips, static=True)
 
 
 def summary(graph: ViewGraph, edges: Edges) -> str:
     """The verdicts counted, and the least probable edges with their reasons, as Markdown."""
-    names, counts = np.unique(edges.verdict, return_counts=True)
-    lines = ["# Which edge is wrong", "", "| verdict | edges |", "|---|---|"]
-    lines += [f"| {name} | {count} |" for name, count in zip(names, counts, strict=True)]
-    listed = _least_probable(edges)
-    if listed:
-        lines += ["", "## The least probable", "", "| edge | verdict | right with | why |", "|---|---|---|---|"]
-    for row in listed:
-        i, j = graph.vertex_ids[graph.edges[row]]
-        lines += [f"| {i} – {j} | {edges.verdict[row]} | {_percent(edges.probability[row])} | {edges.why[row]} |"]
-    return "\n".join(lines)
+    counted = zip(*np.unique(edges.verdict, return_counts=True), strict=True)
+    text = f"# Which edge is wrong\n\n{markdown_table(('verdict', 'edges'), counted)}"
+    if not (listed := _least_probable(edges)):
+        return text
+    rows = [
+        (f"{i} – {j}", edges.verdict[row], _percent(edges.probability[row]), edges.why[row])
+        for row in listed
+        for i, j in [graph.vertex_ids[graph.edges[row]]]
+    ]
+    table = markdown_table(("edge", "verdict", "right with", "why"), rows)
+    return f"{text}\n\n## The least probable\n\n{table}"
 
 
 def _least_probable(edges: Edges) -> list[int]:

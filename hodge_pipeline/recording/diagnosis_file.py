@@ -9,14 +9,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hodge_pipeline.diagnosis.result import Diagnosis
-from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.blueprint import scene_view, without_panels
 from hodge_pipeline.recording.curl import log_tested_triangles
 from hodge_pipeline.recording.diagnosis import log_diagnosis
 from hodge_pipeline.recording.eye import Eye
 from hodge_pipeline.recording.loops import log_loops
-from hodge_pipeline.recording.stream import log_markdown, writing
+from hodge_pipeline.recording.stream import Part, log_markdown, writing
 from hodge_pipeline.types import Edges, Floats, ViewGraph
 
 APPLICATION = "hodge-pipeline diagnosis"
@@ -37,9 +36,10 @@ def write_diagnosis(path: Path, identity: str, graph: ViewGraph, world_from_cam:
     with writing(path, identity, _blueprint(_eye(world_from_cam)), APPLICATION) as stream:
         _log_vertices(stream, graph, world_from_cam)
         edges = diagnosis.put_into(Edges.measured(graph))
-        log_diagnosis(stream, graph, world_from_cam, edges, RecordingOptions())
-        log_tested_triangles(stream, graph, world_from_cam, diagnosis.cycles)
-        log_loops(stream, graph, world_from_cam)
+        part = Part(stream)
+        log_diagnosis(part, graph, world_from_cam, edges)
+        log_tested_triangles(part, graph, world_from_cam, diagnosis.cycles)
+        log_loops(part, graph, world_from_cam)
         log_markdown(stream, layout.LEGEND, LEGEND)
 
 

@@ -11,7 +11,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.shapes import or_grey
-from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes
+from hodge_pipeline.recording.stream import Part, frame_columns, log_markdown
 from hodge_pipeline.types import Camera, CloudSet, EncodedImage, Floats, Frame, Ints
 from hodge_pipeline.types.arrays import evenly
 
@@ -19,18 +19,19 @@ CHUNK_BYTES = 4_000_000
 """Images go in chunks of this size: few enough to be quick, small enough for a viewer to fetch one."""
 IMAGE_PLANE_M = 0.25
 POINT_BYTES = 16
+MOST_POINTS = 300_000
+"""Of all frames' clouds together; more says little beside the fused model."""
 SIZED_FRAMES, MARGIN = 16, 1.1
 """Frames whose images are read to know how large all are, and what their mean is taken times: of red kitchen's frames
 the largest is 1.2 times the mean, and the mean of 16 is known to 3 %."""
 
 
-def log_frames(
-    stream: rr.RecordingStream, name: str, frames: Sequence[Frame], notes: Sequence[str], options: RecordingOptions
-) -> tuple[str, ...]:
-    """Log encoded images, cameras and names of the frames; gives notes of what was thinned or unreadable."""
-    rows, thinned = image_rows(frames, options)
+def log_frames(part: Part, name: str, frames: Sequence[Frame], notes: Sequence[str]) -> None:
+    """Log encoded images, cameras and names of the frames; `notes` are the reader's."""
+    stream, (rows, thinned) = part.stream, image_rows(frames, part.options)
     log_markdown(stream, layout.SOURCE, "\n".join([f"# {name}", f"{len(frames)} frames", *(f"- {n}" for n in notes)]))
-    log_notes(stream, 0, thinned)
+    if thinned:
+        part.note(thinned)
     _log_names(stream, frames)
     _log_cameras(stream, frames)
     kept = 0
@@ -39,24 +40,20 @@ def log_frames(
             _log_images(stream, path, frame_columns(frames, len(frames), chunk_rows), images)
             kept += len(images)
     wished = sum((frames[row].encoded_colour is not None) + (frames[row].encoded_depth is not None) for row in rows)
-    lost = (f"recording: {wished - kept} images cannot be read and are not shown",) if kept < wished else ()
-    log_notes(stream, 0, lost, level="WARN")
-    return thinned + lost
+    if kept < wished:
+        part.note(f"{wished - kept} images cannot be read and are not shown", level="WARN")
 
 
-def image_rows(frames: Sequence[Frame], options: RecordingOptions) -> tuple[Ints, tuple[str, ...]]:
-    """The frames whose images are kept, evenly spaced and within the size, and what that left out."""
+def image_rows(frames: Sequence[Frame], options: RecordingOptions) -> tuple[Ints, str]:
+    """The frames whose images are kept, evenly spaced and within the size, and what that left out, in words."""
     if not options.has_images:
-        return np.zeros(0, np.int64), ()
-    sizes = _sizes(frames)
-    wished = every = options.image_every if options.level == "normal" else 1
+        return np.zeros(0, np.int64), ""
+    sizes, every = _sizes(frames), 1
     while every <= len(frames) and sizes[::every].sum() > options.max_bytes("images"):
         every += 1
     rows = np.arange(0, len(frames), every) if every <= len(frames) else np.arange(0)
-    if every == wished:
-        return rows, ()
-    note = f"images of {len(rows)} of {len(frames)} frames, to stay under {options.max_megabytes:g} MB"
-    return rows, (f"recording: {note} (recording.max_megabytes)",)
+    told = f"images of {len(rows)} of {len(frames)} frames, to stay under {options.max_megabytes:g} MB"
+    return rows, f"{told} (recording.max_megabytes)" if every > 1 else ""
 
 
 def _sizes(frames: Sequence[Frame]) -> Floats:
@@ -69,14 +66,12 @@ def _sizes(frames: Sequence[Frame]) -> Floats:
     return np.full(len(frames), MARGIN * np.mean(some))
 
 
-def log_clouds(
-    stream: rr.RecordingStream, frames: Sequence[Frame], clouds: CloudSet, options: RecordingOptions
-) -> tuple[str, ...]:
-    """Log each frame's cloud in its camera's axes; gives notes of what was thinned."""
-    total = int(clouds.offsets[-1])
-    kept = options.count(options.cloud_points, total, POINT_BYTES, options.max_bytes("clouds"))
-    if not options.has_images or not total or not kept:
-        return ()
+def log_clouds(part: Part, frames: Sequence[Frame], clouds: CloudSet) -> None:
+    """Log each frame's cloud in its camera's axes."""
+    stream, total = part.stream, int(clouds.offsets[-1])
+    kept = part.options.count(MOST_POINTS, total, POINT_BYTES, part.options.max_bytes("clouds"))
+    if not part.options.has_images or not total or not kept:
+        return
     sizes = np.diff(clouds.offsets)
     parts = [
         start + evenly(int(size), int(np.floor(size * kept / total)))
@@ -92,9 +87,8 @@ def log_clouds(
     )
     clouds.forget()
     _log_counts(stream, frames, sizes)
-    notes = (f"recording: {len(picked)} of {total} cloud points",) if len(picked) < total else ()
-    log_notes(stream, 0, notes)
-    return notes
+    if len(picked) < total:
+        part.note(f"{len(picked)} of {total} cloud points")
 
 
 def _log_counts(stream: rr.RecordingStream, frames: Sequence[Frame], sizes: Ints) -> None:

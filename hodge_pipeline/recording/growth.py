@@ -7,9 +7,8 @@ import rerun as rr
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
-from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
-from hodge_pipeline.recording.stream import story_columns
+from hodge_pipeline.recording.stream import Part, story_columns
 from hodge_pipeline.types import CloudSet, Floats, Floats32, Ints, Model
 from hodge_pipeline.types.arrays import evenly
 
@@ -23,15 +22,9 @@ GRIDS = 2.0
 POINT_RADIUS = -1.2
 
 
-def log_growth(
-    stream: rr.RecordingStream,
-    model: Model,
-    clouds: CloudSet,
-    world_from_cam: Floats,
-    slot: int,
-    options: RecordingOptions,
-) -> None:
-    """Log the model's points in `STEPS` entities, each of which appears with its first frame."""
+def log_growth(part: Part, model: Model, clouds: CloudSet, world_from_cam: Floats, slot: int) -> None:
+    """Log the model's points in `STEPS` entities, each of which appears with its first frame in a slot of the story."""
+    stream, options = part.stream, part.options
     kept = options.count(MOST_POINTS, len(model.points_in_world), POINT_BYTES, options.max_bytes("model") / 2)
     rows = evenly(len(model.points_in_world), min(kept, MOST_POINTS))
     if not options.has_images or not len(rows) or not len(clouds):

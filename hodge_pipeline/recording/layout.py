@@ -48,7 +48,6 @@ LEGEND = "/text/legend"
 SCANNER = "scanner"
 """Detail of the frames' part where they are those of a scanner, x ahead and z up."""
 PART_SUFFIX = ".rrd"
-PARTIAL_SUFFIX = ".partial.rrd"
 
 _PART = re.compile(r"\d{3}-(?P<stage>[a-z]+)(?:-(?P<detail>.+))?$")
 
@@ -140,7 +139,7 @@ def part_name(number: int, stage: str, detail: str = "") -> str:
 
 def parse_part(file_name: str) -> tuple[str, str]:
     """Stage and detail of a part's file name; empty where it is none."""
-    match = _PART.match(file_name.removesuffix(PARTIAL_SUFFIX).removesuffix(PART_SUFFIX).lstrip("."))
+    match = _PART.match(file_name.removesuffix(PART_SUFFIX))
     return (match["stage"], match["detail"] or "") if match else ("", "")
 
 

@@ -14,12 +14,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from urllib.parse import quote
 
-from rerun.chunk import RrdReader
-
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import binary, layout
 from hodge_pipeline.recording.blueprint import legend, make_blueprint
-from hodge_pipeline.recording.merge import contents_of, eyes, send, with_entities
+from hodge_pipeline.recording.merge import contents_of, eyes, readers_of, send, with_entities
 from hodge_pipeline.recording.stream import log_markdown, open_stream
 
 HOST = "127.0.0.1"
@@ -38,15 +36,14 @@ class Live:
 
     def show(self, parts: Sequence[Path]) -> None:
         """Send the parts that were not sent yet; the views follow what there is."""
-        readers = [(part, RrdReader(part)) for part in parts]
-        contents = with_entities(contents_of(parts), readers)
-        poses = layout.poses(contents.trajectory)
-        for part, reader in readers:
+        readers = readers_of(parts)
+        contents = with_entities(contents_of(parts), readers.values())
+        for part, reader in readers.items():
             if part not in self._sent:
-                send(self._stream, reader, poses)
+                send(self._stream, reader, layout.poses(contents.trajectory))
                 self._sent.add(part)
         log_markdown(self._stream, layout.LEGEND, legend(contents))
-        self._stream.send_blueprint(make_blueprint(contents, eyes(contents, readers)))
+        self._stream.send_blueprint(make_blueprint(contents, eyes(contents, readers.values())))
         self._stream.flush()
 
     def close(self) -> None:

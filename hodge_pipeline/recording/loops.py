@@ -11,7 +11,7 @@ from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.curl import vertices_along
-from hodge_pipeline.recording.stream import log_notes
+from hodge_pipeline.recording.stream import Part
 from hodge_pipeline.types import Bytes, Floats, Ints, ViewGraph
 
 MOST_LOOPS = 200
@@ -22,15 +22,13 @@ BRIGHT_MEDIANS = 4.0
 """Medians of the loops' errors at which their colours end: the worst stand out, whatever the scene's size."""
 
 
-def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats) -> tuple[str, ...]:
-    """Log one closed line for each hole, labelled with its closure error; gives notes of what was left out."""
-    notes: tuple[str, ...] = ()
+def log_loops(part: Part, graph: ViewGraph, world_from_cam: Floats) -> None:
+    """Log one closed line for each hole, labelled with its closure error."""
     try:
         holes = unfilled_loops(graph.edges, graph.vertex_count, most_loops=MOST_LOOPS)
     except GraphError as error:
-        notes = (f"recording: no harmonic loops: {error}",)
-        log_notes(stream, 0, notes)
-        return notes
+        part.note(f"no harmonic loops: {error}")
+        return
     chosen = holes.loops.select(np.arange(len(holes.loops))[::-1])
     starts = chosen.offsets[:-1]
     corners = np.split(vertices_along(graph, chosen, np.arange(len(chosen))), starts[1:]) if len(chosen) else []
@@ -46,11 +44,9 @@ def log_loops(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floa
         labels=[_label(graph, corners[row], shift_m[row], angle[row]) for row in kept],
         show_labels=False,
     )
-    stream.log(layout.LOOPS, strips, static=True)
+    part.stream.log(layout.LOOPS, strips, static=True)
     if len(kept) < holes.count:
-        notes = (f"recording: {len(kept)} of {holes.count} harmonic loops drawn, the longest",)
-    log_notes(stream, 0, notes)
-    return notes
+        part.note(f"{len(kept)} of {holes.count} harmonic loops drawn, the longest")
 
 
 def _loop_colours(size: Floats) -> Bytes:

@@ -1,65 +1,42 @@
-"""Merge the parts of a run into one recording with its blueprint; damaged parts are repaired."""
+"""Merge the parts of a run into one recording with its blueprint."""
 
 from __future__ import annotations
 
-import tempfile
-import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from subprocess import SubprocessError
 
 import numpy as np
 import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
-from hodge_pipeline.recording import binary, layout
+from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import Contents, legend, make_blueprint
 from hodge_pipeline.recording.eye import Eyes, look_at, look_from, points_of
-from hodge_pipeline.recording.stream import log_markdown, log_notes, partial_path, writing
+from hodge_pipeline.recording.stream import log_markdown, writing
 
 
-@dataclass(frozen=True)
-class Merged:
-    """The file that `merge` wrote, and notes of parts that were mended or lost."""
+def merge(parts: Iterable[Path], out: Path, recording_id: str, *, active_tab: int = 0) -> None:
+    """One file of these parts, in the order of the run that their names say; it opens on a tab, the story."""
+    parts = sorted(parts, key=lambda part: part.name)
+    readers = readers_of(parts)
+    contents = with_entities(contents_of(parts), readers.values())
+    blueprint = make_blueprint(contents, eyes(contents, readers.values()), active_tab)
+    with writing(out, recording_id, blueprint) as stream:
+        for reader in readers.values():
+            send(stream, reader, layout.poses(contents.trajectory))
+        log_markdown(stream, layout.LEGEND, legend(contents))
 
-    path: Path
-    notes: tuple[str, ...] = ()
 
-
-def merge(parts: Iterable[Path], out: Path, recording_id: str, *, active_tab: int = 0) -> Merged:
-    """One file of these parts, in the order of the run that their names say; it opens on a tab, the story.
-
-    A damaged part is mended as far as it can be read; the others are not touched by it.
-    """
-    parts = sorted(parts, key=_place)
-    contents = contents_of(parts)
-    notes: list[str] = []
-    with tempfile.TemporaryDirectory(prefix="hodge-recording-") as scratch:
-        readers = [(part, reader) for part in parts if (reader := _open(part, Path(scratch), notes)) is not None]
-        contents = with_entities(contents, readers)
-        poses = layout.poses(contents.trajectory)
-        blueprint = make_blueprint(contents, eyes(contents, readers), active_tab)
-        with writing(out, recording_id, blueprint) as stream:
-            for _, reader in readers:
-                send(stream, reader, poses)
-            log_notes(stream, 0, notes, level="WARN")
-            log_markdown(stream, layout.LEGEND, legend(contents))
-    return Merged(out, tuple(notes))
+def readers_of(parts: Iterable[Path]) -> dict[Path, RrdReader]:
+    """A reader of each part that holds anything."""
+    readers = {part: RrdReader(part) for part in parts}
+    return {part: reader for part, reader in readers.items() if reader.recordings()}
 
 
 def find_parts(folder: Path) -> list[Path]:
-    """The parts in the order of the run; what a killed writer left where there is no complete one."""
-    complete = [path for path in folder.glob(f"*{layout.PART_SUFFIX}") if not path.name.startswith(".")]
-    unfinished = set(folder.glob(f".*{layout.PARTIAL_SUFFIX}")) - {partial_path(path) for path in complete}
-    parts = [path for path in (*complete, *unfinished) if layout.parse_part(path.name)[0]]
-    return sorted(parts, key=_place)
-
-
-def _place(part: Path) -> str:
-    """Names begin with the number of their stage."""
-    return part.name.lstrip(".")
+    """The parts in the order of the run; what a killed writer left is none."""
+    return sorted(path for path in folder.glob(f"*{layout.PART_SUFFIX}") if layout.parse_part(path.name)[0])
 
 
 def contents_of(parts: Iterable[Path]) -> Contents:
@@ -79,12 +56,12 @@ def contents_of(parts: Iterable[Path]) -> Contents:
     )
 
 
-def with_entities(contents: Contents, readers: Sequence[tuple[Path, RrdReader]]) -> Contents:
+def with_entities(contents: Contents, readers: Collection[RrdReader]) -> Contents:
     """The contents with the paths of all entities."""
-    return replace(contents, entities=frozenset(c.entity_path for _, reader in readers for c in reader.stream()))
+    return replace(contents, entities=frozenset(c.entity_path for reader in readers for c in reader.stream()))
 
 
-def eyes(contents: Contents, readers: Sequence[tuple[Path, RrdReader]]) -> Eyes:
+def eyes(contents: Contents, readers: Collection[RrdReader]) -> Eyes:
     """Where the views of these parts are looked at from."""
     poses, is_scanner = layout.poses(contents.trajectory), contents.is_scanner
     pairs = points_of(_chunks(readers, f"{layout.PAIRS}/**"))
@@ -95,41 +72,8 @@ def eyes(contents: Contents, readers: Sequence[tuple[Path, RrdReader]]) -> Eyes:
     )
 
 
-def _open(part: Path, scratch: Path, notes: list[str]) -> RrdReader | None:
-    """A reader of the part, of its mended copy where it is damaged, or None where it holds nothing."""
-    with suppress(RuntimeError):
-        reader = _reader(part)
-        return reader if reader.recordings() else None
-    mended = _mended(part, scratch)
-    if mended is None or not mended.recordings():
-        notes.append(f"recording: {part.name} is damaged and left out: record that stage again")
-        return None
-    notes.append(f"recording: {part.name} is cut off: what could be read of it is shown")
-    return mended
-
-
-def _mended(part: Path, scratch: Path) -> RrdReader | None:
-    copy = scratch / part.name
-    try:
-        environment = binary.quiet_environment(scratch)
-        binary.run(["rrd", "merge", "--continue-on-error", str(part), "-o", str(copy)], environment)
-        return _reader(copy)
-    except (RuntimeError, OSError, SubprocessError):
-        return None
-
-
-def _reader(part: Path) -> RrdReader:
-    """A reader that has seen the entire file, so that damage shows here and not half-way into the merge."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        reader = RrdReader(part)
-        for _ in reader.stream() if reader.recordings() else ():
-            pass
-    return reader
-
-
-def _chunks(readers: Iterable[tuple[Path, RrdReader]], entity: str) -> Iterator[Chunk]:
-    for _, reader in readers:
+def _chunks(readers: Iterable[RrdReader], entity: str) -> Iterator[Chunk]:
+    for reader in readers:
         yield from reader.stream().filter(content=entity)
 
 

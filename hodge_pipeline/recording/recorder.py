@@ -5,28 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-import rerun as rr
-
-from hodge_pipeline.complex.cech import SimplicialComplex
-from hodge_pipeline.complex.parts import decompose, flag_of, one_form
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.recipe.recording_options import RecordingOptions
-from hodge_pipeline.recording import frames as frame_log
 from hodge_pipeline.recording import graph as graph_log
-from hodge_pipeline.recording import layout, results, shapes
-from hodge_pipeline.recording.curl import ALPHA, log_triangles, triangle_curl_m
+from hodge_pipeline.recording import layout
+from hodge_pipeline.recording.curl import log_complex
 from hodge_pipeline.recording.diagnosis import log_diagnosis
+from hodge_pipeline.recording.frames import log_clouds, log_frames
 from hodge_pipeline.recording.growth import log_growth
-from hodge_pipeline.recording.merge import Merged, find_parts, merge
+from hodge_pipeline.recording.merge import find_parts, merge
 from hodge_pipeline.recording.registration import log_registration
-from hodge_pipeline.recording.stream import log_markdown, log_notes, writing
+from hodge_pipeline.recording.results import log_evaluation, log_model, log_text
+from hodge_pipeline.recording.stream import Part, writing
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Model, Solution, ViewGraph
-from hodge_pipeline.types.arrays import evenly
 
 Notes = tuple[str, ...]
-
-TRIANGLE_BYTES = 60
 
 
 class Recorder:
@@ -34,7 +26,7 @@ class Recorder:
 
     A part depends on its arguments and the options alone, and is replaced as a whole: a resumed run records only what
     it computes again. Outer rounds count from 1; `rounds` says how many there will be, since they share the solver's
-    bytes. Each method gives notes of what was thinned or left out. With level `off` nothing is written.
+    bytes. Each method gives notes of what was thinned or left out.
     `is_scanner`: the poses are those of scanners or robots, x ahead and z up.
     """
 
@@ -54,43 +46,26 @@ class Recorder:
     def frames(self, name: str, frames: Sequence[Frame], notes: Sequence[str] = ()) -> Notes:
         """The frames' images as their files hold them, their cameras and names; `notes` are the reader's."""
         sensor = layout.SCANNER if self.is_scanner else ""
-        return self._part(0, "frames", sensor, lambda s: frame_log.log_frames(s, name, frames, notes, self.options))
+        return self._part(0, "frames", sensor, lambda part: log_frames(part, name, frames, notes))
 
     def clouds(self, frames: Sequence[Frame], clouds: CloudSet) -> Notes:
         """Each frame's down-sampled cloud, in its camera's axes."""
-        return self._part(1, "clouds", "", lambda s: frame_log.log_clouds(s, frames, clouds, self.options))
+        return self._part(1, "clouds", "", lambda part: log_clouds(part, frames, clouds))
 
     def poses(self, name: str, world_from_cam: Floats, frames: Sequence[Frame] = ()) -> Notes:
         """A trajectory (N, 4, 4) by its name, such as truth or odometry; NaN where a pose is unknown."""
-        return self._part(
-            2,
-            "poses",
-            name,
-            lambda s: graph_log.log_poses(s, name, world_from_cam, frames, self.options, self.is_scanner),
-        )
+        return self._part(2, "poses", name, lambda part: graph_log.log_poses(part, name, world_from_cam, frames))
 
     def registration(self, outer: int, registered: Edges, guesses: Floats, clouds: CloudSet) -> Notes:
         """What registration found for every pair (P,) of an outer round, and why it was rejected, if it was."""
-        return self._part(
-            layout.outer_number(outer, 2),
-            "registration",
-            str(outer),
-            lambda s: log_registration(s, outer, registered, guesses, clouds, self.options, self.is_scanner),
+        return self._round(
+            2, "registration", outer, lambda part: log_registration(part, outer, registered, guesses, clouds)
         )
 
-    def edges(
-        self,
-        outer: int,
-        graph: ViewGraph,
-        world_from_cam: Floats,
-        rejected: Edges | None = None,
-    ) -> Notes:
+    def edges(self, outer: int, graph: ViewGraph, world_from_cam: Floats, rejected: Edges | None = None) -> Notes:
         """The viewing graph of an outer round under the poses it was made with, and the candidates that failed."""
-        return self._part(
-            layout.outer_number(outer, 0),
-            "edges",
-            str(outer),
-            lambda s: graph_log.log_edges(s, outer, graph, world_from_cam, rejected, self.options, self._round_bytes),
+        return self._round(
+            0, "edges", outer, lambda part: graph_log.log_edges(part, outer, graph, world_from_cam, rejected)
         )
 
     def solution(
@@ -108,131 +83,47 @@ class Recorder:
         `first_iteration` is the number of the start on the iteration timeline: 1 + the iterations of earlier rounds.
         """
 
-        def log(stream: rr.RecordingStream) -> Notes:
-            notes = graph_log.log_solution(
-                stream, outer, graph, start, solution, first_iteration, self.options, self._round_bytes
-            )
-            notes += log_complex(stream, outer, graph, start, solution, self.options, self._round_bytes / 4)
-            name = layout.round_name(outer)
-            poses = solution.world_from_cam
-            return notes + graph_log.log_poses(stream, name, poses, frames, self.options, self.is_scanner)
+        def log(part: Part) -> None:
+            graph_log.log_solution(part, outer, graph, start, solution, first_iteration)
+            log_complex(part, outer, graph, start, solution)
+            graph_log.log_poses(part, layout.round_name(outer), solution.world_from_cam, frames)
 
-        return self._part(layout.outer_number(outer, 1), "solution", str(outer), log)
+        return self._round(1, "solution", outer, log)
 
     def diagnosis(self, graph: ViewGraph, world_from_cam: Floats, edges: Edges) -> Notes:
         """The edges of a graph by verdict, under the last poses; the label of each says how probable it is, and why."""
-        return self._part(890, "diagnosis", "", lambda s: log_diagnosis(s, graph, world_from_cam, edges, self.options))
+        return self._part(890, "diagnosis", "", lambda part: log_diagnosis(part, graph, world_from_cam, edges))
 
     def model(self, model: Model, clouds: CloudSet | None = None, world_from_cam: Floats | None = None) -> Notes:
         """The fused scene; with the clouds of the frames and their poses also how it grows."""
 
-        def log(stream: rr.RecordingStream) -> Notes:
+        def log(part: Part) -> None:
             if clouds is not None and world_from_cam is not None:
-                log_growth(stream, model, clouds, world_from_cam, self.rounds + 1, self.options)
-            return results.log_model(stream, model, self.options)
+                log_growth(part, model, clouds, world_from_cam, self.rounds + 1)
+            log_model(part, model)
 
         return self._part(900, "model", "", log)
 
-    def evaluation(
-        self,
-        frames: Sequence[Frame],
-        per_frame: Mapping[str, Floats],
-        bars: Mapping[str, Floats],
-        tables: Mapping[str, str],
-    ) -> Notes:
-        """Scores: series (N,) over the frames such as the ATE in metres, bar charts, and Markdown tables by title."""
-
-        def log(stream: rr.RecordingStream) -> Notes:
-            results.log_evaluation(stream, frames, per_frame, bars, tables)
-            return ()
-
-        return self._part(901, "evaluation", "", log)
+    def evaluation(self, frames: Sequence[Frame], per_frame: Mapping[str, Floats], tables: Mapping[str, str]) -> Notes:
+        """Scores: series (N,) over the frames such as the ATE in metres, and Markdown tables by title."""
+        return self._part(901, "evaluation", "", lambda part: log_evaluation(part, frames, per_frame, tables))
 
     def text(self, recipe: str, log_lines: Sequence[str]) -> Notes:
         """The resolved recipe as YAML, and the run's log."""
+        return self._part(902, "text", "", lambda part: log_text(part, recipe, log_lines, self.rounds + 1))
 
-        def log(stream: rr.RecordingStream) -> Notes:
-            results.log_text(stream, recipe, log_lines, self.rounds + 1)
-            return ()
+    def finish(self, out: Path) -> None:
+        """All parts of the folder as one file that opens on the story."""
+        merge(find_parts(self.folder), out, self.recording_id)
 
-        return self._part(902, "text", "", log)
+    def _round(self, offset: int, stage: str, outer: int, log: Callable[[Part], None]) -> Notes:
+        return self._part(layout.outer_number(outer, offset), stage, str(outer), log, slot=outer)
 
-    def finish(self, out: Path) -> Merged | None:
-        """All parts of the folder as one file that opens on the story; None with level `off`."""
-        if self.options.level == "off":
-            return None
-        return merge(find_parts(self.folder), out, self.recording_id)
-
-    @property
-    def _round_bytes(self) -> float:
-        return self.options.max_bytes("solver") / self.rounds
-
-    def _part(self, number: int, stage: str, detail: str, log: Callable[[rr.RecordingStream], Notes]) -> Notes:
-        if self.options.level == "off":
-            return ()
+    def _part(self, number: int, stage: str, detail: str, log: Callable[[Part], None], *, slot: int = 0) -> Notes:
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / layout.part_name(number, stage, detail)
         with writing(path, self.recording_id) as stream:
-            return log(stream)
-
-
-def log_complex(
-    stream: rr.RecordingStream,
-    outer: int,
-    graph: ViewGraph,
-    start: Floats,
-    solution: Solution,
-    options: RecordingOptions,
-    max_bytes: float,
-) -> tuple[str, ...]:
-    """Log triangles by curl, and the 1-form's energy before and after the solve; gives notes of what was thinned."""
-    try:
-        complex_ = flag_of(graph)
-    except GraphError as error:
-        notes = (f"recording: no triangles of round {outer} drawn: {error}",)
-        log_notes(stream, outer, notes)
-        return notes
-    triangles = complex_.simplices[2]
-    curl_m = triangle_curl_m(graph, triangles)
-    kept = options.count(options.edge_lines, len(triangles), TRIANGLE_BYTES, max_bytes)
-    corners = solution.world_from_cam[triangles, :3, 3]
-    drawable = np.flatnonzero(np.isfinite(corners).all(axis=(1, 2)))
-    rows = drawable[np.argsort(curl_m[drawable], kind="stable")][evenly(len(drawable), kept)]
-    colours = shapes.residual_colours(curl_m[rows], options.residual_scale_m)
-    if len(rows):
-        log_triangles(stream, layout.complex_mesh(outer), corners[rows], colours, np.full(len(rows), ALPHA, np.uint8))
-    log_markdown(stream, layout.complex_text(outer), _text(outer, complex_, curl_m, _energy(graph, start, solution)))
-    drawn = f"recording: {len(rows)} of {len(triangles)} triangles of round {outer} drawn"
-    thinned = (drawn,) if len(rows) < len(triangles) else ()
-    log_notes(stream, outer, thinned)
-    return thinned
-
-
-def _energy(graph: ViewGraph, start: Floats, solution: Solution) -> list[str]:
-    """Table rows: the share of each part in rotation and in translation, before and after the solve, of edges used."""
-    used, rows = graph.select(solution.weights > 0), []
-    complex_ = flag_of(used)
-    for when, poses in (("before", start), ("after", solution.world_from_cam)):
-        if not np.isfinite(poses).all():
-            continue
-        found = decompose(complex_, one_form(used, poses, solution.component)).energies(complex_.counts)
-        rows += [f"| {when} | {part} | {100 * r:.2f} % | {100 * t:.2f} % |" for part, (r, t) in found.shares.items()]
-    return rows
-
-
-def _text(outer: int, complex_: SimplicialComplex, curl_m: Floats, energy: list[str]) -> str:
-    counts = complex_.counts
-    lines = [f"# Complex, round {outer}", "", "| | |", "|---|---|", f"| frames | {counts[0]} |"]
-    lines += [f"| edges, parallel ones once | {counts[1]} |", f"| triangles | {counts[2]} |"]
-    if len(curl_m):
-        middle, high, top = np.percentile(curl_m, [50, 95, 100]) * 1000
-        lines.append(f"| curl, median / 95th / largest | {middle:.1f} / {high:.1f} / {top:.1f} mm |")
-    if energy:
-        lines += [
-            "",
-            "## Energy of the residual 1-form",
-            "",
-            "Exact is what a solve can remove; curl and harmonic stay.",
-        ]
-        lines += ["", "| solve | part | rotation | translation |", "|---|---|---|---|", *energy]
-    return "\n".join(lines)
+            round_bytes = self.options.max_bytes("solver") / self.rounds
+            part = Part(stream, self.options, round_bytes, slot, self.is_scanner)
+            log(part)
+        return tuple(part.notes)

@@ -9,12 +9,12 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from hodge_pipeline import se3
-from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.stream import log_markdown
+from hodge_pipeline.recording.stream import Part, log_markdown
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.edges import REJECTED
+from hodge_pipeline.types.text import markdown_table
 
 POINTS_SHOWN = 6_000
 TARGET_COLOUR, BEFORE_COLOUR, AFTER_COLOUR = (86, 180, 233), (230, 130, 0), (240, 228, 66)
@@ -23,30 +23,22 @@ BINS = 30
 POINT_RADIUS = -1.0
 
 
-def log_registration(
-    stream: rr.RecordingStream,
-    outer: int,
-    registered: Edges,
-    guesses: Floats,
-    clouds: CloudSet,
-    options: RecordingOptions,
-    is_scanner: bool = False,
-) -> tuple[str, ...]:
-    """Log histograms and columns of all pairs (P,), and the clouds of chosen ones in i's axes; nothing is left out.
+def log_registration(part: Part, outer: int, registered: Edges, guesses: Floats, clouds: CloudSet) -> None:
+    """Log histograms and columns of all pairs (P,), and the clouds of chosen ones in i's axes.
 
     `guesses (P, 4, 4)` is `i_from_j` as registration began.
     """
+    stream = part.stream
     log_columns(stream, outer, registered)
     for name, values in (("fitness", registered.fitness), ("rmse_mm", registered.rmse_m * 1000)):
         _log_histogram(stream, layout.under(layout.BARS, f"{name}_round_{outer}"), values)
-    if options.has_images:
+    if part.options.has_images:
         chosen = chosen_pairs(registered, guesses)
         for name, row in chosen.items():
             _log_pair(stream, name, registered, row, guesses, clouds)
-            axes = rr.ViewCoordinates.FLU if is_scanner else rr.ViewCoordinates.RDF
+            axes = rr.ViewCoordinates.FLU if part.is_scanner else rr.ViewCoordinates.RDF
             stream.log(layout.pair(name), axes, static=True)
         log_markdown(stream, layout.PAIRS_TEXT, _text(registered, guesses, chosen))
-    return ()
 
 
 def log_columns(stream: rr.RecordingStream, outer: int, registered: Edges) -> None:
@@ -121,14 +113,15 @@ def _log_histogram(stream: rr.RecordingStream, path: str, values: Floats) -> Non
 def _text(registered: Edges, guesses: Floats, chosen: Mapping[str, int]) -> str:
     moved = moved_m(registered, guesses)
     reasons, counts = np.unique(_reasons(registered), return_counts=True)
-    lines = ["# Registration", "", "| outcome | pairs |", "|---|---|"]
-    lines += [f"| {reason or 'edge'} | {count} |" for reason, count in zip(reasons, counts, strict=True)]
-    lines += ["", "Blue: frame i. Orange: frame j as guessed. Yellow: frame j as registered.", ""]
-    lines += ["| shown | i – j | fitness | RMSE | iterations | moved |", "|---|---|---|---|---|---|"]
+    outcomes = markdown_table(
+        ("outcome", "pairs"), [(why or "edge", count) for why, count in zip(reasons, counts, strict=True)]
+    )
+    rows = []
     for name, row in chosen.items():
         i, j = registered.pairs[row]
-        lines.append(
-            f"| {name.replace('_', ' ')} | {i} – {j} | {registered.fitness[row]:.2f} "
-            f"| {1000 * registered.rmse_m[row]:.1f} mm | {registered.iterations[row]} | {100 * moved[row]:.1f} cm |"
-        )
-    return "\n".join(lines)
+        fitness, rmse_mm = f"{registered.fitness[row]:.2f}", f"{1000 * registered.rmse_m[row]:.1f} mm"
+        moved_cm = f"{100 * moved[row]:.1f} cm"
+        rows.append((name.replace("_", " "), f"{i} – {j}", fitness, rmse_mm, registered.iterations[row], moved_cm))
+    shown = markdown_table(("shown", "i – j", "fitness", "RMSE", "iterations", "moved"), rows)
+    colours = "Blue: frame i. Orange: frame j as guessed. Yellow: frame j as registered."
+    return f"# Registration\n\n{outcomes}\n\n{colours}\n\n{shown}"

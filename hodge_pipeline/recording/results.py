@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout, shapes
-from hodge_pipeline.recording.stream import frame_columns, log_markdown, log_notes, story_columns
+from hodge_pipeline.recording.stream import Part, frame_columns, log_markdown, log_notes, story_columns
 from hodge_pipeline.types import Floats, Frame, Model
 
 VERTEX_BYTES = 28
@@ -21,13 +20,11 @@ POINT_RADIUS = -1.2
 """Negative: points on the screen."""
 
 
-def log_model(
-    stream: rr.RecordingStream, model: Model, options: RecordingOptions, path: str = layout.MODEL
-) -> tuple[str, ...]:
-    """Log the fused scene as a static mesh or point cloud; gives notes of what was thinned."""
-    available = len(model.points_in_world)
+def log_model(part: Part, model: Model, path: str = layout.MODEL) -> None:
+    """Log the fused scene as a static mesh or point cloud."""
+    stream, available = part.stream, len(model.points_in_world)
     bytes_each = VERTEX_BYTES + (0 if model.triangles is None else 2 * TRIANGLE_BYTES)
-    kept = options.count(MODEL_POINTS, available, bytes_each, options.max_bytes("model"))
+    kept = part.options.count(MODEL_POINTS, available, bytes_each, part.options.max_bytes("model"))
     thin = shapes.thin_model(model, max(kept, 1))
     if thin.triangles is None or not len(thin.triangles):
         colours = shapes.or_grey(thin.colours, len(thin.points_in_world))
@@ -43,38 +40,34 @@ def log_model(
             face_rendering=rr.components.MeshFaceRendering.Front,
         )
         stream.log(path, mesh, static=True)
-    thinned = len(thin.points_in_world) < available
-    notes = (f"recording: {len(thin.points_in_world)} of {available} points of model {model.name}",) if thinned else ()
-    log_notes(stream, 0, (*model.notes, *notes))
-    return notes
+    log_notes(stream, part.slot, model.notes)
+    if len(thin.points_in_world) < available:
+        part.note(f"{len(thin.points_in_world)} of {available} points of model {model.name}")
 
 
 def log_evaluation(
-    stream: rr.RecordingStream,
+    part: Part,
     frames: Sequence[Frame],
     per_frame: Mapping[str, Floats],
-    bars: Mapping[str, Floats],
     tables: Mapping[str, str],
 ) -> None:
-    """Series over the frames (NaN where a frame has no score), bar charts, and tables in Markdown."""
+    """Series over the frames (NaN where a frame has no score), and tables in Markdown."""
     for name, values in per_frame.items():
         rows = np.flatnonzero(np.isfinite(values))
         if len(rows):
             indexes = frame_columns(frames, len(values), rows)
             scalars = rr.Scalars.columns(scalars=np.asarray(values, float)[rows])
-            stream.send_columns(layout.under(layout.FRAME_PLOTS, name), indexes, scalars)
-    for name, values in bars.items():
-        stream.log(layout.under(layout.BARS, name), rr.BarChart(np.asarray(values, float)), static=True)
+            part.stream.send_columns(layout.under(layout.FRAME_PLOTS, name), indexes, scalars)
     text = "\n\n".join(f"## {title}\n\n{table}" for title, table in tables.items())
-    log_markdown(stream, layout.SCORES, text or "No scores.")
+    log_markdown(part.stream, layout.SCORES, text or "No scores.")
 
 
-def log_text(stream: rr.RecordingStream, recipe: str, log_lines: Sequence[str], slots: int) -> None:
+def log_text(part: Part, recipe: str, log_lines: Sequence[str], slots: int) -> None:
     """The resolved recipe, and the run's log spread over the story."""
-    log_markdown(stream, layout.RECIPE, f"```yaml\n{recipe}\n```")
+    log_markdown(part.stream, layout.RECIPE, f"```yaml\n{recipe}\n```")
     if log_lines:
         share = slots * np.arange(len(log_lines)) / len(log_lines)
-        stream.send_columns(
+        part.stream.send_columns(
             layout.LOG,
             indexes=story_columns(0, share),
             columns=rr.TextLog.columns(text=list(log_lines), level=[level_of(line) for line in log_lines]),

@@ -30,6 +30,7 @@ from hodge_pipeline.types import CloudSet, Floats, Ints, Source
 from hodge_pipeline.types.input_files import read_input_text
 from hodge_pipeline.types.notes import notes_of
 from hodge_pipeline.types.ply import read_model
+from hodge_pipeline.types.text import markdown_table
 
 FILE = "recording.rrd"
 RECORDING = "recording"
@@ -166,7 +167,8 @@ class Recording:
         parts = [*self._parts, *find_parts(folder)]
         if self._live is not None:
             self._live.show(parts)
-        return notes + merge(parts, out, self._identity).notes
+        merge(parts, out, self._identity)
+        return notes
 
 
 def record_part(
@@ -218,17 +220,16 @@ def _record_evaluation(recorder: Recorder, source: Source, rounds: Sequence[Roun
     if has_truth(source):
         for name, poses in pose_sets(rounds, source).items():
             per_frame[f"error_m/{name}"] = absolute_error(poses, truth).per_frame_m
-    bars, tables = {}, {}
+    tables = {}
     if scores is not None:
         for graph in scores.graphs:
-            bars[f"score_{graph.kind}"] = graph.mean_score
             for name, scores_of_pairs in zip(scores.names, graph.scores, strict=True):
                 if graph.kind == scores.graphs[-1].kind and len(graph.pairs):
                     per_frame[f"score/{name}"] = mean_at_frames(graph.pairs, scores_of_pairs, len(source.frames))
             rows = zip(scores.names, graph.mean_score, graph.mean_distance_m * 1000, strict=True)
-            lines = [f"| {name} | {score:.4f} | {distance:.2f} |" for name, score, distance in rows]
-            tables[f"Scores, {graph.kind} graph"] = "\n".join(["| poses | score | d, mm |", "|---|---|---|", *lines])
-    return recorder.evaluation(source.frames, per_frame=per_frame, bars=bars, tables=tables)
+            cells = [(name, f"{score:.4f}", f"{distance:.2f}") for name, score, distance in rows]
+            tables[f"Scores, {graph.kind} graph"] = markdown_table(("poses", "score", "d, mm"), cells)
+    return recorder.evaluation(source.frames, per_frame=per_frame, tables=tables)
 
 
 def mean_at_frames(pairs: Ints, values: Floats, count: int) -> Floats:

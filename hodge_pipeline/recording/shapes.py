@@ -16,9 +16,13 @@ REJECTED_COLOUR = (110, 110, 110)
 RESULT_COLOUR = (255, 255, 255)
 GREY = 190
 """Of points without a colour."""
-TRAJECTORY_COLOURS = {"truth": (0, 200, 140), "odometry": (230, 130, 0), "start": (185, 130, 235)}
-"""Bluish green, orange and purple of Okabe and Ito's colour-blind safe set, brightened for the dark background."""
+TRAJECTORY_COLOURS = {
+    "truth": (0, 200, 140), "odometry": (230, 130, 0), "start": (185, 130, 235), "a": (230, 130, 0), "b": (86, 180, 233)
+}  # fmt: skip
+"""Bluish green, orange, purple, sky blue of Okabe and Ito's colour-blind safe set, brightened for a dark background."""
 
+MOST_LINES = 20_000
+"""In one picture of the graph; more is a solid block."""
 LEAST_POSE_M, POSE_SHARE = 0.06, 0.02
 """How large a pose is drawn: in a room, and of the extent of its trajectory where that is more."""
 _CORNERS = np.array([[-0.8, -0.6, 1.0], [0.8, -0.6, 1.0], [0.8, 0.6, 1.0], [-0.8, 0.6, 1.0]])

@@ -37,5 +37,5 @@ def record_graph(
         left_out += [note for label, poses in sets.items() for note in recorder.poses(label, poses)]
         if graph is not None and solution is not None:
             left_out += [*recorder.edges(1, graph, start), *recorder.solution(1, graph, start, solution)]
-        merged = recorder.finish(folder / FILE)
-    return (*left_out, *(merged.notes if merged else ()))
+        recorder.finish(folder / FILE)
+    return tuple(left_out)

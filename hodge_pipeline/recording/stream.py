@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event, Thread
 
@@ -13,15 +15,46 @@ import numpy as np
 import rerun as rr
 
 from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recording import layout
 from hodge_pipeline.scene import UNIX_STAMP_S, has_real_stamps
 from hodge_pipeline.types import Floats, Frame, Ints
+from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.output_files import draft_of
 
 APPLICATION = "hodge-pipeline"
 """By which the viewer keeps a layout that the user has changed."""
 TURN_S, STALLED_S = 2.0, 60.0
 """How long Rerun is waited for at a time, and after how long without a byte its writer counts as dead."""
 LEAST_FREE_BYTES = 1 << 16
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a recording while it is written: `options` say what is kept, `solver_bytes` what one round may take.
+
+    `slot` is its stage's on the story. `is_scanner`: the poses are those of scanners or robots, x ahead and z up.
+    `notes` grow by what was thinned or left out.
+    """
+
+    stream: rr.RecordingStream
+    options: RecordingOptions = field(default_factory=RecordingOptions)
+    solver_bytes: float = math.inf
+    slot: int = 0
+    is_scanner: bool = False
+    notes: list[str] = field(default_factory=list)
+
+    def note(self, text: str, level: str = "INFO") -> None:
+        """Note what was thinned or left out, in the log too."""
+        self.notes.append(f"recording: {text}")
+        log_notes(self.stream, self.slot, self.notes[-1:], level)
+
+    def some(self, available: int, most: int, bytes_each: float, max_bytes: float, what: str) -> Ints:
+        """The rows to keep of so many, spread evenly: see `RecordingOptions.count`; what is left out is noted."""
+        rows = evenly(available, self.options.count(most, available, bytes_each, max_bytes))
+        if len(rows) < available:
+            self.note(f"{len(rows)} of {available} {what}")
+        return rows
 
 
 def open_stream(recording_id: str, application: str = APPLICATION) -> rr.RecordingStream:
@@ -32,17 +65,12 @@ def open_stream(recording_id: str, application: str = APPLICATION) -> rr.Recordi
     return stream
 
 
-def partial_path(path: Path) -> Path:
-    """Where a part lies while it is written; a killed writer leaves it there."""
-    return path.with_name(f".{path.name.removesuffix(layout.PART_SUFFIX)}{layout.PARTIAL_SUFFIX}")
-
-
 @contextmanager
 def writing(
     path: Path, recording_id: str, blueprint: rr.blueprint.Blueprint | None = None, application: str = APPLICATION
 ) -> Iterator[rr.RecordingStream]:
     """A stream into this file, which appears under its name only when all is in it."""
-    partial = partial_path(path)
+    partial = draft_of(path)
     stream = open_stream(recording_id, application)
     stream.save(partial, default_blueprint=blueprint)
     try:

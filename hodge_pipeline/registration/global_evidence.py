@@ -20,6 +20,13 @@ MARGIN_M, MARGIN_PER_M2 = 0.06, 0.006
 NEAREST_M = 0.1
 PANORAMA_STEP = np.radians(3.0)
 """Side of a panorama's cell: that of a scan's voxels at 6 m in a room."""
+STREET_SCALE = 5.0
+"""From this scale on traffic passes, and hardly any two places are the same but for what stands in them."""
+DIRECTIONS, BUSY_DIRECTIONS, QUIET_SHARE = 12, 3, 0.03
+"""Of a panorama, of these those where most was seen through, and what may be seen through in the others: vehicles
+stand in few directions, a wrong motion is seen through in all. In modelled streets with 6 to 30 vehicles each way on
+500 m the others have more in 13 % of 112 right pairs, and in all of 252 wrong optima of GICP (0.07 at least).
+"""
 
 
 @dataclass(frozen=True)
@@ -95,7 +102,8 @@ class FreeSpace:
 
 
 def free_space(view: DepthView, points_in_view: Floats, scale: float = 1.0) -> FreeSpace:
-    """Points (N, 3) of another frame, under a hypothesis, against this view; those behind its surface do not count.
+    """Points (N, 3) of another frame, under a hypothesis, against this view; those behind its surface do not count, nor
+    does traffic around a scanner: what a few directions see through, where the others do not.
 
     `scale` multiplies lengths that are for rooms.
     """
@@ -105,7 +113,13 @@ def free_space(view: DepthView, points_in_view: Floats, scale: float = 1.0) -> F
     measured = np.isfinite(surface)
     before = measured & (z < surface - margin)
     on = measured & (np.abs(z - surface) <= margin)
-    return FreeSpace(int(before.sum()), int(on.sum()))
+    every = FreeSpace(int(before.sum()), int(on.sum()))
+    if view.camera is not None or scale < STREET_SCALE:
+        return every
+    direction = column * DIRECTIONS // view.nearest_m.shape[1]
+    quiet = np.isin(direction, np.argsort(np.bincount(direction[before], minlength=DIRECTIONS))[:-BUSY_DIRECTIONS])
+    others = FreeSpace(int((before & quiet).sum()), int((on & quiet).sum()))
+    return others if others.violation <= QUIET_SHARE else every  # false for NaN
 
 
 def violation(

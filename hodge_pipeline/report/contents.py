@@ -10,6 +10,7 @@ import numpy as np
 
 from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.refine.guard import Measure
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.notes import Note
@@ -172,18 +173,6 @@ class StageRow:
 
 
 @dataclass(frozen=True)
-class MeasureRow:
-    """One quality of the poses before and after a refinement; `better` says which way is good."""
-
-    name: str
-    before: float
-    after: float
-    better: str
-    unit: str
-    is_worse: bool
-
-
-@dataclass(frozen=True)
 class CandidateRow:
     """What one candidate for a refined model costs: see `refine.judge.Cost`; `images_off` counts them."""
 
@@ -207,7 +196,7 @@ class RefinementSummary:
     outcome: str
     headline: str
     reason: str
-    measures: tuple[MeasureRow, ...] = ()
+    measures: tuple[Measure, ...] = ()
     change: str = ""
     scale: str = ""
     candidates: tuple[CandidateRow, ...] = ()

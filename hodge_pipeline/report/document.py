@@ -12,6 +12,8 @@ from typing import Literal, TypeAlias
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
+from hodge_pipeline.types.text import markdown_table
+
 Mark: TypeAlias = Literal["", "better", "same", "worse", "mixed", "not measured"]
 JPEG = b"\xff\xd8"
 TEMPLATE = "page.html.j2"
@@ -27,10 +29,14 @@ class Picture:
     image: bytes
 
     @property
+    def media_type(self) -> str:
+        """`image/png` or `image/jpeg`."""
+        return "image/jpeg" if self.image.startswith(JPEG) else "image/png"
+
+    @property
     def address(self) -> Markup:
         """The picture as a data URI."""
-        kind = "jpeg" if self.image.startswith(JPEG) else "png"
-        return Markup(f"data:image/{kind};base64,{b64encode(self.image).decode()}")
+        return Markup(f"data:{self.media_type};base64,{b64encode(self.image).decode()}")
 
 
 @dataclass(frozen=True)
@@ -125,13 +131,9 @@ def render(document: Document) -> str:
 
 def markdown(tables: Sequence[Table]) -> str:
     """The tables as Markdown."""
-    parts: list[str] = []
-    for table in tables:
-        align = ["---" if column < table.names else "---:" for column in range(len(table.header))]
-        rows = [table.header, tuple(align), *table.rows]
-        lines = [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in rows]
-        parts.append(f"## {table.title}\n\n" + "\n".join(lines) + f"\n\n{table.caption}\n")
-    return "\n".join(parts)
+    return "\n".join(
+        f"## {one.title}\n\n{markdown_table(one.header, one.rows, one.names)}\n\n{one.caption}\n" for one in tables
+    )
 
 
 @cache

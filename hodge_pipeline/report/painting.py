@@ -26,9 +26,9 @@ LINES = (":", "#D55E00"), ("-", "#0072B2")
 """Before and after, as in every plot."""
 
 
-def painted(title: str, caption: str, paint: Callable[[Figure], None], size: tuple[float, float] = SIZE) -> Picture:
+def painted(title: str, caption: str, paint: Callable[[Figure], None]) -> Picture:
     """A painted figure as a picture."""
-    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
+    figure = Figure(figsize=SIZE, dpi=DOTS_PER_INCH, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     paint(figure)
     for axes in figure.axes:

@@ -13,7 +13,6 @@ from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.report.contents import (
     CandidateRow,
     EdgeRow,
-    MeasureRow,
     Path3D,
     Pictures,
     RefinementSummary,
@@ -39,10 +38,9 @@ HEADLINES = {
 
 def summary(decision: Decision) -> RefinementSummary:
     """The decision as the report shows it."""
-    rows = tuple(MeasureRow(m.name, m.before, m.after, m.better, m.unit, m.is_worse) for m in decision.measures)
     change = "" if decision.change is None else f"The {decision.change}."
-    headline = HEADLINES[decision.outcome]
-    return RefinementSummary(decision.outcome, headline, decision.reason, rows, change, doubt=decision.doubt)
+    headline, measures = HEADLINES[decision.outcome], tuple(decision.measures)
+    return RefinementSummary(decision.outcome, headline, decision.reason, measures, change, doubt=decision.doubt)
 
 
 def _scales(result: RefinedModel) -> str:

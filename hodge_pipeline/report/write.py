@@ -8,7 +8,7 @@ from typing import Any
 
 from hodge_pipeline.evaluation.scores import SIGMA_M, ScoreTable
 from hodge_pipeline.report import known_positions
-from hodge_pipeline.report.contents import Report
+from hodge_pipeline.report.contents import RefinementSummary, Report
 from hodge_pipeline.report.document import render
 from hodge_pipeline.report.run_page import document
 from hodge_pipeline.report.verdict import judge, suspicions
@@ -40,7 +40,7 @@ def as_json(report: Report) -> dict[str, Any]:
             "after": report.after,
             "changes": [{**asdict(change), "share": change.share} for change in verdict.changes],
         },
-        "refinement": None if report.refinement is None else asdict(report.refinement),
+        "refinement": None if report.refinement is None else _refinement(report.refinement),
         "source": asdict(report.source),
         "scores": None if report.scores is None else _scores(report.scores),
         "trajectories": [asdict(row) for row in report.trajectories],
@@ -56,6 +56,11 @@ def as_json(report: Report) -> dict[str, Any]:
         "versions": dict(report.versions),
         "recipe": report.recipe,
     }
+
+
+def _refinement(refinement: RefinementSummary) -> dict[str, Any]:
+    measures = [{**asdict(measure), "is_worse": measure.is_worse} for measure in refinement.measures]
+    return {**asdict(refinement), "measures": measures}
 
 
 def _scores(table: ScoreTable) -> dict[str, Any]:

@@ -52,11 +52,6 @@ class Candidate:
         return Candidate(self.i, self.j, guess, by, points_i=first, points_j=second)
 
 
-def guess_from_poses(world_from_cam: Floats, i: int, j: int) -> Floats:
-    """The motion `i_from_j (4, 4)` by the present poses."""
-    return np.asarray(se3.inverse(world_from_cam[i]) @ world_from_cam[j])
-
-
 def guess_from_points(points_in_i: Floats, points_in_j: Floats) -> Floats:
     """The rigid motion `i_from_j (4, 4)` that lays points (N, 3) of j best onto those of i (Arun 1987).
 

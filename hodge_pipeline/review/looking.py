@@ -92,9 +92,14 @@ def shown_pair(session: Session, flip: bool) -> Shown | None:
 
 
 def extent(cloud: PointCloud) -> tuple[Floats, float]:
-    """The middle of a cloud, in its camera's axes, and its size."""
-    points = np.asarray(cloud.points_in_cam, float)
+    """The middle of a cloud, in its camera's axes, and its size, at least a millimetre."""
+    middle, size_m = ball(np.asarray(cloud.points_in_cam, float))
+    return middle, max(size_m, 1e-3)
+
+
+def ball(points: Floats) -> tuple[Floats, float]:
+    """The middle of points (N, 3) and the distance from it within which most lie; 1 where they are one or none."""
     if not len(points):
         return np.zeros(3), 1.0
     middle = np.median(points, axis=0)
-    return middle, max(float(np.percentile(np.linalg.norm(points - middle, axis=1), EXTENT)), 1e-3)
+    return middle, float(np.percentile(np.linalg.norm(points - middle, axis=1), EXTENT)) or 1.0

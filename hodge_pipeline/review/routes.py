@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import pair_names
-from hodge_pipeline.report.document import JPEG, Picture
+from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.review.front import Answer, Route, Site
 from hodge_pipeline.review.keeping import save
@@ -80,8 +80,7 @@ def _shown(session: Session) -> Mapping[str, Route]:
         plots, number = pictures.of(_whole(asked, "row")), _whole(asked, "number")
         if not 0 <= number < len(plots):
             raise GraphError("there is no such picture")
-        image = plots[number].image
-        return Answer(image, "image/jpeg" if image.startswith(JPEG) else "image/png")
+        return Answer(plots[number].image, plots[number].media_type)
 
     def log(_: Asked) -> Answer:
         body = read_input(session.subject.log) if session.subject.log.exists() else b""

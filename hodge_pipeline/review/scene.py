@@ -14,7 +14,7 @@ from hodge_pipeline.recording.shapes import or_grey, up_and_ahead
 from hodge_pipeline.report.diagnosis_plots import COLOURS as REPORTED
 from hodge_pipeline.review.closeup import Closeup, placed, quat_wxyz
 from hodge_pipeline.review.listing import witnesses
-from hodge_pipeline.review.looking import Shown, shown_pair
+from hodge_pipeline.review.looking import Shown, ball, shown_pair
 from hodge_pipeline.review.picking import nearest_point, nearest_segment
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.types import CloudSet, Floats, Floats32, Ints
@@ -100,11 +100,11 @@ class Scene:
     def overview(self, poses: Floats) -> tuple[Floats, Floats]:
         """Where the whole scene is seen from at these poses, and its middle; up and its size follow from them too."""
         known = poses[np.isfinite(poses).all(axis=(1, 2))]
-        _, radius = _ball(known[:, :3, 3])
+        _, radius = ball(known[:, :3, 3])
         self._size = max(radius, 0.5) if self._subject.unit == "m" else radius
         clouds = self._subject.clouds
         self._up, ahead = up_and_ahead(known if len(known) else np.eye(4)[None], self._subject.is_scanner)
-        centre, radius = _ball(np.concatenate([known[:, :3, 3], _sampled(clouds, poses)]))
+        centre, radius = ball(np.concatenate([known[:, :3, 3], _sampled(clouds, poses)]))
         return centre + max(radius, self._size) * (1.8 * self._up - 1.3 * ahead), centre
 
     def draw(self, flip: bool = False) -> None:
@@ -249,14 +249,6 @@ def thinned(clouds: CloudSet, row: int, step: int) -> tuple[Floats32, np.ndarray
     entry = slice(int(clouds.offsets[row]), int(clouds.offsets[row + 1]), step)
     points, colours = np.asarray(clouds.points[entry]), np.asarray(clouds.colours[entry])
     return points, or_grey(colours, len(points))
-
-
-def _ball(points: Floats) -> tuple[Floats, float]:
-    """The middle of points (N, 3) and the distance from it within which most lie; 1 where they are one or none."""
-    if not len(points):
-        return np.zeros(3), 1.0
-    centre = np.median(points, axis=0)
-    return centre, float(np.percentile(np.linalg.norm(points - centre, axis=1), 90)) or 1.0
 
 
 def _sampled(clouds: CloudSet | None, world_from_cam: Floats) -> Floats:

@@ -17,7 +17,7 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, Edit, pair_names, vertex_rows
-from hodge_pipeline.review.adding import Candidate, assessed, guess_from_poses, register_candidate
+from hodge_pipeline.review.adding import Candidate, assessed, register_candidate
 from hodge_pipeline.review.decisions import Decisions, LockedError, Said
 from hodge_pipeline.review.jobs import Jobs
 from hodge_pipeline.review.settle import Judged, Settled, Settler, Table, judge
@@ -258,8 +258,8 @@ class Session:
             frames = tuple(dict.fromkeys(frames))[-2:]
             self.candidate = None
             if len(frames) == 2:
-                i, j = sorted(frames)
-                self.candidate = Candidate(i, j, guess_from_poses(self.settled.world_from_cam, i, j))
+                (i, j), poses = sorted(frames), self.settled.world_from_cam
+                self.candidate = Candidate(i, j, se3.inverse(poses[i]) @ poses[j])
             self.show(picked=frames, selected=-1)
 
     def click_point(self, point: Floats) -> None:

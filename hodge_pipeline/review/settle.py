@@ -101,9 +101,9 @@ class Table:
         weights[(switches == RIGHT) | ((switches == REGISTERED) & self.added)] = 1.0
         return weights
 
-    def with_edge(self, i: int, j: int, found: Registration, proposed_by: str) -> Table:
+    def with_edge(self, i: int, j: int, found: Registration) -> Table:
         """The table with a new edge, which counts while the decisions say that it was registered."""
-        row = replace(Edges.of([[i, j]], proposed_by).with_registrations([found]), status=np.array([USED]))
+        row = replace(Edges.of([[i, j]], BY_HAND).with_registrations([found]), status=np.array([USED]))
         edges = Edges.joined([self.edges, row])
         graph = edges.as_graph(self.graph.vertex_ids)
         graph = replace(graph, dimension=self.graph.dimension, fixed=self.graph.fixed, priors=self.graph.priors)
@@ -135,7 +135,7 @@ class Settler:
 
     def add(self, i: int, j: int, found: Registration) -> None:
         """Put a new edge into the table."""
-        self.table = self.table.with_edge(i, j, found, BY_HAND)
+        self.table = self.table.with_edge(i, j, found)
         weights = np.zeros(len(self.table)) if self._editor is None else np.append(self._editor.weights, 0.0)
         self._solution = replace(self._solution, weights=weights)
         self._editor = _editor(self.table.graph, self._solution)

@@ -26,7 +26,6 @@ from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
-from hodge_pipeline.types.notes import Note
 
 SIDE_FILE, SIDE_LOG = ".edits.json", ".decisions.csv"
 LOG = "decisions.csv"
@@ -101,7 +100,6 @@ def _of_run(path: Path) -> Subject:
     rows = np.flatnonzero(last.edges.in_graph | _rejected_with_motion(last.edges))
     edges = last.edges.select(rows)
     left = int((last.edges.status == REJECTED).sum() - (edges.status == REJECTED).sum())
-    unknown = tuple(str(Note("option unknown", detail=line)) for line in run.options_left_out)
     notes = (f"{left} rejected pairs have no motion and are not listed",) if left else ()
     frames, complaint = run.key_frames_with_images()
     unfinished = "the run is not finished: run the same command again; until then it can only be looked at"
@@ -119,7 +117,7 @@ def _of_run(path: Path) -> Subject:
         clouds=run.clouds,
         frames=frames,
         locked="" if run.ending is not None else unfinished,
-        notes=(*unknown, *notes, *complaint),
+        notes=(*notes, *map(str, (*run.options_left_out, *complaint))),
     )
 
 

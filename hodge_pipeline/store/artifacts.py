@@ -6,8 +6,7 @@ import json
 import math
 import os
 import shutil
-import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -16,21 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.types.input_files import open_input, read_input_text
+from hodge_pipeline.types.output_files import draft_of, replacing
 
 T = TypeVar("T")
-
-
-def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Write through a temporary file beside `path` and rename it: a reader sees all of it or none."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            write(stream)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def reserve(file: IO[bytes], size: int) -> None:
@@ -44,7 +31,8 @@ def reserve(file: IO[bytes], size: int) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically; what is no text in a file name becomes its escape."""
-    write_atomically(path, lambda stream: stream.write(text.encode(errors="backslashreplace")))
+    with replacing(path) as file:
+        file.write(text.encode(errors="backslashreplace"))
 
 
 def json_text(data: Any) -> str:
@@ -61,7 +49,7 @@ def link_or_copy(existing: Path, path: Path) -> None:
     """Give a file another name atomically: no second copy where the file system can link."""
     if path.exists() and os.path.samefile(existing, path):
         return  # a rename of one name of a file onto another does nothing and would leave the draft behind
-    draft = path.with_name(f".{path.name}.draft")
+    draft = draft_of(path)
     draft.unlink(missing_ok=True)
     try:
         os.link(existing, draft)
@@ -96,7 +84,8 @@ def read_json(path: Path) -> Any:
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write named arrays as one uncompressed `.npz`, atomically."""
-    write_atomically(path, lambda stream: np.savez(stream, **arrays))  # type: ignore[arg-type]
+    with replacing(path) as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:

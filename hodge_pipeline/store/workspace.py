@@ -19,9 +19,9 @@ from hodge_pipeline.types.input_files import read_input
 from hodge_pipeline.types.text import command
 
 RECIPE_FILE, LOCK_FILE = "recipe.yaml", ".lock"
-_DRAFT = re.compile(r"\.[^.].*\.(csv|g2o|html|json|kitti|npz|ply|rrd|tum|txt|yaml)\.([a-z0-9_]{8}|draft|[0-9]+\.tmp)")
+_DRAFT = re.compile(r"\.[^.].*\.(csv|g2o|html|json|kitti|npz|ply|rrd|tum|txt|yaml)\.[0-9]+\.draft")
 _DRAFT_FOLDER = re.compile(r"\.(recording-|sparse\.)[a-z0-9_]{8}")
-"""What `artifacts`, the writers and the recording call a file or folder that is not whole yet."""
+"""What `output_files` and the recording call a file or folder that is not whole yet."""
 OLD_KEY_FILE = "key.json"
 """In each stage of the layout before `Store`."""
 RUN, REFINEMENT = "stages", "refinement"

@@ -73,7 +73,7 @@ LOOKS = {
     "or an antenna away from the sensor (positions.antenna_m), looks like that.",
     "no decomposition": "{detail}",
     "damaged step": "{detail}: the step is computed again",
-    "without images": "recorded without images: {detail}",
+    "without images": "without images: {detail}",
     "edit lost": "edits without effect, since the last round has no such edge: {detail}",
     "edit rejected": "{detail}",
     "nothing held out": "no overlapping pair was left to judge the result by: only the edges' own chi2 does",

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 _UNSEEN = "\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ud800-\udfff\ufeff\ufff9-\ufffb"
 _ONE_LINE, _LINES = re.compile(f"[{_UNSEEN}]"), re.compile(f"(?![\n\t])[{_UNSEEN}]")
@@ -44,6 +44,14 @@ def csv_text(rows: Iterable[Iterable[object]], *, quoted: bool = False) -> str:
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL if quoted else csv.QUOTE_MINIMAL).writerows(rows)
     return text.getvalue()
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Iterable[object]], names: int | None = None) -> str:
+    """The rows under a header as Markdown; the first `names` columns (None: all) are words, the rest numbers."""
+    words = len(header) if names is None else names
+    align = ["---" if column < words else "---:" for column in range(len(header))]
+    cells = ([str(cell).replace("|", "\\|") for cell in row] for row in (header, align, *rows))
+    return "\n".join(f"| {' | '.join(row)} |" for row in cells)
 
 
 def file_stems(names: list[str]) -> list[str]:

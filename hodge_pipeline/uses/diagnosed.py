@@ -33,7 +33,6 @@ from hodge_pipeline.store.edge_table import read_edges, write_edges
 from hodge_pipeline.store.workspace import is_run_folder, make_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, IGNORED, USED
-from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import command
 
 PICTURED, LEAST_PICTURED = 6, 2
@@ -100,7 +99,6 @@ def _run_subject(path: Path, run: Run) -> Subject:
     edges = _edited(path, last.graph, last.graph_edges)
     as_solved = np.array_equal(edges.status, last.graph_edges.status)
     frames, notes = run.key_frames_with_images()
-    unknown = tuple(str(Note("option unknown", detail=line)) for line in run.options_left_out)
     return Subject(
         path,
         path.resolve().name,
@@ -112,7 +110,7 @@ def _run_subject(path: Path, run: Run) -> Subject:
         tried=last.rejected.pairs,
         frames=frames,
         clouds=run.clouds,
-        notes=(*unknown, *notes),
+        notes=tuple(map(str, (*run.options_left_out, *notes))),
         harmless=_harmless(report) if as_solved else "",
     )
 

@@ -7,18 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hodge_pipeline.errors import HodgeError, WorkspaceError
-from hodge_pipeline.recipe.schema import Recipe
+from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording.run import FILE, Recording
 from hodge_pipeline.run_folder import Run, check_layout
 from hodge_pipeline.scene import key_source
-from hodge_pipeline.sources.opening import fingerprints, open_with_reader, remembered
+from hodge_pipeline.sources.opening import fingerprints, remembered
 from hodge_pipeline.store.log import log, logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.store.workspace import holding
 from hodge_pipeline.types import Source
-from hodge_pipeline.types.notes import Note
 
 PARTS = "recording"
 """The folder of the parts, which depend on the level and are not those that the run made."""
@@ -40,26 +38,19 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
         log.info("recording made again from the run folder")
         (folder / PARTS).mkdir(exist_ok=True)
         store = Store(folder / PARTS, watcher)
-        store.note(*(Note("option unknown", detail=line) for line in run.options_left_out))
-        source = _with_images(run, recipe, store)
+        store.note(*run.options_left_out)
+        source = _with_images(run, store)
         with Recording(store, folder, changed, source) as recording:
             recording.begin(source, run.clouds, run.rounds[0])
             _record(run, recording)
     return folder / FILE, run.ending is not None
 
 
-def _with_images(run: Run, recipe: Recipe, store: Store) -> Source:
+def _with_images(run: Run, store: Store) -> Source:
     """The key frames of the run, with their images where the source that they came from is still what it was."""
-    source = run.source
-    if recipe.source.path is not None:
-        try:
-            opened, reader = open_with_reader(recipe.source.path, recipe.source.reader)
-            if [frame.frame_id for frame in opened.frames] == [frame.frame_id for frame in source.frames]:
-                source = remembered(opened, reader, store, fingerprints(opened.files))
-            else:
-                store.note(Note("without images", detail=f"{opened.path}: holds other frames by now"))
-        except (HodgeError, OSError) as error:
-            store.note(Note("without images", detail=str(error)))
+    opened, reader, complaint = run.reopened()
+    store.note(*complaint)
+    source = run.source if opened is None else remembered(opened, reader, store, fingerprints(opened.files))
     keys = key_source(source, run.key_frames.rows)
     store.remember(keys, store.key([source, run.key_frames.rows]))
     return keys

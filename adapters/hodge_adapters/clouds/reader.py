@@ -20,6 +20,8 @@ from hodge_adapters.clouds.pcd import read_pcd
 from hodge_adapters.clouds.ply import read_ply, write_ply
 from hodge_adapters.clouds.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
 from hodge_adapters.clouds.tables import names_points, read_table
+from hodge_adapters.clouds.uos import POSE, pose_file, read_uos, uos_pose
+from hodge_adapters.clouds.vtk import read_vtk
 from hodge_adapters.posed import posed_frames, written
 from hodge_adapters.text_rows import listed, natural
 from hodge_adapters.trajectories.log import read_log_file
@@ -29,7 +31,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, PointCloud, Source, ViewGraph
 
-OTHER_SCANS = frozenset((".pts", ".ptx", ".3d", ".vtk", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
+OTHER_SCANS = frozenset((".pts", ".ptx", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
 _NUMBER = re.compile(r"(\d{1,19})\D*$")
 _CLOCK = re.compile(r"(?<!\d)(\d{9,10})([._])(\d{1,9})$")
 """Seconds since 1970 with a fraction, as bag_to_pcd names its files, or with nanoseconds of their own."""
@@ -57,7 +59,7 @@ class CloudFolderReader:
         """By the endings of the files."""
         path = Path(path)
         try:
-            names = [path] if path.is_file() else [path / name for name in os.listdir(path)]
+            names = [path] if path.is_file() else [path / name for name in os.listdir(path) if not name.endswith(POSE)]
         except OSError:
             return Sniff(0.0, "not a folder that can be read")
         count = sum(map(_is_scan, names))
@@ -86,7 +88,7 @@ class CloudFolderReader:
         log = self._log(path if path.is_dir() else path.parent) if path.is_dir() or self.log != "auto" else None
         parsed = read_log_file(log) if log else None
         poses: Mapping[float, Floats] = dict(parsed.poses.items()) if parsed else {}
-        beside = tuple(filter(None, [log]))
+        beside = tuple(filter(None, [log, *(pose_file(file) for file in files)]))
         if not poses and is_scan(fragments[0].path.name):
             poses, beside = scan_poses(fragments[0].path.parent, numbers, notes)
         raise_deg = self._raise_deg([fragment.path for fragment in fragments], notes)
@@ -233,10 +235,9 @@ def _fragments(files: list[Path], notes: list[str]) -> list[Fragment]:
     for file in files:
         if file.suffix.lower() == ".e57":
             for scan in e57_scans(file):
-                pose = None if scan.world_from_scan is None else tuple(scan.world_from_scan.ravel().tolist())
-                found.append(Fragment(file, scan.row, world_from_scan=pose))
+                found.append(Fragment(file, scan.row, world_from_scan=_flat(scan.world_from_scan)))
         else:
-            found.append(Fragment(file, corner=corner if file in las else None))
+            found.append(Fragment(file, None, corner if file in las else None, _flat(uos_pose(file))))
     return found
 
 
@@ -250,7 +251,13 @@ READERS: Mapping[str, Callable[[Path], PointCloud]] = {
     ".xyz": read_table,
     ".asc": read_table,
     ".csv": read_table,
+    ".3d": read_uos,
+    ".vtk": read_vtk,
 }
+
+
+def _flat(pose: Floats | None) -> tuple[float, ...] | None:
+    return None if pose is None else tuple(pose.ravel().tolist())
 
 
 def _is_scan(path: Path) -> bool:
