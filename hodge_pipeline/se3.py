@@ -150,7 +150,8 @@ def exp(xi: Floats) -> Floats:
     """Motions (..., 4, 4) of twists (..., 6) = (φ, ρ)."""
     xi = np.asarray(xi, float)
     phi, rho = xi[..., :3], xi[..., 3:]
-    return from_parts(so3_exp(phi), np.einsum("...ij,...j->...i", left_jacobian(phi), rho))
+    v = left_jacobian(phi)  # and exp(φ^) = 1 + φ^ V(φ)
+    return from_parts(np.eye(3) + hat(phi) @ v, np.einsum("...ij,...j->...i", v, rho))
 
 
 def log(b_from_a: Floats) -> Floats:

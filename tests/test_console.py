@@ -47,6 +47,17 @@ def test_what_nobody_waited_for_is_no_line_and_facts_wait_for_the_report(
     assert len(lines) == 3 and "falls into 2 parts" in lines[2]
 
 
+def test_recording_in_parts_is_one_line_at_the_end(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([0.0, 1.5, 2.0, 4.0, 5.0, 7.0])
+    monkeypatch.setattr(console.time, "perf_counter", lambda: next(clock))
+    with ProgressBars() as terminal:
+        work(terminal)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["clouds: done, 50 in 2.0 s, 25 a second", "a [note]", "recording: done, 3.5 s"]
+
+
 def test_a_stage_that_fails_prints_no_line(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError), ProgressBars(quiet=False) as terminal, terminal.stage("clouds", 3):
         raise ValueError

@@ -129,6 +129,8 @@ def test_a_pair_is_registered_again_only_where_the_poses_moved_it(folder: Path, 
     assert sum(asked) == len(PAIRS)
     rejected = replace(settled, status=np.full(len(PAIRS), "rejected"))
     assert same_bits(registered(poses, rejected), first)
+    unguessed = replace(rejected, iterations=np.zeros(len(PAIRS), np.int64), converged=np.ones(len(PAIRS), bool))
+    assert same_bits(registered(moved, unguessed), replace(unguessed, status=first.status))
 
 
 def test_no_pairs_are_no_edges(folder: Path) -> None:

@@ -29,6 +29,7 @@ from hodge_pipeline.cli.guard import unguarded
 from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.store.artifacts import json_text
+from hodge_pipeline.store.progress import RECORDING
 from hodge_pipeline.types.notes import Note, Rank
 from hodge_pipeline.types.text import visible
 
@@ -50,6 +51,7 @@ class ProgressBars:
         self._console = Console(file=stream, quiet=quiet, highlight=False, soft_wrap=True, force_jupyter=in_notebook)
         self._tasks: dict[str, TaskID] = {}
         self._totals: dict[str, int] = {}
+        self._recorded_s = 0.0
         self._draws = (self._console.is_terminal or self._console.is_jupyter) and not quiet
         self._progress = Progress(
             TextColumn("{task.description:<24}"),
@@ -73,6 +75,9 @@ class ProgressBars:
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
+        if self._recorded_s >= WAITED_FOR_S:
+            self._done(RECORDING, 1, self._recorded_s)
+        self._recorded_s = 0.0
 
     def stage(self, title: str, total: int) -> AbstractContextManager[Advance]:
         """A bar of `total` units."""
@@ -80,12 +85,18 @@ class ProgressBars:
 
     @contextmanager
     def _line(self, title: str, total: int) -> Iterator[Advance]:
-        """Say once that the stage is done: how much it was, and how long it took."""
+        """Say once that the stage is done: how much it was, and how long it took; of recording, which comes in parts,
+        at the end.
+        """
         start = time.perf_counter()
         yield no_progress
         seconds = time.perf_counter() - start
-        if seconds < WAITED_FOR_S and not self._verbose:
-            return
+        if title == RECORDING and not self._verbose:
+            self._recorded_s += seconds
+        elif seconds >= WAITED_FOR_S or self._verbose:
+            self._done(title, total, seconds)
+
+    def _done(self, title: str, total: int, seconds: float) -> None:
         amount = f"{total} in {seconds:.1f} s, {total / seconds:.3g} a second" if total > 1 else f"{seconds:.1f} s"
         self.say(f"{title}: done, {amount}")
 

@@ -24,6 +24,7 @@ from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.start.clouds import clouds as clouds_step
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.log import log
+from hodge_pipeline.store.progress import RECORDING
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.store.workspace import RECIPE_FILE, RUN, identity_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
@@ -33,8 +34,6 @@ from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.types.text import markdown_table
 
 FILE = "recording.rrd"
-RECORDING = "recording"
-"""The title of every step that only records."""
 Notes = tuple[str, ...]
 
 

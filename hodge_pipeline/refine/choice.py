@@ -118,7 +118,7 @@ def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
         return "no candidate fits the tracks: mend matches or cameras (--refine focal), or --force the best one"
     gain = 1.0 - _per_freedom(found, at) / _per_freedom(found, 0, poses=False)
     if not gain >= LEAST_GAIN:
-        fitted = f"{before.px:.4g} -> {after.px:.4g} px"
+        fitted = f"{before.px:.4g} → {after.px:.4g} px"
         return f"the best candidate's gain ({fitted}) is what so many poses gain by fitting noise"
     if gain >= CLEAR_GAIN and start.quality.mean_track_length >= LONG_TRACKS:
         return ""

@@ -44,7 +44,7 @@ class Measure:
         return sign_of(self.before, self.after, self.tolerance / 3, self.better) > 0
 
     def __str__(self) -> str:
-        return f"{self.name} {self.before:.4g} -> {self.after:.4g}{self.unit and ' '}{self.unit}"
+        return f"{self.name} {self.before:.4g} → {self.after:.4g}{self.unit and ' '}{self.unit}"
 
 
 @dataclass(frozen=True)

@@ -145,8 +145,8 @@ def _placed_decision(start: TrackedModel, found: Found, choice: Choice) -> Decis
     if not start.placing:
         return None
     off, name = found.positions_off, found.candidates[choice.row].name
-    fit = f", {off[0]:.3g} -> {off[choice.row]:.3g} m off in the median" if np.isfinite(off[0]) else ""
-    told = f"mean error {found.costs[0].px:.4g} -> {found.costs[choice.row].px:.4g} px{_by(name)}"
+    fit = f", {off[0]:.3g} → {off[choice.row]:.3g} m off in the median" if np.isfinite(off[0]) else ""
+    told = f"mean error {found.costs[0].px:.4g} → {found.costs[choice.row].px:.4g} px{_by(name)}"
     return Decision("refined", f"{start.placing}{fit}; {told}")
 
 
@@ -156,7 +156,7 @@ def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool
     name = found.candidates[choice.row].name
     if len(scales) > 1:
         return _join_decision(found.inputs, after, name, force)
-    told = f"mean error {before.px:.4g} -> {after.px:.4g} px{_by(name)}"
+    told = f"mean error {before.px:.4g} → {after.px:.4g} px{_by(name)}"
     if scales[0].is_observable and not scales[0].is_one:
         return Decision("refined", f"in metres now; {told}")
     if not choice.row:

@@ -30,7 +30,7 @@ BACKWARD_PX = 0.7
 """A corner that is followed back must end this near to where it began."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FlowImage:
     """One frame as the flow wants it: its grey image and its depth image (H, W), its camera, its range of depth, and
     the metre in the unit of its depth.

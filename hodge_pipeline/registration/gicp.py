@@ -240,7 +240,7 @@ def _register(
         if not se3.is_motion(result.T_target_source):  # a singular system: nothing within the distance
             return unregistered(guess)
         motion, converged = np.asarray(result.T_target_source), bool(result.converged)
-        iterations += int(result.iterations)
+        iterations += 1 + int(result.iterations)  # small_gicp counts from 0
     points = source.sample_points(levels[-1].source_points)
     assessment = assess(
         source_points=points,

@@ -70,30 +70,31 @@ class Rival:
     contradicting: float
 
 
-class Agreement(NamedTuple):
-    """Shares of the tested pixels: `contradicting`, whose depth or grey value contradicts a motion; `misplaced`, whose
-    depth in the view is off what the motion predicts, by `OFF_M` and `OFF_SIGMAS`: few where both see one rigid scene,
-    most of a bare room where the motion is an object's.
-    """
-
-    contradicting: float
-    misplaced: float
-
-
-def agreement(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments = AT_REST) -> Agreement:
-    """How much of the view contradicts a motion."""
+def contradicting(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments = AT_REST) -> float:
+    """The share of the tested pixels whose depth or grey value contradicts a motion."""
     return _compared(key, view, key_from_view, moments)[0]
+
+
+def misplaced(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
+    """The share of the tested pixels whose depth in the view is off what a motion predicts, by `OFF_M` and
+    `OFF_SIGMAS`: few where both see one rigid scene, most of a bare room where the motion is an object's.
+    """
+    expected = _expected(key, view, key_from_view)
+    off = np.abs(_depth(view, expected[:, :2]) - expected[:, 2]) / view.unit_m
+    seen = np.isfinite(off)
+    sigma = depth_sigma(expected[seen, 2] / view.unit_m)
+    return float((off[seen] > np.maximum(OFF_M, OFF_SIGMAS * sigma)).mean()) if seen.any() else 0.0
 
 
 def rival_motion(
     corners: Corners, view: FlowImage, found: Followed, guess: Floats, moments: Moments = AT_REST
-) -> tuple[Agreement, Rival | None]:
+) -> tuple[float, Rival | None]:
     """How much contradicts the motion found, and the motion of corners where that has none; None where little
     contradicts it, or no other motion agrees.
     """
     key = corners.image
     share, misfit = _compared(key, view, found.key_from_view, moments)
-    if share.contradicting <= MUCH:
+    if share <= MUCH:
         return share, None
     own = _tiles_with(key, corners.pixels[found.rows])
     others = find_corners(key, 1 - own)
@@ -106,71 +107,70 @@ def rival_motion(
         return share, None
     fits_better = won > lost
     moving = own if fits_better else _tiles_with(key, others.pixels[other.rows])
-    return share, Rival(others, other, fits_better, moving, others_share.contradicting)
+    return share, Rival(others, other, fits_better, moving, others_share)
 
 
-def _compared(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments) -> tuple[Agreement, Floats]:
-    """How much of the view contradicts a motion, and the misfit (n,) at each tested pixel.
+def _compared(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments) -> tuple[float, Floats]:
+    """The share that contradicts a motion, and the misfit (n,) at each tested pixel.
 
     Where a camera turns, depth lies elsewhere than the colour image's motion says if the two images are not of one
     moment: where much contradicts, the delay of `UNTOLD_S` with which the least does counts.
     """
     told = _at_delay(key, view, key_from_view, moments.between_depths(key_from_view, 0))
-    if told[0].contradicting <= MUCH:
+    if told[0] <= MUCH:
         return told
     others = (moments.between_depths(key_from_view, untold_s) for untold_s in UNTOLD_S)
-    tried = [told, *(_at_delay(key, view, key_from_view, motion) for motion in others)]
-    least, misfit = min(tried, key=lambda one: one[0].contradicting)
-    return least._replace(misplaced=told[0].misplaced), misfit
+    return min([told, *(_at_delay(key, view, key_from_view, motion) for motion in others)], key=lambda one: one[0])
 
 
-def _at_delay(key: FlowImage, view: FlowImage, by_colour: Floats, by_depth: Floats) -> tuple[Agreement, Floats]:
+def _at_delay(key: FlowImage, view: FlowImage, by_colour: Floats, by_depth: Floats) -> tuple[float, Floats]:
     """What `_compared` tells, by the motion of the colour images and that of the depth images."""
-    points = _points(key)
-    expected = project(se3.transform(se3.inverse(by_depth), points), view.camera)
-    actual = _depth(view, expected[:, :2])
-    grey_at = project(se3.transform(se3.inverse(by_colour), points), view.camera)[:, :2]
-    misfit = _misfit(key, view, expected, actual, grey_at)
-    return Agreement(_contradicting(misfit), _misplaced(view, expected, actual)), misfit
+    expected = _expected(key, view, by_depth)
+    change = _grey(view, _expected(key, view, by_colour)[:, :2]) - _tested(key).grey
+    misfit = _misfit(view, expected, _depth(view, expected[:, :2]), change)
+    compared = misfit[np.isfinite(misfit)]
+    return float((compared >= 1).mean()) if len(compared) else 0.0, misfit
 
 
-def _misplaced(view: FlowImage, expected: Floats, actual: Floats) -> float:
-    off = np.abs(actual - expected[:, 2])
-    off = off[np.isfinite(off)] / view.unit_m
-    sigma = depth_sigma(expected[np.isfinite(actual), 2] / view.unit_m)
-    return float((off > np.maximum(OFF_M, OFF_SIGMAS * sigma)).mean()) if len(off) else 0.0
+def _expected(key: FlowImage, view: FlowImage, key_from_view: Floats) -> Floats:
+    """Columns u, v, z (n, 3) at which a motion puts the tested pixels."""
+    return project(se3.transform(se3.inverse(key_from_view), _tested(key).points), view.camera)
 
 
 def _votes(key: FlowImage, gain: Floats) -> tuple[int, int]:
     """The tiles that another motion fits better by so much (n,) at each pixel, and those that it fits worse."""
     compared = np.isfinite(gain)
-    votes = np.bincount(_tile(key, tested_pixels(key.depth.shape))[compared], gain[compared], minlength=TILES**2)
+    votes = np.bincount(_tested(key).tile[compared], gain[compared], minlength=TILES**2)
     return int((votes > 1).sum()), int((votes < -1).sum())
 
 
-def _contradicting(misfit: Floats) -> float:
-    compared = misfit[np.isfinite(misfit)]
-    return float((compared >= 1).mean()) if len(compared) else 0.0
+class _Tested(NamedTuple):
+    """The tested pixels (n,) of a key frame, those of a regular grid that have a depth: their points (n, 3) in its
+    axes, grey values, and tiles.
+    """
+
+    points: Floats
+    grey: Floats
+    tile: Ints
 
 
-@lru_cache(maxsize=4)
-def tested_pixels(shape: tuple[int, ...]) -> Floats:
-    """Pixels (n, 2) of a regular grid over an image (H, W)."""
-    height, width = shape
+@lru_cache(maxsize=2)
+def _tested(key: FlowImage) -> _Tested:
+    height, width = key.depth.shape
     step = max(1, width // CELLS)
     v, u = np.mgrid[step // 2 : height : step, step // 2 : width : step]
-    return np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
+    z = _depth(key, pixels)
+    pixels, z = pixels[np.isfinite(z)], z[np.isfinite(z)]
+    return _Tested(back_project(np.column_stack([pixels, z]), key.camera), _grey(key, pixels), _tile(key, pixels))
 
 
-def _misfit(key: FlowImage, view: FlowImage, expected: Floats, actual: Floats, grey_at: Floats) -> Floats:
-    """Of the tested pixels (n,) of the key frame: how far the depth (n,) in the view is off columns u, v, z (n, 3), and
-    the grey value at `grey_at (n, 2)` off the key frame's, 1: by as much as may be or more; NaN where not both frames
-    have a depth.
+def _misfit(view: FlowImage, expected: Floats, actual: Floats, change: Floats) -> Floats:
+    """How far the depth (n,) in the view is off columns u, v, z (n, 3) and the grey value has changed (n,), 1: by as
+    much as may be or more; NaN where not both frames have a depth.
     """
-    pixels = tested_pixels(key.depth.shape)
     sigma = DEPTH_SIGMAS * view.unit_m * depth_sigma(expected[:, 2] / view.unit_m)
     off = (actual - expected[:, 2]) / (GATE_PX / PIXEL_SIGMA * sigma)
-    change = _grey(view, grey_at) - _grey(key, pixels)
     seen = np.isfinite(actual) & np.isfinite(change)
     exposure = float(np.median(change[seen])) if seen.any() else 0.0
     return np.asarray(np.minimum(1, off**2 + ((change - exposure) / GREY_LEVELS) ** 2))
@@ -194,16 +194,11 @@ def _tiles_with(image: FlowImage, pixels: Floats) -> Bytes:
 def _at(values: Floats32 | Bytes, pixels: Floats) -> Floats:
     """The values (n,) of an image at pixels (n, 2); NaN outside it."""
     height, width = values.shape
-    rounded = np.round(np.where(np.isfinite(pixels), pixels, -1)).astype(np.int64)
-    inside = np.asarray(((rounded >= 0) & (rounded < [width, height])).all(axis=1))
-    u, v = np.where(inside[:, None], rounded, 0).T
-    return np.where(inside, values[v, u].astype(np.float32), np.nan)
-
-
-def _points(image: FlowImage) -> Floats:
-    """The tested points (n, 3) in the camera's axes; NaN where there is no depth."""
-    pixels = tested_pixels(image.depth.shape)
-    return back_project(np.column_stack([pixels, _depth(image, pixels)]), image.camera)
+    u, v = np.round(pixels).T
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)  # false for NaN
+    out = np.full(len(pixels), np.nan)
+    out[inside] = values[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+    return out
 
 
 def _depth(image: FlowImage, pixels: Floats) -> Floats:

@@ -87,7 +87,8 @@ def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) ->
     twist = se3.log(se3.inverse(guesses[rows]) @ registered.i_from_j[rows])
     slid = np.einsum("nik,nk,njk,nj->ni", directions[rows], weak[rows].astype(float), directions[rows], twist[:, 3:])
     twist[:, 3:] -= slid
-    return registered.put(rows, i_from_j=guesses[rows] @ se3.exp(twist))
+    iterations = np.maximum(registered.iterations[rows], 1)
+    return registered.put(rows, i_from_j=guesses[rows] @ se3.exp(twist), iterations=iterations)
 
 
 def weak_directions(registered: Edges, min_spread: float) -> tuple[Bools, Floats]:

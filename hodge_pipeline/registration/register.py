@@ -33,8 +33,8 @@ def register_edges(
 ) -> Edges:
     """Step: the table with its candidates registered from these poses; a killed run goes on at its last block.
 
-    A pair that was registered `earlier`, to where the poses put it still, keeps that registration; lengths are
-    multiplied by `scale`. `min_spread`: see `Acceptance`.
+    A pair that was registered `earlier`, without its guess or to where the poses put it still, keeps that registration;
+    lengths are multiplied by `scale`. `min_spread`: see `Acceptance`.
     """
     assert clouds.folder is not None
     held_out = edges.status == HELD_OUT
@@ -70,12 +70,12 @@ def _reusable(candidates: Edges, guesses: Floats, earlier: Edges | None, scale: 
     """Rows of the candidates whose earlier registration stands, and its rows in that table."""
     if earlier is None:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    by_pair = {
-        (int(a), int(b)): row for row, (a, b) in enumerate(earlier.pairs) if earlier.status[row] == USED
-    }  # of parallel ones the last
+    unguessed = earlier.converged & (earlier.iterations == 0)
+    standing = np.flatnonzero(unguessed | (earlier.status == USED))
+    by_pair = dict(zip(map(tuple, earlier.pairs[standing].tolist()), standing.tolist(), strict=True))  # the last one's
     both = [(row, by_pair[a, b]) for row, (a, b) in enumerate(candidates.pairs.tolist()) if (a, b) in by_pair]
     rows, known = np.array(both, np.int64).reshape(-1, 2).T
     apart = se3.log(se3.inverse(earlier.i_from_j[known]) @ guesses[rows])
     moved = np.linalg.norm(apart[:, 3:], axis=1) + se3.ARM_M * scale * np.linalg.norm(apart[:, :3], axis=1)
-    near = moved < REUSE_WITHIN_M * scale
-    return rows[near], known[near]
+    kept = unguessed[known] | (moved < REUSE_WITHIN_M * scale)
+    return rows[kept], known[kept]

@@ -82,7 +82,8 @@ class Rgbd:
         """Frame j (source) moved onto frame i (target); the guess is needed where landmarks do not suffice."""
         pairs = match(target.descriptors, source.descriptors, self.ratio)
         visual = self._visual(target, source, pairs)
-        if not self._suffices(visual):
+        guessed = not self._suffices(visual)
+        if guessed:
             hint, visual = visual, self._guided(target, source, [i_from_j, *([visual.i_from_j] if visual else [])])
             if visual is None and not self._in_reach(target, source, i_from_j):
                 return unregistered(i_from_j)
@@ -94,7 +95,7 @@ class Rgbd:
         assert visual is not None
         if self.measure == "surfaces":
             return self.near.register(target, source, visual.i_from_j)
-        return self._by_landmarks(target, source, visual)
+        return replace(self._by_landmarks(target, source, visual), iterations=int(guessed))
 
     def _visual(self, target: PreparedFrame, source: PreparedFrame, pairs: Ints) -> VisualMotion | None:
         i, j = pairs.T
@@ -165,7 +166,7 @@ class Rgbd:
             fitness=seen.fitness,
             rmse_m=seen.rmse_m,
             correspondences=max(seen.correspondences, visual.inliers),
-            iterations=0,
+            iterations=1,
             converged=True,
         )
 

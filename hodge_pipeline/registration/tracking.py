@@ -17,7 +17,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, is_blank
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
-from hodge_pipeline.registration.moving import AT_REST, Agreement, Moments, agreement, rival_motion
+from hodge_pipeline.registration.moving import AT_REST, Moments, contradicting, misplaced, rival_motion
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registration.tracked_blocks import TrackedBlock
@@ -256,23 +256,23 @@ class _Tracker:
         found, against = self._of_most_area(key, view, found, guess)
         if len(found.rows) < FEWEST_FOLLOWED or found.share < self._limits.min_fitness:
             return None
-        if against.misplaced > MISPLACED:
+        off = misplaced(key.image, view.image, found.key_from_view)
+        if off > MISPLACED:
             by_clouds = self._registrar.register(key.prepared, view.prepared, guess)
-            left = agreement(key.image, view.image, by_clouds.i_from_j)
-            if self._good(by_clouds) and 2 * left.misplaced < against.misplaced:
-                self._doubt(view, max(left.contradicting, key.left_out))
+            if self._good(by_clouds) and 2 * misplaced(key.image, view.image, by_clouds.i_from_j) < off:
+                self._doubt(view, max(contradicting(key.image, view.image, by_clouds.i_from_j), key.left_out))
                 return by_clouds
-        self._doubt(view, max(against.contradicting, key.left_out))
+        self._doubt(view, max(against, key.left_out))
         self._corner_points[key.place] = key.corners.points
         self._sightings[key.place, view.place] = found
         information = found.information / CORNERS_A_SAMPLE
-        return Registration(found.key_from_view, information, found.share, found.rmse_m, len(found.rows), 0, True)
+        return Registration(found.key_from_view, information, found.share, found.rmse_m, len(found.rows), 1, True)
 
-    def _of_most_area(self, key: _View, view: _View, found: Followed, guess: Floats) -> tuple[Followed, Agreement]:
-        """The motion found, or another one that more of the image follows, and what contradicts it; what moves leaves
-        the key frame's cloud.
+    def _of_most_area(self, key: _View, view: _View, found: Followed, guess: Floats) -> tuple[Followed, float]:
+        """The motion found, or another one that more of the image follows, and the share that contradicts it; what
+        moves leaves the key frame's cloud.
         """
-        assert key.image is not None and key.corners is not None and view.image is not None
+        assert key.corners is not None and view.image is not None
         moments = self._moments(key, view, found.key_from_view)
         against, rival = rival_motion(key.corners, view.image, found, guess, moments)
         if rival is not None and len(rival.followed.rows) >= FEWEST_FOLLOWED:
@@ -280,10 +280,7 @@ class _Tracker:
             key.leave_out(rival.moving, rival.corners if rival.fits_better else key.corners)
             if rival.fits_better:
                 self._sightings = {pair: one for pair, one in self._sightings.items() if pair[0] != key.place}
-                found, against = rival.followed, against._replace(contradicting=rival.contradicting)
-        if key.left_out:  # the corners' image still has what moves
-            left = agreement(key.image, view.image, found.key_from_view, moments)
-            against = against._replace(misplaced=left.misplaced)
+                found, against = rival.followed, rival.contradicting
         return found, against
 
     def _moments(self, key: _View, view: _View, key_from_view: Floats) -> Moments:

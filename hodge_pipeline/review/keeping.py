@@ -61,7 +61,7 @@ def _write_model(path: Path, model: TrackedModel, world_from_body: Floats) -> st
     done.write(folder)
     is_worse = after.px > (1 + SAME_COST) * before.px + SAME_PX
     worse = "; that is worse: keep the model as it was" if is_worse else ""
-    return f"after bundle adjustment, mean reprojection error {before.px:.3g} -> {after.px:.3g} px{worse}"
+    return f"after bundle adjustment, mean reprojection error {before.px:.3g} → {after.px:.3g} px{worse}"
 
 
 def _free(subject: Subject) -> Path:

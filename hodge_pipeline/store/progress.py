@@ -8,6 +8,9 @@ from typing import Protocol
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types.notes import Note
 
+RECORDING = "recording"
+"""The title of every step that only records: they are spread over the run, and make one stage for who watches."""
+
 
 class Watcher(Protocol):
     """Is told of each stage as it begins, moves and ends."""

@@ -32,7 +32,11 @@ class Priors:
 
 @dataclass(frozen=True)
 class Registration:
-    """What a registrar found for one pair; see `ViewGraph` for the meaning and units of each field."""
+    """What a registrar found for one pair; see `ViewGraph` for the meaning and units of each field.
+
+    `iterations` are its steps from the guess: where it `converged` in none, its answer does not depend on the guess,
+    and the pair is not registered again from other poses.
+    """
 
     i_from_j: Floats
     information: Floats

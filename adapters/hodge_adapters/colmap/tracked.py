@@ -326,7 +326,7 @@ class ColmapModel:
         pairs = [(cameras[key].mean_focal_length(), new.mean_focal_length()) for key, new in after.cameras.items()]
         ratios: Floats = np.array([new / old for old, new in pairs])
         if len(ratios) == 1:
-            return (f"focal length {pairs[0][0]:.6g} -> {pairs[0][1]:.6g} px",)
+            return (f"focal length {pairs[0][0]:.6g} → {pairs[0][1]:.6g} px",)
         low, middle, high = 100 * (np.percentile(ratios, [0, 50, 100]) - 1)
         return (f"focal lengths of {len(ratios)} cameras changed by {middle:+.3g} % ({low:+.3g} to {high:+.3g} %)",)
 
