@@ -60,6 +60,19 @@ class CarFree:
         return far, far, 0 * far
 
 
+@dataclass(frozen=True)
+class Stop(CarFree):
+    """A scanner that stands on the demo's street, where a car of 7 m/s is after a time."""
+
+    after_s: float
+    speed_m_s: float = 7.0
+    length_m: float = 1e9
+
+    def world_from_car(self, times_s: Floats) -> Floats:
+        """Poses (N, 4, 4), all the same."""
+        return Road(self.speed_m_s).world_from_car(np.full(len(times_s), self.after_s))
+
+
 class Walk(CarFree):
     """A closed way through `corners (K, 2)` over the ground, the scanner `height_m` above it, pitched as the slope."""
 

@@ -94,8 +94,8 @@ class Gicp(_SmallGicp):
 
     both_ways: bool = Field(
         default=False,
-        description="Align j with i, then i with j, and take the middle, and the mean of information and fitness: each "
-        "way errs by the sampling of its target. Twice the time.",
+        description="Align j with i, then, below the coarsest level, i with j, and take the middle, and the mean of "
+        "information and fitness: each way errs by the sampling of its target.",
     )
 
     def prepare(self, cloud: PointCloud) -> PreparedCloud:
@@ -107,7 +107,13 @@ class Gicp(_SmallGicp):
         found = self._one_way(target, source, i_from_j)
         if not self.both_ways or not found.converged:
             return found
-        back = self._one_way(source, target, se3.inverse(found.i_from_j))
+        # The coarsest level would lead away again: of scans of few beams by metres.
+        finer = replace(
+            self,
+            distances_m=self.distances_m[1:] or self.distances_m,
+            source_points=self.source_points[1:] or self.source_points,
+        )
+        back = finer._one_way(source, target, se3.inverse(found.i_from_j))
         if not back.converged:
             return found
         apart = se3.log(se3.inverse(found.i_from_j) @ se3.inverse(back.i_from_j))
