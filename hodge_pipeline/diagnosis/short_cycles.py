@@ -1,5 +1,5 @@
-"""The cycles that test edges: triangles where there are any, then the shortest loops of a tree; which of them close,
-and which are evidence for or against each edge.
+"""The cycles that test edges: triangles where there are any, then squares, then the shortest loops of a tree; which of
+them close, and which are evidence for or against each edge.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.result import WITNESSES, Cycles
 from hodge_pipeline.types import Bools, Floats, Ints
 
+NEIGHBOURS = 8
+"""Of each end of an edge that are tried for a square."""
+EDGES_AT_ONCE = 20_000
 LONGEST_ENTRIES = 5_000_000
 GATE = 30.0
 """χ² over six dimensions of a cycle that closes, and of two edges that agree. Generous, since tails are heavy."""
@@ -21,11 +24,13 @@ GATE = 30.0
 def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     """Cycles of the graph such that every edge that lies in one is in one of these, unless that would be too long.
 
-    Pairs of parallel edges, triangles (thinned evenly where there are very many), and where edges have none of these
-    the loops that all chords close in a breadth-first tree.
+    Pairs of parallel edges, triangles (thinned evenly where there are very many), squares for edges that have none
+    of these, and for the rest the loops that their chords close in a breadth-first tree.
     """
     loops = _joined([_parallel_pairs(edges, vertex_count), _triangles(edges, vertex_count, most_per_edge)])
-    if len(np.unique(loops.edge)) < len(edges):
+    if (bare := _uncovered(loops, len(edges))).any():
+        loops = _joined([loops, _squares(edges, vertex_count, np.flatnonzero(bare))])
+    if _uncovered(loops, len(edges)).any():
         loops = _joined([loops, tree_loops(edges, vertex_count)])
     return _distinct(loops, len(edges))
 
@@ -66,6 +71,12 @@ def _middles(loops: Loops, i_from_j: Floats) -> Floats:
     return total / np.maximum(np.minimum(lengths, 4), 1)[:, None]
 
 
+def _uncovered(loops: Loops, edge_count: int) -> Bools:
+    out = np.ones(edge_count, bool)
+    out[loops.edge] = False
+    return out
+
+
 def _joined(found: list[Loops]) -> Loops:
     lengths = np.concatenate([loops.lengths for loops in found])
     offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
@@ -75,7 +86,7 @@ def _joined(found: list[Loops]) -> Loops:
 
 
 def _distinct(loops: Loops, edge_count: int) -> Loops:
-    """Each cycle once: a triangle is found again as a loop of the tree.
+    """Each cycle once: a square is found from each of its edges that lack a triangle, and again as a loop of the tree.
 
     Cycles are the same where the sums of random numbers of their edges are, 64 bits each.
     """
@@ -103,15 +114,51 @@ def _parallel_pairs(edges: Ints, vertex_count: int) -> Loops:
 
 def _triangles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     """Triangles of the first of parallel edges, thinned by a stride where an edge would be in too many."""
-    corners = flag_complex(edges, vertex_count).simplices[2]
+    complex_ = flag_complex(edges, vertex_count)
+    corners = complex_.simplices[2]
+    limit = max(most_per_edge * len(complex_.simplices[1]) // 3, 1)
+    return _along(corners[:: max(-(-len(corners) // limit), 1)], edges, vertex_count)
+
+
+def _along(corners: Ints, edges: Ints, vertex_count: int) -> Loops:
+    """The loops that pass corners (N, K) in order along the first of parallel edges, where all are joined."""
     simple = orient_edges(edges, vertex_count)
-    limit = max(most_per_edge * len(simple.edges) // 3, 1)
-    corners = corners[:: max(-(-len(corners) // limit), 1)]
     real = np.flatnonzero(simple.row >= 0)
     measured = real[np.unique(simple.row[real], return_index=True)[1]]
+    keys = simple.edges @ [vertex_count, 1]
     sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=2), axis=2) @ [vertex_count, 1]
-    edge = measured[np.searchsorted(simple.edges @ [vertex_count, 1], sides)]
-    return _of_equal_length(edge, np.where(edges[edge, 0] == corners, 1, -1))
+    place = np.minimum(np.searchsorted(keys, sides), len(keys) - 1)
+    joined = (keys[place] == sides).all(axis=1)
+    edge = measured[place[joined]]
+    return _of_equal_length(edge, np.where(edges[edge, 0] == corners[joined], 1, -1))
+
+
+def _squares(edges: Ints, vertex_count: int, wanted: Ints) -> Loops:
+    """Cycles i–j–b–a–i for the wanted edges (i, j), over some neighbours a of i and b of j."""
+    neighbours = _some_neighbours(orient_edges(edges, vertex_count).edges, vertex_count)
+    found = []
+    for start in range(0, len(wanted), EDGES_AT_ONCE):
+        rows = np.repeat(wanted[start : start + EDGES_AT_ONCE], NEIGHBOURS**2)
+        i, j = edges[rows].T
+        a, b = (
+            neighbours[i, np.arange(len(rows)) // NEIGHBOURS % NEIGHBOURS],
+            neighbours[j, np.arange(len(rows)) % NEIGHBOURS],
+        )
+        possible = (a >= 0) & (b >= 0) & (a != j) & (b != i) & (a != b) & (i != j)
+        found.append(_along(np.stack([i, j, b, a], axis=1)[possible], edges, vertex_count))
+    return _joined(found)
+
+
+def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
+    """Up to NEIGHBOURS neighbours (V, NEIGHBOURS) of each vertex, −1 where there are fewer."""
+    tail, head = np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]])
+    order = np.lexsort((np.abs(head - tail), tail))
+    tail, head = tail[order], head[order]
+    rank = np.arange(len(tail)) - np.searchsorted(tail, tail)
+    out = np.full((vertex_count, NEIGHBOURS), -1, np.int64)
+    few = rank < NEIGHBOURS
+    out[tail[few], rank[few]] = head[few]
+    return out
 
 
 def tree_loops(edges: Ints, vertex_count: int) -> Loops:
