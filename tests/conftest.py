@@ -11,10 +11,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from plugin_metadata import write_metadata
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, which says why
+settings.load_profile("ci")  # everywhere the same examples, and none has a deadline
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.append(str(REPOSITORY))  # for benchmarks/, which is no part of the package
 if find_spec("hodge_paper") is None:  # the plugin with the paper's solver: `make setup` installs it
