@@ -15,6 +15,8 @@ from hodge_pipeline.types import Floats, PointCloud
 
 ENDING, POSE = ".3d", ".pose"
 UNITS_PER_METRE = 100.0
+MOST_DEGREES = 1e6
+"""Angles beyond are damage, and have no turn left in double precision."""
 AHEAD_LEFT_UP = np.array([[0.0, 0, 1], [-1, 0, 0], [0, 1, 0]])
 """Of 3DTK's x to the right, y up, z ahead: the inverse of what its reader of `xyz` does."""
 
@@ -47,7 +49,7 @@ def uos_pose(scan: Path) -> Floats | None:
     if path is None:
         return None
     values = to_floats([field for row in read_rows(path) for field in row.fields]) or []
-    if len(values) != 6 or not np.isfinite(values).all():
+    if len(values) != 6 or not np.isfinite(values).all() or max(map(abs, values[3:])) > MOST_DEGREES:
         raise SourceError(f"{path}: holds no six numbers (x y z in cm, angles in degrees): restore or remove it")
     turns = se3.so3_exp(np.diag(np.radians(values[3:])))
     turn = AHEAD_LEFT_UP @ turns[0] @ turns[1] @ turns[2] @ AHEAD_LEFT_UP.T
