@@ -138,11 +138,11 @@ def _pieces(report: Report) -> str:
         return ""
     of_all = f"of {graph.vertices} {report.source.vertex_name}"
     if not sizes:
-        told = {note.kind: note for note in report.notes}
-        if (note := told.get("ambiguous")) is not None:
+        notes = {note.kind: note for note in report.notes}
+        if (note := notes.get("ambiguous")) is not None:
             todo = "take scans in between, with furniture or targets in sight"
             return f"No two {of_all} joined, and {note.count} of {note.detail} pairs fit in several ways ({todo})"
-        note = told.get("none joined")
+        note = notes.get("none joined")
         return f"No two {of_all} joined" + (f" ({note.detail})" if note else "")
     if len(sizes) > 1:
         listed = [str(size) for size in sizes[:MOST_SIZES]] + ["…"] * (len(sizes) > MOST_SIZES)
