@@ -98,7 +98,7 @@ def test_what_is_of_the_other_dimension_is_counted(tmp_path):
     assert source.graph.vertex_ids.tolist() == [7, 3]
     assert source.notes == ("2 lines of kind VERTEX_SE2 are not read",)
     planar = load_g2o(write(tmp_path / "p.g2o", "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1", "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1"))
-    assert planar.notes == ("1 lines of kind VERTEX_SE3:QUAT are not read",)
+    assert planar.notes == ("1 line of kind VERTEX_SE3:QUAT not read",)
 
 
 def test_what_is_not_read_is_counted(tmp_path):

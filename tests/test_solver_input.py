@@ -45,7 +45,7 @@ def test_an_edge_longer_than_the_earth_gives_a_result_and_a_warning(objective, l
     solution = solve(dataclasses.replace(graph, i_from_j=motion), objective=objective)
     i, j = graph.vertex_ids[graph.edges[3]]
     assert any(
-        note.startswith("1 edges are longer than the earth") and f"({i}, {j})" in note for note in solution.notes
+        note.startswith("1 edge is longer than the earth") and f"({i}, {j})" in note for note in solution.notes
     )
     assert np.isfinite(solution.world_from_cam).all()
     left = motion - se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
@@ -137,8 +137,8 @@ def test_zero_information_is_ignored_and_said():
     solution = solve(more)
     assert solution.metrics["objective"] == pytest.approx(solve(graph).metrics["objective"], rel=1e-9)
     assert solution.weights[-2:].tolist() == [0, 0]
-    assert any("1 edges have no information" in note for note in solution.notes)
-    assert any("1 edges join a vertex to itself" in note for note in solution.notes)
+    assert any("1 edge has no information" in note for note in solution.notes)
+    assert any("1 edge joins a vertex to itself" in note for note in solution.notes)
 
 
 def test_edges_of_rotation_alone_are_solved():
