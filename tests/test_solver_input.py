@@ -44,9 +44,7 @@ def test_an_edge_longer_than_the_earth_gives_a_result_and_a_warning(objective, l
     motion[3, :3, 3] += [length, 0, 0]
     solution = solve(dataclasses.replace(graph, i_from_j=motion), objective=objective)
     i, j = graph.vertex_ids[graph.edges[3]]
-    assert any(
-        note.startswith("1 edge is longer than the earth") and f"({i}, {j})" in note for note in solution.notes
-    )
+    assert any(note.startswith("1 edge is longer than the earth") and f"({i}, {j})" in note for note in solution.notes)
     assert np.isfinite(solution.world_from_cam).all()
     left = motion - se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
     assert solution.metrics["objective"] < (left[3, :3, 3] @ left[3, :3, 3]) * (1 + 1e-9)

@@ -172,7 +172,9 @@ def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: in
 def skipped(other: dict[str, int]) -> list[str]:
     """A note for each kind of line that is not read, with its count."""
     shown = sorted(other.items(), key=lambda item: -item[1])
-    notes = [f"{counted(count, 'line')} of kind {tag} not read{_meaning(tag)}" for tag, count in shown[:SKIPPED_TAGS_SHOWN]]
+    notes = [
+        f"{counted(count, 'line')} of kind {tag} not read{_meaning(tag)}" for tag, count in shown[:SKIPPED_TAGS_SHOWN]
+    ]
     if len(shown) > SKIPPED_TAGS_SHOWN:
         rest = shown[SKIPPED_TAGS_SHOWN:]
         notes.append(f"{sum(count for _, count in rest)} lines of {len(rest)} more kinds are not read")
