@@ -72,13 +72,16 @@ def test_a_recording_of_point_clouds_gets_the_recipe_of_clouds() -> None:
     assert next_command(Path("a.mcap"), {**facts, "scanner": "spins"}, None).startswith("hodge run lidar ")
 
 
-def test_posed_scans_of_an_e57_start_from_their_poses() -> None:
+def test_posed_scans_of_an_e57_and_of_3dtk_start_from_their_poses(tmp_path: Path) -> None:
     facts = {"frames": 3, "frames with depth": 0, "frames with a pose": 3, "formats": [{"reader": "clouds"}]}
     model = {"frames": 7, "frames with depth": 0, "formats": [{"reader": "colmap"}]}
     assert next_command(Path("sparse/0"), model, None) == "hodge refine colmap sparse/0 --out runs/0"
     command = next_command(Path("hall.e57"), facts, None)
     assert command == "hodge run scans --source hall.e57 --set start=given --out runs/hall"
     assert "start" not in next_command(Path("hall.e57"), {**facts, "frames with a pose": 0}, None)
+    assert "start" not in next_command(tmp_path, facts, None)
+    (tmp_path / "scan000.pose").touch()
+    assert " --set start=given " in next_command(tmp_path, facts, None)
 
 
 def test_a_sound_sequence_has_no_oddities() -> None:

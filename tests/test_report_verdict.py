@@ -283,3 +283,5 @@ def test_scans_that_fit_in_several_ways_are_told_first(report: Report) -> None:
     assert verdict.headline.startswith(
         "No two of 20 scans joined, and 9 of 190 pairs fit in several ways (take scans in"
     )
+    verdict = judge(replace(report, graph=graph, source=source, notes=(Note("none joined", detail="do this"),)))
+    assert verdict.headline.startswith("No two of 20 scans joined (do this)")

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -271,18 +272,19 @@ def test_costs_are_those_of_the_run_that_computed_it_and_are_added_by_title(tmp_
     assert cost["peak_mb"] == max(part["peak_mb"] for part in parts) > 1
 
 
-def test_short_steps_share_one_look_at_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    looks: list[int] = []
-    monkeypatch.setattr(cost_module, "SAMPLE_SECONDS", 1000.0)
-    monkeypatch.setattr(cost_module, "_memory_bytes", lambda process: looks.append(process.pid) or 5_000_000)
-    monitor = cost_module.Monitor()
-    peaks = []
-    for _ in range(3):
+def test_shared_pages_are_counted_again_only_when_memory_has_grown(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = list[int]()
+    one = SimpleNamespace(rss=100_000_000)
+    monkeypatch.setattr(cost_module.psutil.Process, "memory_info", lambda process: one)
+    monkeypatch.setattr(cost_module.psutil.Process, "children", lambda process, recursive: [])
+    monkeypatch.setattr(cost_module, "_memory_bytes", lambda process: looks.append(one.rss) or one.rss // 2)
+    monitor, peaks = cost_module.Monitor(), []
+    for one.rss in (100_000_000, 101_000_000, 200_000_000, 80_000_000):
         with monitor.measure() as spent:
             pass
         peaks.append(spent.peak_mb)
-    assert looks.count(os.getpid()) == 1
-    assert peaks == [5.0 * len(looks)] * 3
+    assert looks == [100_000_000, 200_000_000]
+    assert peaks == [50.0, 50.5, 100.0, 40.0]
 
 
 VALUES: list[tuple[Any, Any]] = [

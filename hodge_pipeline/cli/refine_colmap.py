@@ -82,4 +82,4 @@ def _lines(result: RefinedModel, *, alone: bool, verbose: bool) -> list[str]:
     if verbose:
         return lines + [line for note in result.notes for line in labelled("note", str(note))]
     shown = [textwrap.shorten(str(note), COLUMNS - LABEL, placeholder=" …") for note in result.notes]
-    return lines + [f"{'look':<9}{note}" for note in shown[: NOTES if alone else 0]]
+    return lines + [f"{'note':<9}{note}" for note in shown[: NOTES if alone else 0]]

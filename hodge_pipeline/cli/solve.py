@@ -126,7 +126,7 @@ def _lines(
     if verbose:
         lines += [line for note in summary["notes"] for line in labelled("note", note)]
     else:
-        lines += [line for note in summary["notes"][:NOTES] for line in at_most(labelled("look", note), 1)]
+        lines += [line for note in summary["notes"][:NOTES] for line in at_most(labelled("note", note), 1)]
         if (left := len(summary["notes"]) - NOTES) > 0:
             lines.append(f"  - … and {left} more notes: --verbose")
     time = f"{summary['wall_s']:.3f} s, {summary['cpu_s']:.3f} CPU s, {summary['newton_steps']} steps"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,10 @@ import psutil
 from hodge_pipeline.types.input_files import open_input
 
 SAMPLE_SECONDS = 1.0
-"""Between two samples of the memory: one costs 6 ms a process, the kernel's sum over its pages."""
+GROWTH = 1.02
+"""Of the resident sizes together, from which shared pages are counted again: that costs 30 ms a process, the kernel's
+walk over its pages.
+"""
 
 
 @dataclass
@@ -28,15 +31,16 @@ class Cost:
 
 @dataclass
 class Monitor:
-    """Measures the process tree: workers that come and go are counted while they live, memory once a second at most.
+    """Measures the process tree: workers that come and go are counted while they live.
 
     Memory is the proportional share (PSS) where the system tells it, so that pages mapped by several workers count
-    once; elsewhere the resident size.
+    once; elsewhere the resident size. Its part of the resident size is measured whenever that has grown, and else taken
+    to be what it was.
     """
 
     _cpu_by_process: dict[tuple[int, float], float] = field(default_factory=dict)
-    _memory_mb: float = 0.0
-    _memory_at: float = float("-inf")
+    _largest: float = 0.0
+    _part: float = 1.0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @contextmanager
@@ -67,26 +71,28 @@ class Monitor:
 
     def _sample(self, cost: Cost) -> None:
         """Note the CPU time so far of each process of the tree, and the memory of all of them."""
-        memory, now = 0, time.monotonic()
-        is_due = now - self._memory_at >= SAMPLE_SECONDS
-        me = psutil.Process()
+        me, resident, alive = psutil.Process(), 0, []
         for process in [me, *me.children(recursive=True)]:
             try:
                 times = process.cpu_times()
                 with self._lock:
                     self._cpu_by_process[process.pid, process.create_time()] = times.user + times.system
-                memory += _memory_bytes(process) if is_due else 0
+                resident += process.memory_info().rss
+                alive.append(process)
             except psutil.Error:  # it ended meanwhile: its last sample stands
                 continue
-        if is_due:
-            self._memory_mb, self._memory_at = memory / 1e6, now
-        cost.peak_mb = max(cost.peak_mb, self._memory_mb)
+        if resident > GROWTH * self._largest:
+            self._largest, self._part = resident, sum(map(_memory_bytes, alive)) / resident
+        cost.peak_mb = max(cost.peak_mb, self._part * resident / 1e6)
 
 
 def _memory_bytes(process: psutil.Process) -> int:
+    """The process's share of the memory; 0 where it has ended."""
     try:
         with open_input(Path(f"/proc/{process.pid}/smaps_rollup")) as rollup:
             lines = (line.split() for line in rollup)
             return next(int(words[1]) * 1024 for words in lines if words[0] == b"Pss:")
     except (OSError, StopIteration):
-        return int(process.memory_info().rss)
+        with suppress(psutil.Error):
+            return int(process.memory_info().rss)
+        return 0

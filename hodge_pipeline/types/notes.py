@@ -20,6 +20,7 @@ DOUBTS = {
     "again once they stay as they are.",
     "ambiguous": "{count} of {detail} pairs fit in several ways, as in a bare room, and join nothing: take scans in "
     "between, with furniture or targets in sight.",
+    "none joined": "No two are joined: {detail}.",
     "camera or object": "The path may in part be that of objects: in {count} of {detail}, more than a quarter of "
     "the image moves otherwise than the camera is said to. Compare the model with the scene, or leave these "
     "frames out.",
