@@ -145,7 +145,7 @@ def test_edges_of_rotation_alone_are_solved():
     information[0, 3:, 3:] = 0
     solution = solve(dataclasses.replace(graph, information=information))
     np.testing.assert_allclose(solution.world_from_cam, truth, atol=1e-6)
-    assert any("have no definite information on translation" in note for note in solution.notes)
+    assert any("has no definite information on translation" in note for note in solution.notes)
 
 
 def test_indefinite_information_falls_back_and_says_so():
