@@ -297,7 +297,7 @@ def _matrices(poses: Sequence[Floats | None]) -> Floats:
 def has_given(source: Source) -> bool:
     """Whether the source gives poses to at least half of its frames, and these are not the true ones."""
     given, true = given_poses(source), true_poses(source)
-    known = np.isfinite(given).all(axis=(1, 2)) & (given != true).any(axis=(1, 2))
+    known = se3.has_pose(given) & (given != true).any(axis=(1, 2))
     return bool(known.sum() > 1 and 2 * known.sum() >= len(known))
 
 

@@ -294,10 +294,15 @@ def spread_correction(
     return np.asarray(about @ local @ back @ world_from_cam)
 
 
+def has_pose(world_from_cam: Floats) -> Bools:
+    """Where (...,) a pose (..., 4, 4) is finite: a frame without truth holds NaN."""
+    return np.asarray(np.isfinite(world_from_cam).all(axis=(-1, -2)))
+
+
 def is_motion(matrix: Floats, tolerance: float = 1e-2) -> Bools:
     """Where (...,) a matrix (..., 4, 4) is finite, its last row is (0, 0, 0, 1) and RᵀR is I within the tolerance."""
     matrix = np.asarray(matrix, float)
-    finite = np.asarray(np.isfinite(matrix).all(axis=(-1, -2)))
+    finite = has_pose(matrix)
     safe = np.where(finite[..., None, None], matrix, 0.0)
     rotation = safe[..., :3, :3]
     gram_error = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(-1, -2))

@@ -102,8 +102,8 @@ def test_a_sound_sequence_has_no_oddities() -> None:
         (9, {"stamp_s": 7.0}, "1 gap in time of more than 5 steps; the longest, 6.2 s, between 8 and 9"),
         (5, {"frame_id": 4}, "1 frame ids are given more than once: 4"),
         (5, {"read_depth": None}, "1 of 10 frames have no depth: 5"),
-        (9, {"world_from_cam": se3.exp(np.array([0, 0, 0, 3.0, 0, 0]))}, "1 jumps of the pose, the largest 2.92 m"),
-        (9, {"world_from_cam": se3.exp(np.array([0, 0, 1.0, 0.09, 0, 0]))}, "1 jumps of the pose, the largest 57.3 °"),
+        (9, {"world_from_cam": se3.exp(np.array([0, 0, 0, 3.0, 0, 0]))}, "1 jump of the pose, the largest 2.92 m"),
+        (9, {"world_from_cam": se3.exp(np.array([0, 0, 1.0, 0.09, 0, 0]))}, "1 jump of the pose, the largest 57.3 °"),
         (0, {"read_depth": partial(constant_depth, 0.0)}, "frame 0: 100% of its pixels have no depth"),
     ],
 )

@@ -19,7 +19,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, DistanceBlock, block_distances
 from hodge_pipeline.pairs.overlap import pairwise_iou
 from hodge_pipeline.stages import Workers
-from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, PointCloud
+from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud
 
 GraphKind: TypeAlias = Literal["distance", "iou"]
 GRAPH_KINDS: tuple[GraphKind, ...] = get_args(GraphKind)
@@ -53,7 +53,7 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind, 
         raise GraphError(f"{len(clouds)} clouds but {len(world_from_cam)} poses: give one pose for each cloud")
     if kind not in GRAPH_KINDS:
         raise ValueError(f"graph kind {kind!r}: expected one of {', '.join(GRAPH_KINDS)}")
-    usable = np.flatnonzero((clouds.sizes > 0) & has_pose(world_from_cam))
+    usable = np.flatnonzero((clouds.sizes > 0) & se3.has_pose(world_from_cam))
     if len(usable) < 2:
         return np.zeros((0, 2), np.int64)
     find = _near_centroids if kind == "distance" else _overlapping_voxels
@@ -61,11 +61,6 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind, 
     found = find(clouds.read(usable), world_from_cam[usable], some, scale)
     pairs = np.unique(np.sort(found[found[:, 0] != found[:, 1]], axis=1), axis=0)
     return np.asarray(usable[pairs], np.int64)
-
-
-def has_pose(world_from_cam: Floats) -> Bools:
-    """Where (...,) a pose (..., 4, 4) is finite: a frame without truth holds NaN."""
-    return np.asarray(np.isfinite(world_from_cam).all(axis=(-1, -2)))
 
 
 def _near_centroids(clouds: Iterable[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:

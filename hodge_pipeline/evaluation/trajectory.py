@@ -130,7 +130,7 @@ def _nearest(moments: Floats, among: Floats) -> Ints:
 def _usable(estimate: Floats, reference: Floats) -> Bools:
     if estimate.shape != reference.shape:
         raise GraphError(f"{len(estimate)} poses against {len(reference)} reference poses: associate them first")
-    return np.asarray(np.isfinite(estimate).all(axis=(-1, -2)) & np.isfinite(reference).all(axis=(-1, -2)))
+    return np.asarray(se3.has_pose(estimate) & se3.has_pose(reference))
 
 
 def _rms(values: Floats) -> float:

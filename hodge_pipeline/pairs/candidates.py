@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
 
 
@@ -15,7 +16,7 @@ def usable_rows(clouds: CloudSet, world_from_cam: Floats | None = None) -> Ints:
     """Rows of the frames that have points and, where poses (N, 4, 4) are given, a finite pose; ascending."""
     usable = clouds.sizes > 0
     if world_from_cam is not None:
-        usable &= np.isfinite(world_from_cam).all(axis=(-1, -2))
+        usable &= se3.has_pose(world_from_cam)
     return np.flatnonzero(usable).astype(np.int64)
 
 

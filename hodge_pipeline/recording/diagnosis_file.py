@@ -8,8 +8,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import Diagnosis
-from hodge_pipeline.recording import layout, shapes
+from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import scene_view, without_panels
 from hodge_pipeline.recording.curl import log_tested_triangles
 from hodge_pipeline.recording.diagnosis import log_diagnosis
@@ -44,7 +45,7 @@ def write_diagnosis(path: Path, identity: str, graph: ViewGraph, world_from_cam:
 
 
 def _log_vertices(stream: rr.RecordingStream, graph: ViewGraph, world_from_cam: Floats) -> None:
-    drawn = np.flatnonzero(shapes.is_drawable(world_from_cam))
+    drawn = np.flatnonzero(se3.has_pose(world_from_cam))
     names = [str(name) for name in graph.vertex_ids[drawn]] if len(drawn) <= MOST_NAMED else None
     points = rr.Points3D(
         world_from_cam[drawn, :3, 3].astype(np.float32),
@@ -71,7 +72,7 @@ def _blueprint(eye: Eye | None) -> rrb.Blueprint:
 
 def _eye(world_from_cam: Floats) -> Eye | None:
     """From above the plane in which the frames spread most, a little aside."""
-    places = world_from_cam[shapes.is_drawable(world_from_cam), :3, 3]
+    places = world_from_cam[se3.has_pose(world_from_cam), :3, 3]
     if len(places) < 2:
         return None
     middle = (places.min(axis=0) + places.max(axis=0)) / 2

@@ -30,7 +30,7 @@ TRAJECTORY_RADIUS, FRUSTUM_RADIUS, EDGE_RADIUS, CENTRE_RADIUS = -1.6, -0.5, -0.6
 
 def log_poses(part: Part, name: str, world_from_cam: Floats, frames: Sequence[Frame] = ()) -> None:
     """Log a trajectory as a line, as shapes (`pose_lines`) and as transforms."""
-    drawable = np.flatnonzero(shapes.is_drawable(world_from_cam))
+    drawable = np.flatnonzero(se3.has_pose(world_from_cam))
     sequences = np.array([frame.sequence for frame in frames] or [""] * len(world_from_cam), dtype=np.str_)
     colour = shapes.TRAJECTORY_COLOURS.get(name, shapes.RESULT_COLOUR)
     path = shapes.strips(world_from_cam, sequences)
@@ -146,7 +146,7 @@ def _log_film(
     part: Part, outer: int, graph: ViewGraph, states: Sequence[Floats], residuals: Floats, first_iteration: int
 ) -> None:
     """Log edges and camera centres after each inner iteration; edges are thinned before iterations are."""
-    drawn = np.flatnonzero(np.all([shapes.is_drawable(poses) for poses in states], axis=0))
+    drawn = np.flatnonzero(np.all([se3.has_pose(poses) for poses in states], axis=0))
     has_ends = np.isin(graph.edges, drawn).all(axis=1)
     options, max_bytes = part.options, part.solver_bytes / 2
     steps = options.count(FILM_STEPS, len(states), STEP_LINES * LINE_BYTES, max_bytes)

@@ -50,7 +50,7 @@ def first_frame(points: Floats32, clouds: CloudSet, world_from_cam: Floats) -> I
     Memory holds the cells of the points and one cloud.
     """
     found = np.full(len(points), len(clouds) - 1)
-    known = np.flatnonzero(shapes.is_drawable(world_from_cam) & (clouds.sizes > 0))
+    known = np.flatnonzero(se3.has_pose(world_from_cam) & (clouds.sizes > 0))
     if not len(points) or not len(known):
         return found
     cell_m = GRIDS * grid_m(np.asarray(clouds[int(known[len(known) // 2])].points_in_cam, float))

@@ -70,14 +70,9 @@ def or_grey(colours: Bytes | None, count: int) -> Bytes:
     return colours if colours is not None and colours.any() else np.full((count, 3), GREY, np.uint8)
 
 
-def is_drawable(world_from_cam: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Where (...,) a pose is finite."""
-    return np.asarray(np.isfinite(world_from_cam).all(axis=(-1, -2)))
-
-
 def strips(world_from_cam: Floats, sequences: np.ndarray[tuple[int, ...], np.dtype[np.str_]]) -> list[Floats32]:
     """Lines through the camera centres, broken where a sequence ends or a pose is missing."""
-    drawable = is_drawable(world_from_cam)
+    drawable = se3.has_pose(world_from_cam)
     broken = (sequences[1:] != sequences[:-1]) | ~drawable[1:] | ~drawable[:-1]
     runs = np.split(np.arange(len(drawable)), np.flatnonzero(broken) + 1)
     return [np.asarray(world_from_cam[run, :3, 3], np.float32) for run in runs if len(run) and drawable[run[0]]]

@@ -94,7 +94,7 @@ def turns_deg(report: Report) -> dict[str, Floats]:
         if own is None or reference is None:
             continue
         component = report.pictures.component if len(report.pictures.component) == len(own) else np.zeros(len(own), int)
-        known = np.isfinite(own).all(axis=(1, 2)) & np.isfinite(reference).all(axis=(1, 2))
+        known = se3.has_pose(own) & se3.has_pose(reference)
         found[name] = np.full(len(own), np.nan)
         for part in np.unique(component[known]):
             rows = np.flatnonzero(known & (component == part))

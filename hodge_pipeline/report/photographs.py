@@ -41,7 +41,7 @@ def changed_most(
     """The place where the run changed most, before and after: what the first frame of the pair (P, 2) looks at whose
     relative motion changed most, in all clouds of its component.
     """
-    known = np.isfinite(before).all(axis=(1, 2)) & np.isfinite(after).all(axis=(1, 2)) & (clouds.sizes > 0)
+    known = se3.has_pose(before) & se3.has_pose(after) & (clouds.sizes > 0)
     pairs = pairs[known[pairs].all(axis=1)]
     if not len(pairs):
         return ()
@@ -112,7 +112,7 @@ def four_sides(clouds: CloudSet, before: Floats, after: Floats, component: Ints)
 
     Only frames of the largest component, which both sets of poses (N, 4, 4) know; none where there is nothing to see.
     """
-    finite = np.isfinite(before).all(axis=(1, 2)) & np.isfinite(after).all(axis=(1, 2))
+    finite = se3.has_pose(before) & se3.has_pose(after)
     rows = _some(np.flatnonzero(finite & (component == 0) & (clouds.sizes > 0)))
     if len(rows) < 2:
         return ()

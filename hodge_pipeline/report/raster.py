@@ -112,7 +112,7 @@ def _tinted(count: int, tint: Sequence[float]) -> Bytes:
 def around(scene: Points, world_from_cam: Floats, is_scanner: bool = False) -> dict[str, View]:
     """One view from each of four sides, above the scene; up is where the cameras, or scanners, have it, on average."""
     sample = scene.points[:: max(1, len(scene.points) // FRAMING_POINTS)].astype(float)
-    known = world_from_cam[np.isfinite(world_from_cam).all(axis=(1, 2))]
+    known = world_from_cam[se3.has_pose(world_from_cam)]
     up, ahead = up_and_ahead(known, is_scanner)
     found = {}
     for name, degrees in SIDES.items():

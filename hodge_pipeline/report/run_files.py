@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline import registry
+from hodge_pipeline import registry, se3
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
@@ -195,7 +195,7 @@ def _of_file(
     """The errors of the poses of a file, as `evo_ape -a` and `evo_rpe` have them: one alignment, poses without a truth
     left out first.
     """
-    known = np.isfinite(given.true_world_from_cam).all(axis=(1, 2))
+    known = se3.has_pose(given.true_world_from_cam)
     if not known.any():
         return ()
     every = {name: given.expand(key_frames, poses)[known] for name, poses in sets.items()}

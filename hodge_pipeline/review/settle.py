@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import Diagnosis
@@ -199,7 +200,7 @@ class Settler:
 
 def moved_m(before: Floats, after: Floats) -> float:
     """The farthest that a position of the poses (V, 4, 4) lies from where it was, the two sets aligned."""
-    known = np.isfinite(before).all(axis=(1, 2)) & np.isfinite(after).all(axis=(1, 2))
+    known = se3.has_pose(before) & se3.has_pose(after)
     if not known.any():
         return 0.0
     aligned = align(after[known], before[known]).apply(after[known])
@@ -208,7 +209,7 @@ def moved_m(before: Floats, after: Floats) -> float:
 
 def error_m(world_from_cam: Floats, truth: Floats) -> float | None:
     """The RMS error of the positions after alignment; None where fewer than three true poses are known."""
-    if np.isfinite(truth).all(axis=(1, 2)).sum() < 3:
+    if se3.has_pose(truth).sum() < 3:
         return None
     return absolute_error(world_from_cam, truth).rmse_m
 

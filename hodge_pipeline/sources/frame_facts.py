@@ -143,8 +143,8 @@ def pose_facts(
         if jumps.any():
             at = rows[np.argmax(size)]
             oddities.append(
-                f"{int(jumps.sum())} jumps of the pose, the largest {size.max():.3g} {sign} between {names[at]} and "
-                f"{names[at + 1]}; half of the steps are below {np.median(size):.3g} {sign}"
+                f"{counted(int(jumps.sum()), 'jump')} of the pose, the largest {size.max():.3g} {sign} between "
+                f"{names[at]} and {names[at + 1]}; half of the steps are below {np.median(size):.3g} {sign}"
             )
     centres = world_from_cam[np.union1d(rows, rows + 1), :3, 3]
     return {

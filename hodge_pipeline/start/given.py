@@ -83,7 +83,7 @@ class GivenStart:
         Raises `SourceError` where there are none, or those of the file are not of these frames.
         """
         matched, file = self._matched(source, steps)
-        known = np.isfinite(matched.world_from_cam).all(axis=(1, 2))
+        known = se3.has_pose(matched.world_from_cam)
         told = (
             f"{counted(len(source.frames), 'frame has|frames have')} a given pose, by {matched.how}; "
             f"{len(matched.pose_times)}"
@@ -155,7 +155,7 @@ class GivenStart:
         Where frames of a sequence have no given pose at all, they begin at the nearest given pose.
         """
         given = matched.world_from_cam
-        known: Bools = np.asarray(np.isfinite(given).all(axis=(1, 2)))
+        known: Bools = se3.has_pose(given)
         steps.note(Note("carried", int((~known).sum())))
         gaps = gaps_between(known, list(sequences_of(source).values()))
         rows = np.concatenate(gaps)
@@ -218,7 +218,7 @@ def given_away(source: Source, poses: Floats, rows: np.ndarray) -> Source:
 def _true_at(times: Floats, matched: Matched, source: Source) -> Floats:
     """The truth (P, 4, 4) nearest to each given pose, on the clock that these were matched by."""
     true = true_poses(source)
-    known = np.isfinite(true).all(axis=(1, 2))
+    known = se3.has_pose(true)
     true_times, true = matched.frame_times[known], true[known]
     if matched.how == "stamp" and known.any() and source.trajectory is not None:
         true_times, true = source.trajectory.stamps_s, source.trajectory.world_from_cam

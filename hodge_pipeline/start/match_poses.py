@@ -59,7 +59,7 @@ def own_poses(frames: Sequence[Frame]) -> Matched:
         if frame.world_from_cam is not None:
             poses[row] = frame.world_from_cam
     times = np.arange(len(frames), dtype=float)
-    return Matched(times, times[np.isfinite(poses).all(axis=(1, 2))], poses, "the frames' own")
+    return Matched(times, times[se3.has_pose(poses)], poses, "the frames' own")
 
 
 def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, max_gap_s: float, where: str) -> Matched:
@@ -67,7 +67,7 @@ def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, m
 
     Raises `SourceError` where they have nothing in common, or `match` asks for what is not there.
     """
-    usable = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2)) & np.isfinite(trajectory.stamps_s)
+    usable = se3.has_pose(trajectory.world_from_cam) & np.isfinite(trajectory.stamps_s)
     trajectory = Trajectory(trajectory.stamps_s[usable], trajectory.world_from_cam[usable])
     if not len(trajectory):
         raise SourceError(f"{where}: no pose in it: give a trajectory")
@@ -81,7 +81,7 @@ def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, m
     )
     for how in ("row", "stamp", "number") if rows_for_stamps else ("stamp", "number"):
         matched = _matched(how, trajectory, frames, max_gap_s)
-        found = 0 if matched is None else int(np.isfinite(matched.world_from_cam).all(axis=(1, 2)).sum())
+        found = 0 if matched is None else int(se3.has_pose(matched.world_from_cam).sum())
         if matched is not None and found and (how != "number" or found >= LIKELY_SHARE * len(frames)):
             return matched
     raise SourceError(

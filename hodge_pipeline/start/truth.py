@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.scene import given_poses
 from hodge_pipeline.stages import Steps
@@ -36,7 +37,7 @@ def with_truth(source: Source, truth: Path | None, steps: Steps) -> Source:
         matched = match_poses(trajectory, source.frames, "auto", MAX_GAP_S, str(truth))
         poses = matched.world_from_cam
         trajectory = trajectory if matched.how == "stamp" else None
-    known: Bools = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    known: Bools = se3.has_pose(poses)
     steps.note(Note("truth", int(known.sum()), str(len(known))))
     frames = tuple(
         replace(frame, true_world_from_cam=pose if true else None)

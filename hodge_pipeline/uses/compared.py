@@ -84,7 +84,7 @@ def _rows(run: Run) -> dict[tuple[str, float], int]:
     """The rows of the frames that have a pose, by sequence and stamp."""
     frames = run.source.frames
     several = len({frame.sequence for frame in frames}) > 1
-    known = np.flatnonzero(np.isfinite(run.poses).all(axis=(1, 2))).tolist()
+    known = np.flatnonzero(se3.has_pose(run.poses)).tolist()
     return {(frames[row].sequence if several else "", frames[row].stamp_s): row for row in known}
 
 
