@@ -32,7 +32,7 @@ from hodge_pipeline.start.unordered.hypotheses import (
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
-from hodge_pipeline.start.unordered.start import Frames, Start, _ambiguous_pairs, find_start
+from hodge_pipeline.start.unordered.start import Frames, Start, _ambiguous_pairs, _none_joined, find_start
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, ViewGraph
 from hodge_pipeline.types.edges import REJECTED, USED
@@ -315,3 +315,16 @@ def test_pairs_that_fit_in_several_ways_are_told_unless_others_join_their_scans(
         ("ambiguous", 1, "3")
     ]
     assert _ambiguous_pairs(edges, np.array([0, 0, 0])) == ()
+
+
+@pytest.mark.parametrize(("pose", "todo"), [(np.eye(4), "start=given"), (None, "2 of 3 pairs: too little overlap")])
+def test_where_no_two_scans_are_joined_the_report_says_what_to_do(pose: Floats | None, todo: str) -> None:
+    edges = Edges.of([[0, 1], [0, 2], [1, 2]])
+    edges = edges.put(
+        slice(None), status=REJECTED, why=np.array([AMBIGUOUS, "too little overlap", "too little overlap"])
+    )
+    frames = [Frame(row, float(row), world_from_cam=pose) for row in range(3)]
+    scene = Frames(frames, Path(), np.arange(3))
+    (note,) = _none_joined(scene, edges, np.arange(3))
+    assert note.kind == "none joined" and todo in note.detail
+    assert _none_joined(scene, edges, np.array([0, 0, 1])) == ()

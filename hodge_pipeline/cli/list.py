@@ -44,8 +44,9 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings
     recipe = "lidar" if facts.get("scanner") and not reader else {"clouds": "scans"}.get(name, name)
     if recipe == "mcap" and facts.get("frames with points") == facts["frames"]:
         recipe = "mcap_clouds"
-    if path.suffix.lower() == ".e57" and facts["frames with a pose"] == facts["frames"]:
-        options += ["--set", "start=given"]  # the surveyor's poses, which keep the scans in his world
+    brings_poses = path.suffix.lower() == ".e57" or (recipe == "scans" and any(path.glob("*.pose")))
+    if brings_poses and facts["frames with a pose"] == facts["frames"]:
+        options += ["--set", "start=given"]  # the surveyor's poses, which keep the scans in his world, or 3DTK's
     if recipe in recipe_names():
         return command("hodge", "run", recipe, "--source", path, *options, "--out", f"runs/{path.stem}")
     recipe = "seven_scenes" if facts["frames with depth"] else "clouds"

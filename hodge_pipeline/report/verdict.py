@@ -138,9 +138,12 @@ def _pieces(report: Report) -> str:
         return ""
     of_all = f"of {graph.vertices} {report.source.vertex_name}"
     if not sizes:
-        pairs = next((f"{note.count} of {note.detail}" for note in report.notes if note.kind == "ambiguous"), "")
-        todo = "take scans in between, with furniture or targets in sight"
-        return f"No two {of_all} joined" + (f", and {pairs} pairs fit in several ways ({todo})" if pairs else "")
+        notes = {note.kind: note for note in report.notes}
+        if (note := notes.get("ambiguous")) is not None:
+            todo = "take scans in between, with furniture or targets in sight"
+            return f"No two {of_all} joined, and {note.count} of {note.detail} pairs fit in several ways ({todo})"
+        note = notes.get("none joined")
+        return f"No two {of_all} joined" + (f" ({note.detail})" if note else "")
     if len(sizes) > 1:
         listed = [str(size) for size in sizes[:MOST_SIZES]] + ["…"] * (len(sizes) > MOST_SIZES)
         return f"In {len(sizes)} pieces ({', '.join(listed)} {of_all})"

@@ -79,8 +79,8 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
     poses = laid_apart(pieces.piece, pieces.poses, clouds)
-    said = (*_ambiguous_pairs(hypotheses, pieces.piece), *notes_of("start", notes))
-    return Start(poses, Edges.measured(pieces.graph), pieces.piece, said)
+    told = (*_ambiguous_pairs(hypotheses, pieces.piece), *_none_joined(scene, hypotheses, pieces.piece))
+    return Start(poses, Edges.measured(pieces.graph), pieces.piece, (*told, *notes_of("start", notes)))
 
 
 def _ambiguous_pairs(hypotheses: Edges, piece: Ints) -> tuple[Note, ...]:
@@ -88,6 +88,16 @@ def _ambiguous_pairs(hypotheses: Edges, piece: Ints) -> tuple[Note, ...]:
     first, second = hypotheses.pairs[hypotheses.why == AMBIGUOUS].T
     count = int((piece[first] != piece[second]).sum())
     return (Note("ambiguous", count, str(len(hypotheses))),) if count else ()
+
+
+def _none_joined(scene: Frames, hypotheses: Edges, piece: Ints) -> tuple[Note, ...]:
+    """A note with what to do where no two frames are joined: to begin from their own poses, where all have one."""
+    if scene.given is not None or len(np.unique(piece)) < max(len(scene.frames), 2):
+        return ()
+    if all(frame.world_from_cam is not None for frame in scene.frames):
+        return (Note("none joined", detail="--set start=given begins from the poses that they bring"),)
+    count, why = max(((count, why) for why, count in hypotheses.rejected_counts.items()), default=(0, "none was tried"))
+    return (Note("none joined", detail=f"{count} of {len(hypotheses)} pairs: {why}; take more between them"),)
 
 
 def weighed_matches(
