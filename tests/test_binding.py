@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import registry
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.recipe import binding
@@ -100,6 +101,17 @@ def test_errors_name_file_line_key_and_what_was_expected(tmp_path: Path, change:
 def test_a_misspelt_section_of_an_override_is_where_it_was_given() -> None:
     with pytest.raises(RecipeError, match=r"^--set sorce.path=x: sorce: unknown option \(did you mean 'source'"):
         load_recipe("demo", ["sorce.path=x"])
+
+
+def test_options_alone_are_those_of_the_surest_reader_of_the_source(tmp_path: Path) -> None:
+    (tmp_path / "rgb").mkdir()
+    (tmp_path / "rgb.txt").write_text("1.0 rgb/1.0.png\n")
+    (tmp_path / "depth.txt").write_text("1.0 depth/1.0.png\n")
+    source = load_recipe("slam_refine", ["source.reader.every=3"], tmp_path).source
+    assert source.reader == TumReader(every=3) and source.path == tmp_path
+    assert load_recipe("slam_refine", [f"source.path={tmp_path}", "source.reader.every=3"]).source == source
+    with pytest.raises(RecipeError, match="source.reader: expected {stage: NAME"):
+        load_recipe("slam_refine", ["source.reader.every=3"])
 
 
 def test_a_missing_stage_is_named(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _vi
 from hodge_pipeline.report.energy import energy_rows
 from hodge_pipeline.types import PointCloud, ViewGraph
 from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject
+from readers_data import tum_folder
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 
@@ -314,8 +315,13 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     (tmp_path / "half/stages").mkdir(parents=True)
     (tmp_path / "half/recipe.yaml").write_text("x: 1\n")
+    tum_folder(tmp_path / "recorded")
     for path, message in (
         ("poses.tum", "no graph"),
+        (
+            "recorded",
+            "no graph of measured edges; its frames give one: hodge run tum --source .*recorded --out RUN",
+        ),
         ("half", "has not begun to register"),
         ("nothing.g2o", "no such file"),
     ):

@@ -127,7 +127,8 @@ def test_an_edge_is_taken_out_the_run_resumes_with_it_and_undo_gives_the_old_pos
     assert any(pair in str(note) for note in resumed.report.notes)
     assert resumed.report.scores is not None
 
-    assert "(undone)" in hodge("edit", folder, "--undo", "--list")
+    told = hodge("edit", folder, "--undo", "--list")
+    assert f"undone     disable {pair}" in told and "(undone)" in told
     again = solve_again(folder)
     np.testing.assert_array_equal(again.result.world_from_cam, before)
     assert "disabled" not in statuses(folder).values()

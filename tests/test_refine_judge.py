@@ -89,6 +89,13 @@ def test_an_image_that_is_off_is_named_and_the_candidate_not_sound() -> None:
     assert not given.is_sound and right.is_sound
 
 
+def test_poses_are_in_doubt_where_most_observations_are_off_whatever_else_fits() -> None:
+    half = {**flat(0.1), **flat(9.0, images=1)}
+    given, *others = costs([quality(flat(913.0))], [quality(flat(0.1)), quality(half)])
+    assert given.doubt == "in doubt, since 100% of the observations are more than 4 px off"
+    assert [cost.doubt for cost in others] == ["", ""]
+
+
 def test_of_candidates_at_one_optimum_the_first_is_kept() -> None:
     found = costs([quality(flat(1.0))], [quality(flat(1.0 - 1e-6)), quality(flat(1.0 - 1e-7))])
     assert best(found) == 0

@@ -49,6 +49,13 @@ def test_what_holds_nothing_or_something_packed_is_told_so(tmp_path: Path) -> No
     assert complaint(tmp_path / "graph.g2o.gz").endswith(": packed: unpack it first")
 
 
+def test_images_of_another_format_are_told_what_to_become(tmp_path: Path) -> None:
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "depth/0.pgm").write_bytes(b"P5 1 1 65535 00")
+    assert complaint(tmp_path).endswith("convert depth/0.pgm and its like to PNG, depth with all 16 bits")
+    assert "convert 0.pgm" in complaint(tmp_path / "depth") and "convert 0.pgm" in complaint(tmp_path / "depth/0.pgm")
+
+
 def test_a_folder_of_many_sources_names_a_few(tmp_path: Path) -> None:
     for number in range(200):
         (tmp_path / f"{number:03}.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
@@ -101,7 +108,7 @@ def test_of_a_graph_with_landmarks_the_poses_are_solved(tmp_path: Path) -> None:
     path.write_text(ISAM)
     source = guess_reader(path).open(path)
     assert source.graph is not None and source.graph.edges.tolist() == [[0, 1], [1, 2]]
-    assert "2 lines of kind LANDMARK are not read: landmarks, where only edges between poses are solved" in source.notes
+    assert "2 lines of kind LANDMARK not read: landmarks, where only edges between poses are solved" in source.notes
 
 
 def test_landmarks_alone_are_refused(tmp_path: Path) -> None:

@@ -49,6 +49,7 @@ def edit(folder: Path, pairs: Pairs, shown: Shown, *, undo: bool, listing: bool)
     changed = bool(undo or pairs)
     with holding(folder):
         history = read_history(folder)
+        taken_back = history.edits[history.latest] if undo and history.latest is not None else None
         if changed:
             history = history.undo() if undo else history.added(_checked(folder, listed, pairs))
             write_history(folder, history)
@@ -56,6 +57,8 @@ def edit(folder: Path, pairs: Pairs, shown: Shown, *, undo: bool, listing: bool)
         edits = [asdict(one) for one in history.edits]
         print_json({"run": str(folder), "switches": history.switches, "edits": edits})
     elif not shown.quiet:
+        if taken_back is not None:
+            print(f"undone     {taken_back}")
         _print(folder, history, listed, changed=changed, listing=listing or not changed)
 
 

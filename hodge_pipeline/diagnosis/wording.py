@@ -15,7 +15,7 @@ SPLITS = 1 - 1e-6
 
 def ranked(diagnosis: Diagnosis) -> Ints:
     """Rows of all edges, the worst first: wrong, suspect, untestable, consistent; in each the least probable."""
-    place = np.array([ORDER.index(str(verdict)) for verdict in diagnosis.verdict], np.int64)
+    place = np.argmax(diagnosis.verdict[:, None] == np.array(ORDER), axis=1)
     probability = np.nan_to_num(diagnosis.probability, nan=0.5)
     return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), probability.round(1), place))
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline import registry
 from hodge_pipeline.complex.parts import ComplexOptions
 from hodge_pipeline.diagnosis.options import DiagnosisOptions, SolveWith, SuggestionOptions
 from hodge_pipeline.errors import RecipeError
@@ -18,6 +19,7 @@ from hodge_pipeline.recipe import binding, recipe_file
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.pairs import Acceptance
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.measured_edges import MeasuredOptions
 from hodge_pipeline.stages import (
     ConsistencySolver,
@@ -114,13 +116,26 @@ REQUIRED = ("edges", "registration", "solver", "executor")
 def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path | None = None) -> Recipe:
     """The recipe of a name or file, with overrides such as `solver.inner_iterations=5` and another source.
 
-    Raises `RecipeError`: `file:line: key: what was expected`.
+    Options of a reader that nothing names are those of the source's surest one. Raises `RecipeError`: `file:line: key:
+    what was expected`.
     """
     document = recipe_file.load(name_or_path, overrides)
     if "model" in document.data:
         raise RecipeError(f"recipe '{name_or_path}' refines a model: hodge refine colmap MODEL --recipe {name_or_path}")
-    recipe = binding.bind(Recipe, document.data, document.where)
+    recipe = binding.bind(Recipe, _with_reader(document.data, source), document.where)
     return recipe if source is None else with_source(recipe, source)
+
+
+def _with_reader(data: dict[str, Any], source: Path | None) -> dict[str, Any]:
+    """The recipe's data in which a reader with options alone is the surest of the source."""
+    section = data.get("source")
+    if not isinstance(section, dict):
+        return data
+    options, path = section.get("reader"), source or section.get("path")
+    if not isinstance(options, dict) or "stage" in options or not isinstance(path, (str, Path)):
+        return data
+    name = registry.name_of(guess_reader(Path(path)))
+    return {**data, "source": {**section, "reader": {"stage": name, **options}}}
 
 
 def recipe_of_run(path: Path) -> tuple[Recipe, tuple[str, ...]]:

@@ -22,7 +22,7 @@ FREE_OF_A_POINT = 3
 SAME_COST = 1e-4
 """Relative: two candidates nearer than this have come to the same optimum."""
 OFF_SHARE, DOUBTFUL_SHARE = 0.5, 0.1
-"""Of the observations of an image."""
+"""Of the observations of an image, or of all of them."""
 SOUND_SHARE = 0.05
 """Of the observations beyond the cap: as many are wrong in models that nothing is the matter with."""
 
@@ -50,8 +50,13 @@ class Cost:
     @property
     def doubt(self) -> str:
         """Why these poses may be wrong although nothing fits better; empty where nothing says so."""
-        off = f"in doubt, since tracks contradict each other by {self.px:.3g} px (merged wrongly, or cameras are wrong)"
-        return off if self.px > CONTRADICTING_PX else ""
+        if self.px > CONTRADICTING_PX:
+            off = f"tracks contradict each other by {self.px:.3g} px (merged wrongly, or cameras are wrong)"
+        elif self.beyond > OFF_SHARE:
+            off = f"{self.beyond:.0%} of the observations are more than {self.cap_px:.3g} px off"
+        else:
+            return ""
+        return f"in doubt, since {off}"
 
     @property
     def is_sound(self) -> bool:

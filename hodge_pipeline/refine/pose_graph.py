@@ -16,12 +16,14 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.pairs.edits import joining
+from hodge_pipeline.recipe.recipe_file import recipe_names
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.unknown import without_frames
 from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, ViewGraph
+from hodge_pipeline.types.text import command, counted
 
 RUN_GRAPH = "graph.g2o"
 ROUNDING = 1e-15
@@ -116,13 +118,12 @@ class SolvedFile:
 def read_graph(path: Path) -> Source:
     """The graph at a path: of any registered format, or of a run folder. Raises `SourceError` where there is none."""
     path = path / RUN_GRAPH if (path / RUN_GRAPH).is_file() else path
-    source = guess_reader(path).open(path)
+    reader = guess_reader(path)
+    source = reader.open(path)
     if source.graph is None:
-        rest = (
-            ": run a recipe on it first, then give its run folder"
-            if source.frames
-            else f" but {without_frames(source)}"
-        )
+        recipe = registry.name_of(reader) if registry.name_of(reader) in recipe_names() else "RECIPE"
+        run = command("hodge", "run", recipe, "--source", path, "--out", "RUN")
+        rest = f"; its frames give one: {run}, then give RUN" if source.frames else f" but {without_frames(source)}"
         raise SourceError(f"{path}: holds no graph of measured edges{rest}")
     return source
 
@@ -159,7 +160,9 @@ def solve_file(path: Path, choices: Choices) -> SolvedFile:
     cpu_s, wall_s = time.process_time() - cpu_s, time.monotonic() - wall_s
     weights = np.zeros(len(off))
     weights[~off] = solution.weights
-    notes = (f"{int(off.sum())} edges are disabled", *solution.notes) if off.any() else solution.notes
+    notes = (
+        (f"{counted(int(off.sum()), 'edge is|edges are')} disabled", *solution.notes) if off.any() else solution.notes
+    )
     return SolvedFile(source, source.graph, replace(solution, weights=weights, notes=notes), choices, cpu_s, wall_s)
 
 

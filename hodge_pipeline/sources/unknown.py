@@ -14,8 +14,10 @@ from hodge_pipeline.types.input_files import open_input
 
 LOOKED_AT = 60
 """Paths inside a folder that the readers are asked about: some hundredths of a second."""
+IMAGES, AS_PNG = "images are read as PNG or JPEG", "to PNG, depth with all 16 bits"
 DEPTH = 3
 NAMED = 3
+UNREAD_IMAGES = (".pgm", ".ppm", ".tif", ".tiff", ".bmp", ".exr", ".webp")
 PACKED = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst")
 
 
@@ -42,6 +44,8 @@ def _nothing(path: Path) -> str:
         return "the file is empty: record or copy it again"
     if path.is_file() and path.suffix.lower() in PACKED:
         return "packed: unpack it first"
+    if path.is_file() and path.suffix.lower() in UNREAD_IMAGES:
+        return f"{IMAGES}: convert {path.name} {AS_PNG}"
     if not path.is_dir():
         try:
             open_input(path).close()
@@ -52,7 +56,11 @@ def _nothing(path: Path) -> str:
     packed = [child.name for child in children if child.suffix.lower() in PACKED]
     if not children:
         return "the folder is empty"
-    return f"holds packed files: unpack {packed[0]} first" if packed else ""
+    if packed:
+        return f"holds packed files: unpack {packed[0]} first"
+    files = [*children, *(file for child in children if child.is_dir() for file in _children(child))]
+    image = next((file for file in files if file.suffix.lower() in UNREAD_IMAGES), None)
+    return "" if image is None else f"{IMAGES}: convert {image.relative_to(path)} and its like {AS_PNG}"
 
 
 def without_frames(source: Source) -> str:

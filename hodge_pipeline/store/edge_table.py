@@ -59,11 +59,13 @@ def write_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic], *, ha
 
 
 def _cells(name: str, column: NDArray[Any]) -> list[Any]:
+    if column.dtype.kind == "U":
+        shown = {value: cell(value) for value in set(column.tolist())}
+        return [shown[value] for value in column.tolist()]
     if column.dtype.kind != "f":
-        return [cell(value) if isinstance(value, str) else value for value in column.tolist()]
-    return [
-        f"{value:.6g}" if isfinite(value) else "" for value in (np.rad2deg(column) if name.endswith("_deg") else column)
-    ]
+        return list(column.tolist())
+    values = (np.rad2deg(column) if name.endswith("_deg") else column).tolist()
+    return [f"{value:.6g}" if isfinite(value) else "" for value in values]
 
 
 def read_edges(path: Path) -> tuple[Edges, Words]:

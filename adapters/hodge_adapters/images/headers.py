@@ -42,7 +42,7 @@ def parse_header(contents: bytes, path: Path) -> ImageHeader:
     elif not contents:
         raise SourceError(f"{path}: the file is empty: copy it again from its source")
     else:
-        raise SourceError(f"{path}: neither PNG nor JPEG: convert it, or leave it out")
+        raise SourceError(f"{path}: neither PNG nor JPEG: convert it to PNG (depth with all 16 bits), or leave it out")
     if not 0 < header.width * header.height <= MAX_PIXELS:
         raise SourceError(f"{path}: its header says {header.width}x{header.height} pixels: it is damaged")
     return header

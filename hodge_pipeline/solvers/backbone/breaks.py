@@ -84,9 +84,9 @@ class Testimony:
         end = self.displaced(loop) @ poses[high]
 
         def local(frame: Floats, covariance: Floats) -> Floats:
-            turned, origin = frame.copy(), np.broadcast_to(np.eye(4), frame.shape).copy()
-            turned[:, :3, 3], origin[:, :3, 3] = 0.0, -frame[:, :3, 3]
-            return chain.carried(se3.inverse(turned), shifted(covariance, chain.adjoint(origin)))
+            turned = frame.copy()
+            turned[:, :3, 3] = 0.0
+            return chain.carried(se3.inverse(turned), shifted(covariance, chain.lever(frame[:, :3, 3])))
 
         before = local(end, total[np.maximum(a, low)] - total[np.minimum(a, low)])
         after = local(poses[high], total[np.maximum(b, high)] - total[np.minimum(b, high)])

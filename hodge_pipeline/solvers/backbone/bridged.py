@@ -27,7 +27,6 @@ from hodge_pipeline.solvers.backbone.inference import (
     by_chance,
     infer,
     refused,
-    thinned,
 )
 from hodge_pipeline.types import Bools
 
@@ -56,7 +55,7 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     if found.confirmed:
         return chain, found
     # nor is a break confirmed that they speak of
-    return unbroken, first if first.confirmed else refused(first, unbroken, always)
+    return unbroken, first if first.confirmed else refused(first, always)
 
 
 def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> tuple[Chain, Inferred] | None:
@@ -76,17 +75,15 @@ def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]
 
 def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     """Breaks worth a trial, with what each must win beside what it has won."""
-    scaled = found.scales.applied(chain)
-    linear, (right, wrong) = linearise(scaled, chain.poses), found.judged.log_density
+    linear, (right, wrong) = found.start, found.judged.log_density
     shares = np.log(mixture(found.judged.log_density)[0])
-    told = Testimony(scaled, linear, np.logaddexp(shares[0] + right - wrong, shares[1]), wrong, found.used)
+    told = Testimony(linear.chain, linear, np.logaddexp(shares[0] + right - wrong, shares[1]), wrong, found.used)
     usual, least, fold = Usual.of(chain), by_chance(len(right)), np.log(max(told.testimonies(), 1))
     agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     worth = [(each, least) for each in agreed[:MOST_TRIED]]
-    reduced = thinned(scaled, np.flatnonzero(found.used))
-    if len(reduced.runs):
-        fit = settled(Fit(reduced, linearise(scaled, found.poses)), MOST_STEPS)
+    if len(found.reduced.runs):
+        fit = settled(Fit(found.reduced, linearise(linear.chain, found.poses)), MOST_STEPS)
         strained = strained_break(fit, usual)
         if strained is not None and strained.log_evidence > BY_CHANCE:
             worth.append((strained, BY_CHANCE - strained.log_evidence))

@@ -88,6 +88,11 @@ class Chain:
         whole = se3.adjoint(poses)
         return whole if len(self.axes) == 6 else np.asarray(whole[..., self.axes[:, None], self.axes])
 
+    def lever(self, origin: Floats) -> Floats:
+        """The lower left block (K, 3, 3), (K, 2, 1) in the plane, of what takes twists to other origins (K, 3)."""
+        turns = self.axes < 3
+        return se3.hat(-origin)[:, self.axes[~turns, None] - 3, self.axes[turns]]
+
     def carried(self, poses: Floats, covariance: Floats) -> Floats:
         """Covariances (..., p, p) of twists, in the axes that the poses lead to: `Ad Σ Adᵀ`."""
         into = self.adjoint(poses)

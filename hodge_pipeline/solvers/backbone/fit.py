@@ -21,14 +21,11 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Linear:
-    """The chain at some poses (n, 4, 4), in world axes: the steps' residuals summed over positions `residual (n, p)`;
-    `shift (n, p, p)` takes a twist from the world's origin to a pose's own.
-    """
+    """The chain at some poses (n, 4, 4): `residual (n, p)` are the steps' in world axes, summed over positions."""
 
     chain: Chain
     poses: Floats
     residual: Floats
-    shift: Floats
 
     @cached_property
     def covariance(self) -> Floats:
@@ -47,20 +44,28 @@ class Linear:
         third position, by default the second.
         """
         low, high = np.minimum(a, b), np.maximum(a, b)
-        return shifted(self.covariance[high] - self.covariance[low], self.shift[b if at is None else at])
+        to = self.poses[b if at is None else at, :3, 3]
+        return shifted(self.covariance[high] - self.covariance[low], self.chain.lever(to))
+
+    def shift(self, at: Ints) -> Floats:
+        """What takes twists (K, p, p) at the world's origin to those of these positions."""
+        return self._identity_and(self.chain.lever(self.poses[at, :3, 3]))
 
     def carry(self, a: Ints, b: Ints) -> Floats:
         """What takes twists (K, p, p) at one position's origin to another's."""
-        out = np.broadcast_to(np.eye(self.shift.shape[-1]), (len(a), *self.shift.shape[1:])).copy()
-        split = out.shape[-1] - (2 if out.shape[-1] == 3 else 3)
-        out[:, split:, :split] = self.shift[b, split:, :split] - self.shift[a, split:, :split]
+        to, back = (self.chain.lever(self.poses[each, :3, 3]) for each in (b, a))
+        return self._identity_and(to - back)
+
+    def _identity_and(self, lever: Floats) -> Floats:
+        size = len(self.chain.axes)
+        out = np.broadcast_to(np.eye(size), (len(lever), size, size)).copy()
+        out[:, -lever.shape[1] :, : lever.shape[2]] = lever
         return out
 
 
-def shifted(covariance: Floats, shift: Floats) -> Floats:
-    """Covariances (K, p, p) about the world's origin, in extended precision, in axes with another (K, p, p) there."""
-    split = shift.shape[-1] - (2 if shift.shape[-1] == 3 else 3)
-    lever = shift[:, split:, :split]
+def shifted(covariance: Floats, lever: Floats) -> Floats:
+    """Covariances (K, p, p) about the world's origin, in extended precision, about another: see `Chain.lever`."""
+    split = lever.shape[2]
     turn, across = covariance[:, :split, :split], covariance[:, split:, :split]
     moved = across + lever @ turn
     out = np.empty(covariance.shape)
@@ -73,11 +78,9 @@ def shifted(covariance: Floats, shift: Floats) -> Floats:
 def linearise(chain: Chain, poses: Floats) -> Linear:
     """The chain's sums at these poses (n, 4, 4)."""
     before = np.concatenate([poses[:1], poses[:-1]])
-    moved_origin = np.broadcast_to(np.eye(4), poses.shape).copy()
-    moved_origin[:, :3, 3] = -poses[:, :3, 3]
     left = chain.log(se3.inverse(chain.step) @ se3.inverse(before) @ poses)
     residual = np.where(chain.inner[:, None], np.einsum("nij,nj->ni", chain.adjoint(poses), left), 0.0)
-    return Linear(chain, poses, np.cumsum(residual, axis=0), chain.adjoint(moved_origin))
+    return Linear(chain, poses, np.cumsum(residual, axis=0))
 
 
 def loops_at(chain: Chain, poses: Floats, rows: Ints) -> tuple[Floats, Floats]:
@@ -204,7 +207,7 @@ class Fit:
     def residual(self) -> Floats:
         """Of the runs and the active loops (S + L, p)."""
         linear, (low, high) = self.linear, self.reduced.ends[self.reduced.runs].T
-        along = linear.shift[high] @ (linear.residual[high] - linear.residual[low])[..., None]
+        along = linear.shift(high) @ (linear.residual[high] - linear.residual[low])[..., None]
         return np.concatenate([along[..., 0], self.loops[0]])
 
     @cached_property
@@ -234,7 +237,7 @@ class Fit:
         """The Gauss–Newton move (R, p) of the ends, about the world's origin, and how much of χ² it should win."""
         force = self.force(self.precision @ self.residual[..., None])
         at_ends = self.factor.solve(force)
-        about_origin = np.linalg.inv(self.linear.shift[self.reduced.ends]) @ at_ends
+        about_origin = np.linalg.inv(self.linear.shift(self.reduced.ends)) @ at_ends
         return about_origin[..., 0], float((at_ends * force).sum())
 
     def moved(self, moves: Floats) -> Floats:
@@ -247,9 +250,10 @@ class Fit:
         out = moves[anchor] - (linear.residual - linear.residual[reduced.ends[anchor]])
         out[~touched] = 0.0
         gap = moves[second] - moves[first] + linear.residual[end] - linear.residual[begin]
-        pull = self.precision[: len(gap)] @ linear.shift[end] @ gap[..., None]
+        shift = linear.shift(end)
+        pull = self.precision[: len(gap)] @ shift @ gap[..., None]
         bent = np.concatenate([np.zeros((1, gap.shape[1])), np.cumsum((self.steps @ pull[run])[..., 0], axis=0)])
-        back = 2 * np.eye(gap.shape[1]) - linear.shift[end]
+        back = 2 * np.eye(gap.shape[1]) - shift
         out[at] += (back[run] @ (bent[1:] - bent[reduced.first[run]])[..., None])[..., 0]
         return np.asarray(linear.chain.exp(out) @ linear.poses)
 

@@ -37,8 +37,10 @@ class Inferred:
     """The result: loops that are `used (M,)`, how all were judged, the poses of the used ones, and what their errors
     were found to be: scales, and `loop_width (M,)`, factors on standard deviations for the last solve.
 
-    `log_evidence`: of the loops as judged, against all being wrong. `confirmed`: whether they say more than chance; if
-    not, none should be used: see `refused`.
+    - `start`: the bare chain with those scales; `reduced`: the network of the used loops, or of as many as `thinned`
+      leaves.
+    - `log_evidence`: of the loops as judged, against all being wrong. `confirmed`: whether they say more than chance;
+      if not, none should be used: see `refused`.
     """
 
     used: Bools
@@ -46,6 +48,8 @@ class Inferred:
     poses: Floats
     scales: Scales
     loop_width: Floats
+    start: Linear
+    reduced: Reduced
     log_evidence: float
     confirmed: bool
 
@@ -59,9 +63,10 @@ def infer(
     `scales`: of the errors; learned from the loops where none are given. `anew`: where nothing confirms them, judged
     again from the places of most loops on.
     """
-    scales, shares = learn_scales(chain, chain.poses, wrong) if scales is None else (scales, EVEN)
+    poses = chain.poses
+    scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
     chain = scales.applied(chain)
-    start = linearise(chain, chain.poses)
+    start = linearise(chain, poses)
     alone = _judge(start, None, shares, wrong)
     judge = partial(_inferred, start, alone, shares=shares, wrong=wrong, always=always, thin=thin, scales=scales)
     found = judge(alone.factor > np.log(max(len(always), 1)))
@@ -127,21 +132,20 @@ def _inferred(
     enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0)
     used, confirmed = _of_right_places(start, alone, judged, agreed, wrong, enough)
     used |= always
-    rows = thinned(chain, np.flatnonzero(used)).active
+    reduced = thinned(chain, np.flatnonzero(used))
     if (agreed & ~used).any():
-        fit = settled(Fit(Reduced.of(chain, rows), start), MOST_STEPS)
+        fit = settled(Fit(reduced, start), MOST_STEPS)
         linear, judged = fit.linear, _judge(fit.linear, fit, shares, wrong)
         top = mixture(judged.log_density)[1] - float(judged.log_density[1].sum())
-    linear, width = polished(rows, linear if used.any() else start)
-    return Inferred(used, judged, linear.poses, scales, width, top, confirmed)
+    linear, width = polished(reduced, linear if used.any() else start)
+    return Inferred(used, judged, linear.poses, scales, width, start, reduced, top, confirmed)
 
 
-def refused(found: Inferred, chain: Chain, always: Bools) -> Inferred:
+def refused(found: Inferred, always: Bools) -> Inferred:
     """The result without the loops that nothing confirms: at the poses of the bare chain and of those of `always`."""
-    chain = found.scales.applied(chain)
-    rows = thinned(chain, np.flatnonzero(always)).active
-    linear, width = polished(rows, linearise(chain, chain.poses))
-    return replace(found, used=always.copy(), poses=linear.poses, loop_width=width)
+    reduced = thinned(found.start.chain, np.flatnonzero(always))
+    linear, width = polished(reduced, found.start)
+    return replace(found, used=always.copy(), poses=linear.poses, loop_width=width, reduced=reduced)
 
 
 SETTLING = 2

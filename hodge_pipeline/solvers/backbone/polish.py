@@ -9,7 +9,7 @@ import numpy as np
 from hodge_pipeline.solvers.backbone.chain import loops_at_place
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, settled
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Floats
 
 LOCAL = 0.5
 """Of the scale of the steps' errors over long paths, that over short ones: these errors are alike from step to step.
@@ -25,12 +25,11 @@ SAME_WEIGHT = 0.01
 """Loops whose weights change by less are not solved for again."""
 
 
-def polished(rows: Ints, linear: Linear) -> tuple[Linear, Floats]:
-    """The chain at the poses of the loops of these rows, and the factors (M,) on the standard deviations of all."""
-    chain, count = linear.chain, len(linear.chain.ends)
+def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
+    """The chain at the poses of these active loops, and the factors (M,) on the standard deviations of all."""
+    chain, count, rows = linear.chain, len(linear.chain.ends), reduced.active
     if not len(rows):
         return linear, np.ones(count)
-    reduced = Reduced.of(chain, rows)
     chain = replace(chain, step_covariance=LOCAL**2 * chain.step_covariance)
     wide = np.ones(count)
     wide[rows] = loops_at_place(chain.places[rows]) ** CROWDED_POWER
