@@ -96,16 +96,16 @@ def test_gtsam_keys_of_64_bits_survive(tmp_path):
 def test_what_is_of_the_other_dimension_is_counted(tmp_path):
     source = load_g2o(write(tmp_path / "g.g2o", EDGE, "VERTEX_SE2 5 0 0 0", "VERTEX_SE2 6 0 0 0"))
     assert source.graph.vertex_ids.tolist() == [7, 3]
-    assert source.notes == ("2 lines of kind VERTEX_SE2 are not read",)
+    assert source.notes == ("2 lines of kind VERTEX_SE2 not read",)
     planar = load_g2o(write(tmp_path / "p.g2o", "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1", "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1"))
-    assert planar.notes == ("1 lines of kind VERTEX_SE3:QUAT are not read",)
+    assert planar.notes == ("1 line of kind VERTEX_SE3:QUAT not read",)
 
 
 def test_what_is_not_read_is_counted(tmp_path):
     path = write(tmp_path / "a.g2o", "VERTEX_XY 5 1 1", EDGE, "VERTEX_XY 6 1 1", "VERTEX_SE3:QUAT 7 0 0 0 0 0 0 1")
     notes = G2oReader().open(path).notes
     meaning = "landmarks, where only edges between poses are solved"
-    assert f"2 lines of kind VERTEX_XY are not read: {meaning}" in notes
+    assert f"2 lines of kind VERTEX_XY not read: {meaning}" in notes
     assert "1 of 2 vertices are named by edges only: no initial poses" in notes
 
 

@@ -97,9 +97,9 @@ def test_a_sound_sequence_has_no_oddities() -> None:
 @pytest.mark.parametrize(
     ("row", "change", "expected"),
     [
-        (4, {"stamp_s": 0.3}, "1 stamps are that of the one before: after 3"),
-        (4, {"stamp_s": 0.25}, "1 stamps are before the one before them"),
-        (9, {"stamp_s": 7.0}, "1 gaps in time of more than 5 steps; the longest, 6.2 s, between 8 and 9"),
+        (4, {"stamp_s": 0.3}, "1 stamp is that of the one before: after 3"),
+        (4, {"stamp_s": 0.25}, "1 stamp is before the one before them"),
+        (9, {"stamp_s": 7.0}, "1 gap in time of more than 5 steps; the longest, 6.2 s, between 8 and 9"),
         (5, {"frame_id": 4}, "1 frame ids are given more than once: 4"),
         (5, {"read_depth": None}, "1 of 10 frames have no depth: 5"),
         (9, {"world_from_cam": se3.exp(np.array([0, 0, 0, 3.0, 0, 0]))}, "1 jumps of the pose, the largest 2.92 m"),
@@ -180,7 +180,7 @@ def test_parallel_edges_and_loops_are_no_cycles() -> None:
     facts = graph_facts(square((1, 0), (2, 2)), found)
     assert facts["independent cycles"] == 1 and facts["pairs with more than one edge"] == 1
     assert "1 of 6 edges have both ends at one vertex: 12-12" in found
-    assert "1 edges repeat a pair that has one already" in found
+    assert "1 edge repeats a pair that has one already" in found
 
 
 def test_information_that_is_none() -> None:

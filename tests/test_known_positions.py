@@ -42,7 +42,7 @@ def test_a_table_of_metres_with_sigma(tmp_path: Path) -> None:
     assert found is not None and found.names.tolist() == ["a.jpg", "b.jpg"]
     assert found.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert found.covariances[0] == pytest.approx(0.01 * np.eye(3)) and np.isnan(found.covariances[1]).all()
-    assert "1 rows without" in source.notes[0] and "line 5" in source.notes[0]
+    assert "1 row without" in source.notes[0] and "line 5" in source.notes[0]
     assert isinstance(guess_reader(path), PositionsReader)
 
 

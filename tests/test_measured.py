@@ -60,7 +60,7 @@ def test_fixed_vertices_and_priors_have_no_part_in_a_run_and_a_note_says_so() ->
     own = replace(graph([0, 1], [(0, 1)]), fixed=np.array([0, 1]), priors=priors)
     found, notes = measured_edges(Source("s", Path("s"), frames(0, 1), graph=own), MeasuredOptions())
     assert not len(found.fixed) and found.priors is None
-    assert notes[0] == "s: its 2 fixed vertices and 1 priors have no part in a run: hodge solve heeds them"
+    assert notes[0] == "s: its 2 fixed vertices and 1 prior has no part in a run: hodge solve heeds them"
 
 
 def test_files_of_fragments_begin_at_their_first_frame(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import string
 import pytest
 
 from hodge_pipeline.types.notes import WORDING, Note, Rank
+from hodge_pipeline.types.text import counted
 
 
 @pytest.mark.parametrize("kind", WORDING)
@@ -23,3 +24,11 @@ def test_an_unknown_kind_is_refused_by_name() -> None:
 def test_doubt_comes_before_what_only_informs() -> None:
     notes = [Note("solver", detail="a"), Note("parts", 2), Note("untestable", 3, "9")]
     assert [note.rank for note in sorted(notes, key=lambda note: note.rank)] == [Rank.DOUBT, Rank.LOOK, Rank.FACT]
+
+
+def test_a_note_of_one_speaks_of_one() -> None:
+    assert str(Note("alone", 1, "20")).startswith("1 of 20 frames has no edge at all: it keeps the pose it started")
+    assert str(Note("alone", 3, "20")).startswith("3 of 20 frames have no edge at all: they keep the pose they started")
+    assert "1 frame without a given pose is carried" in str(Note("carried", 1))
+    assert counted(1, "edge") == "1 edge" and counted(0, "edge") == "0 edges"
+    assert counted(2, "vertex is|vertices are") == "2 vertices are"

@@ -159,7 +159,7 @@ def test_self_loops_are_ignored_and_counted_and_parallel_edges_average() -> None
     solution = PoissonSolver().solve(ViewGraph.from_edges(np.arange(2), edges, motion), start)
     assert solution.world_from_cam[1, 0, 3] == pytest.approx(1.1)
     assert solution.weights.tolist() == [1.0, 1.0, 0.0]
-    assert any("1 edges join a vertex to itself" in note for note in solution.notes)
+    assert any("1 edge joins a vertex to itself" in note for note in solution.notes)
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -115,7 +115,7 @@ def test_a_folder_with_poses_and_pairs(tmp_path: Path) -> None:
     assert source.frames[2].world_from_cam is None and len(source.trajectory) == 2
     assert source.graph.edges.tolist() == [[0, 1]]
     np.testing.assert_allclose(source.graph.i_from_j[0], poses[2], atol=1e-12)
-    assert any("1 pairs of the log" in note for note in source.notes)
+    assert any("1 pair of the log" in note for note in source.notes)
     assert any("1 of 3 fragments have no pose: cloud_bin_10.ply" in note for note in source.notes)
     scaled = CloudFolderReader(units_per_metre=1000.0).open(folder).frames[0].read_points()
     np.testing.assert_allclose(scaled.points_in_cam * 1000, cloud(seed=0).points_in_cam, rtol=1e-5)
@@ -337,7 +337,7 @@ def test_tables_of_points_are_read(tmp_path: Path, name: str, head: str, separat
 def test_tables_of_something_else_are_no_scans_and_told(tmp_path: Path) -> None:
     (tmp_path / "gps.csv").write_text("stamp,x,y,z\n0,1,2,3\n")
     (tmp_path / "scan.pts").write_text("1 2 3\n")
-    with pytest.raises(SourceError, match="1 files are scans of another format, left out: scan.pts: convert to PLY"):
+    with pytest.raises(SourceError, match="1 file is a scan of another format, left out: scan.pts: convert to PLY"):
         CloudFolderReader().open(tmp_path)
     (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n")
     source = CloudFolderReader().open(tmp_path)

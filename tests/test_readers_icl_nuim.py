@@ -103,7 +103,7 @@ def test_pov_frames_without_pose_or_colour_are_noted(tmp_path: Path) -> None:
     (folder / "scene_00_0001.txt").write_text(pov_text([149.376, 451.41, -285.9]))
     source = IclNuimReader().open(folder)
     assert source.frames[0].world_from_cam is None and source.frames[1].read_colour is None
-    assert "1 frames without usable camera parameters: 0" in source.notes
+    assert "1 frame without usable camera parameters: 0" in source.notes
     assert any("centimetres" in note for note in source.notes)
 
 
@@ -151,8 +151,8 @@ def test_the_redwood_layout(tmp_path: Path) -> None:
     assert source.frames[1].read_colour is None
     np.testing.assert_allclose(source.frames[2].world_from_cam, some_poses(3)[2], atol=1e-7)
     np.testing.assert_allclose(source.frames[1].read_depth(), depth_values(1) / 1000, rtol=1e-6)
-    assert "depth: 1 images without a number of their own left out: readme.png" in source.notes
-    assert "1 frames have no colour image: 1" in source.notes
+    assert "depth: 1 image without a number left out: readme.png" in source.notes
+    assert "1 frame has no colour image: 1" in source.notes
     assert any("an estimate of another program" in note for note in source.notes)
     assert [f.frame_id for f in IclNuimReader(every=2).open(folder).frames] == [0, 2]
 

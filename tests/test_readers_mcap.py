@@ -277,6 +277,6 @@ def test_frames_in_order_once_each_and_every_nth(tmp_path: Path) -> None:
     source = check_reader(McapReader(camera=(10, 10, 4, 3)), path)
     assert [frame.stamp_s for frame in source.frames] == [101.0, 102.0, 103.0, 104.0]
     assert np.array_equal(source.frames[0].read_depth(), depth_values(101).astype(np.float32) * np.float32(1e-3))
-    assert f"{DEPTH}: 1 messages with the stamp of an earlier one left out" in source.notes
+    assert f"{DEPTH}: 1 message with the stamp of an earlier one left out" in source.notes
     thinned = McapReader(camera=(10, 10, 4, 3), every=3).open(path)
     assert [(frame.frame_id, frame.stamp_s) for frame in thinned.frames] == [(0, 101.0), (3, 104.0)]

@@ -71,9 +71,9 @@ def test_a_split_bag(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text(metadata("bag_0.mcap", "bag_2.mcap", "bag_9.mcap", "../../etc/passwd"))
     source = check_reader(McapReader(), tmp_path)
     assert len(source.frames) == 3 and tmp_path / "metadata.yaml" in source.files
-    assert "metadata.yaml: 1 files that are not there left out: bag_9.mcap" in source.notes
-    assert "metadata.yaml: 1 files outside of the folder left out" in source.notes
-    assert "1 files that metadata.yaml does not list read as well: bag_1.mcap" in source.notes
+    assert "metadata.yaml: 1 file not there left out: bag_9.mcap" in source.notes
+    assert "metadata.yaml: 1 file outside of the folder left out" in source.notes
+    assert "1 file that metadata.yaml does not list read as well: bag_1.mcap" in source.notes
     (tmp_path / "metadata.yaml").write_text("{broken: [")
     assert any("metadata.yaml cannot be read" in note for note in check_reader(McapReader(), tmp_path).notes)
 

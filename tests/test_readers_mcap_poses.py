@@ -159,7 +159,7 @@ def test_topics_and_transforms_are_listed_with_counts_and_rates(tmp_path: Path) 
     assert contents == (
         "/chatter (foxglove.PackedElementField): 10 messages, 5 a second",
         "/odom (nav_msgs/msg/Odometry): 4 messages, 1 a second",
-        "/tf (tf2_msgs/msg/TFMessage): 1 messages",
-        "tf map -> odom: 1 poses",
+        "/tf (tf2_msgs/msg/TFMessage): 1 message",
+        "tf map -> odom: 1 pose",
     )
     assert inspect(tmp_path / "log.mcap")["contents"] == list(contents)

@@ -96,7 +96,7 @@ def test_a_line_that_is_no_pose_is_named_or_noted(tmp_path: Path, line: str) -> 
     path.write_text(f"# header\n0 {IDENTITY}\n{line}\n2 {IDENTITY}\n")
     parsed = parse_tum(path)
     assert parsed.trajectory.stamps_s.tolist() == [0, 2]
-    assert parsed.notes == ("a.tum: 1 lines that are no pose left out: 3",)
+    assert parsed.notes == ("a.tum: 1 line that is no pose left out: 3",)
     path.write_text(line)
     with pytest.raises(SourceError, match=r"a\.tum:1: "):
         parse_tum(path)

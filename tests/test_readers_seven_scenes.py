@@ -107,7 +107,7 @@ def test_a_frame_without_a_usable_pose_is_kept_and_noted(sequence: Path, text: s
     source = check_reader(SevenScenesReader(), sequence)
     assert [frame.world_from_cam is None for frame in source.frames] == [False, True, False]
     assert len(source.trajectory) == 2
-    assert source.notes == ("1 frames without a usable pose (missing, not finite or not rigid): seq-01/000001",)
+    assert source.notes == ("1 frame without a usable pose (missing, not finite or not rigid): seq-01/000001",)
 
 
 def test_rotations_are_made_orthonormal(sequence: Path) -> None:
@@ -125,8 +125,8 @@ def test_frames_that_lack_an_image(sequence: Path) -> None:
     (sequence / "frame-000002.color.png").unlink()
     source = check_reader(SevenScenesReader(), sequence)
     assert [(f.frame_id, f.read_colour is None) for f in source.frames] == [(1, False), (2, True)]
-    assert "1 frames without a depth image left out: seq-01/000000" in source.notes
-    assert "1 frames have no colour image: seq-01/000002" in source.notes
+    assert "1 frame without a depth image left out: seq-01/000000" in source.notes
+    assert "1 frame has no colour image: seq-01/000002" in source.notes
 
 
 def test_a_bad_image_is_found_on_reading_and_not_before(sequence: Path) -> None:

@@ -168,7 +168,7 @@ def test_stamps_and_names_that_no_clock_and_no_system_knows_are_left_out(folder:
     assert len(source.frames) == whole
     assert "depth.txt: 2 lines that are not `stamp file` left out: 5, 6" in source.notes
     assert "depth.txt: 2 lines that name no file in the folder left out: 7, 8" in source.notes
-    assert any(note.startswith("groundtruth.txt: 1 lines that are no pose left out") for note in source.notes)
+    assert any(note.startswith("groundtruth.txt: 1 line that is no pose left out") for note in source.notes)
 
 
 def test_bad_lines_are_left_out_and_noted(folder: Path) -> None:
@@ -179,7 +179,7 @@ def test_bad_lines_are_left_out_and_noted(folder: Path) -> None:
     assert len(source.frames) == 3
     assert "depth.txt: 3 lines that are not `stamp file` left out: 5, 6, 7" in source.notes
     assert "depth.txt: 3 lines that name no file in the folder left out: 9, 10, 11" in source.notes
-    assert "depth.txt: 1 lines with the stamp of an earlier one left out" in source.notes
+    assert "depth.txt: 1 line with the stamp of an earlier one left out" in source.notes
     assert "1 depth images listed but not there left out: gone.png" in source.notes
     assert not any("secret" in str(file) for file in source.files)
 
@@ -234,7 +234,7 @@ def test_truth_is_interpolated_only_between_near_neighbours(folder: Path) -> Non
     np.testing.assert_allclose(exact, a, atol=1e-6)
     assert none is None
     assert "1 of 3 frames have no truth within 0.1 s" in source.notes
-    assert "groundtruth.txt: 1 lines that are no pose left out: 2" in source.notes
+    assert "groundtruth.txt: 1 line that is no pose left out: 2" in source.notes
 
 
 def test_truth_by_row(folder: Path) -> None:
@@ -245,7 +245,7 @@ def test_truth_by_row(folder: Path) -> None:
     np.testing.assert_allclose(by_row.frames[2].world_from_cam, some_poses(3)[2], atol=1e-6)
     assert by_row.trajectory.stamps_s.tolist() == [10.0, 10.5, 11.25]
     (folder / "truth.txt").write_text(tum_line(1.0, np.eye(4)))
-    with pytest.raises(SourceError, match="1 poses for 3 frames"):
+    with pytest.raises(SourceError, match="1 pose for 3 frames"):
         TumReader(truth="truth.txt", truth_match="row").open(folder)
     with pytest.raises(SourceError, match=r"gone\.txt"):
         TumReader(truth="gone.txt").open(folder)

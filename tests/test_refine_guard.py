@@ -24,7 +24,7 @@ def test_a_better_result_is_kept():
 def test_one_worse_measure_gives_the_input_back_with_exit_code_3():
     decision = decide([BETTER, WORSE], MOVED)
     assert decision.outcome == "worse" and decision.keeps_input and decision.exit_code == 3
-    assert "held-out score 0.9 → 0.88" in decision.reason and "distance" not in decision.reason
+    assert "held-out score 0.9000 → 0.8800" in decision.reason and "distance" not in decision.reason
 
 
 def test_force_writes_a_worse_result():

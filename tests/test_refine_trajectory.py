@@ -266,5 +266,5 @@ def test_a_single_pose_and_nan_poses_do_not_stop_it(
     (tmp_path / "one.txt").write_text(text)
     found = refine(tmp_path / "one.txt", sequence, tmp_path / "run")
     assert found.exit_code == 0, found.output
-    assert "1 lines that are no pose left out" in (tmp_path / "run" / "log.txt").read_text()
+    assert "1 line that is no pose left out" in (tmp_path / "run" / "log.txt").read_text()
     assert (tmp_path / "run" / "refined.txt").read_text().endswith("nan nan nan nan nan nan nan\n")

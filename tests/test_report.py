@@ -218,7 +218,7 @@ def test_what_is_a_large_residual_and_how_many_pairs_may_see_nothing_goes_by_the
         far = replace(report.worst_edges[0], residual_m=0.15, residual_deg=0.0, weight=1.0)
         return "\n".join(map(str, suspicions(replace(report, scores=scores, worst_edges=(far,)))))
 
-    assert "1 edges that the solver used are more than 10 cm" in said(1.0, 0)
+    assert "1 edge that the solver used is more than 10 cm" in said(1.0, 0)
     assert "that the solver used are more than" not in said(10.0, 0)
     assert "have no point within" not in said(1.0, 2)
     assert "result: 3 of 200" in said(1.0, 3)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hodge_pipeline.evaluation.difference import MEASURABLE, sign_of
+from hodge_pipeline.evaluation.difference import MEASURABLE, Change, sign_of
 from hodge_pipeline.evaluation.residuals import with_residuals
-from hodge_pipeline.refine.guard import Decision
+from hodge_pipeline.refine.guard import Decision, Measure
 from hodge_pipeline.refine.judge import Cost
 from hodge_pipeline.report.brief import brief
 from hodge_pipeline.report.contents import (
@@ -45,7 +45,7 @@ def report() -> Report:
     [
         (0.020, 0.012, "improved", "fell from 20 mm to 12 mm (−40 %)"),
         (0.010, 0.015, "worse", "rose from 10 mm to 15 mm (+50 %)"),
-        (0.010, 0.0101, "unchanged", "hardly changed, from 10 mm to 10.1 mm (+1 %)"),
+        (0.010, 0.0101, "unchanged", "hardly changed, from 10.0 mm to 10.1 mm (+1 %)"),
     ],
 )
 def test_the_verdict_follows_the_scores(before_m: float, after_m: float, outcome: str, words: str) -> None:
@@ -58,7 +58,7 @@ def test_errors_that_disagree_are_mixed(report: Report) -> None:
     verdict = judge(replace(report, scores=scored(0.01, 0.01, 0.02)))
     assert verdict.outcome == "mixed"
     best, bad = verdict.headline.split(", but ")
-    assert best == "Mixed against odometry: RPE of the rotation 4.43° → 0.443° and 2 more better"
+    assert best == "Mixed against odometry: RPE of the rotation 4.43° → 0.44° and 2 more better"
     assert bad.startswith("distance of clouds (near-centroid pairs) 10 mm → 20 mm, distance of clouds (overlapping")
     assert [change.sign for change in verdict.changes] == [1, 1, 1, -1, -1]
 
@@ -209,9 +209,9 @@ def test_what_to_distrust_is_said(report: Report) -> None:
     for expected in (
         "2 pairs were tried twice",
         "falls into 3 parts",
-        "1 of 20 frames have no edge",
+        "1 of 20 frames has no edge",
         "ignored 2 of 20 edges",
-        "At least 1 edges",
+        "At least 1 edge ",
         "odometry: 2 of 3 near-centroid pairs have no point within 10 cm",
     ):
         assert expected in said
@@ -285,3 +285,20 @@ def test_scans_that_fit_in_several_ways_are_told_first(report: Report) -> None:
     )
     verdict = judge(replace(report, graph=graph, source=source, notes=(Note("none joined", detail="do this"),)))
     assert verdict.headline.startswith("No two of 20 scans joined (do this)")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        (0.0691, 0.00968, "6.91 cm → 0.97 cm"),
+        (0.0183, 0.00672, "18.3 mm → 6.7 mm"),
+        (0.998, 0.7, "99.8 cm → 70.0 cm"),
+        (0.05, 0.07, "5 cm → 7 cm"),
+        (0.9, 0.0009, "90.0 cm → 0.09 cm"),
+        (np.inf, 0.05, "– → 5 cm"),
+    ],
+)
+def test_the_two_numbers_of_a_change_have_digits_alike(before: float, after: float, told: str) -> None:
+    assert Change("", "ATE", before, after, 1e-7).briefly == f"ATE {told}"
+    assert str(Measure("score", 0.9812, 1.0)) == "score 0.981 → 1.000"
+    assert str(Measure("images off", 3, 0)) == "images off 3 → 0"

@@ -123,7 +123,7 @@ def test_poses_are_of_all_frames_wherever_they_come_from(run: Run, sequence: Pat
     drift = se3.exp(np.linspace(0, 1, FRAMES)[:, None] * np.array([0, 0.05, 0, 0.05, 0, 0]))
     write_tum(tmp_path / "slam.txt", Trajectory(np.array([frame.stamp_s for frame in frames]), true @ drift))
     given = load_recipe("slam_refine", [*quick, f"start.path={tmp_path / 'slam.txt'}", "start.every=3"], sequence)
-    unordered = load_recipe("demo", [*quick, "start={stage: unordered, use: geometry}"], sequence)
+    unordered = load_recipe("demo", [*quick, "start=unordered"], sequence)
     for name, recipe in (("given", given), ("unordered", unordered)):
         made = hodge_pipeline.run(recipe, tmp_path / name)
         for one in (made, Run.load(made.folder)):

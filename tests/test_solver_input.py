@@ -44,9 +44,7 @@ def test_an_edge_longer_than_the_earth_gives_a_result_and_a_warning(objective, l
     motion[3, :3, 3] += [length, 0, 0]
     solution = solve(dataclasses.replace(graph, i_from_j=motion), objective=objective)
     i, j = graph.vertex_ids[graph.edges[3]]
-    assert any(
-        note.startswith("1 edges are longer than the earth") and f"({i}, {j})" in note for note in solution.notes
-    )
+    assert any(note.startswith("1 edge is longer than the earth") and f"({i}, {j})" in note for note in solution.notes)
     assert np.isfinite(solution.world_from_cam).all()
     left = motion - se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
     assert solution.metrics["objective"] < (left[3, :3, 3] @ left[3, :3, 3]) * (1 + 1e-9)
@@ -137,8 +135,8 @@ def test_zero_information_is_ignored_and_said():
     solution = solve(more)
     assert solution.metrics["objective"] == pytest.approx(solve(graph).metrics["objective"], rel=1e-9)
     assert solution.weights[-2:].tolist() == [0, 0]
-    assert any("1 edges have no information" in note for note in solution.notes)
-    assert any("1 edges join a vertex to itself" in note for note in solution.notes)
+    assert any("1 edge has no information" in note for note in solution.notes)
+    assert any("1 edge joins a vertex to itself" in note for note in solution.notes)
 
 
 def test_edges_of_rotation_alone_are_solved():
@@ -147,7 +145,7 @@ def test_edges_of_rotation_alone_are_solved():
     information[0, 3:, 3:] = 0
     solution = solve(dataclasses.replace(graph, information=information))
     np.testing.assert_allclose(solution.world_from_cam, truth, atol=1e-6)
-    assert any("have no definite information on translation" in note for note in solution.notes)
+    assert any("has no definite information on translation" in note for note in solution.notes)
 
 
 def test_indefinite_information_falls_back_and_says_so():

@@ -108,7 +108,7 @@ def test_of_a_graph_with_landmarks_the_poses_are_solved(tmp_path: Path) -> None:
     path.write_text(ISAM)
     source = guess_reader(path).open(path)
     assert source.graph is not None and source.graph.edges.tolist() == [[0, 1], [1, 2]]
-    assert "2 lines of kind LANDMARK are not read: landmarks, where only edges between poses are solved" in source.notes
+    assert "2 lines of kind LANDMARK not read: landmarks, where only edges between poses are solved" in source.notes
 
 
 def test_landmarks_alone_are_refused(tmp_path: Path) -> None:

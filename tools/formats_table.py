@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hodge_pipeline.errors import HodgeError
 from hodge_pipeline.sources import inspect as inspection
+from hodge_pipeline.types.text import counted
 
 OPENED_WHOLE = 0.6
 """A folder that a reader is so sure of is opened as one; its files are its own."""
@@ -81,11 +82,12 @@ def _open(data: Path, path: Path, name: str) -> tuple[str, str, set[Path]]:
         return name, f"refused: {reason}", own
     parts = []
     if source.frames:
-        parts.append(f"{len(source.frames)} frames")
+        parts.append(counted(len(source.frames), "frame"))
     if source.trajectory is not None:
-        parts.append(f"{len(source.trajectory)} poses")
+        parts.append(counted(len(source.trajectory), "pose"))
     if source.graph is not None:
-        parts.append(f"{source.graph.vertex_count} vertices, {source.graph.edge_count} edges")
+        edges = counted(source.graph.edge_count, "edge")
+        parts.append(f"{counted(source.graph.vertex_count, 'vertex|vertices')}, {edges}")
     return name, ", ".join(parts), {file.resolve() for file in source.files}
 
 

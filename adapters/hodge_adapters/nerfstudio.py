@@ -22,6 +22,7 @@ from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, Frame, ImageFile, Source, Trajectory
 from hodge_pipeline.types.input_files import read_input
+from hodge_pipeline.types.text import counted
 
 FILE = "transforms.json"
 IMAGES = "images"
@@ -115,7 +116,7 @@ class NerfstudioWriter:
                 _target(path.parent, path.name),
                 {"camera_model": PERSPECTIVE, "orientation_override": "none", "frames": bare},
             )
-            return written(f"{len(bare)} poses without images", source)
+            return written(f"{counted(len(bare), 'pose')} without images", source)
         lenses = [None if frame.image is None else named(frame.image) for frame in posed]
         models = {lens[0] for lens in lenses if lens}
         model = models.pop() if len(models) == 1 else None
@@ -133,7 +134,7 @@ class NerfstudioWriter:
             {"camera_model": model or PERSPECTIVE, "orientation_override": "none", "frames": entries},
         )
         how = ", ".join(f"{count} {what}" for what, count in done.items())
-        return written(f"{len(entries)} frames: {how}", source, {"cameras", "names", "images"})
+        return written(f"{counted(len(entries), 'frame')}: {how}", source, {"cameras", "names", "images"})
 
 
 def transforms_file(path: Path) -> Path:

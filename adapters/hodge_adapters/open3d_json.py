@@ -21,6 +21,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, Floats, Frame, Source, Trajectory, ViewGraph
+from hodge_pipeline.types.text import counted
 
 GRAPH, TRAJECTORY = "PoseGraph", "PinholeCameraTrajectory"
 CERTAIN, UNCERTAIN = "open3d", "open3d_uncertain"
@@ -74,7 +75,9 @@ class Open3dPoseGraphWriter:
             **VERSION,
         }
         write_json(Path(path), content)
-        return written(f"{graph.vertex_count} vertices, {graph.edge_count} edges", source, {"edges"})
+        return written(
+            f"{counted(graph.vertex_count, 'vertex|vertices')}, {counted(graph.edge_count, 'edge')}", source, {"edges"}
+        )
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -102,7 +105,7 @@ class Open3dTrajectoryWriter:
             **VERSION,
         }
         write_json(Path(path), content)
-        return written(f"{len(poses)} poses", source, {"cameras"})
+        return written(counted(len(poses), "pose"), source, {"cameras"})
 
 
 def information_of_open3d(j_from_i: Floats, information: Floats) -> Floats:

@@ -79,11 +79,6 @@ def listed(items: Sequence[object]) -> str:
     return ", ".join(str(item) for item in items[:SHOWN]) + more
 
 
-def counted(count: int, noun: str) -> str:
-    """A count with its noun: `1 image`, `2 images`."""
-    return f"{count} {noun}{'s' * (count != 1)}"
-
-
 def natural(name: str) -> tuple[tuple[int, int, str], ...]:
     """A sort key that takes digits for numbers."""
     parts = (part for part in _DIGITS.split(name) if part)

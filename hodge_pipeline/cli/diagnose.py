@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from hodge_pipeline.cli.console import ProgressBars, print_json, print_table
 from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.report.brief import COLUMNS, LABEL, LINES, at_most, labelled
+from hodge_pipeline.types.text import counted
 
 if TYPE_CHECKING:
     from hodge_pipeline.report.energy import EnergyRow
@@ -82,7 +83,7 @@ def _lines(found: Diagnosed, out: Path | None, top: int | None, bad: int) -> lis
     left = found.subject.graph.edge_count - len(points)
     if left and (points or top is not None):
         where = "--verbose" if out is None else str(out / "edges.csv")
-        points.append(f"  - … and {left} more edges, none of them worse: {where}")
+        points.append(f"  - … and {counted(left, 'more edge')}, none of them worse: {where}")
     return [*head, *points, *tail]
 
 

@@ -13,6 +13,7 @@ from hodge_pipeline.cli.run import resumable
 from hodge_pipeline.errors import CheckError
 from hodge_pipeline.refine.model_options import RECIPE, load_model_refinement
 from hodge_pipeline.report.brief import COLUMNS, LABEL, labelled
+from hodge_pipeline.types.text import counted
 
 if TYPE_CHECKING:
     from hodge_pipeline.refine.model import RefinedModel
@@ -61,7 +62,7 @@ def refine(
 def _print_tables(result: RefinedModel) -> None:
     rows = [(m.name, f"{m.before:.4g}", f"{m.after:.4g}", m.unit) for m in result.decision.measures]
     if rows:
-        print_table(f"{result.start.quality.images} images", ("measure", "before", "after", "unit"), rows)
+        print_table(counted(result.start.quality.images, "image"), ("measure", "before", "after", "unit"), rows)
     costs = [
         (name, f"{cost.px:.4g}", f"{cost.median_px:.4g}", str(len(cost.images_off)), "kept" * (row == result.kept_row))
         for row, (name, cost) in enumerate(result.candidates)

@@ -20,7 +20,7 @@ from hodge_pipeline.solvers.newton import TIME_LIMIT_REACHED
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.store.workspace import RECIPE_FILE
 from hodge_pipeline.types import Source
-from hodge_pipeline.types.text import command
+from hodge_pipeline.types.text import command, counted
 
 COUNTED = ("pose", "edge", "piece")
 KNOWN_ENDINGS = (".tum", ".kitti", ".csv", ".log", ".json", ".ply")
@@ -119,7 +119,7 @@ def _lines(
     solved: SolvedFile, summary: dict[str, Any], out: Path | None, run_folder: Path | None, *, verbose: bool
 ) -> list[str]:
     """The verdict, what was solved, what to heed, where it is: ten lines; `verbose`: with every note, whole."""
-    poses, edges, pieces = (f"{summary[f'{one}s']} {one}{'s' * (summary[f'{one}s'] != 1)}" for one in COUNTED)
+    poses, edges, pieces = (counted(summary[f"{one}s"], one) for one in COUNTED)
     ignored = f", {summary['edges_ignored']} ignored" if summary["edges_ignored"] else ""
     shape = f"{summary['dimension']}-D, {poses}, {edges}{ignored}, {pieces}"
     lines = [*labelled("verdict", solved.headline), f"  - {solved.source.name}: {shape}"]
@@ -129,7 +129,7 @@ def _lines(
         lines += [line for note in summary["notes"][:NOTES] for line in at_most(labelled("note", note), 1)]
         if (left := len(summary["notes"]) - NOTES) > 0:
             lines.append(f"  - … and {left} more notes: --verbose")
-    time = f"{summary['wall_s']:.3f} s, {summary['cpu_s']:.3f} CPU s, {summary['newton_steps']} steps"
+    time = f"{summary['wall_s']:.3f} s, {summary['cpu_s']:.3f} CPU s, {counted(summary['newton_steps'], 'step')}"
     lines.append(f"{'time':<{LABEL}}{time}")
     lines += [f"{'written':<{LABEL}}{out}"] if out is not None else []
     lines += [f"{'report':<{LABEL}}{run_folder / 'report.html'}"] if run_folder is not None else []

@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import connected_components as csgraph_components
 
 from hodge_pipeline.complex.coboundary import check_edges
 from hodge_pipeline.types import Bools, Ints
+from hodge_pipeline.types.text import counted
 
 MOST_PIECES_LISTED = 8
 
@@ -58,7 +59,7 @@ def describe_components(component: Ints, vertex_ids: NDArray[np.generic]) -> tup
 
 
 def _describe_piece(number: int, names: NDArray[np.generic]) -> str:
-    return f"piece {number}: {len(names)} vertices ({names[0]} … {names[-1]})"
+    return f"piece {number}: {counted(len(names), 'vertex|vertices')} ({names[0]} … {names[-1]})"
 
 
 def in_runs(rows: Ints, vertex_ids: Ints | np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.types import Floats, ViewGraph
+from hodge_pipeline.types.text import counted
 
 KINDS = ("turning about", "sliding along")
 UNMEASURED = 1e-6
@@ -47,7 +48,8 @@ def free_direction_notes(graph: ViewGraph) -> tuple[str, ...]:
         for k in frames[:NAMED]
     ]
     more = f", {len(frames) - NAMED} more" if len(frames) > NAMED else ""
-    return (f"no edge measures these motions of {len(frames)} frames, in their axes: {', '.join(told)}{more}",)
+    whose = f"{counted(len(frames), 'frame')}, in their axes: {', '.join(told)}{more}"
+    return (f"no edge measures these motions of {whose}",)
 
 
 def _held(graph: ViewGraph) -> Floats:

@@ -27,6 +27,7 @@ from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import check_choice, held_rows
 from hodge_pipeline.solvers.weights import edge_weights, is_planar
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, ViewGraph
+from hodge_pipeline.types.text import counted
 
 LEVEL = 0.01
 """Choices of edges that agree so well by chance, expected among all: as the gate of the edges, which 1 % miss."""
@@ -156,7 +157,10 @@ def _with_confirmation(graph: ViewGraph, usable: Bools, solution: Solution) -> S
     if confirmed(graph.select(np.flatnonzero(usable)), np.flatnonzero(weights)):
         return replace(solution, confirmed=True)
     if left_out := int((weights == 0).sum()):
-        why = f"{left_out} edges are left out, and the cycles of the others close no better than by chance"
+        why = (
+            f"{counted(left_out, 'edge is|edges are')} left out, and the cycles of the others close no better "
+            "than by chance"
+        )
         note = f"{why}: nothing confirms the poses"
         return replace(solution, confirmed=False, notes=(note, *solution.notes))
     note = "no edge is left out, and no cycles close better than by chance: nothing tests the edges"

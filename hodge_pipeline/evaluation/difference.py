@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -83,11 +84,17 @@ class Change:
 
     @property
     def values(self) -> tuple[str, str]:
-        """Before and after in the same unit."""
-        if self.unit == "°":
-            return angle(self.before, self.floor), angle(self.after, self.floor)
-        larger_m = max(self.before, self.after)
-        return length(self.before, larger_m, self.floor), length(self.after, larger_m, self.floor)
+        """Before and after in the same unit, with digits alike."""
+        larger = max((value for value in (self.before, self.after) if value < float("inf")), default=0.0)
+        factor, unit = (1.0, "°") if self.unit == "°" else _unit(larger)
+        before, after = (f"{text}{unit}" for text in alike(self.before * factor, self.after * factor))
+        return self._or_floor(self.before, before), self._or_floor(self.after, after)
+
+    def _or_floor(self, value: float, text: str) -> str:
+        """The text of a value, unless that is below the floor or no number."""
+        if self.floor <= abs(value) < float("inf"):
+            return text
+        return angle(value, self.floor) if self.unit == "°" else length(value, None, self.floor)
 
     @property
     def _in_percent(self) -> str:
@@ -100,12 +107,38 @@ def length(metres: float, unit_of_m: float | None = None, floor_m: float = 0.0) 
         return "–"
     if abs(metres) < floor_m:
         return f"< {length(floor_m)}"
-    size_m = abs(metres if unit_of_m is None else unit_of_m)
+    factor, unit = _unit(abs(metres if unit_of_m is None else unit_of_m))
+    return f"{metres * factor:.3g}{unit}"
+
+
+def _unit(size_m: float) -> tuple[float, str]:
+    """The factor from metres to the unit that suits a size, and its name after a space."""
     if size_m < 0.025:
-        return f"{metres * 1000:.3g} mm"
+        return 1000.0, " mm"
     if size_m < 1:
-        return f"{metres * 100:.3g} cm"
-    return f"{metres:.3g} m" if size_m < 999.5 else f"{metres / 1000:.3g} km"
+        return 100.0, " cm"
+    return (1.0, " m") if size_m < 999.5 else (0.001, " km")
+
+
+ROUNDING = 1e-9
+"""Of a whole number, by a change of units."""
+
+
+def alike(before: float, after: float, digits: int = 3) -> tuple[str, str]:
+    """Two numbers of one change with the same decimals, so many that the larger has these significant digits.
+
+    Whole numbers have none; a smaller one that this leaves less than two digits has two.
+    """
+    larger = max(abs(before), abs(after))
+    if not 1e-3 <= larger < 1e6:  # too small or too large for decimals, or no number
+        return f"{before:.{digits}g}", f"{after:.{digits}g}"
+    is_whole = all(abs(value - round(value)) < ROUNDING for value in (before, after) if math.isfinite(value))
+    decimals = 0 if is_whole else max(digits - 1 - math.floor(math.log10(larger)), 0)
+    least = 0.0 if is_whole else 10.0 ** (1 - decimals)
+    first, second = (
+        f"{value:.{decimals}f}" if value == 0 or abs(value) >= least else f"{value:.2g}" for value in (before, after)
+    )
+    return first, second
 
 
 def angle(degrees: float, floor_deg: float = 0.0) -> str:

@@ -14,6 +14,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.fusion.views import Skipped, posed
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Bools, Bytes, Camera, Floats, Floats32, Frame, Ints, Model, PointCloud
+from hodge_pipeline.types.text import counted
 
 POINTS_AT_ONCE = 1 << 20
 
@@ -99,7 +100,7 @@ class CloudFuser:
                 f"max_points = {self.max_points}"
             )
         if far:
-            notes.append(f"{far} points left out: more than a million voxels from the first frame")
+            notes.append(f"{counted(far, 'point')} left out: more than a million voxels from the first frame")
         return notes
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import HodgeError
 from hodge_pipeline.types import Bytes, Floats, Frame
+from hodge_pipeline.types.text import counted
 
 
 class Skipped:
@@ -42,7 +43,7 @@ class Skipped:
     def notes(self) -> tuple[str, ...]:
         """One line for each reason."""
         return tuple(
-            f"{len(names)} frame{'s' if len(names) > 1 else ''} {why} (the first: {next(iter(names.values()))})"
+            f"{counted(len(names), 'frame')} {why} (the first: {next(iter(names.values()))})"
             for why, names in self._frames.items()
         )
 

@@ -22,6 +22,7 @@ from hodge_pipeline.pairs.sift_similarity import global_descriptors, most_simila
 from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Bytes, CloudSet, Edges, Floats, Floats32, Frame, Ints
+from hodge_pipeline.types.text import counted
 
 log = logging.getLogger("hodge_pipeline")
 
@@ -103,7 +104,7 @@ def _matched(options: SiftEdges, same: _Same, features: Features) -> Edges:
     rows = np.array([row for row in same.rows.tolist() if features.count(row)], np.int64)
     if not len(rows):
         raise SourceError(
-            f"no image of the {len(same.rows)} frames gave a SIFT feature ({features.complaints[0]}): "
+            f"no image of the {counted(len(same.rows), 'frame')} gave a SIFT feature ({features.complaints[0]}): "
             "use edges that need no images, such as centroid or overlap"
         )
     proposed = _proposed(options, same, features, rows)

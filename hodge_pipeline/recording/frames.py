@@ -14,6 +14,7 @@ from hodge_pipeline.recording.shapes import or_grey
 from hodge_pipeline.recording.stream import Part, frame_columns, log_markdown
 from hodge_pipeline.types import Camera, CloudSet, EncodedImage, Floats, Frame, Ints
 from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.text import counted
 
 CHUNK_BYTES = 4_000_000
 """Images go in chunks of this size: few enough to be quick, small enough for a viewer to fetch one."""
@@ -29,7 +30,9 @@ the largest is 1.2 times the mean, and the mean of 16 is known to 3 %."""
 def log_frames(part: Part, name: str, frames: Sequence[Frame], notes: Sequence[str]) -> None:
     """Log encoded images, cameras and names of the frames; `notes` are the reader's."""
     stream, (rows, thinned) = part.stream, image_rows(frames, part.options)
-    log_markdown(stream, layout.SOURCE, "\n".join([f"# {name}", f"{len(frames)} frames", *(f"- {n}" for n in notes)]))
+    log_markdown(
+        stream, layout.SOURCE, "\n".join([f"# {name}", counted(len(frames), "frame"), *(f"- {n}" for n in notes)])
+    )
     if thinned:
         part.note(thinned)
     _log_names(stream, frames)
@@ -41,7 +44,7 @@ def log_frames(part: Part, name: str, frames: Sequence[Frame], notes: Sequence[s
             kept += len(images)
     wished = sum((frames[row].encoded_colour is not None) + (frames[row].encoded_depth is not None) for row in rows)
     if kept < wished:
-        part.note(f"{wished - kept} images cannot be read and are not shown", level="WARN")
+        part.note(f"{counted(wished - kept, 'image')} cannot be read and are not shown", level="WARN")
 
 
 def image_rows(frames: Sequence[Frame], options: RecordingOptions) -> tuple[Ints, str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.refine.candidates import Found
@@ -118,7 +119,7 @@ def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
         return "no candidate fits the tracks: mend matches or cameras (--refine focal), or --force the best one"
     gain = 1.0 - _per_freedom(found, at) / _per_freedom(found, 0, poses=False)
     if not gain >= LEAST_GAIN:
-        fitted = f"{before.px:.4g} → {after.px:.4g} px"
+        fitted = f"{' → '.join(alike(before.px, after.px, 4))} px"
         return f"the best candidate's gain ({fitted}) is what so many poses gain by fitting noise"
     if gain >= CLEAR_GAIN and start.quality.mean_track_length >= LONG_TRACKS:
         return ""

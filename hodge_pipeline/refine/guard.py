@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from hodge_pipeline.evaluation.difference import Better, sign_of
+from hodge_pipeline.evaluation.difference import Better, alike, sign_of
 
 Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "nothing"]
 
@@ -44,7 +44,7 @@ class Measure:
         return sign_of(self.before, self.after, self.tolerance / 3, self.better) > 0
 
     def __str__(self) -> str:
-        return f"{self.name} {self.before:.4g} → {self.after:.4g}{self.unit and ' '}{self.unit}"
+        return f"{self.name} {' → '.join(alike(self.before, self.after, 4))}{self.unit and ' '}{self.unit}"
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.refine.candidates import GIVEN, Found, weigh
@@ -146,7 +147,7 @@ def _placed_decision(start: TrackedModel, found: Found, choice: Choice) -> Decis
         return None
     off, name = found.positions_off, found.candidates[choice.row].name
     fit = f", {off[0]:.3g} → {off[choice.row]:.3g} m off in the median" if np.isfinite(off[0]) else ""
-    told = f"mean error {found.costs[0].px:.4g} → {found.costs[choice.row].px:.4g} px{_by(name)}"
+    told = f"mean error {' → '.join(alike(found.costs[0].px, found.costs[choice.row].px, 4))} px{_by(name)}"
     return Decision("refined", f"{start.placing}{fit}; {told}")
 
 
@@ -156,7 +157,7 @@ def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool
     name = found.candidates[choice.row].name
     if len(scales) > 1:
         return _join_decision(found.inputs, after, name, force)
-    told = f"mean error {before.px:.4g} → {after.px:.4g} px{_by(name)}"
+    told = f"mean error {' → '.join(alike(before.px, after.px, 4))} px{_by(name)}"
     if scales[0].is_observable and not scales[0].is_one:
         return Decision("refined", f"in metres now; {told}")
     if not choice.row:

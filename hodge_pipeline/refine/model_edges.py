@@ -13,6 +13,7 @@ from hodge_pipeline.registration.clouds import CloudOptions, prepare_clouds
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, ViewGraph
+from hodge_pipeline.types.text import counted
 
 HELD_OUT_SHARE, LEAST_HELD_OUT = 0.2, 4
 """Of the pairs with depth: kept out of registration and solve, to judge the result by."""
@@ -54,7 +55,7 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, steps: Steps, wor
     reasons = options.acceptance.reasons(registered)
     notes = (
         *notes,
-        *(f"{(reasons == why).sum()} pairs with depth left out: {why}" for why in np.unique(reasons) if why),
+        *(f"{counted((reasons == why).sum(), 'pair')} with depth left out: {why}" for why in np.unique(reasons) if why),
     )
     accepted = registered.select(reasons == "")
     names = np.array([str(frame.frame_id) for frame in frames])

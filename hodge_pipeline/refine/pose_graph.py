@@ -23,7 +23,7 @@ from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.unknown import without_frames
 from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, ViewGraph
-from hodge_pipeline.types.text import command
+from hodge_pipeline.types.text import command, counted
 
 RUN_GRAPH = "graph.g2o"
 ROUNDING = 1e-15
@@ -160,7 +160,9 @@ def solve_file(path: Path, choices: Choices) -> SolvedFile:
     cpu_s, wall_s = time.process_time() - cpu_s, time.monotonic() - wall_s
     weights = np.zeros(len(off))
     weights[~off] = solution.weights
-    notes = (f"{int(off.sum())} edges are disabled", *solution.notes) if off.any() else solution.notes
+    notes = (
+        (f"{counted(int(off.sum()), 'edge is|edges are')} disabled", *solution.notes) if off.any() else solution.notes
+    )
     return SolvedFile(source, source.graph, replace(solution, weights=weights, notes=notes), choices, cpu_s, wall_s)
 
 

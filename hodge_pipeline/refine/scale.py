@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.text import counted
 
 LEAST_POINTS = 50
 LEAST_IMAGES = 3
@@ -49,8 +50,9 @@ class Scale:
         if not self.is_observable:
             return f"scale not observable, kept: {self.reason}"
         return (
-            f"scale {self.metres_per_unit:.6g} m per unit (± {self.sigma:.2%}), by depth at {self.points} points of "
-            f"{self.images} images, half of them within {self.spread:.1%}"
+            f"scale {self.metres_per_unit:.6g} m per unit (± {self.sigma:.2%}), by depth at "
+            f"{counted(self.points, 'point')} of "
+            f"{counted(self.images, 'image')}, half of them within {self.spread:.1%}"
         )
 
 
@@ -65,7 +67,9 @@ def metric_scale(ratios: Sequence[Floats]) -> Scale:
     if not len(ratios):
         return _unknown(0, 0, "there is no depth")
     if len(found) < LEAST_POINTS or len(useful) < LEAST_IMAGES:
-        return _unknown(len(found), len(useful), f"depth at only {len(found)} points of {len(useful)} images")
+        return _unknown(
+            len(found), len(useful), f"depth at only {counted(len(found), 'point')} of {len(useful)} images"
+        )
     scale = float(np.median(found))
     spread = float(np.median(np.abs(found / scale - 1)))
     if not spread <= MAX_SPREAD:

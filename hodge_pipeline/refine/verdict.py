@@ -92,7 +92,7 @@ def _nothing(last: Round) -> str:
         rejected = ", ".join(f"{count} {reason}" for reason, count in last.edges.rejected_counts.items())
         return f"no edge joins two frames ({rejected or 'no pair overlaps'}): nothing was refined"
     if not (last.solution.weights > 0).any():
-        return f"the solver rejected all {last.graph.edge_count} edges: nothing was refined"
+        return f"the solver rejected every edge ({last.graph.edge_count}): nothing was refined"
     joined = len(np.unique(last.graph.edges))
     if joined < LEAST_JOINED * last.graph.vertex_count:
         found = f"{joined} of {last.graph.vertex_count} key frames overlap with another one"

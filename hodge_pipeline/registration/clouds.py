@@ -16,6 +16,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.voxel_means import voxel_means
 from hodge_pipeline.stages import Advance, Workers, no_progress
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats32, Frame, Landmarks, PointCloud
+from hodge_pipeline.types.text import counted
 
 FRAMES_IN_BLOCK = 16
 MIN_POINTS_FOR_NORMALS = 5
@@ -129,7 +130,7 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     if not len(points):
         odd = Oddity(frame.frame_id, "no valid measurement in range, its cloud is empty", samples.why_none)
     elif samples.looked_at > MANY_POINTS:
-        kept = f"{samples.looked_at} points to {len(points)}, one a voxel of {options.voxel_m:.3g} m"
+        kept = f"{counted(samples.looked_at, 'point')} to {len(points)}, one a voxel of {options.voxel_m:.3g} m"
         odd = Oddity(frame.frame_id, "down-sampled in parts", kept)
     valid, no_returns = len(samples.points_in_cam), samples.no_returns
     return cloud, CloudCounts(samples.looked_at, valid, len(points), odd, samples.blank, no_returns)

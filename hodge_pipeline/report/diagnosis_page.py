@@ -15,6 +15,7 @@ from hodge_pipeline.report.energy import CAVEAT, PARTS, SHARE_CAVEAT, EnergyRow
 from hodge_pipeline.report.tables import number
 from hodge_pipeline.rounds.suggestions import Suggestions
 from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types.text import counted
 
 LISTED = 20
 CYCLES_EACH = 2
@@ -55,7 +56,8 @@ def document(contents: PageContents) -> Document:
     frames = frames_table(contents.graph, contents.diagnosis)
     return Document(
         f"Which edge is wrong: {contents.title}",
-        f"{contents.graph.vertex_count} frames, {contents.graph.edge_count} edges. Each edge is a measured motion "
+        f"{counted(contents.graph.vertex_count, 'frame')}, {counted(contents.graph.edge_count, 'edge')}. Each "
+        "edge is a measured motion "
         "between two frames; the cycles that it lies in test it.",
         (Banner(MARKS[worst], sentence(contents.graph, contents.diagnosis), rest, worst),),
         first=(Section("What to do", text="\n".join(contents.commands)),),

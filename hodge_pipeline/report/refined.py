@@ -26,6 +26,7 @@ from hodge_pipeline.store import yaml_file
 from hodge_pipeline.store.cost import Cost
 from hodge_pipeline.store.store import versions
 from hodge_pipeline.types.notes import Note, notes_of
+from hodge_pipeline.types.text import counted
 
 HEADLINES = {
     "refined": "Better than the poses given",
@@ -70,7 +71,8 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
     """The report of the first result, which has most images; the others in its notes."""
     first = results[0]
     others = [
-        f"model {number} ({result.start.quality.images} images): {result.decision.outcome}, {result.decision.reason}"
+        f"model {number} ({counted(result.start.quality.images, 'image')}): {result.decision.outcome}, "
+        f"{result.decision.reason}"
         for number, result in enumerate(results[1:], start=1)
     ]
     metric = () if first.final_scale.is_observable else (Note("no metres"),)
@@ -90,7 +92,7 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
         )
     return Report(
         title=f"{source}, refined",
-        source=SourceSummary(f"{quality.points} points", source, quality.images, format="colmap", kind="images"),
+        source=SourceSummary(counted(quality.points, "point"), source, quality.images, format="colmap", kind="images"),
         before="start",
         refinement=replace(summary(first.decision), scale=_scales(first), candidates=_candidates(first)),
         graph=graph,

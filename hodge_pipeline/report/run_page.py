@@ -20,7 +20,7 @@ from hodge_pipeline.report.tables import (
 )
 from hodge_pipeline.report.verdict import Outcome, capital, judge, suspicions
 from hodge_pipeline.types.notes import Rank
-from hodge_pipeline.types.text import command
+from hodge_pipeline.types.text import command, counted
 
 MARKS: dict[Outcome, Mark] = {
     "improved": "better", "unchanged": "same", "worse": "worse", "mixed": "mixed", "not measured": "not measured",
@@ -77,7 +77,7 @@ def _subtitle(report: Report) -> str:
     told = [f"{form}{source.counted}{sequences}, {truth}"]
     if graph is not None:
         parts = len(graph.components)
-        told.append(f"{graph.edges} edges, {parts} connected part{'s' * (parts != 1)}")
+        told.append(f"{counted(graph.edges, 'edge')}, {counted(parts, 'connected part')}")
     if report.stages:
         told.append(f"{duration(sum(stage.wall_s for stage in report.stages))}{peak(report)}")
     return f"{'; '.join(told)}."

@@ -27,6 +27,7 @@ from hodge_pipeline.store.store import versions
 from hodge_pipeline.store.workspace import make_folder
 from hodge_pipeline.types import Edges, Floats
 from hodge_pipeline.types.notes import notes_of
+from hodge_pipeline.types.text import counted
 
 SOLVED = "solved.json"
 
@@ -59,7 +60,7 @@ def _before(solved: SolvedFile) -> dict[str, Floats]:
 
 def _outcome(solved: SolvedFile) -> RefinementSummary:
     summary = solved.summary()
-    reason = f"{summary['edges']} edges, {summary['edges_ignored']} of them ignored"
+    reason = f"{counted(summary['edges'], 'edge')}, {summary['edges_ignored']} of them ignored"
     return RefinementSummary("worse" if solved.doubt else "solved", solved.headline, reason)
 
 

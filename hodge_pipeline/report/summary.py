@@ -16,6 +16,7 @@ from hodge_pipeline.scene import Round
 from hodge_pipeline.stages import ConsistencySolver, Step
 from hodge_pipeline.types import Edges, Floats, Ints
 from hodge_pipeline.types.notes import Note
+from hodge_pipeline.types.text import counted
 
 CENTIMETRES_PER_DEGREE = 1.0
 """How a residual's angle counts beside its translation when edges are ranked: a scene lies about 0.6 m away."""
@@ -107,7 +108,7 @@ def unheld(edges: Edges, vertex_ids: NDArray[np.generic], min_spread: float) -> 
     if free.sum() <= UNHELD * steps.sum():
         return ()
     frames = in_runs(np.unique(graph.pairs[free].max(axis=1)), vertex_ids)
-    return (Note("unheld", int(free.sum()), f"{int(steps.sum())} steps (to {frames})"),)
+    return (Note("unheld", int(free.sum()), f"{counted(int(steps.sum()), 'step')} (to {frames})"),)
 
 
 def _verdicts(graph: Edges) -> dict[str, int]:

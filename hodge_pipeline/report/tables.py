@@ -12,6 +12,7 @@ from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import RefinementSummary, Report
 from hodge_pipeline.report.document import Table
 from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m
+from hodge_pipeline.types.text import counted
 
 
 def peak_mb(report: Report) -> float:
@@ -76,7 +77,8 @@ def _candidates(refinement: RefinementSummary) -> Table:
     )  # fmt: skip
     header = ("candidate", "mean, px", "median, px", "behind", "distant", "beyond the cap", "images off")
     caption = (
-        f"Each on the same {refinement.candidates[0].observations} observations; a mean is of errors up to the cap. "
+        f"Each on the same {counted(refinement.candidates[0].observations, 'observation')}; a mean is of "
+        "errors up to the cap. "
         "Lost or behind a camera, or distant (with no parallax where most candidates have one) counts as the cap."
     )
     return Table("Candidates", header, rows, caption)

@@ -15,6 +15,7 @@ from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.subject import SIDE_FILE, Subject
 from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.types import Floats, Trajectory, ViewGraph
+from hodge_pipeline.types.text import counted
 from hodge_pipeline.uses.model_folder import MODELS
 
 SAME_PX = 1e-3
@@ -49,7 +50,7 @@ def _write_graph(path: Path, subject: Subject, graph: ViewGraph, world_from_cam:
     trajectory = Trajectory(np.arange(len(world_from_cam), dtype=float), world_from_cam)
     source = replace(subject.source, graph=graph, trajectory=trajectory)
     registry.load("writers", "g2o")().write(path, source)
-    return f"{graph.edge_count} edges"
+    return counted(graph.edge_count, "edge")
 
 
 def _write_model(path: Path, model: TrackedModel, world_from_body: Floats) -> str:

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline.diagnosis.resistance import Network
 from hodge_pipeline.diagnosis.result import UNTESTABLE, Diagnosis
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types.text import counted
 
 NEAREST = 6
 """Nearest views of each view that are candidates, whatever edges there are."""
@@ -165,6 +166,6 @@ def _reasons(resistance: Floats, tests: Ints) -> tuple[str, ...]:
             after = np.sqrt(value / (1 + value))
             text = f"the deviation between the two falls from {np.sqrt(value):.2g} to {after:.2g} of one edge's"
         if number:
-            text = f"tests {number} untestable edge{'s' if number > 1 else ''}; {text}"
+            text = f"tests {counted(number, 'untestable edge')}; {text}"
         lines.append(text)
     return tuple(lines)

@@ -24,6 +24,7 @@ from hodge_pipeline.solvers.priors import with_world, without_world
 from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import InitialName, Setup, check_choice, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, SolverIteration, ViewGraph
+from hodge_pipeline.types.text import counted
 
 ObjectiveName: TypeAlias = Literal["isotropic", "full"]
 WILD_NUMBERS = "the edges' lengths or weights differ too much for more: look for a wrong edge or unit"
@@ -128,7 +129,7 @@ def solve(
         metrics["gap_bound"] = answer.gap_bound
         metrics |= {} if answer.optimal else {"smallest_eigenvalue": answer.smallest_eigenvalue}
     if not descent.converged:
-        why = f"{descent.reason} after {len(descent.costs) - 1} steps: these are the best poses so far"
+        why = f"{descent.reason} after {counted(len(descent.costs) - 1, 'step')}: these are the best poses so far"
         notes.append(f"{why}; {WILD_NUMBERS}" if descent.reason == ROUNDING_REACHED else why)
     weights = setup.weights.used.astype(float)
     return Solution(

@@ -20,6 +20,7 @@ from hodge_pipeline.solvers.potential import (
     unconverged_notes,
 )
 from hodge_pipeline.types import Bools, Floats, Solution, SolverIteration, ViewGraph
+from hodge_pipeline.types.text import counted
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -115,4 +116,5 @@ def _problem(graph: ViewGraph, used: Bools, world_from_cam: Floats) -> CentredPr
 def _edge_notes(used: Bools) -> tuple[str, ...]:
     if used.all():
         return ()
-    return (f"{int((~used).sum())} edges join a vertex to itself and hold no information on poses: ignored",)
+    told = counted(int((~used).sum()), "edge joins|edges join")
+    return (f"{told} a vertex to itself, without information on poses: ignored",)

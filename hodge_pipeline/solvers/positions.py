@@ -20,6 +20,7 @@ from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.setup import NO_ROWS
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph, Words
 from hodge_pipeline.types.positions import PositionFit
+from hodge_pipeline.types.text import counted
 
 FEWEST = 3
 """Positions that place a piece: two leave it free to turn about the line between them."""
@@ -99,7 +100,7 @@ def place(
         rows, members = np.flatnonzero(component[fixes.vertices] == label), component == label
         own = fixes.select(rows)
         if problem := _cannot_place(own, poses):
-            problems.append(f"{int(members.sum())} frames are not placed: {problem}")
+            problems.append(f"{counted(int(members.sum()), 'frame is|frames are')} not placed: {problem}")
             continue
         found, used[rows] = align_positions(own.found(poses), own.points, _sigma(own), up)
         poses[members], placed[members] = found @ poses[members], True

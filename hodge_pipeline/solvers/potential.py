@@ -22,6 +22,7 @@ from hodge_pipeline.complex.one_form import Logarithm, residual_form, shifted
 from hodge_pipeline.solvers.linear import factorise
 from hodge_pipeline.solvers.problem import pinned_vertices
 from hodge_pipeline.types import Floats, Ints, SolverIteration
+from hodge_pipeline.types.text import counted
 
 STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
 AroundLoops: TypeAlias = Callable[[Floats], Floats]
@@ -93,7 +94,10 @@ class CentredProblem:
         count = int((np.linalg.norm(self.form(self.start, log)[:, :3], axis=1) > np.pi - 1e-3).sum())
         if not count:
             return ()
-        return (f"{count} edges disagree with the start by a half turn: the sign of their ω is arbitrary",)
+        return (
+            f"{counted(count, 'edge disagrees|edges disagree')} with the start by a half turn: the sign of "
+            "their ω is arbitrary",
+        )
 
 
 def tree_loops(edges: Ints, vertex_count: int) -> AroundLoops:

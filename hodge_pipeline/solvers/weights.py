@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types.text import counted
 
 PLANAR_AXES = np.array([2, 3, 4])
 """(θ, x, y) in (φ, ρ)."""
@@ -59,14 +60,15 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
     loops = graph.edges[:, 0] == graph.edges[:, 1]
     used = ((kappa > 0) | (tau > 0)) & ~loops
     if loops.any():
-        notes.append(f"{int(loops.sum())} edges join a vertex to itself: ignored")
+        notes.append(f"{counted(int(loops.sum()), 'edge joins|edges join')} a vertex to itself: ignored")
     if (silent := int((~used & ~loops).sum())) > 0:
-        notes.append(f"{silent} edges have no information: ignored")
+        notes.append(f"{counted(silent, 'edge has|edges have')} no information: ignored")
     lengths = np.where(used, np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1), 0.0)
     if (far := int((lengths > EARTH_M).sum())) > 0:
         i, j = graph.vertex_ids[graph.edges[np.argmax(lengths)]]
         notes.append(
-            f"{far} edges are longer than the earth, ({i}, {j}) {lengths.max():.2g} m: check them and the unit"
+            f"{counted(far, 'edge is|edges are')} longer than the earth, ({i}, {j}) {lengths.max():.2g} m: "
+            "check them and the unit"
         )
     indefinite = _indefinite(information) & used
     if indefinite.any():
@@ -149,6 +151,7 @@ def _floor(weights: Floats, used: Bools, what: str, notes: list[str]) -> Floats:
         return weights
     positive = weights[used & (weights > 0)]
     notes.append(
-        f"{int(uninformed.sum())} edges have no definite information on {what}: their weight there is almost zero"
+        f"{counted(int(uninformed.sum()), 'edge has|edges have')} no definite information on {what}: their "
+        "weight there is almost zero"
     )
     return np.where(uninformed, FLOOR * np.median(positive) if len(positive) else 1.0, weights)

@@ -13,6 +13,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.depth_units import PLAUSIBLE_DEPTH_M, SAMPLED_FRAMES, doubts_of
 from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Frame, Trajectory
 from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.text import counted
 
 LISTED = 5
 METRES, OWN_UNIT = "metres", "units of its own"
@@ -59,13 +60,15 @@ def _cameras(count_of: Counter[Camera]) -> list[str]:
     """A line each; of more than a few, as of photographs, a line for each size of image."""
     if len(count_of) <= LISTED:
         return [
-            f"{c.width}x{c.height} fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g} ({count} frames)"
+            f"{c.width}x{c.height} fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g} ({counted(count, 'frame')})"
             for c, count in sorted(count_of.items(), key=str)
         ]
     focal_px: dict[str, list[float]] = {}
     for camera in count_of:
         focal_px.setdefault(f"{camera.width}x{camera.height}", []).append(camera.fx)
-    return [f"{size} fx {min(fx):g} to {max(fx):g} ({len(fx)} cameras)" for size, fx in sorted(focal_px.items())]
+    return [
+        f"{size} fx {min(fx):g} to {max(fx):g} ({counted(len(fx), 'camera')})" for size, fx in sorted(focal_px.items())
+    ]
 
 
 def _scanner_facts(frames: Sequence[Frame]) -> dict[str, Any]:
@@ -101,15 +104,17 @@ def stamp_facts(stamps_s: Floats, together: Bools, names: Sequence[str], odditie
     after = np.flatnonzero(together)
     if (steps == 0).any():
         same = [names[row] for row in after[steps == 0]]
-        oddities.append(f"{len(same)} stamps are that of the one before: after {listed(same)}")
+        oddities.append(f"{counted(len(same), 'stamp is|stamps are')} that of the one before: after {listed(same)}")
     if (steps < 0).any():
-        oddities.append(f"{int((steps < 0).sum())} stamps are before the one before them: not in order of time")
+        oddities.append(
+            f"{counted(int((steps < 0).sum()), 'stamp is|stamps are')} before the one before them: not in order of time"
+        )
     usual = float(np.median(steps)) if len(steps) else 0.0
     gaps = steps > GAP * usual
     if usual > 0 and gaps.any():
         at = after[np.argmax(steps)]
         oddities.append(
-            f"{int(gaps.sum())} gaps in time of more than {GAP:g} steps; the longest, {steps.max():.6g} s, "
+            f"{counted(int(gaps.sum()), 'gap')} in time of more than {GAP:g} steps; the longest, {steps.max():.6g} s, "
             f"between {names[at]} and {names[at + 1]}"
         )
     return {

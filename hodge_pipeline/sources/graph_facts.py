@@ -13,6 +13,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.sources.frame_facts import LISTED, METRES, listed
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types.text import counted
 
 MOST_TRIANGLES = 20_000
 """Elimination takes seconds beyond."""
@@ -110,7 +111,7 @@ def _note_shape(graph: ViewGraph, parallel: int, sizes: Ints, degree: Ints, oddi
     if pieces > 1:
         oddities.append(f"the graph falls into {pieces} pieces with edges: each has a gauge of its own")
     if parallel and parallel < 0.5 * graph.edge_count:
-        oddities.append(f"{parallel} edges repeat a pair that has one already")
+        oddities.append(f"{counted(parallel, 'edge repeats|edges repeat')} a pair that has one already")
 
 
 def _note_edges(graph: ViewGraph, wrong: Bools, what: str, oddities: list[str]) -> None:

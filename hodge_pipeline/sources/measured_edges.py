@@ -15,6 +15,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import FrameReader
 from hodge_pipeline.types import Bools, Edges, Frame, Ints, Source, ViewGraph, number_of
+from hodge_pipeline.types.text import counted
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
@@ -103,7 +104,8 @@ def _between_frames(
     known = 0 if graph.priors is None else len(graph.priors.vertices)
     if known or len(graph.fixed):
         notes.append(
-            f"{name}: its {len(graph.fixed)} fixed vertices and {known} priors have no part in a run: "
+            f"{name}: its {len(graph.fixed)} fixed vertices and {counted(known, 'prior has|priors have')} no "
+            "part in a run: "
             "hodge solve heeds them"
         )
     over_frames = replace(graph.select(good), edges=rows[good], vertex_ids=_no_edges(frames).vertex_ids)

@@ -39,6 +39,7 @@ from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_po
 from hodge_pipeline.start.odometry import OPTIONS, chain
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, Source, Trajectory
 from hodge_pipeline.types.notes import Note, notes_of
+from hodge_pipeline.types.text import counted
 
 JUMP_SHARE = 0.25
 """Of what makes a key frame: smaller jumps move the frames between two key frames by little."""
@@ -83,7 +84,10 @@ class GivenStart:
         """
         matched, file = self._matched(source, steps)
         known = np.isfinite(matched.world_from_cam).all(axis=(1, 2))
-        told = f"{len(source.frames)} frames have a given pose, by {matched.how}; {len(matched.pose_times)}"
+        told = (
+            f"{counted(len(source.frames), 'frame has|frames have')} a given pose, by {matched.how}; "
+            f"{len(matched.pose_times)}"
+        )
         steps.note(Note("given poses", int(known.sum()), told))
         poses = matched.world_from_cam
         if not known.all():

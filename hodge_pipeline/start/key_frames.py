@@ -35,6 +35,7 @@ from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of
+from hodge_pipeline.types.text import counted
 
 NOTES_SHOWN = 5
 WHOLE_VIDEO, WHOLE_STILLS = 50, 300
@@ -266,7 +267,9 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
     doubtful = np.unique(np.concatenate([part.doubtful for part in parts]))
     if len(doubtful) > DOUBTED * len(tracked.anchors):
         notes.append(
-            Note("camera or object", len(doubtful), f"{len(tracked.anchors)} frames, {in_runs(doubtful, ids)}")
+            Note(
+                "camera or object", len(doubtful), f"{counted(len(tracked.anchors), 'frame')}, {in_runs(doubtful, ids)}"
+            )
         )
     sizes = np.bincount(tracked.piece)
     pieces = int((sizes > 1).sum())

@@ -17,6 +17,7 @@ from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import Steps
 from hodge_pipeline.types import Bools, Floats, Frame, Ints, Positions, Source, Trajectory, Words
 from hodge_pipeline.types.notes import Note, notes_of
+from hodge_pipeline.types.text import counted
 
 OWN = "source"
 
@@ -80,7 +81,8 @@ def fixes_of(positions: Positions, options: PositionOptions, scene: Scene, steps
     found = _nearest_each(frame, positions.stamps_s, frames)
     if not len(found):
         raise SourceError(
-            f"{options.path}: none of its {len(positions)} positions is of a frame: {_ranges(positions, frames)}"
+            f"{options.path}: none of its {counted(len(positions), 'position')} is of a frame: "
+            f"{_ranges(positions, frames)}"
         )
     if len(found) < len(positions):
         steps.note(Note("positions of no frame", len(positions) - len(found), str(len(positions))))

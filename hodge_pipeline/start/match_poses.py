@@ -13,6 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader, guesses
 from hodge_pipeline.types import Floats, Frame, Trajectory, number_of
+from hodge_pipeline.types.text import counted
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
 LIKELY_SHARE = 0.5
@@ -120,6 +121,6 @@ def _by_row(trajectory: Trajectory, frames: Sequence[Frame]) -> Matched | None:
 def _ranges(trajectory: Trajectory, frames: Sequence[Frame]) -> str:
     stamps = [frame.stamp_s for frame in frames]
     return (
-        f"{len(trajectory)} poses at {trajectory.stamps_s[0]:.10g} to {trajectory.stamps_s[-1]:.10g}, "
-        f"{len(frames)} frames at {min(stamps):.10g} to {max(stamps):.10g}"
+        f"{counted(len(trajectory), 'pose')} at {trajectory.stamps_s[0]:.10g} to {trajectory.stamps_s[-1]:.10g}, "
+        f"{counted(len(frames), 'frame')} at {min(stamps):.10g} to {max(stamps):.10g}"
     )

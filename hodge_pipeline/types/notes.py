@@ -16,25 +16,24 @@ class Rank(IntEnum):
 
 
 DOUBTS = {
-    "input changed": "{count} files of the input changed while the run read them ({detail}): run the same command "
-    "again once they stay as they are.",
-    "ambiguous": "{count} of {detail} pairs fit in several ways, as in a bare room, and join nothing: take scans in "
-    "between, with furniture or targets in sight.",
+    "input changed": "{count} {count:file|files} of the input changed while the run read {count:it|them} ({detail}): "
+    "run the same command again once {count:it stays as it is|they stay as they are}.",
+    "ambiguous": "{count} of {detail} pairs {count:fits|fit} in several ways, as in a bare room, and "
+    "{count:joins|join} nothing: take scans in between, with furniture or targets in sight.",
     "none joined": "No two are joined: {detail}.",
-    "camera or object": "The path may in part be that of objects: in {count} of {detail}, more than a quarter of "
-    "the image moves otherwise than the camera is said to. Compare the model with the scene, or leave these "
-    "frames out.",
+    "camera or object": "The path may in part be that of objects: in {count} of {detail}, more than a quarter of the "
+    "image moves otherwise than the camera is said to. Compare the model with the scene, or leave these frames out.",
     "unheld": "The path may slide: at {count} of {detail} what both frames see, such as a bare wall, does not hold "
     "the camera in every direction, and no other edge tests the step.",
     "reader's doubt": "{detail}",
     "depth unit": "Depth is probably not in metres: {detail}.",
     "other scale": "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
-    "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not "
-    "of the camera.",
-    "path scaled": "The refined path is {detail} times as large as the one given: depth and the given poses are of two "
-    "scales, or depth is warped, and nothing here tells which is right.",
-    "path loose": "The length of the path is in doubt: {count} of {detail} sweeps tell little of how far the "
-    "scanner went, as on a bare field, and it goes on as before there. Known positions (positions.path) would "
+    "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not of the "
+    "camera.",
+    "path scaled": "The refined path is {detail} times as large as the one given: depth and the given poses are of "
+    "two scales, or depth is warped, and nothing here tells which is right.",
+    "path loose": "The length of the path is in doubt: {count} of {detail} sweeps {count:tells|tell} little of how "
+    "far the scanner went, as on a bare field, and it goes on as before there. Known positions (positions.path) would "
     "hold it.",
     "not placed": "{detail}",
     "unsettled": "The result is not to be trusted: the last round still moved the cameras by {detail}, so the "
@@ -42,7 +41,8 @@ DOUBTS = {
     "parts": "The viewing graph falls into {count} parts that nothing connects: their poses relative to each other "
     "mean nothing.",
 }
-"""What puts the result in doubt: the sentence of each kind of note; `{count}` and `{detail}` are the note's."""
+"""What puts the result in doubt: the sentence of each kind of note; `{count}` and `{detail}` are the note's, and of
+`{count:is|are}` the side that suits the count."""
 LOOKS = {
     "single frame": "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
@@ -50,28 +50,31 @@ LOOKS = {
     "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "
     "{detail}",
     "depth range": "{detail}: is the depth scale right (source.reader.depth_scale)?",
-    "tracking lost": "tracking was lost at {count} frames ({detail}): their poses lie between their neighbours'",
-    "blank images": "{count} frames have depth, but a colour image that shows nothing, black or of one even colour "
-    "({detail}): surfaces alone place them",
-    "moving objects": "much of {count} frames moved otherwise than the camera ({detail}): people or objects that "
-    "move? The camera's motion is the one that fits more of the image; key frames leave out what moves",
+    "tracking lost": "tracking was lost at {count} {count:frame|frames} ({detail}): {count:its pose lies between "
+    "its|their poses lie between their} neighbours'",
+    "blank images": "{count} {count:frame has|frames have} depth, but a colour image that shows nothing, black or of "
+    "one even colour ({detail}): surfaces alone place them",
+    "moving objects": "much of {count} {count:frame|frames} moved otherwise than the camera ({detail}): people or "
+    "objects that move? The camera's motion is the one that fits more of the image; key frames leave out what moves",
     "clock": "the clock goes back at {detail}: the step there counts as long as the usual one",
     "holes": "the recording stops for {detail}: what the frames on both sides share tells the motion there",
-    "path broken": "tracking was lost for good in {count} places: {detail} pieces of the path begin anew",
-    "slid": "odometry slid unnoticed at {count} frames ({detail}): the pairs over these steps agree on where they "
-    "lead, and count in its place",
-    "sweeps left out": "{count} sweeps are left out, and posed by their neighbours where these are known; the "
-    "first: {detail}",
-    "sweeps loose": "{count} of {detail} sweeps tell little of how far the scanner went, as in a tunnel, and it "
-    "goes on as before",
-    "misfits": "{count} frames fit nothing that their key frame saw ({detail}): their poses follow from its own",
+    "path broken": "tracking was lost for good in {count} {count:place|places}: {detail} pieces of the path begin anew",
+    "slid": "odometry slid unnoticed at {count} {count:frame|frames} ({detail}): the pairs over these steps agree on "
+    "where they lead, and count in its place",
+    "sweeps left out": "{count} {count:sweep is|sweeps are} left out, and posed by neighbours where these are known; "
+    "the first: {detail}",
+    "sweeps loose": "{count} of {detail} sweeps {count:tells|tell} little of how far the scanner went, as in a "
+    "tunnel, and it goes on as before",
+    "misfits": "{count} {count:frame fits|frames fit} nothing that the key frame saw ({detail}), and "
+    "{count:follows|follow} its pose",
     "no truth near": "{detail}: no pose has a true one near in time: its error is not measured",
-    "carried": "{count} frames without a given pose are carried from the nearest ones by odometry",
+    "carried": "{count} {count:frame|frames} without a given pose {count:is|are} carried from the nearest ones by "
+    "odometry",
     "left apart": "nothing joins what tracking left apart: it starts where the guessed motion puts it",
-    "positions rejected": "{count} known positions are rejected: the others contradict them by more than 5 sigma: "
-    "{detail}",
-    "positions scatter": "Known positions scatter {detail} times as far as their sigma says: a clock that is off, "
-    "or an antenna away from the sensor (positions.antenna_m), looks like that.",
+    "positions rejected": "{count} known {count:position is|positions are} rejected: the others contradict "
+    "{count:it|them} by more than 5 sigma: {detail}",
+    "positions scatter": "Known positions scatter {detail} times as far as their sigma says: a clock that is off, or "
+    "an antenna away from the sensor (positions.antenna_m), looks like that.",
     "no decomposition": "{detail}",
     "damaged step": "{detail}: the step is computed again",
     "without images": "without images: {detail}",
@@ -81,9 +84,11 @@ LOOKS = {
     "rougher": "the steps from key frame to key frame are rougher than those given: from those that images show they "
     "are {detail}",
     "other format": "poses are not written back into {detail}: refined.tum holds them",
-    "alone": "{count} of {detail} frames have no edge at all: they keep the pose they started with.",
-    "wrong": "{count} of the edges used are judged wrong, {detail}: hodge diagnose shows them.",
-    "untestable": "{count} of {detail} edges are untestable: nothing in the graph says whether they are right.",
+    "alone": "{count} of {detail} frames {count:has|have} no edge at all: {count:it keeps the pose it|they keep the "
+    "pose they} started with.",
+    "wrong": "{count} of the edges used {count:is|are} judged wrong, {detail}: hodge diagnose shows them.",
+    "untestable": "{count} of {detail} edges {count:is|are} untestable: nothing in the graph says whether {count:it "
+    "is|they are} right.",
     "unmatched": "{detail} of each other.",
     "no metres": "There is no depth that tells the scale: lengths are in the model's own unit.",
 }
@@ -99,35 +104,38 @@ FACTS = {
     "refinement": "{detail}",
     "given poses": "{count} of {detail} poses given",
     "given file": "{detail}",
-    "key frames": "{count} of {detail} frames are key frames: these are registered, the others move as those around "
-    "them",
+    "key frames": "{count} of {detail} frames {count:is a key frame|are key frames}: {count:this is|these are} "
+    "registered, the others move as those around them",
     "sweeps untimed": "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an "
     "instant",
-    "readout": "the camera's read-out (rolling shutter), estimated: {detail}; readout_s in the camera's file would "
-    "be exact",
-    "truth": "{count} of {detail} frames have a true pose, by the truth that was named",
-    "revisits": "{count} pairs close loops along the path, before the first round: odometry's poses move by up to "
-    "{detail}",
-    "positions of no frame": "{count} of {detail} known positions are of no frame, or another is nearer to theirs "
-    "in time.",
+    "readout": "the camera's read-out (rolling shutter), estimated: {detail}; readout_s in the camera's file would be "
+    "exact",
+    "truth": "{count} of {detail} frames {count:has|have} a true pose, by the truth that was named",
+    "revisits": "{count} {count:pair closes|pairs close} loops along the path, before the first round: odometry's "
+    "poses move by up to {detail}",
+    "positions of no frame": "{count} of {detail} known positions {count:is|are} of no frame, or another is nearer to "
+    "theirs in time.",
     "world": "The result is in the world of {count} known positions, east, north, up: its zero is {detail}.",
-    "left out": "{detail}: {count} edges that the diagnosis calls wrong or suspect are left out of the solve",
-    "matched": "{count} pairs between pieces matched, {detail}",
+    "left out": "{detail}: {count} {count:edge|edges} that the diagnosis calls wrong or suspect {count:is|are} left "
+    "out of the solve",
+    "matched": "{count} {count:pair|pairs} between pieces matched, {detail}",
     "suggested": "{detail}",
     "scores of before": "the scores are not measured again after an edit: hodge run, as before, measures them",
-    "fused key frames": "fused after an edit: the {count} key frames alone; hodge run, as before, fuses all frames",
+    "fused key frames": "fused after an edit: the {count} key {count:frame|frames} alone; hodge run, as before, fuses "
+    "all frames",
     "edited": "edited by hand: {detail}",
     "guard": "{detail}",
-    "held out": "{count} overlapping pairs were kept out of the solve: clouds there {detail}",
+    "held out": "{count} overlapping {count:pair was|pairs were} kept out of the solve: clouds there {detail}",
     "edges ignored": "The solver ignored {count} of {detail} edges (weight 0).",
-    "harmless": "{count} of the edges used are judged wrong, {detail}: nothing to do.",
-    "suspect": "{count} of the edges used are suspect: hodge diagnose shows them.",
+    "harmless": "{count} of the edges used {count:is|are} judged wrong, {detail}: nothing to do.",
+    "suspect": "{count} of the edges used {count:is|are} suspect: hodge diagnose shows them.",
     "above truth": "The clouds lie closer together at the result than at the true poses: a score measures how well "
-    "clouds fit, and the noise of depth, or an error of the truth, moves the best fit away from it. Errors of "
-    "the trajectory do not depend on that.",
-    "edges far off": "At least {count} edges that the solver used are more than {detail} off the result: see the "
-    "worst edges.",
-    "not in the error": "{detail}: {count} without a true pose, or joined to no other, are not in the error.",
+    "clouds fit, and the noise of depth, or an error of the truth, moves the best fit away from it. Errors of the "
+    "trajectory do not depend on that.",
+    "edges far off": "At least {count} {count:edge|edges} that the solver used {count:is|are} more than {detail} off "
+    "the result: see the worst edges.",
+    "not in the error": "{detail}: {count} without a true pose, or joined to no other, {count:is|are} not in the "
+    "error.",
     "degenerate": "{detail}: its positions lie on a line (or are fewer than three): its orientations aligned it.",
 }
 """What only informs; the first eight are what stages report in their own words."""
@@ -137,6 +145,14 @@ WORDING = {
     for kind, text in texts.items()
 }
 """Each kind's rank, and its sentence."""
+
+
+class _Count(int):
+    """A number whose format `frame has|frames have` is the side that suits it."""
+
+    def __format__(self, words: str) -> str:
+        one, _, many = words.partition("|")
+        return (one if self == 1 else many) if many else super().__format__(words)
 
 
 @dataclass(frozen=True)
@@ -154,7 +170,7 @@ class Note:
             raise ValueError(f"'{self.kind}' is no kind of note: use {', '.join(WORDING)}")
 
     def __str__(self) -> str:
-        return WORDING[self.kind][1].format(count=self.count, detail=self.detail)
+        return WORDING[self.kind][1].format(count=_Count(self.count), detail=self.detail)
 
     @property
     def rank(self) -> Rank:

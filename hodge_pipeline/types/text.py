@@ -24,6 +24,12 @@ def visible(text: object, *, lines: bool = False) -> str:
     return (_LINES if lines else _ONE_LINE).sub(lambda found: ascii(found[0])[1:-1], str(text))
 
 
+def counted(count: int, words: str) -> str:
+    """A count with its noun: `1 image`, `2 images`; of `frame has|frames have` the side that suits the count."""
+    one, _, many = words.partition("|")
+    return f"{count} {one if count == 1 else many or one + 's'}"
+
+
 def command(*words: object) -> str:
     """The words as a shell takes them, to be copied from a page."""
     return shlex.join(map(str, words))

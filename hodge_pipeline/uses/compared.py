@@ -27,6 +27,7 @@ from hodge_pipeline.store.artifacts import write_text
 from hodge_pipeline.store.workspace import RECIPE_FILE, make_folder
 from hodge_pipeline.types import Floats, Model
 from hodge_pipeline.types.ply import read_model
+from hodge_pipeline.types.text import counted
 
 FEWEST_SHARED = 3
 SAME = 0.005
@@ -229,7 +230,11 @@ def _model(run: Run, world_from_run: Floats) -> Model | None:
 
 def _page(comparison: Comparison, models: tuple[Model | None, Model | None]) -> Document:
     (a, b), shared = comparison.names, len(comparison.apart_m)
-    laid = f"B is laid onto A by the {shared} frames that both have." if shared else "The runs share too few frames."
+    laid = (
+        f"B is laid onto A by the {counted(shared, 'frame')} that both have."
+        if shared
+        else "The runs share too few frames."
+    )
     judged = zip(comparison.names, map(judge, comparison.reports), strict=True)
     return Document(
         f"{a} and {b}",

@@ -30,6 +30,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, PointCloud, Source, ViewGraph
+from hodge_pipeline.types.text import counted
 
 OTHER_SCANS = frozenset((".pts", ".ptx", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
 _NUMBER = re.compile(r"(\d{1,19})\D*$")
@@ -65,7 +66,9 @@ class CloudFolderReader:
         count = sum(map(_is_scan, names))
         if not count:
             return Sniff(0.0, f"no {', '.join(READERS)}")
-        return Sniff(0.8 if count * 2 > len(names) else 0.4, f"{count} point clouds among {len(names)} files")
+        return Sniff(
+            0.8 if count * 2 > len(names) else 0.4, f"{count} point clouds among {counted(len(names), 'file')}"
+        )
 
     def open(self, path: Path) -> Source:
         """Fragments in natural order of their names. Ids are the names of the files, `a.e57/3` one scan of several;
@@ -130,7 +133,10 @@ class CloudFolderReader:
             )
         if others:
             told = _listed(others)
-            unread.append(f"{len(others)} files are scans of another format, left out: {told}: convert to PLY")
+            unread.append(
+                f"{counted(len(others), 'file is a scan|files are scans')} of another format, left out: "
+                f"{told}: convert to PLY"
+            )
         if not found:
             why = "; ".join(unread) or "give a folder of fragments"
             raise SourceError(f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it: {why}")
@@ -183,7 +189,7 @@ class PlyWriter:
         )
         write_ply(path, PointCloud(np.concatenate(points).astype(np.float32), None, colours))
         count = sum(map(len, points))
-        return written(f"{count} points of {len(frames)} clouds as one", source, {"point clouds"})
+        return written(f"{counted(count, 'point')} of {len(frames)} clouds as one", source, {"point clouds"})
 
 
 @plain_dataclass(frozen=True)
@@ -322,6 +328,8 @@ def _graph(names: Mapping[float, str], pairs: Any, i_from_j: Any, notes: list[st
     row_of = {number: row for row, number in enumerate(names)}
     known = np.array([int(i) in row_of and int(j) in row_of for i, j in pairs], bool)
     if not known.all():
-        notes.append(f"{int((~known).sum())} pairs of the log name fragments that are not there: left out")
+        notes.append(
+            f"{counted(int((~known).sum()), 'pair')} of the log left out: it names fragments that are not there"
+        )
     edges = np.array([(row_of[int(i)], row_of[int(j)]) for i, j in pairs[known]], np.int64).reshape(-1, 2)
     return ViewGraph.from_edges(np.array(list(names.values())), edges, i_from_j[known], source="log")

@@ -16,10 +16,11 @@ from hodge_adapters.colmap.check import REMEDY, check_files, check_words, names_
 from hodge_adapters.colmap.files import MODEL_FILES, model_ending
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, Points, matrix_of
-from hodge_adapters.text_rows import counted, natural
+from hodge_adapters.text_rows import natural
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.text import counted
 
 MOST_PIXELS = 1 << 16
 """Across an image: wider ones are no photographs, and buffers of that size would be asked for."""
@@ -65,7 +66,9 @@ def read_model(folder: Path, tracks: bool = True) -> tuple[pycolmap.Reconstructi
         raise
     content = checked_content(model, folder, has_points)
     several = sum(rig.num_sensors() > 1 for rig in model.rigs.values())
-    told = f"{several} of {len(model.rigs)} rigs have more than one sensor: {len(model.frames)} frames of rigs"
+    told = (
+        f"{several} of {len(model.rigs)} rigs have more than one sensor: {counted(len(model.frames), 'frame')} of rigs"
+    )
     return model, replace(content, files=files, notes=(*([told] if several else []), *content.notes))
 
 

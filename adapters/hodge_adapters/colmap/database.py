@@ -17,6 +17,7 @@ from hodge_adapters.colmap.relative import Sighting
 from hodge_adapters.sqlite_file import DAMAGED, opened_database
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types.text import counted
 
 MAX_IMAGE_ID = 2147483647
 """A pair's key is `first · this + second`."""
@@ -65,7 +66,7 @@ def database_pairs(path: Path, model: Model, min_shared: int, notes: list[str]) 
                 keys = _keypoints(database, path, ids[0]), _keypoints(database, path, ids[1])
                 yield Pair(i, j, _sighting(path, model, cameras, (i, j), keys, matches, config, matrices), "database")
     if outside:
-        notes.append(f"{path.name}: {outside} pairs are of images that the model does not have")
+        notes.append(f"{path.name}: {counted(outside, 'pair is|pairs are')} of images that the model does not have")
 
 
 def database_names(path: Path) -> set[str]:

@@ -15,6 +15,7 @@ from hodge_adapters.colmap.records import NO_POINT, Model
 from hodge_adapters.colmap.relative import Relative, Sighting, by_structure, estimate
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types.text import counted
 
 COVISIBILITY, STRUCTURE = "covisibility", "structure"
 """Edges of two views alone, and of the points that they share."""
@@ -46,7 +47,7 @@ def measured_graph(model: Model, pairs: Iterator[Pair], min_inliers: int, seed: 
             else:
                 kept.append(replace(pair, source=source))
                 found.append(hypothesis)
-    notes += [f"{count} pairs of images left out: {why}" for why, count in sorted(refused.items())]
+    notes += [f"{counted(count, 'pair')} of images left out: {why}" for why, count in sorted(refused.items())]
     graph = ViewGraph.from_edges(
         np.array([image.name for image in model.images]),
         np.array([(pair.i, pair.j) for pair in kept], np.int64).reshape(-1, 2),

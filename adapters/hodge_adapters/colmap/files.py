@@ -8,8 +8,8 @@ from pathlib import Path
 
 from hodge_adapters.colmap.check import image_count
 from hodge_adapters.json_files import read_json
-from hodge_adapters.text_rows import counted
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types.text import counted
 
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
 PARENTS = 3

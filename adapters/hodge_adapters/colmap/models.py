@@ -24,9 +24,9 @@ from hodge_adapters.colmap.ties import similarity, tie_points
 from hodge_adapters.colmap.tracked import ColmapModel, DepthOptions, EdgeOptions, PriorOptions
 from hodge_adapters.colmap.union import united
 from hodge_adapters.images import pixels
-from hodge_adapters.text_rows import counted
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Frame
+from hodge_pipeline.types.text import counted
 
 HELD = "intrinsics are held: --refine focal or all adjusts them too"
 COVISIBILITY = "edges come from the points that images share"

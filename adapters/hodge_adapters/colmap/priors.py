@@ -15,11 +15,11 @@ import numpy as np
 from hodge_adapters.colmap.bodies import Bodies
 from hodge_adapters.colmap.database import prior_rows
 from hodge_adapters.colmap.pycolmap_import import pycolmap
-from hodge_adapters.text_rows import counted
 from hodge_adapters.trajectories.positions import read_positions
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, PositionPriors
+from hodge_pipeline.types.text import counted
 
 FEWEST = 3
 LEAST_AGREEING, TRIALS, REFITS = 0.5, 300, 5

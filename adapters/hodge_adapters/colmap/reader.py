@@ -41,6 +41,7 @@ from hodge_adapters.text_rows import inside, listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import EncodedImage, Floats, Frame, ImageFile, Source, Trajectory, ViewGraph
+from hodge_pipeline.types.text import counted
 
 STEREO_FOLDERS = ("stereo/depth_maps", "dense/stereo/depth_maps", "dense/0/stereo/depth_maps")
 SENSOR_FOLDERS = ("depth", "depths", "depth_images")
@@ -235,7 +236,9 @@ class ColmapReader:
                 )
             pairs = database_pairs(database, model, self.min_shared, notes)
         graph = measured_graph(model, pairs, self.min_shared // 2, self.seed, notes)
-        notes.append(f"{graph.edge_count} edges estimated anew ({kind}); their scale is that of the model's points")
+        notes.append(
+            f"{counted(graph.edge_count, 'edge')} estimated anew ({kind}); their scale is that of the model's points"
+        )
         return graph, (database,) if database and kind == "database" else ()
 
 

@@ -16,6 +16,7 @@ from hodge_adapters.images.lens_models import HALF_PIXEL
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Floats32, ViewGraph
+from hodge_pipeline.types.text import counted
 
 SAMPLED_IMAGES = 12
 MOST_IMAGES = 200
@@ -33,12 +34,13 @@ def metres_per_unit(
     chosen = {rows[at]: sensors[rows[at]] for at in picked}
     found = np.concatenate([np.zeros(0), *depth_ratios(model, chosen, units_per_metre, no_depth)])
     if len(found) < LEAST_POINTS:
-        notes.append(f"scale 1 m per unit: only {len(found)} points have sensor depth; set scale")
+        notes.append(f"scale 1 m per unit: only {counted(len(found), 'point has|points have')} sensor depth; set scale")
         return 1.0
     scale = float(np.median(found))
     low, high = np.percentile(found, [25, 75]) / scale
     notes.append(
-        f"scale {scale:.6g} m per unit, by sensor depth at {len(found)} points (half within {low:.3f}–{high:.3f})"
+        f"scale {scale:.6g} m per unit, by sensor depth at {counted(len(found), 'point')} (half within "
+        f"{low:.3f}–{high:.3f})"
     )
     return scale
 

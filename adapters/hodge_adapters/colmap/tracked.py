@@ -38,6 +38,7 @@ from hodge_pipeline.types import (
     PositionPriors,
     ViewGraph,
 )
+from hodge_pipeline.types.text import counted
 
 LEAST_LEFT = 3
 """Entries of a track: two would meet in a point wherever the images are."""
@@ -247,7 +248,7 @@ class ColmapModel:
         if not count:
             return self
         update_errors(copy)
-        notes = (*self.notes, f"{count} pairs of points that a match calls one were merged")
+        notes = (*self.notes, f"{counted(count, 'pair')} of points that a match calls one were merged")
         return replace(self, reconstruction=copy, files=(), notes=notes, tracks=None)
 
     def adjusted(self, priors: PositionPriors | None = None) -> ColmapModel:

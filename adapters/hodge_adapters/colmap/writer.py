@@ -17,11 +17,12 @@ from hodge_adapters.colmap.files import find_model
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.images.lens_models import pinhole_params
 from hodge_adapters.posed import written
-from hodge_adapters.text_rows import counted, listed, write_bytes_atomically
+from hodge_adapters.text_rows import listed, write_bytes_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.types import Frame, Source
 from hodge_pipeline.types.input_files import read_input
+from hodge_pipeline.types.text import counted
 
 SAME = 1e-6
 """Of the positions' spread, and of a rotation's entries: poses that differ by less are the same."""

@@ -14,6 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Floats, Floats32, Frame
 from hodge_pipeline.types.input_files import read_input
+from hodge_pipeline.types.text import counted
 
 FARTHEST_M = 1000.0
 """A ray that hits nothing has a huge length: no measurement."""
@@ -57,7 +58,7 @@ def pov_frames(
             )
         )
     if without:
-        notes.append(f"{len(without)} frames without usable camera parameters: {listed(without)}")
+        notes.append(f"{counted(len(without), 'frame')} without usable camera parameters: {listed(without)}")
     far = [
         frame for frame in frames if frame.world_from_cam is not None and abs(frame.world_from_cam[:3, 3]).max() > 50
     ]

@@ -28,6 +28,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, Source
+from hodge_pipeline.types.text import counted
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
 REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
@@ -241,7 +242,7 @@ def list_images(folder: Path, notes: list[str]) -> StampedImages:
     numbers = sorted(depth)
     alone = [number for number in numbers if number not in colour]
     if alone:
-        notes.append(f"{len(alone)} frames have no colour image: {listed(alone)}")
+        notes.append(f"{counted(len(alone), 'frame has|frames have')} no colour image: {listed(alone)}")
     none_s, one_run = np.zeros(len(numbers)), np.zeros(len(numbers), np.int64)
     stamps_s = np.array(numbers, float)
     return StampedImages(stamps_s, [depth[n] for n in numbers], [colour.get(n) for n in numbers], none_s, (), one_run)
@@ -263,5 +264,5 @@ def _by_number(folder: Path, notes: list[str]) -> dict[int, Path]:
         else:
             found[int(match[1])] = folder / name
     if skipped:
-        notes.append(f"{folder.name}: {len(skipped)} images without a number of their own left out: {listed(skipped)}")
+        notes.append(f"{folder.name}: {counted(len(skipped), 'image')} without a number left out: {listed(skipped)}")
     return found

@@ -15,6 +15,7 @@ from hodge_adapters.text_rows import inside, listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types.input_files import beginning, read_input_text
+from hodge_pipeline.types.text import counted
 
 METADATA = "metadata.yaml"
 MAX_METADATA_BYTES = 1 << 18
@@ -66,11 +67,11 @@ def find_files(path: Path, notes: list[str]) -> Listing:
     listed_files = _listed(metadata, notes)
     absent = [file.name for file in listed_files if not file.is_file()]
     if absent:
-        notes.append(f"{METADATA}: {len(absent)} files that are not there left out: {listed(absent)}")
+        notes.append(f"{METADATA}: {counted(len(absent), 'file')} not there left out: {listed(absent)}")
     found = [file for file in listed_files if file.is_file() and file.suffix in SUFFIXES]
     extra = [file for file in there if file not in found]
     if extra and found:
-        notes.append(f"{len(extra)} files that {METADATA} does not list read as well: {_names(extra)}")
+        notes.append(f"{counted(len(extra), 'file')} that {METADATA} does not list read as well: {_names(extra)}")
     found += extra
     if not found:
         raise SourceError(f"{path}: {METADATA} lists no .mcap or .db3 file that is there: {_remedy(path)}")
@@ -92,7 +93,7 @@ def _listed(metadata: Path, notes: list[str]) -> list[Path]:
         notes.append(f"{METADATA} cannot be read: every file of the recording in the folder is taken, by name")
         return []
     if None in paths:
-        notes.append(f"{METADATA}: {paths.count(None)} files outside of the folder left out")
+        notes.append(f"{METADATA}: {counted(paths.count(None), 'file')} outside of the folder left out")
     return [path for path in dict.fromkeys(paths) if path]
 
 

@@ -25,6 +25,7 @@ from hodge_adapters.mcap.records import (
 from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types.input_files import open_input
+from hodge_pipeline.types.text import counted
 
 MAX_EXPANSION, ALWAYS_EXPANDED_BYTES = 200, 1 << 31
 """Images and scans shrink to a half or a tenth: the chunks of a file together expand to no more, and 2 GiB."""
@@ -94,7 +95,7 @@ class Tally:
 
     def __str__(self) -> str:
         span_s = (self.last_ns - self.first_ns) * 1e-9
-        return f"{self.count} messages" + (f", {(self.count - 1) / span_s:.3g} a second" if span_s > 0 else "")
+        return counted(self.count, "message") + (f", {(self.count - 1) / span_s:.3g} a second" if span_s > 0 else "")
 
 
 Wanted = Callable[[Channel, Schema | None], bool]
@@ -142,7 +143,7 @@ class MessageFile(ABC):
         used = self._of_use
         if not used.count:
             return "no message of use"
-        return f"{used.count} messages of use, logged within {(used.last_ns - used.first_ns) * 1e-9:.3f} s"
+        return f"{counted(used.count, 'message')} of use, logged within {(used.last_ns - used.first_ns) * 1e-9:.3f} s"
 
     def offered(
         self, channel: Channel, schema: Schema | None, log_time_ns: int, place: Place, read: Callable[[], bytes]

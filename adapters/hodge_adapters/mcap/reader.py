@@ -38,6 +38,7 @@ from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, EncodedImage, Floats, Frame, Source
+from hodge_pipeline.types.text import counted
 
 Layout = TypeVar("Layout")
 UNITS_PER_METRE = 1000.0
@@ -240,7 +241,9 @@ def _coordinate_frame(topic: str, seen: Sequence[Seen[Layout]], notes: list[str]
     """The coordinate frame that most messages of a topic are in."""
     (frame, count), *others = Counter(item.frame_id for item in seen).most_common()
     if others:
-        notes.append(f"{topic}: {len(seen) - count} messages are not in {frame}: their poses are taken as if they were")
+        notes.append(
+            f"{topic}: {counted(len(seen) - count, 'message is|messages are')} not in {frame}: taken as if it were"
+        )
     return frame
 
 

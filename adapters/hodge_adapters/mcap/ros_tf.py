@@ -9,6 +9,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Trajectory
+from hodge_pipeline.types.text import counted
 
 
 @dataclass
@@ -52,7 +53,8 @@ class TransformTree:
     def contents(self) -> tuple[str, ...]:
         """Its links, a line each, parents before children where the links form a tree."""
         return tuple(
-            f"tf {parent} -> {child}: " + ("static" if child in self._static else f"{len(self._links[child])} poses")
+            f"tf {parent} -> {child}: "
+            + ("static" if child in self._static else counted(len(self._links[child]), "pose"))
             for child, parent in sorted(self._parent.items(), key=lambda link: (len(self._chain(link[0])), link))
         )
 

@@ -13,6 +13,7 @@ from hodge_adapters.mcap.recording import Calibration, Recording, Seen
 from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera
+from hodge_pipeline.types.text import counted
 
 Item = TypeVar("Item")
 ImageTopics = Mapping[str, Sequence[Seen[ImageLayout]]]
@@ -45,7 +46,9 @@ def split_depth(images: ImageTopics, notes: list[str]) -> tuple[ImageTopics, Ima
         size = Counter(image.layout.size for image in seen if image.layout.is_depth == is_depth).most_common(1)[0][0]
         kept = [image for image in seen if image.layout.is_depth == is_depth and image.layout.size == size]
         if len(kept) < len(seen):
-            notes.append(f"{topic}: {len(seen) - len(kept)} images of another size or kind than most left out")
+            notes.append(
+                f"{topic}: {counted(len(seen) - len(kept), 'image')} of another size or kind than most left out"
+            )
         (depth if is_depth else colour)[topic] = kept
     return depth, colour
 
@@ -153,7 +156,7 @@ def one_per_stamp(topic: str, seen: Sequence[Seen[Item]], notes: list[str]) -> l
     for item in seen:
         first.setdefault(item.stamp_s, item)
     if len(first) < len(seen):
-        notes.append(f"{topic}: {len(seen) - len(first)} messages with the stamp of an earlier one left out")
+        notes.append(f"{topic}: {counted(len(seen) - len(first), 'message')} with the stamp of an earlier one left out")
     return [first[stamp] for stamp in sorted(first)]
 
 

@@ -17,6 +17,7 @@ from hodge_adapters.text_rows import opened_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, PointCloud, Source
+from hodge_pipeline.types.text import counted
 
 WORLD, CAMERA = "map", "camera"
 TF, POINTS = ("/tf", "tf2_msgs/msg/TFMessage"), ("/points", "sensor_msgs/msg/PointCloud2")
@@ -49,8 +50,8 @@ class McapWriter:
                 assert frame.read_points is not None
                 _add(writer, channels[POINTS[0]], frame.stamp_s, _cloud(frame.stamp_s, frame.read_points()))
             writer.finish()  # type: ignore[no-untyped-call]
-        clouds = f", {len(frames)} clouds on {POINTS[0]}" if frames else ""
-        return written(f"{len(trajectory)} poses on {TF[0]}{clouds}", source, {"stamps", "point clouds"})
+        clouds = f", {counted(len(frames), 'cloud')} on {POINTS[0]}" if frames else ""
+        return written(f"{counted(len(trajectory), 'pose')} on {TF[0]}{clouds}", source, {"stamps", "point clouds"})
 
 
 def _add(writer: Writer, channel: int, stamp_s: float, message: _Cdr) -> None:

@@ -20,6 +20,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Ints, Source, Trajectory, ViewGraph
+from hodge_pipeline.types.text import counted
 
 HALF_ANGLE = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """d(q_vec, t) / d(φ, ρ) at the identity."""
@@ -153,14 +154,16 @@ def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: in
         notes.append(f"{len(ids) - named} of {len(ids)} vertices are named by edges only: no initial poses")
     fixed = np.flatnonzero(np.isin(ids, fixed_keys)).astype(np.int64)
     if len(fixed):
-        notes.append(f"{len(fixed)} vertices are marked FIX")
+        notes.append(f"{counted(len(fixed), 'vertex is|vertices are')} marked FIX")
     motions, information = half.motions, half.information
     if count := int((edges[:, 0] == edges[:, 1]).sum()):
-        notes.append(f"{count} edges join a vertex to itself: they say nothing of poses")
+        notes.append(f"{counted(count, 'edge joins|edges join')} a vertex to itself: they say nothing of poses")
     graph = ViewGraph.from_edges(ids, edges, motions, information, kind, dimension=dimension, fixed=fixed)
     priors = g2o_priors.as_priors(half.prior_keys, half.prior_poses, half.prior_information, ids, str(path))
     if priors is not None:
-        notes.append(f"{len(priors.vertices)} priors of single vertices are read")
+        notes.append(
+            f"{counted(len(priors.vertices), 'prior of a single vertex is|priors of single vertices are')} read"
+        )
         graph = replace(graph, priors=priors)
     trajectory = Trajectory(np.arange(named, dtype=float), half.poses) if named == len(ids) else None
     return Source(path.stem, path, trajectory=trajectory, graph=graph, notes=tuple(notes), files=(path,))
@@ -169,7 +172,9 @@ def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: in
 def skipped(other: dict[str, int]) -> list[str]:
     """A note for each kind of line that is not read, with its count."""
     shown = sorted(other.items(), key=lambda item: -item[1])
-    notes = [f"{count} lines of kind {tag} are not read{_meaning(tag)}" for tag, count in shown[:SKIPPED_TAGS_SHOWN]]
+    notes = [
+        f"{counted(count, 'line')} of kind {tag} not read{_meaning(tag)}" for tag, count in shown[:SKIPPED_TAGS_SHOWN]
+    ]
     if len(shown) > SKIPPED_TAGS_SHOWN:
         rest = shown[SKIPPED_TAGS_SHOWN:]
         notes.append(f"{sum(count for _, count in rest)} lines of {len(rest)} more kinds are not read")
@@ -288,7 +293,9 @@ class G2oWriter:
         complete = poses is not None and len(poses) == source.graph.vertex_count
         write_g2o(path, source.graph, poses if complete else None)
         graph = source.graph
-        return written(f"{graph.vertex_count} vertices, {graph.edge_count} edges", source, {"edges"})
+        return written(
+            f"{counted(graph.vertex_count, 'vertex|vertices')}, {counted(graph.edge_count, 'edge')}", source, {"edges"}
+        )
 
 
 def _pose_columns(motions: Floats, dimension: int) -> Floats:

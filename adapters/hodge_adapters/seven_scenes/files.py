@@ -15,6 +15,7 @@ from hodge_adapters.text_rows import listed, names_in, read_rows, read_text, to_
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.text import counted
 
 SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 
@@ -93,10 +94,10 @@ def with_depth(path: Path, chosen: Sequence[tuple[str, Path]], notes: list[str])
             f"{path}: no frame-000000.depth.png in it: give a sequence folder, or a scene with seq-01 in it"
         )
     if missing:
-        notes.append(f"{len(missing)} frames without a depth image left out: {listed(missing)}")
+        notes.append(f"{counted(len(missing), 'frame')} without a depth image left out: {listed(missing)}")
     colourless = [f"{files.sequence}/{files.number:06d}" for files in usable if "color" not in files.paths]
     if colourless:
-        notes.append(f"{len(colourless)} frames have no colour image: {listed(colourless)}")
+        notes.append(f"{counted(len(colourless), 'frame has|frames have')} no colour image: {listed(colourless)}")
     return usable
 
 
@@ -118,7 +119,9 @@ def read_poses(usable: Sequence[FrameFiles], notes: list[str]) -> Floats:
     poses[good, :3, :3] = se3.project_to_so3(poses[good, :3, :3])
     if not good.all():
         bad = [f"{usable[row].sequence}/{usable[row].number:06d}" for row in np.flatnonzero(~good).tolist()]
-        notes.append(f"{len(bad)} frames without a usable pose (missing, not finite or not rigid): {listed(bad)}")
+        notes.append(
+            f"{counted(len(bad), 'frame')} without a usable pose (missing, not finite or not rigid): {listed(bad)}"
+        )
     return poses
 
 

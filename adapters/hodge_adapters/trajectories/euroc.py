@@ -15,6 +15,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source
+from hodge_pipeline.types.text import counted
 
 COLUMNS = 8
 NANO = 1_000_000_000
@@ -50,7 +51,7 @@ class EurocReader:
         notes = ["poses are those of the body in the file (EuRoC's ground truth: the IMU), not of a camera"]
         notes += parsed.notes
         if bad:
-            notes.append(f"{len(bad)} lines that are no pose left out: {listed(bad)}")
+            notes.append(f"{counted(len(bad), 'line that is|lines that are')} no pose left out: {listed(bad)}")
         return Source(path.stem, path, trajectory=parsed.trajectory, notes=tuple(notes), files=(path,))
 
 
@@ -68,7 +69,7 @@ class EurocWriter:
         table = np.column_stack([poses[:, :3, 3], se3.to_quat_xyzw(poses)[:, [3, 0, 1, 2]]]) + 0.0
         lines = [f"{stamp},{','.join(map(repr, row))}\n" for stamp, row in zip(stamps, table.tolist(), strict=True)]
         write_text_atomically(Path(path), HEADER + "".join(lines))
-        return written(f"{len(trajectory)} poses", source, {"stamps"})
+        return written(counted(len(trajectory), "pose"), source, {"stamps"})
 
 
 def file_of(path: Path) -> Path:

@@ -16,6 +16,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Ints, Source, Trajectory, ViewGraph
+from hodge_pipeline.types.text import counted
 
 MAX_NUMBER = 1 << 53
 
@@ -58,7 +59,8 @@ def read_blocks(path: Path, size: int) -> tuple[Ints, Floats, list[int]]:
     rows, height = read_rows(path), size + 1
     if not rows or len(rows) % height:
         raise SourceError(
-            f"{path}: {len(rows)} lines are no blocks of `i j n` and a {size}x{size} matrix: is it whole?"
+            f"{path}: {counted(len(rows), 'line is|lines are')} no blocks of `i j n` and a {size}x{size} "
+            "matrix: is it whole?"
         )
     heads = rows[::height]
     wrong = [
@@ -112,11 +114,11 @@ class LogWriter:
             whole = np.equal(np.mod(stamps, 1), 0).all() and (stamps >= 0).all()
             numbers = stamps.astype(np.int64) if whole else np.arange(len(stamps))
             write_text_atomically(path, _blocks(np.column_stack([numbers, numbers]), source.trajectory.world_from_cam))
-            return written(f"{len(stamps)} poses", source, {"stamps"} if whole else ())
+            return written(counted(len(stamps), "pose"), source, {"stamps"} if whole else ())
         if source.graph is not None and source.graph.vertex_ids.dtype.kind in "iu":
             pairs = source.graph.vertex_ids[source.graph.edges].astype(np.int64)
             write_text_atomically(path, _blocks(pairs, source.graph.i_from_j, source.graph.vertex_count))
-            return written(f"{len(pairs)} edges", source, {"edges"})
+            return written(counted(len(pairs), "edge"), source, {"edges"})
         raise SourceError(f"{source.path}: no trajectory, and no graph with numbered vertices, to write as .log")
 
 

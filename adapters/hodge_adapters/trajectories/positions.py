@@ -15,6 +15,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Source
 from hodge_pipeline.types.positions import Positions, from_geodetic
+from hodge_pipeline.types.text import counted
 
 SPELLINGS = {
     "name": ("name", "image", "image_name", "file", "filename", "frame", "id", "label"),
@@ -71,7 +72,9 @@ def read_positions(path: Path, notes: list[str]) -> Positions:
     good = np.isfinite(points).all(axis=1) & ((names != "") | np.isfinite(stamps))
     if not good.all():
         lines = [row.line for row, fits in zip(rows, good, strict=True) if not fits]
-        notes.append(f"{len(lines)} rows without a name or stamp or three coordinates left out: line {listed(lines)}")
+        notes.append(
+            f"{counted(len(lines), 'row')} without a name or stamp or three coordinates left out: line {listed(lines)}"
+        )
     if not good.any():
         raise SourceError(f"{path}: no row has a name or stamp and three coordinates: give {WANTED}")
     names, stamps = names[good], stamps[good]

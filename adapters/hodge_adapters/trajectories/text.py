@@ -17,6 +17,7 @@ from hodge_adapters.text_rows import Row, first_text, listed, read_rows, to_floa
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Source, Trajectory
+from hodge_pipeline.types.text import counted
 
 COLUMNS = (8, 9)
 """Of a line of TUM's: RTAB-Map adds the number of the node."""
@@ -77,7 +78,10 @@ def parse_tum(path: Path) -> ParsedTrajectory:
     if w_first:
         notes.append(f"{path.name}: quaternions are read with w first, as its head names them")
     if bad:
-        notes.append(f"{path.name}: {len(bad)} lines that are no pose left out: {listed([r.line for r in bad])}")
+        notes.append(
+            f"{path.name}: {counted(len(bad), 'line that is|lines that are')} no pose left out: "
+            f"{listed([r.line for r in bad])}"
+        )
     return ParsedTrajectory(parsed.trajectory, tuple(notes))
 
 
@@ -132,7 +136,7 @@ class TumWriter:
         """One file, atomically; see `write_tum`."""
         trajectory = trajectory_of(source)
         write_tum(path, trajectory)
-        return written(f"{len(trajectory)} poses", source, {"stamps"})
+        return written(counted(len(trajectory), "pose"), source, {"stamps"})
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -143,7 +147,7 @@ class KittiWriter:
         """One file, atomically; see `write_kitti`."""
         trajectory = trajectory_of(source)
         write_kitti(path, trajectory)
-        return written(f"{len(trajectory)} poses", source)
+        return written(counted(len(trajectory), "pose"), source)
 
 
 def _lines(table: Floats) -> str:
@@ -170,7 +174,7 @@ def ordered(table: Floats) -> ParsedTrajectory:
     stamps, first = np.unique(table[:, 0], return_index=True)
     notes = []
     if len(stamps) < len(table):
-        notes.append(f"{len(table) - len(stamps)} poses with the stamp of an earlier one left out")
+        notes.append(f"{counted(len(table) - len(stamps), 'pose')} with the stamp of an earlier one left out")
     if (np.diff(table[:, 0]) < 0).any():
         notes.append("poses were not in order of time: sorted")
     notes += length_notes(table[:, 4:], "poses")

@@ -13,6 +13,7 @@ from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
 from hodge_adapters.trajectories.text import in_seconds, is_stamp
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types.text import counted
 
 ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
 LONGEST_DELAY_S = 0.1
@@ -170,7 +171,7 @@ def _from_association(path: Path, notes: list[str]) -> StampedImages:
 def _left_out(name: str, expected: str, unreadable: list[int], outside: list[int]) -> list[str]:
     """A line for each reason why lines were left out."""
     reasons = ((f"that are not {expected}", unreadable), ("that name no file in the folder", outside))
-    return [f"{name}: {len(lines)} lines {why} left out: {listed(lines)}" for why, lines in reasons if lines]
+    return [f"{name}: {counted(len(lines), 'line')} {why} left out: {listed(lines)}" for why, lines in reasons if lines]
 
 
 def _depth_column(rows: list[Row], path: Path) -> int:
@@ -197,7 +198,7 @@ def _in_order(stamps: Floats, name: str, notes: list[str]) -> tuple[Floats, list
     again = np.flatnonzero((np.diff(stamps_s[order]) == 0) & (np.diff(runs[order]) == 0)) + 1
     order = np.delete(order, again)
     if len(again):
-        notes.append(f"{name}: {len(again)} lines with the stamp of an earlier one left out")
+        notes.append(f"{name}: {counted(len(again), 'line')} with the stamp of an earlier one left out")
     if runs.any():
         places = listed((np.flatnonzero(np.diff(runs)) + 1).tolist())
         notes.append(f"{name}: the clock jumps back before image {places}: images are taken in the order of the file")

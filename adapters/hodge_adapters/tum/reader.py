@@ -23,6 +23,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Source, Trajectory
+from hodge_pipeline.types.text import counted
 
 UNITS_PER_METRE = 5000.0
 READOUT_S = 0.0225
@@ -215,7 +216,7 @@ class TumReader:
         if self.truth_match == "stamp":
             return parsed.trajectory, (file,)
         if len(parsed.trajectory) != len(stamps_s):
-            counts = f"{len(parsed.trajectory)} poses for {len(stamps_s)} frames"
+            counts = f"{counted(len(parsed.trajectory), 'pose')} for {counted(len(stamps_s), 'frame')}"
             raise SourceError(f"{file}: {counts}: truth_match row needs one pose for each frame")
         return Trajectory(stamps_s, parsed.trajectory.world_from_cam), (file,)
 

@@ -19,6 +19,7 @@ from hodge_pipeline.solvers.backbone.chain import (
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types.text import counted
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
 FEWEST_STEPS = 100
@@ -81,7 +82,7 @@ class Backbone:
         loops, used = len(self.chain.loop_edge), int(self.found.used.sum())
         trusted = f"{int(self.steps.sum())} consecutive edges are trusted as a backbone"
         if not self.found.confirmed:
-            return f"{trusted}, {loops} loops that nothing confirms: the poses are the backbone's"
+            return f"{trusted}, {counted(loops, 'loop')} that nothing confirms: the poses are the backbone's"
         broken = int((self.steps & ~self.used).sum())
         said = f", {broken} of them called wrong by the loops over it" if broken else ""
         return f"{trusted}{said}, {used} of {loops} loops confirmed"
