@@ -189,7 +189,7 @@ def scans(world: World, seed: int, beams: int, columns: int) -> list[PointCloud]
         ranges = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)["t_hit"].numpy().astype(float)
         ranges += world.noise_m * rng.standard_normal(len(ranges))
         seen = (ranges > world.nearest_m) & (ranges < FARTHEST_M)
-        clouds.append(PointCloud((directions * ranges[:, None])[seen].astype(np.float32)))
+        clouds.append(PointCloud((directions[seen] * ranges[seen, None]).astype(np.float32)))
     return clouds
 
 

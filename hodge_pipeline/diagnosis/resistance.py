@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -33,10 +34,7 @@ class Network:
     def of(cls, edges: Ints, vertex_count: int) -> Network:
         """The network of these edges; self-loops are left out."""
         proper = edges[edges[:, 0] != edges[:, 1]]
-        component = connected_components(proper, vertex_count)
-        grounded = first_of_component(component)
-        d0 = coboundary_0(proper, vertex_count)
-        return cls(component, grounded, d0, factorise(grounded_laplacian(d0, np.ones(len(proper)), grounded)))
+        return _network(np.asarray(proper, np.int64).tobytes(), vertex_count)
 
     def between(self, pairs: Ints) -> Floats:
         """The resistance (P,) of each pair: the variance of its relative pose in units of an edge's. ∞ where no path
@@ -68,6 +66,16 @@ class Network:
         sketch = np.zeros((self.d0.shape[1], SKETCHES))
         sketch[~self.grounded] = self.factor.solve(np.asarray(self.d0.T @ signs)[~self.grounded])
         return np.asarray(((sketch[i] - sketch[j]) ** 2).sum(axis=1))
+
+
+@lru_cache(maxsize=1)
+def _network(edges: bytes, vertex_count: int) -> Network:
+    """The last one is kept: suggestions ask for that of the kept edges after the verdicts did."""
+    proper = np.frombuffer(edges, np.int64).reshape(-1, 2)
+    component = connected_components(proper, vertex_count)
+    grounded = first_of_component(component)
+    d0 = coboundary_0(proper, vertex_count)
+    return Network(component, grounded, d0, factorise(grounded_laplacian(d0, np.ones(len(proper)), grounded)))
 
 
 def effective_resistance(edges: Ints, vertex_count: int, used: Bools) -> Floats:

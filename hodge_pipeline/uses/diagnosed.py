@@ -204,7 +204,8 @@ def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> t
     used = (found.verdict == WRONG) & ~subject.disabled & ~subject.left_out
     beside = _beside_kept(subject.graph, found)
     meant = used & ~beside & (not subject.harmless)
-    rows = np.array([row for row in ranked(found) if meant[row]], int)
+    rows = ranked(found)
+    rows = rows[meant[rows]]
     wrong = pair_names(subject.graph.vertex_ids, subject.graph.edges[rows])
     if not subject.is_run:
         trust = ("--trust", subject.options.trust) if subject.options.trust != AUTO else ()

@@ -63,14 +63,15 @@ def read_records(
     A tag that is among the `other_names` is read as the one it stands for.
     """
     try:
-        lines = _text(read_input(Path(path))).split("\n")
+        text = _text(read_input(Path(path)))
     except (OSError, ValueError) as error:
         raise SourceError(f"{path}: cannot be read as text ({error}): expected a pose-graph file") from error
     numbers: dict[str, list[int]] = {tag: [] for tag in keys}
     rests: dict[str, list[str]] = {tag: [] for tag in keys}
     other: Counter[str] = Counter()
-    for number, line in enumerate(lines, 1):
-        parts = line.partition("#")[0].split(None, 1)
+    has_comments = "#" in text
+    for number, line in enumerate(text.split("\n"), 1):
+        parts = (line.partition("#")[0] if has_comments else line).split(None, 1)
         if not parts:
             continue
         tag = other_names.get(parts[0], parts[0])

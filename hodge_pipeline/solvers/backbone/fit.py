@@ -250,11 +250,12 @@ class Fit:
         out = moves[anchor] - (linear.residual - linear.residual[reduced.ends[anchor]])
         out[~touched] = 0.0
         gap = moves[second] - moves[first] + linear.residual[end] - linear.residual[begin]
-        shift = linear.shift(end)
-        pull = self.precision[: len(gap)] @ shift @ gap[..., None]
+        pull = self.precision[: len(gap)] @ linear.shift(end) @ gap[..., None]
         bent = np.concatenate([np.zeros((1, gap.shape[1])), np.cumsum((self.steps @ pull[run])[..., 0], axis=0)])
-        back = 2 * np.eye(gap.shape[1]) - shift
-        out[at] += (back[run] @ (bent[1:] - bent[reduced.first[run]])[..., None])[..., 0]
+        bent = bent[1:] - bent[reduced.first[run]]
+        lever = linear.chain.lever(linear.poses[end, :3, 3])[run]
+        bent[:, -lever.shape[1] :] -= np.einsum("kij,kj->ki", lever, bent[:, : lever.shape[2]])  # back to the origin
+        out[at] += bent
         return np.asarray(linear.chain.exp(out) @ linear.poses)
 
 

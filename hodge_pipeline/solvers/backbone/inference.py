@@ -130,7 +130,7 @@ def _inferred(
     judged, linear = best
     agreed = (judged.factor > _limit(judged)) & (judged.log_odds > 0)
     enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0)
-    used, confirmed = _of_right_places(start, alone, judged, agreed, wrong, enough)
+    used, confirmed = _of_right_places(start, linear, alone, judged, agreed, wrong, enough)
     used |= always
     reduced = thinned(chain, np.flatnonzero(used))
     if (agreed & ~used).any():
@@ -184,13 +184,13 @@ def _limit(judged: Judged) -> float:
 
 
 def _of_right_places(
-    start: Linear, alone: Judged, judged: Judged, used: Bools, wrong: Wrong, enough: float
+    start: Linear, linear: Linear, alone: Judged, judged: Judged, used: Bools, wrong: Wrong, enough: float
 ) -> tuple[Bools, bool]:
     """The used loops (M,) of places that are not mistaken for others, and whether they say more than chance finds:
     log-odds that are `enough`.
 
     Loops of one place agree also where it is mistaken: of each, one is judged at the poses that those of the other
-    right places lead to, beginning with the place that says most by itself.
+    right places lead to, beginning with the place that says most by itself. `linear`: at the poses of all used loops.
     """
     if not used.any() or (judged.factor[used] - np.log(len(used))).sum() <= by_chance(len(used)):
         return used, False
@@ -207,7 +207,7 @@ def _of_right_places(
     right, bare = np.ones(len(chosen), bool), alone.factor[chosen]
     strongest = np.arange(len(chosen)) == np.argmax(bare - rivals(right))
     for number in range(ROUNDS):
-        fit = settled(Fit(thinned(chain, chosen[right]), start), MOST_STEPS)
+        fit = settled(Fit(thinned(chain, chosen[right]), start if number else linear), MOST_STEPS)
         factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals(right)
         if not number and together(factor) > enough:
             return used, True
