@@ -111,10 +111,10 @@ def test_a_pair_is_registered_again_only_where_the_poses_moved_it(folder: Path, 
     poses, pairs = path_of(FRAMES), Edges.of(PAIRS, "sequential")
     asked: list[int] = []
 
-    def registered(where: Floats, earlier: Edges | None, before: Floats | None = None) -> Edges:
+    def registered(where: Floats, earlier: Edges | None) -> Edges:
         asked.clear()
-        step, clouds = Step(tmp_path, asked.append, lambda *notes: None), CloudSet.open(folder)
-        return register_edges(pairs, clouds, Gicp(), where, earlier, before, workers=InProcess(), step=step)
+        step = Step(tmp_path, asked.append, lambda *notes: None)
+        return register_edges(pairs, CloudSet.open(folder), Gicp(), where, earlier, workers=InProcess(), step=step)
 
     first = registered(poses, None)
     marked = replace(first, fitness=first.fitness + 1.0)
@@ -129,10 +129,6 @@ def test_a_pair_is_registered_again_only_where_the_poses_moved_it(folder: Path, 
     assert sum(asked) == len(PAIRS)
     rejected = replace(settled, status=np.full(len(PAIRS), "rejected"))
     assert same_bits(registered(poses, rejected), first)
-    nearby = poses.copy()
-    nearby[-1, :3, 3] += 0.01
-    np.testing.assert_array_equal(registered(nearby, rejected, poses).fitness > 1.0, True)
-    np.testing.assert_array_equal(registered(moved, rejected, poses).fitness > 1.0, ~fresh)
     unguessed = replace(rejected, iterations=np.zeros(len(PAIRS), np.int64), converged=np.ones(len(PAIRS), bool))
     assert same_bits(registered(moved, unguessed), replace(unguessed, status=first.status))
 

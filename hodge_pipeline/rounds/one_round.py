@@ -110,8 +110,8 @@ class Work:
         if number == 1 and self.scene.steps_stand:
             earlier = before.edges.select(np.abs(np.diff(before.edges.pairs, axis=1)[:, 0]) == 1)
         registered = self.steps.step(
-            register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier,
-            before.before, self.scale, self.recipe.acceptance.min_spread,
+            register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,
+            self.recipe.acceptance.min_spread,
             title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
         )  # fmt: skip
         fresh = np.flatnonzero(registered.status != HELD_OUT)
