@@ -126,7 +126,7 @@ def test_a_sweep_in_millimetres_among_others_is_left_out_and_named(reach_m: floa
     frames[12] = changed(frames[12], lambda cloud: replace(cloud, points_in_cam=cloud.points_in_cam * 1000))
     found, said = followed(frames, max_range_m=reach_m)
     assert (~found.found).nonzero()[0].tolist() == [12]
-    assert "12.pcd" in said and "millimetres" in said and "1 sweeps are left out" in said
+    assert "12.pcd" in said and "millimetres" in said and "1 sweep is left out" in said
 
 
 def test_a_scanner_whose_sweeps_cannot_be_read_leaves_the_other_be() -> None:
