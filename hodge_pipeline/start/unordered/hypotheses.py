@@ -33,12 +33,14 @@ RIVAL_OVERLAP, RIVAL_VIOLATION = 0.8, 2.0
 since rings of a scanner fit each other; in furnished ones it is seen through by 4 to 20 times as much.
 """
 AMBIGUOUS, NO_LEAD = "it fits in several ways", "another motion explains as many matches"
-USUAL_VIOLATIONS, LEAST_VIOLATION, MOST_VIOLATION = 8.0, 0.03, 0.15
-"""Times the median of a run's pairs, within these: the share of the points in view that the other depth image saw
-through, above which a pair is refused. Places that look alike differ in what surrounds them.
+USUAL_TIMES = 12.0
+"""Times what the best quarter of a run's pairs has: where places look alike, most pairs are wrong."""
+LEAST_VIOLATION, MOST_VIOLATION = 0.03, 0.15
+"""Bounds on the share of the points in view that the other depth image may have seen through. Places that look alike
+differ in what surrounds them.
 """
-USUAL_HUE_CONFLICTS, LEAST_HUE_CONFLICT = 12.0, 0.02
-"""Times the best quarter of a run's pairs, this at least: the share of common points whose hue may differ."""
+LEAST_HUE_CONFLICT = 0.02
+"""Of the common points, whose hue may always differ."""
 ViewOf = Callable[[int], DepthView | None]
 
 
@@ -158,17 +160,18 @@ def _ambiguous(
 
 
 def allowed_violation(seen_through: Floats) -> float:
-    """The violation up to which a pair may be right, from those (P,) of a run, most of which are right."""
-    known = seen_through[np.isfinite(seen_through)]
-    usual = float(np.median(known)) if len(known) else 0.0
-    return float(np.clip(USUAL_VIOLATIONS * usual, LEAST_VIOLATION, MOST_VIOLATION))
+    """The violation up to which a pair may be right, from those (P,) of a run, a quarter of which are right."""
+    return min(_allowed(seen_through, LEAST_VIOLATION), MOST_VIOLATION)
 
 
 def allowed_hue_conflict(conflicts: Floats) -> float:
     """The hue conflict up to which a pair may be right, from those (P,) of a run, a quarter of which are right."""
-    known = conflicts[np.isfinite(conflicts)]
-    good = float(np.quantile(known, 0.25)) if len(known) else 0.0
-    return max(USUAL_HUE_CONFLICTS * good, LEAST_HUE_CONFLICT)
+    return _allowed(conflicts, LEAST_HUE_CONFLICT)
+
+
+def _allowed(shares: Floats, least: float) -> float:
+    known = shares[np.isfinite(shares)]
+    return max(USUAL_TIMES * float(np.quantile(known, 0.25)) if len(known) else 0.0, least)
 
 
 def violations(clouds: CloudSet, pairs: Ints, i_from_j: Floats, view_of: ViewOf, scale: float = 1.0) -> Floats:
