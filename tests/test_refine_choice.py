@@ -12,7 +12,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.refine.candidates import Candidate, Found
 from hodge_pipeline.refine.choice import choose
 from hodge_pipeline.refine.judge import costs
-from hodge_pipeline.refine.model import _metric_poses
+from hodge_pipeline.refine.model import _loose_doubt, _metric_poses
+from hodge_pipeline.refine.uncertainty import loose, told_apart
 from hodge_pipeline.types import Floats, ModelQuality
 from test_refine_judge import flat, quality
 
@@ -27,6 +28,7 @@ class Model:
     quality: ModelQuality
     moved: float = 0.0
     ratio: float = 1.0
+    sigmas: tuple[float, ...] = (0.01,) * 10
     body_names = tuple("abcdefghij")
     known_positions = None
     moves_intrinsics = False
@@ -40,6 +42,9 @@ class Model:
     def frames(self) -> list[SimpleNamespace]:
         return [SimpleNamespace(world_from_cam=pose) for pose in self.world_from_body]
 
+    def standard_errors(self) -> Floats:
+        return np.column_stack([self.sigmas, self.sigmas])
+
     def merged(self) -> Model:
         return self
 
@@ -47,13 +52,13 @@ class Model:
         return [np.full(20, self.ratio) for _ in range(10)]
 
 
-def found(before_px: float, after_px: float, points: int = 40, ratio: float = 1.0) -> Found:
+def found(before_px: float, after_px: float, points: int = 40, ratio: float = 1.0, sigma: float = 0.01) -> Found:
     """The input and its bundle adjustment: 400 observations in ten images, of so many points."""
     parts = [
         replace(quality(flat(px, images=10, count=40)), points=points, mean_track_length=400 / points)
         for px in (before_px, after_px)
     ]
-    models = [Model(parts[0]), Model(parts[1], moved=0.9, ratio=ratio)]
+    models = [Model(parts[0]), Model(parts[1], moved=0.9, ratio=ratio, sigmas=(sigma,) * 10)]
     inputs, *costly = costs(parts[:1], parts)
     held_out = SimpleNamespace(held_out=np.zeros((8, 2), np.int64))
     candidates: Any = [Candidate(name, model) for name, model in zip(("as given", "bundle"), models, strict=True)]
@@ -82,6 +87,21 @@ def test_what_poses_gain_by_fitting_noise_is_no_gain() -> None:
     """Of 800 numbers 230 points leave 110, ten poses 50 of those: noise alone shrinks by a third."""
     choice = choose(found(1.0, 0.7, points=230), np.zeros((2, 0)), 0, NO_STEPS)
     assert choice.row == 0 and "fitting noise" in choice.reason
+
+
+def test_poses_that_tracks_hardly_fix_are_in_doubt() -> None:
+    for sigma, doubt in ((0.01, ""), (0.5, "in doubt, since tracks hardly fix"), (np.nan, "in doubt")):
+        start, candidate = (one.model for one in found(3.5, 0.6, sigma=sigma).candidates)
+        told = _loose_doubt(start, candidate)
+        assert told.startswith(doubt) and bool(told) == bool(doubt)
+
+
+def test_one_image_that_tracks_hardly_fix_is_told_and_does_not_keep_the_others_from_better_poses() -> None:
+    start, candidate = (one.model for one in found(3.5, 0.6).candidates)
+    weak: Any = replace(candidate, sigmas=(2.0,) + (0.01,) * 9)
+    assert told_apart(start, weak)
+    np.testing.assert_array_equal(loose(start, weak), [True] + [False] * 9)
+    assert not loose(start, candidate).any() and not told_apart(start, start)
 
 
 def test_candidates_are_laid_on_the_clouds_in_metres_each_by_its_own_depth() -> None:

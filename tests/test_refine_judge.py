@@ -87,6 +87,8 @@ def test_an_image_that_is_off_is_named_and_the_candidate_not_sound() -> None:
     given, right = costs([quality(off)], [quality(flat(1.0, images=40))])
     assert given.images_off == ("image 3",) and given.beyond == pytest.approx(1 / 40)
     assert not given.is_sound and right.is_sound
+    assert given.images_doubt == "in doubt, since most observations of 1 image (image 3) are more than 4 px off"
+    assert not given.doubt and not right.images_doubt
 
 
 def test_poses_are_in_doubt_where_most_observations_are_off_whatever_else_fits() -> None:

@@ -12,7 +12,7 @@ from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.refine.candidates import Found
 from hodge_pipeline.refine.guard import Measure
-from hodge_pipeline.refine.judge import LEAST_CAP_PX, best
+from hodge_pipeline.refine.judge import best
 from hodge_pipeline.stages import Step, Steps, TrackedModel
 from hodge_pipeline.types import Floats
 
@@ -136,7 +136,7 @@ def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
         )
     if not errors.size:
         return ""
-    medians, capped = np.median(errors, axis=1), np.minimum(errors, LEAST_CAP_PX).mean(axis=1)
+    medians, capped = np.median(errors, axis=1), np.minimum(errors, after.cap_px).mean(axis=1)
     if medians[1] < medians[0] and capped[1] < capped[0]:
         return ""
     return f"observations held out are {medians[0]:.4g} px off, {medians[1]:.4g} px after the best candidate"

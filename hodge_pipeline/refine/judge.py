@@ -23,6 +23,8 @@ SAME_COST = 1e-4
 """Relative: two candidates nearer than this have come to the same optimum."""
 OFF_SHARE, DOUBTFUL_SHARE = 0.5, 0.1
 """Of the observations of an image, or of all of them."""
+NAMED_IMAGES = 3
+"""In a verdict; the report has them all."""
 SOUND_SHARE = 0.05
 """Of the observations beyond the cap: as many are wrong in models that nothing is the matter with."""
 
@@ -57,6 +59,13 @@ class Cost:
         else:
             return ""
         return f"in doubt, since {off}"
+
+    @property
+    def images_doubt(self) -> str:
+        """Which images may be wrong although the whole fits; empty where none is."""
+        if not self.images_off:
+            return ""
+        return f"in doubt, since most observations of {named(self.images_off)} are more than {self.cap_px:.3g} px off"
 
     @property
     def is_sound(self) -> bool:
@@ -117,6 +126,12 @@ def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, name
             )
         )
     return out
+
+
+def named(images: Sequence[str]) -> str:
+    """How many images, and the first of their names."""
+    shown = ", ".join(images[:NAMED_IMAGES]) + ", …" * (len(images) > NAMED_IMAGES)
+    return f"{len(images)} image{'s' * (len(images) > 1)} ({shown})"
 
 
 def best(found: Sequence[Cost]) -> int:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.evaluation.trajectory import align
@@ -15,12 +14,12 @@ from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.refine.candidates import GIVEN, Found, weigh
 from hodge_pipeline.refine.choice import Choice, choose, held_out_score
 from hodge_pipeline.refine.guard import Change, Decision, Measure
-from hodge_pipeline.refine.judge import SAME_COST, Cost
+from hodge_pipeline.refine.judge import SAME_COST, Cost, named
 from hodge_pipeline.refine.model_edges import held_out_distances
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved
 from hodge_pipeline.refine.scale import Scale, metric_scale
-from hodge_pipeline.refine.uncertainty import SIGMAS
+from hodge_pipeline.refine.uncertainty import SIGMAS, loose, moves, told_apart
 from hodge_pipeline.stages import Steps, TrackedModel, Workers
 from hodge_pipeline.types import Floats
 
@@ -136,9 +135,18 @@ def _refine(
     names = [(one.name, cost) for one, cost in zip(found.candidates, found.costs, strict=True)]
     candidates = names if len(inputs) == 1 else [(f"{len(inputs)} models apart", found.inputs), *names]
     notes = (*model.notes, *found.notes, *(str(scale) for scale in scales))
-    decision = replace(decision, measures=measures, change=change, doubt=found.costs[at].doubt)
+    cost = found.costs[at]
+    doubt = cost.doubt or cost.images_doubt or (_loose_doubt(start, model) if at and not is_metric else "")
+    decision = replace(decision, measures=measures, change=change, doubt=doubt)
     kept = 0 if decision.keeps_input else at + len(candidates) - len(names)
     return RefinedModel(inputs, start, model, scales, final, tuple(candidates), kept, found.solved, decision, notes)
+
+
+def _loose_doubt(start: TrackedModel, model: TrackedModel) -> str:
+    if not told_apart(start, model):
+        return "in doubt, since tracks hardly fix the poses, which moved by less than they leave open"
+    names = [str(name) for name, one in zip(model.body_names, loose(start, model), strict=True) if one]
+    return f"in doubt, since tracks fix {named(names)} less well than the poses moved" if names else ""
 
 
 def _placed_decision(start: TrackedModel, found: Found, choice: Choice) -> Decision | None:
@@ -161,8 +169,9 @@ def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool
     if scales[0].is_observable and not scales[0].is_one:
         return Decision("refined", f"in metres now; {told}")
     if not choice.row:
+        doubted = before.doubt or before.images_doubt
         return Decision(
-            "worse" if before.doubt else "optimal", f"{'' if before.doubt else 'already optimal: '}{choice.reason}"
+            "worse" if before.doubt else "optimal", f"{'' if doubted else 'already optimal: '}{choice.reason}"
         )
     return Decision("forced", f"{choice.reason}; {told}") if choice.reason else Decision("refined", told)
 
@@ -222,17 +231,10 @@ def _measures(
     return tuple(out)
 
 
-def _laid_onto(before: Floats, after: Floats) -> Floats:
-    """The poses before, moved rigidly onto those after: by their orientations, which small sets of positions lack."""
-    turn = se3.project_to_so3((after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2)).sum(axis=0))
-    shift = (after[:, :3, 3] - before[:, :3, 3] @ turn.T).mean(axis=0)
-    return np.asarray(se3.from_parts(turn, shift) @ before)
-
-
 def _change(start: TrackedModel, scale: Scale, model: TrackedModel, in_world: bool) -> Change:
     """How far the poses moved from those of the input, laid onto each other: in metres where depth tells the scale."""
     before, after = start.world_from_body, model.world_from_body
-    moved = se3.log(se3.inverse(_laid_onto(before, after)) @ after)
+    moved = moves(before, after)
     errors = model.standard_errors()
     known = errors[np.isfinite(errors).all(axis=1)]
     rotation, position = np.sqrt((known**2).mean(axis=0)) if len(known) else (np.nan, np.nan)
@@ -240,8 +242,8 @@ def _change(start: TrackedModel, scale: Scale, model: TrackedModel, in_world: bo
         size = np.sqrt(np.mean(np.sum((after[:, :3, 3] - after[:, :3, 3].mean(axis=0)) ** 2, axis=1)))
         position = float(np.hypot(position, scale.sigma * size))
     return Change(
-        translation_m=float(np.sqrt(np.mean(np.sum(moved[:, 3:] ** 2, axis=1)))),
-        rotation_deg=float(np.degrees(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=1))))),
+        translation_m=float(np.sqrt(np.mean(moved[:, 1] ** 2))),
+        rotation_deg=float(np.degrees(np.sqrt(np.mean(moved[:, 0] ** 2)))),
         translation_uncertainty_m=float(SIGMAS * position * np.sqrt(3)),
         rotation_uncertainty_deg=float(np.degrees(SIGMAS * rotation * np.sqrt(3))),
         is_metric=scale.is_observable or in_world,

@@ -11,7 +11,8 @@ from hodge_pipeline.complex.judging import chi2_by_information
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.guard import Change
 from hodge_pipeline.solvers.covariance import marginal_covariances
-from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
+from hodge_pipeline.stages import TrackedModel
+from hodge_pipeline.types import Bools, Floats, Ints, Solution, ViewGraph
 from hodge_pipeline.types.arrays import evenly
 
 MOST_SAMPLED = 60
@@ -39,6 +40,40 @@ def change(graph: ViewGraph, solution: Solution, before: Floats) -> Change:
     rows = evenly(graph.vertex_count, MOST_SAMPLED)
     rotation, translation = _sigmas(graph, solution, used, rows)
     return Change(translation_m, rotation_deg, SIGMAS * translation, SIGMAS * float(np.rad2deg(rotation)))
+
+
+def moves(before: Floats, after: Floats) -> Floats:
+    """How far (B, 2) rotations (rad) and positions moved, the poses before laid rigidly onto those after.
+
+    By their orientations, which small sets of positions lack.
+    """
+    turn = se3.project_to_so3((after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2)).sum(axis=0))
+    shift = (after[:, :3, 3] - before[:, :3, 3] @ turn.T).mean(axis=0)
+    moved = se3.log(se3.inverse(se3.from_parts(turn, shift) @ before) @ after)
+    return np.asarray(np.linalg.norm(moved.reshape(-1, 2, 3), axis=2))
+
+
+def told_apart(start: TrackedModel, model: TrackedModel) -> bool:
+    """Whether the model, of the size of the start, moved by more than tracks leave open, in the mean or the median.
+
+    What moved by less may well be farther from the truth than the start: the errors of both add up to the move.
+    """
+    moved, known = _moved_and_known(start, model)
+    total = (moved**2).sum(axis=0) > SIGMAS**2 * (known**2).sum(axis=0)
+    return bool((total | (np.median(moved / known, axis=0) > SIGMAS)).any())
+
+
+def loose(start: TrackedModel, model: TrackedModel) -> Bools:
+    """Which bodies (B,) tracks fix far less well than the others, and than the poses moved: they may be worse now."""
+    moved, known = _moved_and_known(start, model)
+    least = np.maximum(np.sqrt((moved**2).mean(axis=0)), SIGMAS * np.median(known, axis=0))
+    return np.asarray((known > least).any(axis=1))
+
+
+def _moved_and_known(start: TrackedModel, model: TrackedModel) -> tuple[Floats, Floats]:
+    """Moves and standard errors (B, 2), of three axes together; infinite where the tracks tell none."""
+    known = np.sqrt(3) * np.nan_to_num(model.standard_errors(), nan=np.inf)
+    return moves(start.world_from_body, model.world_from_body), np.maximum(known, np.finfo(float).tiny)
 
 
 def _sigmas(graph: ViewGraph, solution: Solution, used: Ints, rows: Ints) -> tuple[float, float]:
