@@ -18,7 +18,7 @@ from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.reader import ColmapReader
 from hodge_adapters.colmap.writer import ColmapWriter
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.errors import SourceError
+from hodge_pipeline.errors import CheckError, SourceError
 from hodge_pipeline.store.edge_table import read_edges
 from readers_data import write_colour
 from test_readers_colmap import synthetic
@@ -184,3 +184,10 @@ def test_a_refined_model_finds_images_and_database_of_the_model_that_it_was_made
     assert all(frame.read_colour for frame in source.frames) and not any("not there" in note for note in source.notes)
     (out / "report.json").write_text("{")
     assert not any(frame.read_colour for frame in ColmapReader().open(out).frames), "the model is read all the same"
+
+
+def test_an_input_that_is_off_everywhere_is_not_called_optimal(data_dir: Path, tmp_path: Path) -> None:
+    model = disturbed(data_dir / "colmap/unsorted_tiny", tmp_path / "off", degrees=8.0, share=0.15)
+    done = CliRunner().invoke(app, ["refine", "colmap", str(model), "--out", str(tmp_path / "out")])
+    assert isinstance(done.exception, CheckError)
+    assert done.stdout.startswith("verdict  in doubt, since 100% of the observations are more than 4 px off: worse:")

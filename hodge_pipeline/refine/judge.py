@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.types import Bools, Floats, Ints, ModelQuality
+from hodge_pipeline.types.text import counted
 
 CONTRADICTING_PX = 4.0
 """Mean error at which observations contradict each other: COLMAP leaves out each that is farther off."""
@@ -131,7 +132,7 @@ def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, name
 def named(images: Sequence[str]) -> str:
     """How many images, and the first of their names."""
     shown = ", ".join(images[:NAMED_IMAGES]) + ", …" * (len(images) > NAMED_IMAGES)
-    return f"{len(images)} image{'s' * (len(images) > 1)} ({shown})"
+    return f"{counted(len(images), 'image')} ({shown})"
 
 
 def best(found: Sequence[Cost]) -> int:

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 
+from hodge_pipeline.types.text import suiting
+
 
 class Rank(IntEnum):
     """How much a reader should heed a note: it puts the result in doubt, needs a look, or only informs."""
@@ -151,8 +153,7 @@ class _Count(int):
     """A number whose format `frame has|frames have` is the side that suits it."""
 
     def __format__(self, words: str) -> str:
-        one, _, many = words.partition("|")
-        return (one if self == 1 else many) if many else super().__format__(words)
+        return suiting(self, words) if words else super().__format__(words)
 
 
 @dataclass(frozen=True)

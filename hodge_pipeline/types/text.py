@@ -26,8 +26,13 @@ def visible(text: object, *, lines: bool = False) -> str:
 
 def counted(count: int, words: str) -> str:
     """A count with its noun: `1 image`, `2 images`; of `frame has|frames have` the side that suits the count."""
+    return f"{count} {suiting(count, words)}"
+
+
+def suiting(count: int, words: str) -> str:
+    """The side of `is|are` that suits the count; of a noun alone its singular, or its plural with an s."""
     one, _, many = words.partition("|")
-    return f"{count} {one if count == 1 else many or one + 's'}"
+    return one if count == 1 else many or f"{one}s"
 
 
 def command(*words: object) -> str:
