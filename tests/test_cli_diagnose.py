@@ -29,7 +29,7 @@ from hodge_pipeline.report.diagnosis_plots import side_by_side as pieces_apart
 from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views, side_by_side
 from hodge_pipeline.report.energy import energy_rows
 from hodge_pipeline.types import PointCloud, ViewGraph
-from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject
+from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
 from readers_data import tum_folder
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
@@ -144,6 +144,18 @@ def test_the_page_needs_nothing_but_itself(wrong_edge: tuple[Path, str, ViewGrap
     assert f'<td class="word">{i}–{j}</td><td class="word wrong">wrong</td>' in page
     for words in ("Energy of the residual motions", "harmonic", "linearisation", "Pieces"):
         assert words in page
+
+
+def test_lengths_of_a_graph_without_a_scale_are_no_metres(wrong_edge: tuple[Path, str, ViewGraph]) -> None:
+    folder = wrong_edge[0]
+    subject = open_subject(folder / "ring.g2o")
+    metric = (folder / "why/diagnosis.html").read_text()
+    write_diagnosed(folder / "own", diagnose_subject(replace(subject, has_metres=False)), recording=False)
+    page = re.sub(r"base64,[^\"]*", "", (folder / "own/diagnosis.html").read_text())
+    lengths = r"\d (c?m|m²)\b"
+    assert re.search(lengths, metric) and not re.search(lengths, page) and "units" in page
+    table = (folder / "own/edges.csv").read_text()
+    assert "residual_units" in table and not re.search(lengths, table)
 
 
 def test_the_recording_holds_verdicts_triangles_and_loops(wrong_edge: tuple[Path, str, ViewGraph]) -> None:

@@ -67,11 +67,9 @@ def _to_register(found: Diagnosed) -> list[str]:
 
 def _lines(found: Diagnosed, out: Path | None, top: int | None, bad: int) -> list[str]:
     """The verdict, the worst edges, what to heed and what to type next: ten lines, or `top` edges."""
-    from hodge_pipeline.report.diagnosis_page import sentence
-
-    head = labelled("verdict", sentence(found.subject.graph, found.diagnosis))
+    head = labelled("verdict", found.sentence)
     worrying = [note for note in found.notes if note not in found.diagnosis.notes]
-    tail = [line for note in worrying[:1] for line in at_most(labelled("look", note), 2)]
+    tail = [line for note in worrying[:1] for line in at_most(labelled("look", note), 3)]
     tail += [line for one in _to_register(found)[:1] if bad for line in at_most(labelled("register", one), 1)]
     tail += [] if out is None else [f"{'report':<{LABEL}}{out / 'diagnosis.html'}"]
     tail += [f"{'next':<{LABEL}}{command}" for command in found.commands]
@@ -134,6 +132,7 @@ def _as_json(found: Diagnosed, out: Path | None) -> dict[str, Any]:
     return {
         "source": str(found.subject.path),
         "out": None if out is None else str(out),
+        "in_metres": found.subject.has_metres,
         "vertices": graph.vertex_count,
         "pieces": int(diagnosis.piece.max(initial=-1)) + 1,
         "counts": counts,

@@ -14,6 +14,7 @@ from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.energy import ALL_EDGES, PARTS, EnergyRow
 from hodge_pipeline.report.painting import flattest_plane, painted
 from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 COLOURS = {CONSISTENT: "#3c73e1", UNTESTABLE: "#7f7f7f", SUSPECT: "#e69f00", WRONG: "#d5308f"}
 """Blue, grey, amber, magenta, as in the recording; markers tell them apart without colour."""
@@ -23,12 +24,12 @@ GAP_SHARE = 0.25
 FEW = 15
 
 
-def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> tuple[Picture, ...]:
+def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], has_metres: bool) -> tuple[Picture, ...]:
     """Every picture that there are data for."""
-    return tuple(_plots(graph, diagnosis, energy))
+    return tuple(_plots(graph, diagnosis, energy, "m" if has_metres else UNKNOWN_UNIT))
 
 
-def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> Iterator[Picture]:
+def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], unit: str) -> Iterator[Picture]:
     if graph.edge_count:
         yield painted(
             "Viewing graph by verdict",
@@ -40,7 +41,7 @@ def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) 
             "Edges from above",
             "The frames at their robust poses, seen across their flattest direction, with the edges by verdict; pieces "
             "that nothing sound connects are drawn beside each other.",
-            lambda figure: _above(figure, graph, diagnosis),
+            lambda figure: _above(figure, graph, diagnosis, unit),
         )
     if energy:
         yield painted(
@@ -81,7 +82,7 @@ def _legend(figure: Figure, axes: Any) -> None:
             handle.set_sizes([25.0])
 
 
-def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
+def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis, unit: str) -> None:
     axes = figure.add_subplot()
     positions = side_by_side(diagnosis.world_from_cam, diagnosis.piece)[:, :3, 3]
     origin, plane = flattest_plane(positions)
@@ -96,7 +97,7 @@ def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
     axes.scatter(places[:, 0], places[:, 1], s=4, c="#222222", linewidths=0, zorder=3)
     axes.set_aspect("equal", adjustable="datalim")
     axes.autoscale_view()
-    axes.set_xlabel("m")
+    axes.set_xlabel(unit)
     _legend(figure, axes)
 
 
