@@ -65,7 +65,6 @@ class AbsoluteError:
     """Absolute trajectory error, after alignment. `per_frame_m (N,)` and `aligned (N, 4, 4)` are NaN where left out."""
 
     rmse_m: float
-    mean_m: float
     median_m: float
     max_m: float
     frames: int
@@ -92,10 +91,9 @@ def absolute_error(
         aligned[rows] = alignments[-1].apply(estimate[rows])
     per_frame_m = np.linalg.norm(aligned[:, :3, 3] - reference[:, :3, 3], axis=-1)
     known = per_frame_m[usable]
-    mean, median, largest = (known.mean(), np.median(known), known.max()) if len(known) else (np.nan,) * 3
+    median, largest = (np.median(known), known.max()) if len(known) else (np.nan,) * 2
     return AbsoluteError(
         rmse_m=_rms(known),
-        mean_m=float(mean),
         median_m=float(median),
         max_m=float(largest),
         frames=int(usable.sum()),
@@ -139,15 +137,11 @@ def _rms(values: Floats) -> float:
 
 @dataclass(frozen=True)
 class RelativeError:
-    """Relative pose error over `delta_frames`, one entry for each pair of frames (M,) that could be compared."""
+    """Relative pose error over `delta_frames`, of the pairs of frames that can be compared; NaN of none."""
 
     delta_frames: int
     translation_rmse_m: float
     rotation_rmse_deg: float
-    start: Ints
-    translation_m: Floats
-    rotation_deg: Floats
-    left_out: int
 
 
 def relative_error(
@@ -155,8 +149,7 @@ def relative_error(
 ) -> RelativeError:
     """The error of the motion from each frame k to k + delta: `(B_k⁻¹ B_l)⁻¹ (A_k⁻¹ A_l)`, B the reference.
 
-    `component (N,)` labels frames that share a gauge (or a sequence): no motion is taken across two labels. `start`
-    holds the rows k.
+    `component (N,)` labels frames that share a gauge (or a sequence): no motion is taken across two labels.
     """
     if delta_frames < 1:
         raise ValueError(f"delta_frames is {delta_frames}: a motion needs at least one frame")
@@ -168,13 +161,4 @@ def relative_error(
     true_motion = se3.inverse(reference[chosen]) @ reference[chosen + delta_frames]
     error = se3.inverse(true_motion) @ motion
     translation_m = np.linalg.norm(error[:, :3, 3], axis=-1)
-    rotation_deg = np.rad2deg(se3.rotation_angle(error))
-    return RelativeError(
-        delta_frames,
-        _rms(translation_m),
-        _rms(rotation_deg),
-        chosen,
-        translation_m,
-        rotation_deg,
-        len(start) - len(chosen),
-    )
+    return RelativeError(delta_frames, _rms(translation_m), _rms(np.rad2deg(se3.rotation_angle(error))))

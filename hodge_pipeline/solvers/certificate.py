@@ -39,15 +39,13 @@ FIRST_SHIFT = 1e-3
 class Certificate:
     """The answer: `optimal`, with every eigenvalue ≥ −shift and `gap_bound` ≥ F − F_optimal when it is.
 
-    `negative_eigenvalues` counts those of Q − Λ + shift · I when it is not; −1 where the factorisation broke down.
-    Then `smallest_eigenvalue` is that of Q − Λ, and `direction (n, d)` its eigenvector: where F falls once the
-    rotations may leave their space.
+    When it is not, `smallest_eigenvalue` is that of Q − Λ, and `direction (n, d)` its eigenvector: where F falls once
+    the rotations may leave their space.
     """
 
     optimal: bool
     shift: float
     gap_bound: float
-    negative_eigenvalues: int
     note: str
     smallest_eigenvalue: float = 0.0
     direction: Floats | None = None
@@ -118,17 +116,17 @@ def certify(problem: Problem, rotations: Floats, translations: Floats, cost: flo
         if negative == 0:
             bound = shift * rank
             note = f"globally optimal: F = {cost:.9g} is within {bound:.3g} of the least (certified)"
-            return Certificate(True, shift, bound, 0, note)
+            return Certificate(True, shift, bound, note)
     if negative < 0:
         note = "not certified as the global minimum: the factorisation broke down"
-        return Certificate(False, shift, np.inf, negative, note)
+        return Certificate(False, shift, np.inf, note)
     smallest, vector = _smallest_eigenvalue(matrix, shift, on_rotations)
     direction = None
     if vector is not None:
         direction = np.empty((problem.count, d))
         direction[order] = vector[on_rotations > 0].reshape(problem.count, d)
     note = f"not certified as the global minimum: {negative} negative eigenvalues, the smallest {smallest:.6g}"
-    return Certificate(False, shift, np.inf, negative, note, smallest, direction)
+    return Certificate(False, shift, np.inf, note, smallest, direction)
 
 
 def _scale(problem: Problem) -> float:

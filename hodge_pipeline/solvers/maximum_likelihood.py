@@ -141,7 +141,7 @@ def solve(
 def _certify(setup: Setup, point: Point) -> Certificate:
     problem = setup.problem
     if problem.count - problem.free_count > setup.component.max(initial=-1) + 1:
-        return Certificate(False, 0.0, math.inf, 0, SEVERAL_FIXED)
+        return Certificate(False, 0.0, math.inf, SEVERAL_FIXED)
     return certify(problem, point.rotations, point.translations, point.cost)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hodge_adapters.colmap.database import database_matches
+from hodge_adapters.colmap.points import LEAST_PARALLAX
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import NO_POINT
 from hodge_pipeline.types import Floats, Ints
@@ -17,7 +18,6 @@ MERGE_ERROR_PX = 4.0
 """Two points are one where their common position is this near to all observations of both; COLMAP's own limit."""
 NEAR_SHARE = 0.03
 """Of a point's distance from the cameras: how far apart two models may place it and still agree."""
-LEAST_PARALLAX = 1e-4
 LEAST_TIES = 12
 LEAST_TIE_SHARE = 0.15
 REFITS = 5
