@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.diagnosis import diagnose, backbone_anyway
+from hodge_pipeline.diagnosis.diagnosis import backbone_anyway, diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError

@@ -16,6 +16,7 @@ from hodge_pipeline.diagnosis.evidence import Evidence, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
 from hodge_pipeline.diagnosis.options import CONSISTENT_FROM, WRONG_BELOW, DiagnosisOptions
+from hodge_pipeline.diagnosis.resistance import Network
 from hodge_pipeline.diagnosis.result import (
     CONSISTENT,
     SUSPECT,
@@ -72,9 +73,9 @@ def backbone_anyway(graph: ViewGraph, found: Diagnosis, options: DiagnosisOption
 
 
 OF_BACKBONE = 4.0
-"""Mistaken places that are as likely as a wrong edge of the backbone where short cycles test most of it, and none refutes
-that edge. In 28 simulated graphs of a right odometry and 100 to 800 right edges over two to four steps, with 40 loops of
-mistaken places, these are up to 2.3 times as many, but for four of the graphs. In a lattice none is tested so.
+"""Mistaken places that are as likely as one wrong edge of a backbone that short cycles test, where none refutes that
+edge. In 28 simulated graphs of a right odometry and 100 to 800 right edges over two to four steps, with 40 loops
+of mistaken places, these are up to 2.3 times as many, but for four of the graphs. In a lattice none is tested so.
 """
 
 
@@ -92,6 +93,7 @@ def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
     right = (probability >= CONSISTENT_FROM) & fit.used
     wrong = probability < WRONG_BELOW
     verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
+    kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
     world_from_cam = fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
     cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))
     telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
@@ -100,7 +102,8 @@ def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
         verdict=verdict,
         probability=probability,
         reasons=partial(reasons, stated, cycles, verdict, telling, undecided, fit.bridge),
-        kept=(verdict == CONSISTENT) | (verdict == UNTESTABLE),
+        kept=kept,
+        network=Network.of(stated.edges[kept], stated.vertex_count),
         resistance=fit.resistance,
         cycles=cycles,
         witnesses=telling,

@@ -28,8 +28,8 @@ edges test each other."""
 COVERED = 0.9
 """Of the vertices that consecutive edges must join, so that a sequence is a backbone."""
 TESTED = 0.3
-"""Of the steps in short cycles that close: from there on every edge is judged, none trusted at first. On graphs of rooms
-.77 to .98 are, on those of places visited again 0 to .1, and as many as there are edges over two steps or three.
+"""Of the steps in short cycles that close: from there on every edge is judged, none trusted at first. On graphs of
+rooms .77 to .98 are, on those of places visited again 0 to .1, and as many as there are edges over two steps or three.
 """
 LOOPS_AT_A_STEP = 0.5
 """From there on loops may make a lattice, or a room, in which no edge needs to be trusted."""
@@ -89,8 +89,8 @@ class Backbone:
 
 
 def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) -> Backbone | None:
-    """The backbone of a graph, None where it has none that should be trusted; `auto` takes none of a large lattice or of
-    a room, in which loops suffice, unless it is asked for one of these `anyway`, and of these alone.
+    """The backbone of a graph, None where it has none that should be trusted; `auto` takes none of a large lattice or
+    of a room, in which loops suffice, unless it is asked for one of these `anyway`, and of these alone.
 
     `trust`: `auto` learns from the graph whether its consecutive edges are one; `sequential` trusts them, `none` no
     edge; any other word those edges whose `source` it is. Raises `GraphError` where no edge is meant.
@@ -182,11 +182,9 @@ def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> Bools:
     """
     steps = linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph))
     chain = make_chain(graph, steps)
-    low, high = chain.ends[kept[chain.loop_edge]].T
-    near = high - low <= LONGEST
-    change = np.bincount(low[near] + 1, minlength=chain.size + 1) - np.bincount(high[near] + 1, minlength=chain.size + 1)
+    near = kept[chain.loop_edge] & (np.diff(chain.ends, axis=1)[:, 0] <= LONGEST)
     out = np.zeros(graph.edge_count, bool)
-    at = np.flatnonzero((chain.step_edge >= 0) & (np.cumsum(change)[:-1] == 0))
+    at = np.flatnonzero((chain.step_edge >= 0) & (chain.over(chain.ends[near]) == 0))
     out[chain.step_edge[at]] = True
     return out & ~kept
 
