@@ -216,7 +216,9 @@ def test_frames_with_depth_and_a_black_image_are_said(sequence: Path, tmp_path: 
 
 def test_a_sequence_without_any_depth_in_range_is_an_error(sequence: Path, tmp_path: Path) -> None:
     source = with_dark(TumReader().open(sequence), range(FRAMES), images=False)
-    with pytest.raises(SourceError, match=f"none of {FRAMES} frames gave a point cloud: hodge inspect .* the first: "):
+    with pytest.raises(
+        SourceError, match=f"none of the {FRAMES} frames gave a point cloud: hodge inspect .* the first: "
+    ):
         track(source, tmp_path / "dark")
 
 

@@ -67,11 +67,9 @@ def _to_register(found: Diagnosed) -> list[str]:
 
 def _lines(found: Diagnosed, out: Path | None, top: int | None, bad: int) -> list[str]:
     """The verdict, the worst edges, what to heed and what to type next: ten lines, or `top` edges."""
-    from hodge_pipeline.report.diagnosis_page import sentence
-
-    head = labelled("verdict", sentence(found.subject.graph, found.diagnosis))
+    head = labelled("verdict", found.sentence)
     worrying = [note for note in found.notes if note not in found.diagnosis.notes]
-    tail = [line for note in worrying[:1] for line in at_most(labelled("look", note), 2)]
+    tail = [line for note in worrying[:1] for line in at_most(labelled("look", note), 3)]
     tail += [line for one in _to_register(found)[:1] if bad for line in at_most(labelled("register", one), 1)]
     tail += [] if out is None else [f"{'report':<{LABEL}}{out / 'diagnosis.html'}"]
     tail += [f"{'next':<{LABEL}}{command}" for command in found.commands]
@@ -103,14 +101,12 @@ def _cells(found: Diagnosed, row: int) -> tuple[str, ...]:
 def _energy(row: EnergyRow) -> dict[str, Any]:
     from hodge_pipeline.report.energy import PARTS
 
-    rotation, translation = (dict(zip(PARTS, shares.tolist(), strict=True)) for shares in row.shares)
-    return {
-        "edges_of": row.group,
-        "when": row.when,
-        "edges": row.edges,
-        "rotation": {"rad2": float(row.rotation.sum()), **rotation},
-        "translation": {"m2": float(row.translation.sum()), **translation},
+    units = {"rotation": "rad2", "translation": "m2"}
+    kinds = {
+        kind: {units[kind]: energy, **dict(zip(PARTS, shares, strict=True))}
+        for kind, (energy, shares) in row.kinds.items()
     }
+    return {"edges_of": "all edges", "when": row.when, "edges": row.edges, **kinds}
 
 
 def _as_json(found: Diagnosed, out: Path | None) -> dict[str, Any]:
@@ -134,6 +130,7 @@ def _as_json(found: Diagnosed, out: Path | None) -> dict[str, Any]:
     return {
         "source": str(found.subject.path),
         "out": None if out is None else str(out),
+        "in_metres": found.subject.has_metres,
         "vertices": graph.vertex_count,
         "pieces": int(diagnosis.piece.max(initial=-1)) + 1,
         "counts": counts,

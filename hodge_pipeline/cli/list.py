@@ -26,7 +26,7 @@ def inspect(path: Path, *, reader: str | None, settings: Sequence[str], as_json:
         return
     for name, value in (*facts.items(), ("next", next_command(path, facts, reader, settings))):
         for row, text in enumerate(_rows(value)):
-            print(f"{name if row == 0 else '':<30}{text}")
+            print(f"{name if row == 0 else '':<33} {text}")
 
 
 def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings: Sequence[str] = ()) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 ORDER = (WRONG, SUSPECT, UNTESTABLE, CONSISTENT)
 SPLITS = 1 - 1e-6
@@ -160,6 +163,11 @@ def distance(metres: float, degrees: float) -> str:
     if not np.isfinite(metres):
         return "its ends lie in different pieces"
     return f"{_amount(metres, degrees)} from the poses"
+
+
+def without_metres(sentence: str) -> str:
+    """A sentence of a diagnosis, which speaks of metres, where lengths are in a unit of their own."""
+    return re.sub(r"(?<=\d) m\b", f" {UNKNOWN_UNIT}", sentence)
 
 
 def _amount(metres: float, degrees: float) -> str:

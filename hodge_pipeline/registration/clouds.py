@@ -169,9 +169,22 @@ def prepare_clouds(
     odd = [counts.odd for _, counts in results if counts.odd is not None]
     if not any(counts.points for _, counts in results):
         reason = odd[0] if odd else "the source has no frames"
-        raise SourceError(f"none of the {len(frames)} frames gave a point cloud; the first: {reason}")
+        raise no_clouds(frames, reason)
     odd += [Oddity(frame.frame_id, BLANK) for frame, (_, counts) in zip(frames, results, strict=True) if counts.blank]
     return CloudSet.from_clouds([cloud for cloud, _ in results]), shortened(odd) + _no_returns(results)
+
+
+def no_clouds(frames: Sequence[Frame], first: object) -> SourceError:
+    """What to say where no frame gave a point; `first`: what was wrong with the first of them."""
+    if frames and not any(frame.read_points or (frame.read_depth and frame.camera) for frame in frames):
+        return SourceError(
+            "no frame has depth with a camera, or points, so that there is nothing to register: hodge inspect says "
+            "what the source is good for"
+        )
+    return SourceError(
+        f"none of the {len(frames)} frames gave a point cloud: hodge inspect shows size and range of their depth; the "
+        f"first: {first}"
+    )
 
 
 def _no_returns(results: Sequence[tuple[PointCloud, CloudCounts]]) -> tuple[str, ...]:
@@ -225,10 +238,7 @@ def _read_samples(frame: Frame, options: CloudOptions) -> _Samples:
         return _back_project(frame, frame.read_depth, frame.camera, options)
     if frame.read_points is not None:
         return _sensor_points(frame.read_points(), options)
-    raise SourceError(
-        f"frame {frame.frame_id}: registration needs depth with a camera, or points, and the source gives neither: "
-        "use a source with geometry, or one whose graph is measured already"
-    )
+    raise SourceError(f"frame {frame.frame_id}: it has neither depth with a camera nor points")
 
 
 def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Camera, options: CloudOptions) -> _Samples:

@@ -9,12 +9,12 @@ import numpy as np
 
 from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle, ranked
+from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle, ranked, without_metres
 from hodge_pipeline.report.document import Banner, Document, Mark, Picture, Section, Table
-from hodge_pipeline.report.energy import CAVEAT, PARTS, SHARE_CAVEAT, EnergyRow
+from hodge_pipeline.report.energy import CAVEAT, PARTS, EnergyRow
 from hodge_pipeline.report.tables import number
 from hodge_pipeline.rounds.suggestions import Suggestions
-from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types import Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 
 LISTED = 20
@@ -45,6 +45,11 @@ class PageContents:
     suggestions: Suggestions | None = None
     commands: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    has_metres: bool = True
+
+    def worded(self, sentence: str) -> str:
+        """A sentence of the diagnosis in the unit of these lengths."""
+        return sentence if self.has_metres else without_metres(sentence)
 
 
 def document(contents: PageContents) -> Document:
@@ -59,7 +64,7 @@ def document(contents: PageContents) -> Document:
         f"{counted(contents.graph.vertex_count, 'frame')}, {counted(contents.graph.edge_count, 'edge')}. Each "
         "edge is a measured motion "
         "between two frames; the cycles that it lies in test it.",
-        (Banner(MARKS[worst], sentence(contents.graph, contents.diagnosis), rest, worst),),
+        (Banner(MARKS[worst], contents.worded(sentence(contents.graph, contents.diagnosis)), rest, worst),),
         first=(Section("What to do", text="\n".join(contents.commands)),),
         sections=(
             *([Section.of(frames)] if frames.rows else []),
@@ -67,7 +72,7 @@ def document(contents: PageContents) -> Document:
             Section.of(edge_table(contents)),
             Section("The graph", pictures=contents.plots),
             *_suggestions(contents),
-            *([Section.of(energy_table(contents.energy))] if contents.energy else []),
+            *([Section.of(energy_table(contents.energy, contents.has_metres))] if contents.energy else []),
             Section.of(pieces_table(contents.graph, contents.diagnosis)),
             Section("Notes", lines=contents.notes, is_folded=True),
         ),
@@ -157,7 +162,8 @@ def edge_table(contents: PageContents) -> Table:
 def _edge_row(contents: PageContents, row: int) -> tuple[str, ...]:
     graph, diagnosis = contents.graph, contents.diagnosis
     i, j = graph.vertex_ids[graph.edges[row]]
-    off = number(diagnosis.residual_m[row] * 100, ".1f", " cm"), number(diagnosis.residual_deg[row], ".2f", "°")
+    far, degrees = diagnosis.residual_m[row], number(diagnosis.residual_deg[row], ".2f", "°")
+    off = number(far * 100, ".1f", " cm") if contents.has_metres else number(far, ".3g"), degrees
     return (
         f"{i}–{j}",
         str(diagnosis.verdict[row]),
@@ -177,7 +183,7 @@ def _cycles(contents: PageContents, rows: Ints) -> str:
     for row in rows[rows >= 0].tolist():
         # one cycle may be listed twice, begun elsewhere
         edges = frozenset(cycles.loops.edge[cycles.loops.offsets[row] : cycles.loops.offsets[row + 1]].tolist())
-        told.setdefault(edges, f"{name_cycle(contents.graph, cycles, row)} {cycle_error(cycles, row)}")
+        told.setdefault(edges, f"{name_cycle(contents.graph, cycles, row)} {contents.worded(cycle_error(cycles, row))}")
     return "; ".join(list(told.values())[:CYCLES_EACH]) or "none"
 
 
@@ -204,37 +210,22 @@ def _suggestions(contents: PageContents) -> Iterator[Section]:
     yield Section.of(Table("Pairs to register next", header, tuple(rows), caption, 2))
 
 
-def energy_table(rows: Sequence[EnergyRow]) -> Table:
+def energy_table(rows: Sequence[EnergyRow], has_metres: bool) -> Table:
     """Shares that add up to 100 %, with the energies themselves."""
-
-    def cells(energy: Floats, shares: Floats, unit: str) -> tuple[str, ...]:
-        return (*(f"{100 * share:.1f} %" for share in shares), f"{energy.sum():.3g} {unit}")
-
-    body = tuple(
-        (
-            row.group,
-            row.when,
-            str(row.edges),
-            *cells(row.rotation, row.shares[0], "rad²"),
-            *cells(row.translation, row.shares[1], "m²"),
-        )
-        for row in rows
-    )
-    header = (
-        "edges of",
-        "when",
-        "edges",
-        *(f"rotation {part}" for part in PARTS),
-        "energy",
-        *(f"translation {part}" for part in PARTS),
-        "energy",
-    )
+    units = {"rotation": "rad²", "translation": "m²" if has_metres else "units²"}
+    body = []
+    for row in rows:
+        cells = [row.when, str(row.edges)]
+        for kind, (energy, shares) in row.kinds.items():
+            cells += [*(f"{100 * share:.1f} %" for share in shares), f"{energy:.3g} {units[kind]}"]
+        body.append(tuple(cells))
+    header = ("when", "edges", *(cell for kind in units for cell in (*(f"{kind} {part}" for part in PARTS), "energy")))
     caption = (
         "Before: all edges inside a piece. After: the edges that are kept. Exact: what moving frames would take away. "
         "Co-exact: curl, seen in triangles. Harmonic: around loops that no triangles fill. "
-        f"{SHARE_CAVEAT} Caveat: {CAVEAT}."
+        f"Caveat: {CAVEAT}."
     )
-    return Table("Energy of the residual motions", header, body, caption, 2)
+    return Table("Energy of the residual motions", header, tuple(body), caption, 1)
 
 
 def pieces_table(graph: ViewGraph, diagnosis: Diagnosis) -> Table:

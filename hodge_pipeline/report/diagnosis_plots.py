@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.report.energy import ALL_EDGES, PARTS, EnergyRow
+from hodge_pipeline.report.energy import PARTS, EnergyRow
 from hodge_pipeline.report.painting import flattest_plane, painted
 from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 COLOURS = {CONSISTENT: "#3c73e1", UNTESTABLE: "#7f7f7f", SUSPECT: "#e69f00", WRONG: "#d5308f"}
 """Blue, grey, amber, magenta, as in the recording; markers tell them apart without colour."""
@@ -23,12 +24,12 @@ GAP_SHARE = 0.25
 FEW = 15
 
 
-def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> tuple[Picture, ...]:
+def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], has_metres: bool) -> tuple[Picture, ...]:
     """Every picture that there are data for."""
-    return tuple(_plots(graph, diagnosis, energy))
+    return tuple(_plots(graph, diagnosis, energy, "m" if has_metres else UNKNOWN_UNIT))
 
 
-def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) -> Iterator[Picture]:
+def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], unit: str) -> Iterator[Picture]:
     if graph.edge_count:
         yield painted(
             "Viewing graph by verdict",
@@ -40,14 +41,14 @@ def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow]) 
             "Edges from above",
             "The frames at their robust poses, seen across their flattest direction, with the edges by verdict; pieces "
             "that nothing sound connects are drawn beside each other.",
-            lambda figure: _above(figure, graph, diagnosis),
+            lambda figure: _above(figure, graph, diagnosis, unit),
         )
     if energy:
         yield painted(
             "Energy of the residual motions",
             "Rotation left, translation right. Exact: what moving frames would take away. Co-exact: seen in triangles. "
             "Harmonic: around loops that no triangles fill.",
-            lambda figure: _bars(figure, [row for row in energy if row.group == ALL_EDGES]),
+            lambda figure: _bars(figure, energy),
         )
 
 
@@ -81,7 +82,7 @@ def _legend(figure: Figure, axes: Any) -> None:
             handle.set_sizes([25.0])
 
 
-def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
+def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis, unit: str) -> None:
     axes = figure.add_subplot()
     positions = side_by_side(diagnosis.world_from_cam, diagnosis.piece)[:, :3, 3]
     origin, plane = flattest_plane(positions)
@@ -96,7 +97,7 @@ def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
     axes.scatter(places[:, 0], places[:, 1], s=4, c="#222222", linewidths=0, zorder=3)
     axes.set_aspect("equal", adjustable="datalim")
     axes.autoscale_view()
-    axes.set_xlabel("m")
+    axes.set_xlabel(unit)
     _legend(figure, axes)
 
 
@@ -120,15 +121,15 @@ def side_by_side(world_from_cam: Floats, piece: Ints) -> Floats:
 
 
 def _bars(figure: Figure, rows: Sequence[EnergyRow]) -> None:
-    for axes, kind, title in zip(figure.subplots(1, 2, sharey=True), (0, 1), ("rotation", "translation"), strict=True):
+    for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("rotation", "translation"), strict=True):
         left = np.zeros(len(rows))
         for part, name, colour, hatch in zip(range(3), PARTS, PART_COLOURS, ("", "//", ".."), strict=True):
-            shares = np.array([100 * row.shares[kind][part] for row in rows])
+            shares = np.array([100 * row.kinds[kind][1][part] for row in rows])
             axes.barh(
                 [row.when for row in rows], shares, left=left, color=colour, hatch=hatch, edgecolor="white", label=name
             )
             left += shares
-        axes.set_title(title, fontsize=9)
+        axes.set_title(kind, fontsize=9)
         axes.set_xlabel("%")
         axes.spines[["top", "right"]].set_visible(False)
     axes.invert_yaxis()

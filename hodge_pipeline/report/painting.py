@@ -15,12 +15,12 @@ from hodge_pipeline.evaluation.difference import floor_of
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 DOTS_PER_INCH = 150
 SIZE = 5.0, 3.9
 """Inches."""
 TRUTH = "truth"
-UNKNOWN_UNIT = "units"
 """Of lengths that nothing relates to metres."""
 LINES = (":", "#D55E00"), ("-", "#0072B2")
 """Before and after, as in every plot."""

@@ -12,9 +12,10 @@ from matplotlib.ticker import NullFormatter
 
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.report.painting import UNKNOWN_UNIT, error_plots, flattest_plane, has_truth, map_axes, painted
+from hodge_pipeline.report.painting import error_plots, flattest_plane, has_truth, map_axes, painted
 from hodge_pipeline.report.tables import counted_pairs
 from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#000000", "linestyle": (0, (4, 2)), "linewidth": 1.2},

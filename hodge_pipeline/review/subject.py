@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from hodge_pipeline.diagnosis.wording import without_metres
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.pairs.edits import FILE
 from hodge_pipeline.recipe.schema import Recipe
@@ -26,6 +26,7 @@ from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
+from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 SIDE_FILE, SIDE_LOG = ".edits.json", ".decisions.csv"
 LOG = "decisions.csv"
@@ -80,11 +81,11 @@ class Subject:
     @property
     def unit(self) -> str:
         """Of its lengths: those of a model without a scale are its own."""
-        return "m" if self.model is None else "units"
+        return "m" if self.model is None else UNKNOWN_UNIT
 
     def worded(self, sentence: str) -> str:
         """A sentence of the diagnosis, which speaks of metres, in the unit of these lengths."""
-        return re.sub(r"(?<=\d) m\b", f" {self.unit}", sentence)
+        return sentence if self.unit == "m" else without_metres(sentence)
 
 
 def open_for_review(path: Path) -> Subject:

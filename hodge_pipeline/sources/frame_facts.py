@@ -13,7 +13,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.depth_units import PLAUSIBLE_DEPTH_M, SAMPLED_FRAMES, doubts_of
 from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Frame, Trajectory
 from hodge_pipeline.types.arrays import evenly
-from hodge_pipeline.types.text import counted
+from hodge_pipeline.types.text import UNKNOWN_UNIT, counted
 
 LISTED = 5
 METRES, OWN_UNIT = "metres", "units of its own"
@@ -136,7 +136,7 @@ def pose_facts(
     moved_m = np.linalg.norm(relative[:, :3, 3], axis=1)
     turned_deg = np.rad2deg(se3.rotation_angle(relative))
     for size, least, sign in (
-        (moved_m, LEAST_JUMP_M, "m" if unit == METRES else "units"),
+        (moved_m, LEAST_JUMP_M, "m" if unit == METRES else UNKNOWN_UNIT),
         (turned_deg, LEAST_JUMP_DEG, "°"),
     ):
         jumps = size > max(JUMP * float(np.median(size)), least)

@@ -93,7 +93,7 @@ def _information_facts(graph: ViewGraph, oddities: list[str]) -> dict[str, Any]:
 
 
 def _spread(values: Floats) -> list[float] | None:
-    return [float(values.min()), float(np.median(values)), float(values.max())] if values.size else None
+    return [float(f"{find(values):.6g}") for find in (np.min, np.median, np.max)] if values.size else None
 
 
 def _repeated(between: Ints) -> int:

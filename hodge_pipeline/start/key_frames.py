@@ -13,9 +13,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.complex.components import connected_components, in_runs
-from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.bridging import bridge
-from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.clouds import CloudOptions, no_clouds
 from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.readout import estimate_readout, with_readout
@@ -156,10 +155,7 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     blocks.join_clouds(fresh, clouds)
     if not CloudSet.open(clouds).sizes.any():
         reason = next((note for part in parts for note in part.notes), "no frame has depth")
-        raise SourceError(
-            f"none of {len(source.frames)} frames gave a point cloud: hodge inspect shows size and range of their "
-            f"depth; the first: {reason}"
-        )
+        raise no_clouds(source.frames, reason)
     key_rows = np.concatenate([part.keys[keep] for part, keep in zip(parts, fresh, strict=True)])
     key_of_row = {int(row): key for key, row in enumerate(key_rows)}
     edges = Edges.joined([part.steps for part in parts])

@@ -12,6 +12,8 @@ _UNSEEN = "\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ud800
 _ONE_LINE, _LINES = re.compile(f"[{_UNSEEN}]"), re.compile(f"(?![\n\t])[{_UNSEEN}]")
 _FORMULA = re.compile(r"['=+\-@\t\r]")
 _NO_STEM = re.compile(r"[^\w.+-]+")
+UNKNOWN_UNIT = "units"
+"""Of lengths where nothing tells the scale."""
 MAX_STEM = 100
 """Characters: with a beginning and an ending they stay below the 255 bytes that file systems allow."""
 

@@ -13,11 +13,11 @@ from hodge_pipeline import registry
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions, SuggestionOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.wording import advice, ranked
+from hodge_pipeline.diagnosis.wording import advice, ranked, without_metres
 from hodge_pipeline.pairs.edits import EDGES, joining, pair_names, read_history
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
 from hodge_pipeline.report.contents import Report
-from hodge_pipeline.report.diagnosis_page import PageContents, document
+from hodge_pipeline.report.diagnosis_page import PageContents, document, sentence
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
 from hodge_pipeline.report.document import render
 from hodge_pipeline.report.edge_pictures import edge_pictures
@@ -45,7 +45,8 @@ COMMANDED = 3
 @dataclass(frozen=True)
 class Subject:
     """A graph to judge. A run also has its frames and clouds; `edges` are the graph's, some of them off by hand; pairs
-    (P, 2) were `tried` in vain; `harmless` says why its wrong edges need not be disabled.
+    (P, 2) were `tried` in vain; `harmless` says why its wrong edges need not be disabled; without
+    `has_metres` lengths are in a unit of their own.
     """
 
     path: Path
@@ -60,6 +61,7 @@ class Subject:
     clouds: CloudSet | None = None
     notes: tuple[str, ...] = ()
     harmless: str = ""
+    has_metres: bool = True
 
     @property
     def disabled(self) -> Bools:
@@ -90,7 +92,9 @@ def _file_subject(path: Path) -> Subject:
     edges = Edges.measured(source.graph)
     if (path / SOLVED).is_file() and len(solved := read_edges(path / EDGES)[0]) == len(edges):
         edges = edges.put(solved.status == IGNORED, status=IGNORED)
-    return Subject(path, name, source.graph, _edited(path, source.graph, edges), notes=source.notes)
+    return Subject(
+        path, name, source.graph, _edited(path, source.graph, edges), notes=source.notes, has_metres=source.in_metres
+    )
 
 
 def _run_subject(path: Path, run: Run) -> Subject:
@@ -144,6 +148,12 @@ class Diagnosed:
     suggestions: Suggestions
 
     @property
+    def sentence(self) -> str:
+        """The verdict on the whole graph in one sentence."""
+        told = sentence(self.subject.graph, self.diagnosis)
+        return told if self.subject.has_metres else without_metres(told)
+
+    @property
     def rows(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
         """The edges, the worst first."""
         return ranked(self.diagnosis)
@@ -152,6 +162,8 @@ class Diagnosed:
 def diagnose_subject(subject: Subject) -> Diagnosed:
     """The verdicts, and what follows from them."""
     found = diagnose(subject.graph, subject.options)
+    if not subject.has_metres:
+        found = replace(found, reason=tuple(map(without_metres, found.reason)))
     pieces = int(found.piece.max(initial=-1)) + 1
     apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
     energy, complaints = energy_rows(subject.graph, found.world_from_cam, found.piece, found.kept)
@@ -227,7 +239,8 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) 
     make_folder(out)
     subject, found = diagnosed.subject, diagnosed.diagnosis
     residuals = {"residual_m": found.residual_m, "residual_rad": np.deg2rad(found.residual_deg)}
-    write_edges(out / "edges.csv", replace(found.put_into(subject.edges), **residuals), subject.graph.vertex_ids)
+    edges, names = replace(found.put_into(subject.edges), **residuals), subject.graph.vertex_ids
+    write_edges(out / "edges.csv", edges, names, has_metres=subject.has_metres)
     _write_poses(out / "poses.tum", subject, found)
     artifacts.write_text(out / "diagnosis.html", render(document(_page(diagnosed))))
     if recording:
@@ -247,7 +260,7 @@ def _write_poses(path: Path, subject: Subject, found: Diagnosis) -> None:
 def _page(diagnosed: Diagnosed) -> PageContents:
     subject, found = diagnosed.subject, diagnosed.diagnosis
     rows = diagnosed.rows[: max(LEAST_PICTURED, min(PICTURED, int((found.verdict != CONSISTENT).sum())))]
-    pictures = edge_pictures(subject.graph, found, rows, subject.frames, subject.clouds)
+    pictures = edge_pictures(subject.graph, found, rows, subject.frames, subject.clouds, has_metres=subject.has_metres)
     return PageContents(
         title=subject.name,
         path=str(subject.path),
@@ -255,9 +268,10 @@ def _page(diagnosed: Diagnosed) -> PageContents:
         diagnosis=found,
         advice=diagnosed.advice,
         energy=diagnosed.energy,
-        plots=draw(subject.graph, found, diagnosed.energy),
+        plots=draw(subject.graph, found, diagnosed.energy, subject.has_metres),
         edges=pictures,
         suggestions=diagnosed.suggestions,
         commands=diagnosed.commands,
         notes=diagnosed.notes,
+        has_metres=subject.has_metres,
     )
