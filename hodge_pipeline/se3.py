@@ -7,6 +7,8 @@ any leading batch shape.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hodge_pipeline.errors import GraphError
@@ -149,9 +151,32 @@ def from_parts(rotation: Floats, translation: Floats) -> Floats:
 def exp(xi: Floats) -> Floats:
     """Motions (..., 4, 4) of twists (..., 6) = (φ, ρ)."""
     xi = np.asarray(xi, float)
+    if xi.ndim == 1:
+        return _exp_of_one(*xi.tolist())
     phi, rho = xi[..., :3], xi[..., 3:]
     v = left_jacobian(phi)  # and exp(φ^) = 1 + φ^ V(φ)
     return from_parts(np.eye(3) + hat(phi) @ v, np.einsum("...ij,...j->...i", v, rho))
+
+
+def _exp_of_one(x: float, y: float, z: float, u: float, v: float, w: float) -> Floats:
+    """The motion (4, 4) of one twist, in a tenth of the time that arrays take: one is needed at each step of a fit."""
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle < SMALL_ANGLE:
+        a, b = 0.5 - angle**2 / 24, 1 / 6 - angle**2 / 120
+    else:
+        a, b = (1 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
+    sine, cosine, along = 1 - b * angle**2, 1 - a * angle**2, b * (x * u + y * v + z * w)  # the sine over the angle
+    xy, yz, zx = a * x * y, a * y * z, a * z * x
+    shift_x = sine * u + a * (y * w - z * v) + along * x
+    shift_y = sine * v + a * (z * u - x * w) + along * y
+    shift_z = sine * w + a * (x * v - y * u) + along * z
+    rows = [
+        [cosine + a * x * x, xy - sine * z, zx + sine * y, shift_x],
+        [xy + sine * z, cosine + a * y * y, yz - sine * x, shift_y],
+        [zx - sine * y, yz + sine * x, cosine + a * z * z, shift_z],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+    return np.array(rows)
 
 
 def log(b_from_a: Floats) -> Floats:

@@ -10,7 +10,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.landmarks import back_projected, find_landmarks
 from hodge_pipeline.registration.rgbd import Rgbd, guided_match
-from hodge_pipeline.registration.visual import VisualMotion, visual_motion
+from hodge_pipeline.registration.visual import VisualMotion, fit_triples, visual_motion
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, Landmarks, PointCloud
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -69,6 +69,15 @@ def test_three_points_give_their_rigid_motion():
     np.testing.assert_allclose(
         se3.fit_rigid(se3.transform(I_FROM_J, points_j)[None], points_j[None])[0], I_FROM_J, atol=1e-9
     )
+
+
+def test_triples_give_the_motions_of_least_squares_and_those_on_a_line_none():
+    rng = np.random.default_rng(1)
+    points_j = points_before(3 * 50, rng).reshape(-1, 3, 3)
+    points_i = se3.transform(I_FROM_J, points_j) + rng.normal(0, 0.1, points_j.shape)
+    np.testing.assert_allclose(fit_triples(points_i, points_j), se3.fit_rigid(points_i, points_j), atol=1e-9)
+    points_j[:20, 2], points_j[20:, 2] = 2 * points_j[:20, 1] - points_j[:20, 0], points_j[20:, 1]
+    assert np.isnan(fit_triples(points_i, points_j)[:, :3]).all()
 
 
 def test_matching_is_mutual_and_refuses_what_looks_like_two():

@@ -30,6 +30,13 @@ def test_log_inverts_exp(xi: np.ndarray) -> None:
 
 @settings(deadline=None)
 @given(twists())
+def test_one_motion_is_that_of_a_batch(xi: np.ndarray) -> None:
+    for one in xi.reshape(-1, 6):
+        np.testing.assert_allclose(se3.exp(one), se3.exp(one[None])[0], atol=1e-12)
+
+
+@settings(deadline=None)
+@given(twists())
 def test_pairing_log_inverts_pairing_exp(xi: np.ndarray) -> None:
     np.testing.assert_allclose(se3.pairing_log(se3.pairing_exp(xi)), xi, atol=1e-9)
 
