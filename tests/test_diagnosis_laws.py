@@ -187,9 +187,8 @@ def test_information_that_explains_nearly_all_cycles_is_believed() -> None:
 def test_what_the_information_states_holds_where_the_poses_are_and_not_where_they_turn_about(seed: int) -> None:
     """Poses on a sphere of 100 m turn about its middle, where an error of rotation is a hundred times as far."""
     number = np.arange(64)
-    turn = se3.so3_exp(np.outer(2 * np.pi * number / 8, [0, 0, 1])) @ se3.so3_exp(
-        np.outer(np.pi * number / 64 - np.pi / 2, [0, 1, 0])
-    )
+    tilt = np.pi * number / 64 - np.pi / 2
+    turn = se3.so3_exp(np.outer(np.pi * number / 4, [0, 0, 1])) @ se3.so3_exp(np.outer(tilt, [0, 1, 0]))
     edges = np.concatenate([np.stack([number, number + step], axis=1)[:-step] for step in (1, 7, 8, 9)])
     poses, sigma = se3.from_parts(turn, 100 * turn[:, :, 0]), np.repeat([0.01, 0.01], 3)
     noise = se3.exp(sigma * np.random.default_rng(seed).normal(size=(len(edges), 6)))
