@@ -57,12 +57,13 @@ def drive(
     group: int = 12,
     misstated: tuple[float, float] = (1.0, 1.0),
     turned: bool = False,
+    short: int = 0,
 ) -> Drive:
     """Three laps round a ring, or another of `WORLDS`. `wrong`: share of the loops that join places at random, or in
     groups of this size that agree.
 
     `misstated`: what the stated standard deviations of steps and of loops are too large by; `turned`: every edge is
-    written the other way round.
+    written the other way round; `short`: right loops over two to four steps, as exact as these.
     """
     rng = np.random.default_rng(seed)
     truth = _world(rng, world, count, dimension)
@@ -71,6 +72,8 @@ def drive(
     near = np.sort(near[np.abs(near[:, 0] - near[:, 1]) > 20], axis=1)
     good = near[rng.choice(len(near), min(len(near), round(loops * (1 - wrong))), replace=False)]
     bad, bad_motion = _wrong(rng, truth, round(loops * wrong), group if in_groups else 1, dimension)
+    begin = rng.choice(count - 4, short, replace=short > count - 4)
+    steps = np.concatenate([steps, np.stack([begin, begin + rng.integers(2, 5, short)], axis=1)])
     edges = np.concatenate([steps, good, bad])
     exact = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]]
     exact[len(steps) + len(good) :] = bad_motion

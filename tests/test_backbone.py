@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.diagnosis import diagnose, lattice_backbone
+from hodge_pipeline.diagnosis.diagnosis import backbone_anyway, diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
@@ -210,6 +210,12 @@ def test_corridors_that_are_mistaken_neither_break_the_backbone_nor_make_a_latti
         assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
 
 
+@pytest.mark.filterwarnings("error")
+def test_places_that_all_contradict_each_other_are_judged_without_a_warning() -> None:
+    made = drive(seed=724, world="town", loops=60, wrong=1.0, in_groups=True, misstated=(3.0, 0.5))
+    assert made.error_m(diagnose(made.graph).world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+
+
 def test_many_loops_of_one_mistaken_place_do_not_outvote_few_of_several_places() -> None:
     made = drive(seed=8203, count=800, loops=80, wrong=0.9, in_groups=True, misstated=(10.0, 10.0))
     np.testing.assert_array_equal(diagnose(made.graph).kept, made.right)
@@ -221,10 +227,20 @@ def test_groups_of_wrong_loops_do_not_outvote_the_backbone_of_a_lattice() -> Non
     found = diagnose(made.graph, DiagnosisOptions(trust="none"))
     cut = np.flatnonzero(steps)[40:400:60]
     kept = ~np.isin(np.arange(made.graph.edge_count), cut)  # more edges than are right, and six steps fewer
-    backbone = lattice_backbone(made.graph, replace(found, kept=kept), DiagnosisOptions())
+    backbone = backbone_anyway(made.graph, replace(found, kept=kept), DiagnosisOptions())
     assert backbone is not None
     np.testing.assert_array_equal(backbone.used, made.right)
-    assert lattice_backbone(made.graph, replace(found, kept=made.right | ~steps), DiagnosisOptions()) is None
+    assert backbone_anyway(made.graph, replace(found, kept=made.right | ~steps), DiagnosisOptions()) is None
+
+
+@pytest.mark.parametrize("wrong", [0.3, 1.0])
+@pytest.mark.parametrize("short", [50, 100, 400])
+def test_edges_over_a_few_steps_are_no_reason_to_doubt_the_odometry(short: int, wrong: float) -> None:
+    """Groups of wrong loops are more edges than those that hold the odometry together at one step."""
+    made = drive(seed=51, count=200, world="town", loops=40, wrong=wrong, in_groups=True, short=short)
+    found = diagnose(made.graph)
+    assert not (found.kept & ~made.right).any()
+    assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

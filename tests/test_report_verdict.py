@@ -114,6 +114,7 @@ def test_what_can_be_measured_goes_by_the_extent_of_the_scene() -> None:
     ("component", "unordered", "headline"),
     [
         ([0] * 12 + [1] * 8, False, "In 2 pieces (12, 8 of 20 frames): improved against odometry"),
+        ([0] * 12 + [1] * 5 + [2, 3, 4], False, "In 2 pieces (12, 5 of 20 frames; 3 alone): improved against"),
         ([0] * 12 + [1] * 3 + [2] * 3 + [3] * 2, False, "In 4 pieces (12, 3, 3, … of 20 frames): improved against"),
         ([0] * 19 + [1], False, "19 of 20 frames joined: improved against odometry"),
         ([0] * 20, False, "Improved against odometry"),

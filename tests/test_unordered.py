@@ -135,9 +135,11 @@ def test_copies_and_other_units_are_noticed() -> None:
 
 def test_pieces_lie_beside_each_other() -> None:
     clouds = CloudSet.from_clouds([read(furnished_corner(k)) for k in range(3)])
-    poses = laid_apart(np.array([0, 1, 0]), POSES, clouds)
+    in_pieces = POSES[::-1]
+    poses = laid_apart(np.array([0, 1, 0]), in_pieces, clouds)
+    assert np.allclose(poses[0], np.eye(4)) and poses[2, 0, 3] < 0  # the world is that of the first frame
     relative = se3.inverse(poses[0]) @ poses[2]
-    assert np.allclose(relative, se3.inverse(POSES[0]) @ POSES[2])
+    assert np.allclose(relative, se3.inverse(in_pieces[0]) @ in_pieces[2])
     assert poses[1, 0, 3] - max(poses[0, 0, 3], poses[2, 0, 3]) > 3 * clouds.reach_m
 
 

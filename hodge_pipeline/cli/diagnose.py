@@ -101,14 +101,12 @@ def _cells(found: Diagnosed, row: int) -> tuple[str, ...]:
 def _energy(row: EnergyRow) -> dict[str, Any]:
     from hodge_pipeline.report.energy import PARTS
 
-    rotation, translation = (dict(zip(PARTS, shares.tolist(), strict=True)) for shares in row.shares)
-    return {
-        "edges_of": row.group,
-        "when": row.when,
-        "edges": row.edges,
-        "rotation": {"rad2": float(row.rotation.sum()), **rotation},
-        "translation": {"m2": float(row.translation.sum()), **translation},
+    units = {"rotation": "rad2", "translation": "m2"}
+    kinds = {
+        kind: {units[kind]: energy, **dict(zip(PARTS, shares, strict=True))}
+        for kind, (energy, shares) in row.kinds.items()
     }
+    return {"edges_of": "all edges", "when": row.when, "edges": row.edges, **kinds}
 
 
 def _as_json(found: Diagnosed, out: Path | None) -> dict[str, Any]:

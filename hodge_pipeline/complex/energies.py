@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+ROUNDING = 1e-20
+"""Energies below it, squares of radians and metres, are those of rounding."""
+
 
 @dataclass(frozen=True)
 class Energies:
@@ -24,5 +27,5 @@ class Energies:
         """The share of each part in the rotation's and the translation's energy; 0 where there is none at all."""
         parts = {"exact": self.exact, "coexact": self.coexact, "harmonic": self.harmonic}
         total = np.sum(list(parts.values()), axis=0)
-        scale = np.where(total > 0, total, 1.0)
+        scale = np.where(total > ROUNDING, total, np.inf)
         return {name: (float(part[0] / scale[0]), float(part[1] / scale[1])) for name, part in parts.items()}

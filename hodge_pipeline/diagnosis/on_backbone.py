@@ -12,7 +12,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import fundamental_loops, fundamental_products, spanning_forest
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.options import WRONG_BELOW
-from hodge_pipeline.diagnosis.resistance import effective_resistance
+from hodge_pipeline.diagnosis.resistance import Network, effective_resistance
 from hodge_pipeline.diagnosis.result import (
     CONSISTENT,
     SUSPECT,
@@ -46,13 +46,15 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
     wrong = ~kept & (probability < WRONG_BELOW) & (backbone.steps | backbone.found.confirmed)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
     cycles, cycle = _cycles(graph, backbone, in_loop)
+    network = Network.of(graph.edges[kept], graph.vertex_count)
     return Diagnosis.of(
         graph,
         verdict=verdict,
         probability=probability,
         reasons=partial(_reasons, backbone, verdict),
         kept=kept,
-        resistance=effective_resistance(graph.edges, graph.vertex_count, kept),
+        network=network,
+        resistance=effective_resistance(graph.edges, kept, network),
         cycles=cycles,
         witnesses=(_witnesses(np.where(kept, cycle, -1)), _witnesses(np.where(kept, -1, cycle))),
         world_from_cam=backbone.world_from_cam,
@@ -113,9 +115,6 @@ def _passed_over(backbone: Backbone) -> Ints:
     """How many used loops (E,) pass over each step."""
     chain, out = backbone.chain, np.zeros(len(backbone.steps), np.int64)
     ends = chain.ends[backbone.found.used & (chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])]
-    change = np.bincount(ends[:, 0] + 1, minlength=chain.size + 1) - np.bincount(
-        ends[:, 1] + 1, minlength=chain.size + 1
-    )
     steps = np.flatnonzero(chain.step_edge >= 0)
-    out[chain.step_edge[steps]] = np.cumsum(change)[steps]
+    out[chain.step_edge[steps]] = chain.over(ends)[steps]
     return out

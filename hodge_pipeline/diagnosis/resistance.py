@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -22,19 +22,24 @@ BRIDGE = 1e-3
 class Network:
     """Edges as unit resistors, and the effective resistance between any two vertices.
 
-    `component (V,)`; `grounded (V,)` one vertex of each; `d0` of the edges, `factor` of their Laplacian without those.
+    `component (V,)`; `grounded (V,)` one vertex of each; `d0` of the edges.
     """
 
     component: Ints
     grounded: Bools
     d0: csr_matrix
-    factor: Factor
 
     @classmethod
     def of(cls, edges: Ints, vertex_count: int) -> Network:
         """The network of these edges; self-loops are left out."""
         proper = edges[edges[:, 0] != edges[:, 1]]
-        return _network(np.asarray(proper, np.int64).tobytes(), vertex_count)
+        component = connected_components(proper, vertex_count)
+        return cls(component, first_of_component(component), coboundary_0(proper, vertex_count))
+
+    @cached_property
+    def factor(self) -> Factor:
+        """Of their Laplacian without the grounded vertices."""
+        return factorise(grounded_laplacian(self.d0, np.ones(self.d0.shape[0]), self.grounded))
 
     def between(self, pairs: Ints) -> Floats:
         """The resistance (P,) of each pair: the variance of its relative pose in units of an edge's. ∞ where no path
@@ -68,20 +73,10 @@ class Network:
         return np.asarray(((sketch[i] - sketch[j]) ** 2).sum(axis=1))
 
 
-@lru_cache(maxsize=1)
-def _network(edges: bytes, vertex_count: int) -> Network:
-    """The last one is kept: suggestions ask for that of the kept edges after the verdicts did."""
-    proper = np.frombuffer(edges, np.int64).reshape(-1, 2)
-    component = connected_components(proper, vertex_count)
-    grounded = first_of_component(component)
-    d0 = coboundary_0(proper, vertex_count)
-    return Network(component, grounded, d0, factorise(grounded_laplacian(d0, np.ones(len(proper)), grounded)))
-
-
-def effective_resistance(edges: Ints, vertex_count: int, used: Bools) -> Floats:
-    """The resistance (E,) between the ends of each edge through the used edges other than itself; see `Network`."""
+def effective_resistance(edges: Ints, used: Bools, network: Network) -> Floats:
+    """The resistance (E,) between the ends of each edge through the other ones that are used, whose network it is."""
     own = used & (edges[:, 0] != edges[:, 1])
-    through = Network.of(edges[own], vertex_count).between(edges)
+    through = network.between(edges)
     rest = np.maximum(1 - through, 0.0)
     without = np.where(rest > BRIDGE, through / np.where(rest > BRIDGE, rest, 1.0), np.inf)
     return np.where(own, without, through)

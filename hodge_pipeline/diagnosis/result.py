@@ -9,8 +9,9 @@ import numpy as np
 from numpy import str_
 from numpy.typing import NDArray
 
-from hodge_pipeline.complex.components import connected_components, describe_components
+from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.cycles import Loops
+from hodge_pipeline.diagnosis.resistance import Network
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, ViewGraph
 
@@ -44,6 +45,7 @@ class Diagnosis:
     - `information (E, 6, 6)`: that the edges were judged with, in j's axes.
     - `cycles`; `witnesses_for`, `witnesses_against (E, 3)`: their rows, the most telling first, −1 for none.
     - `piece (V,)`: 0 the largest; `world_from_cam (V, 4, 4)`: each piece in a frame of its own.
+    - `network`: of the kept edges as resistors.
     - `notes`: counts and caveats, one line each.
     """
 
@@ -60,6 +62,7 @@ class Diagnosis:
     witnesses_against: Ints
     piece: Ints
     world_from_cam: Floats
+    network: Network
     notes: tuple[str, ...]
 
     @classmethod
@@ -71,6 +74,7 @@ class Diagnosis:
         probability: Floats,
         reasons: Callable[[tuple[Floats, Floats]], tuple[str, ...]],
         kept: Bools,
+        network: Network,
         resistance: Floats,
         cycles: Cycles,
         witnesses: tuple[Ints, Ints],
@@ -80,14 +84,14 @@ class Diagnosis:
         """The diagnosis of these verdicts: its pieces are those of the kept edges; `reasons` of the residuals (E,) in
         metres and degrees; `resistance (E,)` as of `effective_resistance`; `tested`: a note on what tested the edges.
         """
-        piece = connected_components(graph.edges[kept], graph.vertex_count)
+        piece = network.component
         apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
         displacement_m, angle = edge_residuals(graph, world_from_cam)
         residual = np.where(apart, np.nan, displacement_m), np.where(apart, np.nan, np.degrees(angle))
         leverage = np.where(kept, 1 - 1 / (1 + resistance), 0.0)
         notes = f"edges: {count_verdicts(verdict)}", tested, *describe_components(piece, graph.vertex_ids)
         told = verdict, probability, reasons(residual), kept, *residual, leverage, graph.information, cycles
-        return cls(*told, *witnesses, piece, world_from_cam, notes)
+        return cls(*told, *witnesses, network.component, world_from_cam, network, notes)
 
     def __repr__(self) -> str:
         return f"Diagnosis({len(self.verdict)} edges: {count_verdicts(self.verdict)})"

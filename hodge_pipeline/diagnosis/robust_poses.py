@@ -11,7 +11,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.judging import FREEDOM, left_over, squares_at_both_ends
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment
-from hodge_pipeline.diagnosis.resistance import effective_resistance
+from hodge_pipeline.diagnosis.resistance import Network, effective_resistance
 from hodge_pipeline.solvers.minimise import descend_isotropic
 from hodge_pipeline.solvers.newton import Limits
 from hodge_pipeline.solvers.setup import prepare
@@ -71,7 +71,8 @@ def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], *, r
 
 
 def _judged(evidence: Evidence, poses: Floats, piece: Ints, used: Bools, student_weight: Floats | float) -> Fit:
-    resistance = effective_resistance(evidence.graph.edges, evidence.graph.vertex_count, used)
+    network = Network.of(evidence.graph.edges[used], evidence.graph.vertex_count)
+    resistance = effective_resistance(evidence.graph.edges, used, network)
     chi2 = chi2_at(evidence, poses, piece, resistance, student_weight)
     return Fit(piece, poses, chi2, chi2 < GATE, resistance)
 

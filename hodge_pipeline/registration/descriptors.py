@@ -6,6 +6,9 @@ import numpy as np
 
 from hodge_pipeline.types import Bytes, Floats32, Ints
 
+CONFIDENCE, MOST_RANSAC_STEPS = 0.999, 2000
+"""Of a search for the one relative pose of two images that most matches agree with."""
+
 
 def root_sift(descriptors: Bytes) -> Floats32:
     """Unit vectors (n, 128) whose products compare as histograms should (Arandjelović and Zisserman 2012)."""

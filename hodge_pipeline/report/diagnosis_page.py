@@ -11,10 +11,10 @@ from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle, ranked, without_metres
 from hodge_pipeline.report.document import Banner, Document, Mark, Picture, Section, Table
-from hodge_pipeline.report.energy import CAVEAT, PARTS, SHARE_CAVEAT, EnergyRow
+from hodge_pipeline.report.energy import CAVEAT, PARTS, EnergyRow
 from hodge_pipeline.report.tables import number
 from hodge_pipeline.rounds.suggestions import Suggestions
-from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types import Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 
 LISTED = 20
@@ -212,35 +212,20 @@ def _suggestions(contents: PageContents) -> Iterator[Section]:
 
 def energy_table(rows: Sequence[EnergyRow], has_metres: bool) -> Table:
     """Shares that add up to 100 %, with the energies themselves."""
-
-    def cells(energy: Floats, shares: Floats, unit: str) -> tuple[str, ...]:
-        return (*(f"{100 * share:.1f} %" for share in shares), f"{energy.sum():.3g} {unit}")
-
-    body = tuple(
-        (
-            row.group,
-            row.when,
-            str(row.edges),
-            *cells(row.rotation, row.shares[0], "rad²"),
-            *cells(row.translation, row.shares[1], "m²" if has_metres else "units²"),
-        )
-        for row in rows
-    )
-    header = (
-        "edges of",
-        "when",
-        "edges",
-        *(f"rotation {part}" for part in PARTS),
-        "energy",
-        *(f"translation {part}" for part in PARTS),
-        "energy",
-    )
+    units = {"rotation": "rad²", "translation": "m²" if has_metres else "units²"}
+    body = []
+    for row in rows:
+        cells = [row.when, str(row.edges)]
+        for kind, (energy, shares) in row.kinds.items():
+            cells += [*(f"{100 * share:.1f} %" for share in shares), f"{energy:.3g} {units[kind]}"]
+        body.append(tuple(cells))
+    header = ("when", "edges", *(cell for kind in units for cell in (*(f"{kind} {part}" for part in PARTS), "energy")))
     caption = (
         "Before: all edges inside a piece. After: the edges that are kept. Exact: what moving frames would take away. "
         "Co-exact: curl, seen in triangles. Harmonic: around loops that no triangles fill. "
-        f"{SHARE_CAVEAT} Caveat: {CAVEAT}."
+        f"Caveat: {CAVEAT}."
     )
-    return Table("Energy of the residual motions", header, body, caption, 2)
+    return Table("Energy of the residual motions", header, tuple(body), caption, 1)
 
 
 def pieces_table(graph: ViewGraph, diagnosis: Diagnosis) -> Table:

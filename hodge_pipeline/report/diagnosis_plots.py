@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.report.energy import ALL_EDGES, PARTS, EnergyRow
+from hodge_pipeline.report.energy import PARTS, EnergyRow
 from hodge_pipeline.report.painting import flattest_plane, painted
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import UNKNOWN_UNIT
@@ -48,7 +48,7 @@ def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], 
             "Energy of the residual motions",
             "Rotation left, translation right. Exact: what moving frames would take away. Co-exact: seen in triangles. "
             "Harmonic: around loops that no triangles fill.",
-            lambda figure: _bars(figure, [row for row in energy if row.group == ALL_EDGES]),
+            lambda figure: _bars(figure, energy),
         )
 
 
@@ -121,15 +121,15 @@ def side_by_side(world_from_cam: Floats, piece: Ints) -> Floats:
 
 
 def _bars(figure: Figure, rows: Sequence[EnergyRow]) -> None:
-    for axes, kind, title in zip(figure.subplots(1, 2, sharey=True), (0, 1), ("rotation", "translation"), strict=True):
+    for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("rotation", "translation"), strict=True):
         left = np.zeros(len(rows))
         for part, name, colour, hatch in zip(range(3), PARTS, PART_COLOURS, ("", "//", ".."), strict=True):
-            shares = np.array([100 * row.shares[kind][part] for row in rows])
+            shares = np.array([100 * row.kinds[kind][1][part] for row in rows])
             axes.barh(
                 [row.when for row in rows], shares, left=left, color=colour, hatch=hatch, edgecolor="white", label=name
             )
             left += shares
-        axes.set_title(title, fontsize=9)
+        axes.set_title(kind, fontsize=9)
         axes.set_xlabel("%")
         axes.spines[["top", "right"]].set_visible(False)
     axes.invert_yaxis()

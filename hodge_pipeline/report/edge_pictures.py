@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.evaluation.difference import length
-from hodge_pipeline.pairs.sift_matching import CONFIDENCE, MOST_RANSAC_STEPS
 from hodge_pipeline.recording.shapes import SCANNER_AXES, is_scanner
-from hodge_pipeline.registration.descriptors import match, root_sift
+from hodge_pipeline.registration.descriptors import CONFIDENCE, MOST_RANSAC_STEPS, match, root_sift
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import EdgePictures
 from hodge_pipeline.report.document import Picture

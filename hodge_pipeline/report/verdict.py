@@ -146,7 +146,8 @@ def _pieces(report: Report) -> str:
         return f"No two {of_all} joined" + (f" ({note.detail})" if note else "")
     if len(sizes) > 1:
         listed = [str(size) for size in sizes[:MOST_SIZES]] + ["…"] * (len(sizes) > MOST_SIZES)
-        return f"In {len(sizes)} pieces ({', '.join(listed)} {of_all})"
+        alone = graph.vertices - sum(sizes)
+        return f"In {len(sizes)} pieces ({', '.join(listed)} {of_all}{f'; {alone} alone' if alone else ''})"
     told = sizes[0] < graph.vertices or report.source.unordered or report.source.kind == "scans"
     return f"{sizes[0]} {of_all} joined" if told else ""
 

@@ -67,7 +67,8 @@ def suggest_pairs(
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     registered = graph.edges if tried is None else np.concatenate([graph.edges, tried])
     pairs = pairs[~_contains(registered, pairs, count)]
-    return _best_first(pairs, graph.edges[kept], graph.edges[diagnosis.verdict == UNTESTABLE], count, most)
+    untestable = graph.edges[diagnosis.verdict == UNTESTABLE]
+    return _best_first(pairs, graph.edges[kept], untestable, diagnosis.network, most)
 
 
 def _missing_sides(edges: Ints, count: int) -> Ints:
@@ -102,12 +103,11 @@ def _contains(edges: Ints, pairs: Ints, count: int) -> Bools:
     return np.isin(wanted, there)
 
 
-def _best_first(pairs: Ints, kept: Ints, untestable: Ints, count: int, most: int) -> Suggestions:
+def _best_first(pairs: Ints, kept: Ints, untestable: Ints, network: Network, most: int) -> Suggestions:
     """The pair that adds most to the kept edges, then the one that adds most to both, and so on; none whose views were
     named too often.
     """
-    network = Network.of(kept, count)
-    resistance, taken = network.between(pairs), list[Floats]()
+    resistance, taken, count = network.between(pairs), list[Floats](), len(network.component)
     pair, edge = _triangles(pairs, untestable, kept, count)
     is_open, free, named = np.ones(len(untestable)), np.ones(len(pairs), bool), np.zeros(count, np.int64)
     rows: list[int] = []

@@ -14,7 +14,7 @@ from hodge_pipeline.solvers import direct
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.full_information import FullObjective
 from hodge_pipeline.solvers.isotropic import CG_FIRST_TO, JointObjective, cg_first
-from hodge_pipeline.solvers.newton import CG_LIMIT_REACHED, ROUNDING_REACHED, Descent, Limits, Point, descend
+from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Descent, Limits, Point, descend
 from hodge_pipeline.solvers.objective import (
     IsotropicObjective,
     IsotropicPoint,
@@ -27,8 +27,6 @@ from hodge_pipeline.solvers.setup import InitialName, Setup
 from hodge_pipeline.types import Floats, Ints
 
 Watch: TypeAlias = Callable[[Point], None]
-CG_STEPS_BEFORE_DIRECT = 200
-"""In all: with these CG has cost about as much as a descent with factorisations."""
 WARM_START_TOLERANCE = 1e-5
 """The isotropic optimum starts the full objective: nearer than this they differ anyway."""
 
@@ -89,23 +87,12 @@ def _minimum(
 def descend_isotropic(
     problem: Problem, begin: tuple[Floats, Floats], limits: Limits, floor: float, watch: Watch | None = None
 ) -> Descent:
-    """The descent of F from these rotations and translations, by the steps that are cheaper on this graph.
-
-    Where a factorisation of all unknowns is cheap, it takes over from CG once that has cost as much.
-    """
+    """The descent of F from these rotations and translations, by the steps that are cheaper on this graph."""
     if joint_at_once(problem):
         joint = JointObjective.of(problem)
         return descend(joint, joint.at(*begin), limits, floor, watch)
-    cheap = steps_are_direct(problem)
-    reduced = IsotropicObjective(problem, CG_STEPS_BEFORE_DIRECT) if cheap else IsotropicObjective(problem)
-    most = CG_STEPS_BEFORE_DIRECT if cheap else math.inf
-    first = descend(reduced, reduced.at(*begin), limits, floor, watch, most)
-    if first.reason != CG_LIMIT_REACHED:
-        return first
-    joint = JointObjective.of(problem)
-    point = joint.at(first.point.rotations, first.point.translations)
-    then = descend(joint, point, limits.after(len(first.costs) - 1), floor, watch)
-    return replace(then, costs=first.costs + then.costs[1:], cg_steps=first.cg_steps + then.cg_steps)
+    reduced = IsotropicObjective(problem)
+    return descend(reduced, reduced.at(*begin), limits, floor, watch)
 
 
 def steps_are_direct(problem: Problem) -> bool:

@@ -128,7 +128,6 @@ class IsotropicObjective:
     """F as a function of the rotations alone, the translations always the best ones."""
 
     problem: Problem
-    most_cg_steps: int = MAX_CG_STEPS
 
     def at(self, rotations: Floats, translations: Floats) -> IsotropicPoint:
         """The point at these rotations; the translations are a start for the best ones."""
@@ -148,7 +147,7 @@ class IsotropicObjective:
             model = quadratic_model(self.problem, point.left, exact)
             gradient = model.gradient.reshape(-1)
             hessian = reduced_hessian(self.problem, model)
-            found = truncated_cg(hessian, self._precondition, gradient, tolerance, self.most_cg_steps, enough)
+            found = truncated_cg(hessian, self._precondition, gradient, tolerance, MAX_CG_STEPS, enough)
             spent += found.steps
             if not found.negative_curvature:
                 break

@@ -209,19 +209,12 @@ def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:
     for seed, factor in told.seeds(rows):
         low, high = chain.ends[seed]
         at = np.arange(low + 1, high + 1)
-        score = _over(chain, rows, told.gains(seed, rows, factor))[at]
+        score = chain.over(chain.ends[rows], told.gains(seed, rows, factor))[at]
         at, score = at[score > score.max() - PLATEAU], score[score > score.max() - PLATEAU]
         fits = _fits(told, usual, np.full(len(at), seed), at) - told.away[seed]
         score = score + np.where(fits > 0, fits, -CARRIED) - told.explained[seed] + usual.unusual[at]
         out.append(_break(told, usual, seed, at, score))
     return sorted(out, key=lambda each: -each.log_evidence)
-
-
-def _over(chain: Chain, rows: Ints, gain: Floats) -> Floats:
-    """Sums over the loops of these rows that pass over each step (n,)."""
-    low, high = chain.ends[rows].T
-    change = np.bincount(low + 1, gain, chain.size + 1) - np.bincount(high + 1, gain, chain.size + 1)
-    return np.asarray(np.cumsum(change)[:-1])
 
 
 def _fits(told: Testimony, usual: Usual, loop: Ints, at: Ints) -> Floats:

@@ -78,6 +78,12 @@ class Chain:
         along = np.clip((steps / own).mean(axis=1) / PLACE, 1 / longest, 1 / STEPS_OF_PLACE)
         return np.asarray(np.cumsum(along)[self.ends])
 
+    def over(self, ends: Ints, worth: Floats | None = None) -> Floats:
+        """How many of the spans (K, 2) of positions, or how much of their `worth (K,)`, pass over each step (n,)."""
+        low, high = ends.T
+        change = np.bincount(low + 1, worth, self.size + 1) - np.bincount(high + 1, worth, self.size + 1)
+        return np.asarray(np.cumsum(change)[:-1])
+
     def with_loops(self, rows: Ints, ends: Ints) -> Chain:
         """The chain with these of its loops alone, between other ends (K, 2)."""
         motion, covariance = self.motion[rows], self.covariance[rows]

@@ -251,7 +251,7 @@ def _judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong, tense:
     residual = linear.loops[0].copy()
     if fit is not None:
         residual[fit.reduced.active] = left_out(fit, covariance)
-    if tense and fit is not None:
+    if tense and fit is not None and len(fit.reduced.active):
         usual = student(residual[fit.reduced.active], covariance[fit.reduced.active])[1]
         covariance = covariance * max(1.0, float(np.median(usual)) / len(linear.chain.axes))
     log_density = np.zeros((2, len(covariance)))

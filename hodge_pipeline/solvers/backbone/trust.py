@@ -28,11 +28,11 @@ edges test each other."""
 COVERED = 0.9
 """Of the vertices that consecutive edges must join, so that a sequence is a backbone."""
 TESTED = 0.3
-"""Of the steps in short cycles that close: from there on every edge is judged, none trusted. On graphs of rooms .77 to
-.98 are, on those of places visited again 0 to .1.
+"""Of the steps in short cycles that close: from there on every edge is judged, none trusted at first. On graphs of
+rooms .77 to .98 are, on those of places visited again 0 to .1, and as many as there are edges over two steps or three.
 """
 LOOPS_AT_A_STEP = 0.5
-"""From there on loops may make a lattice, in which no edge needs to be trusted."""
+"""From there on loops may make a lattice, or a room, in which no edge needs to be trusted."""
 AGREEING = 0.05
 """Where loops are more than steps and no backbone confirms any, so large a share of the steps between loops that agree
 with each other says that the backbone is wrong. Fewer loops may be groups that take one place for another; among random
@@ -88,9 +88,9 @@ class Backbone:
         return f"{trusted}{said}, {used} of {loops} loops confirmed"
 
 
-def find_backbone(graph: ViewGraph, trust: str = AUTO, *, lattice: bool = False) -> Backbone | None:
-    """The backbone of a graph, None where it has none that should be trusted; `auto` takes none of a large lattice, in
-    which loops suffice, unless it is asked for those of a `lattice` alone.
+def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) -> Backbone | None:
+    """The backbone of a graph, None where it has none that should be trusted; `auto` takes none of a large lattice or
+    of a room, in which loops suffice, unless it is asked for one of these `anyway`, and of these alone.
 
     `trust`: `auto` learns from the graph whether its consecutive edges are one; `sequential` trusts them, `none` no
     edge; any other word those edges whose `source` it is. Raises `GraphError` where no edge is meant.
@@ -108,14 +108,14 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, lattice: bool = False)
         return None
     if trust == AUTO and steps.sum() < FEWEST_STEPS * len(np.unique(chain.path[chain.step_edge >= 0])):
         return None
-    if trust == AUTO and tested_steps(chain, chain.poses).sum() > TESTED * steps.sum():
-        return None
     loops = len(chain.loop_edge)
     many_loops = loops > LOOPS_AT_A_STEP * steps.sum()
-    if lattice and not many_loops:
+    if anyway and not many_loops:
+        return None
+    if trust == AUTO and many_loops and not anyway and is_tested(chain):
         return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
-    inferred = infer_bridged(chain, always, trust != AUTO or lattice or not many_loops)
+    inferred = infer_bridged(chain, always, trust != AUTO or anyway or not many_loops)
     if inferred is None:
         return None
     chain, found = inferred
@@ -156,6 +156,11 @@ seldom does.
 """
 
 
+def is_tested(chain: Chain) -> bool:
+    """Whether short cycles test so many of the steps that none needs to be trusted."""
+    return bool(tested_steps(chain, chain.poses).sum() > TESTED * (chain.step_edge >= 0).sum())
+
+
 def tested_steps(chain: Chain, poses: Floats) -> Bools:
     """Steps (n,) that lie in a cycle with one loop that closes to less than a step."""
     out = np.zeros(chain.size, bool)
@@ -169,6 +174,19 @@ def tested_steps(chain: Chain, poses: Floats) -> Bools:
         rows = good[high[good] - low[good] >= ahead]
         out[low[rows] + ahead] = True
     return out
+
+
+def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> Bools:
+    """Consecutive edges (E,) that are not kept, though no edge over few of them is kept which passes over them: where
+    one was measured wrong, those that begin or end beside it tell.
+    """
+    steps = linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph))
+    chain = make_chain(graph, steps)
+    near = kept[chain.loop_edge] & (np.diff(chain.ends, axis=1)[:, 0] <= LONGEST)
+    out = np.zeros(graph.edge_count, bool)
+    at = np.flatnonzero((chain.step_edge >= 0) & (chain.over(chain.ends[near]) == 0))
+    out[chain.step_edge[at]] = True
+    return out & ~kept
 
 
 def tested_by_pairs(chain: Chain, poses: Floats) -> Bools:
