@@ -135,6 +135,8 @@ def test_inspect_says_what_a_folder_is(tiny_sequence: Path) -> None:  # noqa: F8
 def test_inspect_and_convert_take_a_reader_and_its_options(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
     facts = json.loads(hodge("inspect", tiny_sequence, "--reader", "tum", "--set", "every=4", "--json").stdout)
     assert facts["frames"] == 6
+    as_in_a_recipe = hodge("inspect", tiny_sequence, "--set", "source.reader.every=4").stdout
+    assert "--set source.reader.every=4 --out" in as_in_a_recipe
     wrong = hodge("inspect", tiny_sequence, "--set", "evry=4")
     assert wrong.returncode == 1 and "unknown option (did you mean 'every'?)" in wrong.stderr
     assert (

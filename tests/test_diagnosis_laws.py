@@ -183,6 +183,20 @@ def test_information_that_explains_nearly_all_cycles_is_believed() -> None:
         assert not found.kept[~right].any() and found.kept[right].mean() > 0.95
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_the_information_states_holds_where_the_poses_are_and_not_where_they_turn_about(seed: int) -> None:
+    """Poses on a sphere of 100 m turn about its middle, where an error of rotation is a hundred times as far."""
+    number = np.arange(64)
+    tilt = np.pi * number / 64 - np.pi / 2
+    turn = se3.so3_exp(np.outer(np.pi * number / 4, [0, 0, 1])) @ se3.so3_exp(np.outer(tilt, [0, 1, 0]))
+    edges = np.concatenate([np.stack([number, number + step], axis=1)[:-step] for step in (1, 7, 8, 9)])
+    poses, sigma = se3.from_parts(turn, 100 * turn[:, :, 0]), np.repeat([0.01, 0.01], 3)
+    noise = se3.exp(sigma * np.random.default_rng(seed).normal(size=(len(edges), 6)))
+    motion = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ noise
+    graph = ViewGraph.from_edges(number, edges, motion, np.tile(np.diag(1 / sigma**2), (len(edges), 1, 1)))
+    assert diagnose(graph).kept.all()
+
+
 def test_the_same_seed_gives_the_same_answer() -> None:
     graph, _ = spoiled(measured(poses_on_a_ring(16), near_pairs(16, 4)), np.arange(0, 60, 3))
     first, second = diagnose(graph, QUICK), diagnose(graph, QUICK)

@@ -35,9 +35,10 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings
         if facts.get("graph", {}).get("edges"):
             return command("hodge", "solve", path, "--out", "solved.g2o")
         return command("hodge", "refine", "trajectory", path, "--frames", "DIR", "--out", f"runs/{path.stem}")
+    from hodge_pipeline.cli.reader_choice import IN_A_RECIPE
     from hodge_pipeline.recipe.recipe_file import recipe_names
 
-    options = [word for setting in settings for word in ("--set", f"source.reader.{setting}")]
+    options = [word for setting in settings for word in ("--set", IN_A_RECIPE + setting.removeprefix(IN_A_RECIPE))]
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
     if name == "colmap" and not facts["frames with depth"]:  # images alone are nothing to register
         return command("hodge", "refine", "colmap", path, "--out", f"runs/{path.stem}")

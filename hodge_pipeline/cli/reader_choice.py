@@ -12,6 +12,9 @@ from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import FrameReader
 from hodge_pipeline.store import yaml_file
 
+IN_A_RECIPE = "source.reader."
+"""What comes before an option of the reader in a recipe, and in what readers advise."""
+
 
 def choose_reader(path: Path, name: str | None, settings: Sequence[str]) -> FrameReader:
     """The reader of this name, else the surest of the path, with these options.
@@ -24,8 +27,9 @@ def choose_reader(path: Path, name: str | None, settings: Sequence[str]) -> Fram
     options: dict[str, object] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
-        if not equals or not key.strip():
+        key = key.strip().removeprefix(IN_A_RECIPE)
+        if not equals or not key:
             raise RecipeError(f"--set {setting}: expected OPTION=VALUE, an option of the reader")
-        options[key.strip()] = yaml_file.parse_value(text, f"--set {setting}").data["value"]
+        options[key] = yaml_file.parse_value(text, f"--set {setting}").data["value"]
     reader: FrameReader = binding.bind(cls, options, lambda keys: "--set")
     return reader

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.noise import Noise, edge_noise
+from hodge_pipeline.diagnosis.noise import Noise, edge_noise, recentred
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import Cycles
 from hodge_pipeline.diagnosis.short_cycles import closing_support, cycle_errors, judge_cycles, short_cycles, usual_share
@@ -166,15 +165,15 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
     edges, count = graph.edges, graph.vertex_count
     prior = order_prior(edges, count) if options.order_prior else np.full(len(edges), 0.5)
     point, reach_m = working_point(graph.i_from_j, prior)
-    motions = recentred(graph.i_from_j, point)
+    motions = recentred(graph, point).i_from_j
     loops = short_cycles(edges, count, CYCLES_PER_EDGE)
     errors = cycle_errors(loops, motions)
-    noise = edge_noise(graph, loops, *errors, prior, reach_m)
+    noise = edge_noise(graph, point, loops, *errors, prior, reach_m)
     cycles = judge_cycles(loops, *errors, noise, reach_m)
     exhaustive = every_pair_tried(edges, count)
     if exhaustive and options.order_prior and np.ptp(prior) == 0:
         prior = prior_by_cycles(edges, count, cycles)
-        noise = edge_noise(graph, loops, *errors, prior, reach_m)
+        noise = edge_noise(graph, point, loops, *errors, prior, reach_m)
         cycles = judge_cycles(loops, *errors, noise, reach_m)
     if not exhaustive:
         # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
@@ -212,9 +211,3 @@ def working_point(i_from_j: Floats, probability: Floats) -> tuple[Floats, float]
     if np.linalg.norm(point) > FARTHEST * usual or spread > (1 - LEAST_GAIN) * usual:
         return np.zeros(3), usual
     return point, spread
-
-
-def recentred(i_from_j: Floats, point: Floats) -> Floats:
-    """The motions (E, 4, 4) between frames that are moved to the point: `S⁻¹ Z S`."""
-    shift = se3.from_parts(np.eye(3), point)
-    return np.asarray(se3.inverse(shift) @ i_from_j @ shift)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.judging import has_unit_information, mean_variances
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -62,16 +63,17 @@ class Noise:
 
 
 def edge_noise(
-    graph: ViewGraph, loops: Loops, angle: Floats, displacement_m: Floats, prior: Floats, reach_m: float
+    graph: ViewGraph, point: Floats, loops: Loops, angle: Floats, displacement_m: Floats, prior: Floats, reach_m: float
 ) -> Noise:
-    """The noise of each edge: the graph's information gives the proportions, cycles that close give the scale.
+    """The noise of each edge: the graph's information at the working point (3,) gives the proportions, and cycles that
+    close give the scale.
 
     Where the information explains nearly all of these, the scale does so too: edges of several kinds make long tails,
     and their stated information fits the cycles. Where too few cycles close to estimate it, the information is believed
     within bounds: errors as large as the motions would let any loop close, and errors as small as those of rounding
     none.
     """
-    rotation, translation, informed = _proportions(graph)
+    rotation, translation, informed = _proportions(graph, point)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
     any_cycle, loops = len(loops) > 0, loops.select(short)
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, displacement_m[short])
@@ -92,6 +94,14 @@ def edge_noise(
     is_reported = informed and changed and any_cycle and not has_unit_information(graph)
     doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if is_reported else ()
     return Noise(turn * rotation, shift * translation, doubts)
+
+
+def recentred(graph: ViewGraph, point: Floats) -> ViewGraph:
+    """The graph between frames that are moved to the point (3,): motions `S⁻¹ Z S`, and their information there."""
+    shift = se3.from_parts(np.eye(3), point)
+    there = se3.adjoint(shift)
+    motions = np.asarray(se3.inverse(shift) @ graph.i_from_j @ shift)
+    return replace(graph, i_from_j=motions, information=there.T @ graph.information @ there)
 
 
 def _usual_step(graph: ViewGraph) -> float:
@@ -117,12 +127,12 @@ def _doubt(stated: tuple[float, float], taken: tuple[float, float]) -> str:
     )
 
 
-def _proportions(graph: ViewGraph) -> tuple[Floats, Floats, bool]:
-    """Standard deviations from the information, or ones where it is the identity for every edge."""
+def _proportions(graph: ViewGraph, point: Floats) -> tuple[Floats, Floats, bool]:
+    """Standard deviations at the working point by the information, or ones where it is the identity for every edge."""
     same = graph.edge_count < 2 or bool((graph.information == graph.information[:1]).all())
     if same and (not graph.edge_count or np.array_equal(graph.information[0], np.eye(6))):
         return np.ones(graph.edge_count), np.ones(graph.edge_count), False
-    rotation, translation = mean_variances(graph, graph.dimension == 2)
+    rotation, translation = mean_variances(recentred(graph, point), graph.dimension == 2)
     return _deviation(1 / rotation), _deviation(1 / translation), True
 
 

@@ -155,11 +155,16 @@ def _coloured_path(figure: Figure, report: Report, name: str) -> None:
     map_axes(axes, report)
 
 
+MOST_TICKS = 6
+"""Along an axis of a map: the labels of a map of millimetres are long."""
+
+
 def map_axes(axes: Any, report: Report) -> None:
     """Axes of a map: a metre is as long along both."""
     axes.set_aspect("equal", adjustable="datalim")
     unit = "m" if report.has_metres else UNKNOWN_UNIT
     axes.set(xlabel=unit, ylabel=unit)
+    axes.locator_params(nbins=MOST_TICKS)
 
 
 def flattest_plane(positions: Floats) -> tuple[Floats, Floats]:
