@@ -151,6 +151,16 @@ def test_information_that_is_unknown_hides_no_right_loop(dimension: int) -> None
     assert (found.kept & made.right).sum() >= made.right.sum() - 3
 
 
+@pytest.mark.parametrize(("seed", "count", "loops"), [(5036, 250, 100), (5040, 120, 60)])
+def test_where_nothing_is_stated_wrong_loops_do_not_make_the_odometry_useless(
+    seed: int, count: int, loops: int
+) -> None:
+    made = drive(seed=seed, count=count, loops=loops, wrong=1.0, in_groups=True)
+    diagonal = (made.graph.information != 0) & np.eye(6, dtype=bool)
+    found = diagnose(replace(made.graph, information=diagonal.astype(float)))
+    assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+
+
 def test_a_graph_is_not_parted_at_two_steps_that_share_the_blame(data_dir: Path) -> None:
     graph = read_graph(data_dir / "pose_graphs/sesync/parking-garage.g2o").graph
     assert graph is not None

@@ -131,6 +131,10 @@ LEAST_SHARE = 1e-3
 EVEN = np.full(2, 0.5)
 DECOYS = 4
 """To a loop: with one, scales of loops differed up to eightfold from one draw to the next."""
+MOST_OF_A_STEP = 0.2
+"""An odometry's error where nothing states it, root mean squares. On 71 simulated graphs of that kind 75 wrong loops were
+kept without it and 19 with it, 13 and 12 right ones lost.
+"""
 MOST_LOOPS = 3000
 """That scales are learned from: more tell hardly more."""
 
@@ -180,7 +184,10 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     own, decoys = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
     share = len(own.residual) / max(len(decoys.residual), 1)
 
+    most = _most(chain)
+
     def value(logs: Floats, unit: float) -> float:
+        logs = np.minimum(logs, most)
         ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
         if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
             return -np.inf
@@ -195,7 +202,24 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     others = [_likeliest(value, unit) for unit in units[tried].tolist()]
     other = max(others, key=lambda each: each[1], default=found)
     found = other if other[1] > found[1] + BY_CHANCE else found
-    return Scales(*map(float, np.exp(found[0]))), own.value(found[0])[1]
+    logs = np.minimum(found[0], most)
+    return Scales(*map(float, np.exp(logs))), own.value(logs)[1]
+
+
+def _most(chain: Chain) -> Floats:
+    """The logarithms (4,) of the largest scales. Where nothing is stated an odometry errs by no more than a share of
+    what it moves, step by step: else wrong loops that agree pass for right ones of an odometry that tells nothing.
+    """
+    most = np.full(4, np.inf)
+    if chain.stated:
+        return most
+    steps = (chain.step_edge >= 0) & ~chain.bridged
+    moved, spread = chain.log(chain.step[steps]), np.sqrt(np.einsum("mii->mi", chain.step_covariance[steps]))
+    for kind, axes in enumerate((slice(0, turns(chain)), slice(turns(chain), None))):
+        size, unit = np.linalg.norm(moved[:, axes]), np.linalg.norm(spread[:, axes])
+        if size > 0 and unit > 0:
+            most[kind] = np.log(MOST_OF_A_STEP * size / unit)
+    return most
 
 
 def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Floats, float]:
