@@ -152,9 +152,7 @@ def test_information_that_is_unknown_hides_no_right_loop(dimension: int) -> None
 
 
 @pytest.mark.parametrize(("seed", "count", "loops"), [(5036, 250, 100), (5040, 120, 60)])
-def test_where_nothing_is_stated_wrong_loops_do_not_make_the_odometry_useless(
-    seed: int, count: int, loops: int
-) -> None:
+def test_where_nothing_is_stated_wrong_loops_do_not_discard_the_odometry(seed: int, count: int, loops: int) -> None:
     made = drive(seed=seed, count=count, loops=loops, wrong=1.0, in_groups=True)
     diagonal = (made.graph.information != 0) & np.eye(6, dtype=bool)
     found = diagnose(replace(made.graph, information=diagonal.astype(float)))

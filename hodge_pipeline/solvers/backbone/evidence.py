@@ -132,8 +132,8 @@ EVEN = np.full(2, 0.5)
 DECOYS = 4
 """To a loop: with one, scales of loops differed up to eightfold from one draw to the next."""
 MOST_OF_A_STEP = 0.2
-"""An odometry's error where nothing states it, root mean squares. On 71 simulated graphs of that kind 75 wrong loops were
-kept without it and 19 with it, 13 and 12 right ones lost.
+"""An odometry's error where nothing states it, root mean squares. On 71 simulated graphs of that kind 75 wrong loops
+were kept without it and 19 with it, 13 and 12 right ones lost.
 """
 MOST_LOOPS = 3000
 """That scales are learned from: more tell hardly more."""
