@@ -165,15 +165,15 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
     edges, count = graph.edges, graph.vertex_count
     prior = order_prior(edges, count) if options.order_prior else np.full(len(edges), 0.5)
     point, reach_m = working_point(graph.i_from_j, prior)
-    motions = recentred(graph, point).i_from_j
+    there = recentred(graph, point)
     loops = short_cycles(edges, count, CYCLES_PER_EDGE)
-    errors = cycle_errors(loops, motions)
-    noise = edge_noise(graph, point, loops, *errors, prior, reach_m)
+    errors = cycle_errors(loops, there.i_from_j)
+    noise = edge_noise(graph, there, loops, *errors, prior, reach_m)
     cycles = judge_cycles(loops, *errors, noise, reach_m)
     exhaustive = every_pair_tried(edges, count)
     if exhaustive and options.order_prior and np.ptp(prior) == 0:
         prior = prior_by_cycles(edges, count, cycles)
-        noise = edge_noise(graph, point, loops, *errors, prior, reach_m)
+        noise = edge_noise(graph, there, loops, *errors, prior, reach_m)
         cycles = judge_cycles(loops, *errors, noise, reach_m)
     if not exhaustive:
         # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
@@ -184,7 +184,7 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
     support = closing_support(cycles, prior)
     weight = prior / (1 - prior) * (0.5 + support) / (1 + support)
     weight *= 1 + TIE_BREAK * np.random.default_rng(options.seed).random(len(weight))
-    known = replace(graph, i_from_j=motions, information=noise.information)
+    known = replace(there, information=noise.information)
     found = Evidence(known, noise, reach_m, prior, support, unlisted, weight, exhaustive)
     return found, cycles, point
 

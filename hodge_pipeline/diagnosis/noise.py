@@ -63,17 +63,23 @@ class Noise:
 
 
 def edge_noise(
-    graph: ViewGraph, point: Floats, loops: Loops, angle: Floats, displacement_m: Floats, prior: Floats, reach_m: float
+    graph: ViewGraph,
+    there: ViewGraph,
+    loops: Loops,
+    angle: Floats,
+    displacement_m: Floats,
+    prior: Floats,
+    reach_m: float,
 ) -> Noise:
-    """The noise of each edge: the graph's information at the working point (3,) gives the proportions, and cycles that
-    close give the scale.
+    """The noise of each edge: the information `there`, of the graph at the working point, gives the proportions, and
+    cycles that close give the scale.
 
     Where the information explains nearly all of these, the scale does so too: edges of several kinds make long tails,
     and their stated information fits the cycles. Where too few cycles close to estimate it, the information is believed
     within bounds: errors as large as the motions would let any loop close, and errors as small as those of rounding
     none.
     """
-    rotation, translation, informed = _proportions(graph, point)
+    rotation, translation, informed = _proportions(graph, there)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
     any_cycle, loops = len(loops) > 0, loops.select(short)
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, displacement_m[short])
@@ -127,12 +133,12 @@ def _doubt(stated: tuple[float, float], taken: tuple[float, float]) -> str:
     )
 
 
-def _proportions(graph: ViewGraph, point: Floats) -> tuple[Floats, Floats, bool]:
+def _proportions(graph: ViewGraph, there: ViewGraph) -> tuple[Floats, Floats, bool]:
     """Standard deviations at the working point by the information, or ones where it is the identity for every edge."""
     same = graph.edge_count < 2 or bool((graph.information == graph.information[:1]).all())
     if same and (not graph.edge_count or np.array_equal(graph.information[0], np.eye(6))):
         return np.ones(graph.edge_count), np.ones(graph.edge_count), False
-    rotation, translation = mean_variances(recentred(graph, point), graph.dimension == 2)
+    rotation, translation = mean_variances(there, graph.dimension == 2)
     return _deviation(1 / rotation), _deviation(1 / translation), True
 
 

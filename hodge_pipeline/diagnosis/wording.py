@@ -165,9 +165,9 @@ def distance(metres: float, degrees: float) -> str:
     return f"{_amount(metres, degrees)} from the poses"
 
 
-def without_metres(sentence: str) -> str:
-    """A sentence of a diagnosis, which speaks of metres, where lengths are in a unit of their own."""
-    return re.sub(r"(?<=\d) m\b", f" {UNKNOWN_UNIT}", sentence)
+def in_unit(sentence: str, has_metres: bool) -> str:
+    """A sentence of a diagnosis, which speaks of metres, with the unit that its lengths have."""
+    return sentence if has_metres else re.sub(r"(?<=\d) m\b", f" {UNKNOWN_UNIT}", sentence)
 
 
 def _amount(metres: float, degrees: float) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle, ranked, without_metres
+from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, in_unit, name_cycle, ranked
 from hodge_pipeline.report.document import Banner, Document, Mark, Picture, Section, Table
 from hodge_pipeline.report.energy import CAVEAT, PARTS, EnergyRow
 from hodge_pipeline.report.tables import number
@@ -47,10 +47,6 @@ class PageContents:
     notes: tuple[str, ...] = ()
     has_metres: bool = True
 
-    def worded(self, sentence: str) -> str:
-        """A sentence of the diagnosis in the unit of these lengths."""
-        return sentence if self.has_metres else without_metres(sentence)
-
 
 def document(contents: PageContents) -> Document:
     """The page."""
@@ -64,7 +60,11 @@ def document(contents: PageContents) -> Document:
         f"{counted(contents.graph.vertex_count, 'frame')}, {counted(contents.graph.edge_count, 'edge')}. Each "
         "edge is a measured motion "
         "between two frames; the cycles that it lies in test it.",
-        (Banner(MARKS[worst], contents.worded(sentence(contents.graph, contents.diagnosis)), rest, worst),),
+        (
+            Banner(
+                MARKS[worst], in_unit(sentence(contents.graph, contents.diagnosis), contents.has_metres), rest, worst
+            ),
+        ),
         first=(Section("What to do", text="\n".join(contents.commands)),),
         sections=(
             *([Section.of(frames)] if frames.rows else []),
@@ -183,7 +183,8 @@ def _cycles(contents: PageContents, rows: Ints) -> str:
     for row in rows[rows >= 0].tolist():
         # one cycle may be listed twice, begun elsewhere
         edges = frozenset(cycles.loops.edge[cycles.loops.offsets[row] : cycles.loops.offsets[row + 1]].tolist())
-        told.setdefault(edges, f"{name_cycle(contents.graph, cycles, row)} {contents.worded(cycle_error(cycles, row))}")
+        error = in_unit(cycle_error(cycles, row), contents.has_metres)
+        told.setdefault(edges, f"{name_cycle(contents.graph, cycles, row)} {error}")
     return "; ".join(list(told.values())[:CYCLES_EACH]) or "none"
 
 

@@ -21,7 +21,6 @@ DOTS_PER_INCH = 150
 SIZE = 5.0, 3.9
 """Inches."""
 TRUTH = "truth"
-"""Of lengths that nothing relates to metres."""
 LINES = (":", "#D55E00"), ("-", "#0072B2")
 """Before and after, as in every plot."""
 

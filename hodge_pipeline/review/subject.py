@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline.diagnosis.wording import without_metres
+from hodge_pipeline.diagnosis.wording import in_unit
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.pairs.edits import FILE
 from hodge_pipeline.recipe.schema import Recipe
@@ -85,7 +85,7 @@ class Subject:
 
     def worded(self, sentence: str) -> str:
         """A sentence of the diagnosis, which speaks of metres, in the unit of these lengths."""
-        return sentence if self.unit == "m" else without_metres(sentence)
+        return in_unit(sentence, self.unit == "m")
 
 
 def open_for_review(path: Path) -> Subject:

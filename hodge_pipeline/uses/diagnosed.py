@@ -13,7 +13,7 @@ from hodge_pipeline import registry
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions, SuggestionOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.wording import advice, ranked, without_metres
+from hodge_pipeline.diagnosis.wording import advice, in_unit, ranked
 from hodge_pipeline.pairs.edits import EDGES, joining, pair_names, read_history
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
 from hodge_pipeline.report.contents import Report
@@ -150,8 +150,7 @@ class Diagnosed:
     @property
     def sentence(self) -> str:
         """The verdict on the whole graph in one sentence."""
-        told = sentence(self.subject.graph, self.diagnosis)
-        return told if self.subject.has_metres else without_metres(told)
+        return in_unit(sentence(self.subject.graph, self.diagnosis), self.subject.has_metres)
 
     @property
     def rows(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
@@ -162,8 +161,7 @@ class Diagnosed:
 def diagnose_subject(subject: Subject) -> Diagnosed:
     """The verdicts, and what follows from them."""
     found = diagnose(subject.graph, subject.options)
-    if not subject.has_metres:
-        found = replace(found, reason=tuple(map(without_metres, found.reason)))
+    found = replace(found, reason=tuple(in_unit(reason, subject.has_metres) for reason in found.reason))
     pieces = int(found.piece.max(initial=-1)) + 1
     apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
     energy, complaints = energy_rows(subject.graph, found.world_from_cam, found.piece, found.kept)
