@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions, no_clouds
-from hodge_pipeline.registration.gaps import gaps
+from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.readout import estimate_readout, with_readout
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
@@ -248,10 +248,7 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
     back = [row for rows in sequences_of(source).values() for row in _where_the_clock_goes_back(source, rows)]
     if back:
         notes.append(Note("clock", len(back), in_runs(np.array(back), ids)))
-    holes, stamps = gaps(list(sequences_of(source).values()), stamps_of(source)), stamps_of(source)
-    if len(holes):
-        told = [f"{stamps[j] - stamps[i]:.1f} s before {ids[j]}" for i, j in holes[:NOTES_SHOWN].tolist()]
-        notes.append(Note("holes", len(holes), ", ".join(told) + ", …" * (len(holes) > NOTES_SHOWN)))
+    notes += told_gaps(list(sequences_of(source).values()), stamps_of(source), ids)
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
     blank = np.unique(np.concatenate([part.blank for part in parts]))
