@@ -36,27 +36,40 @@ from lidar_worlds import CarFree, scanner_in
 from mcap_data import SECOND, Log, point_cloud, ros_header
 from mcap_encoding import CDR
 
+UNIX_S = 1_700_000_000.0
+
 
 def test_a_revolution_tells_the_unit_of_its_times() -> None:
-    seconds = np.linspace(0, 0.1, 50)
+    seconds, every = np.linspace(0, 0.1, 50), np.ones(50, bool)
     for unit, first in ((1.0, 0.0), (1e-3, 7.0), (1e-6, 1e6), (1e-9, 1.7e18)):
-        found = seconds_after_first(first + seconds / unit)
+        found, first_s = seconds_after_first(first + seconds / unit, every)
         assert found is not None and found == pytest.approx(seconds, abs=1e-6 if unit > 1e-9 else 3e-7)
-    assert seconds_after_first(np.zeros(5)) is None  # an organised cloud without a clock
-    assert seconds_after_first(np.array([0.0, np.nan])) is None
+        assert first_s == pytest.approx(first * unit)
+    assert seconds_after_first(np.zeros(50), every)[0] is None  # an organised cloud without a clock
+    assert seconds_after_first(np.where(seconds > 0, seconds, np.nan), every)[0] is None
+    of_float32 = (UNIX_S + seconds).astype(np.float32) + np.where(seconds > 0.05, np.float32(128), 0)
+    assert seconds_after_first(of_float32.astype(float), every)[0] is None  # no tenth of a second in milliseconds
+
+
+def test_points_without_a_return_tell_no_unit_of_times() -> None:
+    returned = np.arange(50) % 7 > 0
+    times = np.where(returned, UNIX_S + np.linspace(0, 0.1, 50), 0.0)
+    found, first_s = seconds_after_first(times, returned)
+    assert found is not None and found.max() == pytest.approx(0.1, abs=5e-3) and not found[~returned].any()
+    assert first_s == pytest.approx(UNIX_S, abs=0.01)
 
 
 def test_times_come_with_the_points_of_a_pcd(tmp_path: Path) -> None:
-    points = np.array([[1, 2, 3, 0.0], [np.nan, 0, 0, 0.05], [4, 5, 6, 0.1]], "<f4")
+    points = np.array([[1, 2, 3, 0.0], [np.nan, 0, 0, 0.05], [4, 5, 6, 0.08], [4, 5, 6, 0.1]], "<f4")
     header = (
-        "VERSION 0.7\nFIELDS x y z time\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\n"
+        "VERSION 0.7\nFIELDS x y z time\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\nPOINTS 4\n"
         "DATA binary\n"
     )
     (tmp_path / "0.pcd").write_bytes(header.encode() + points.tobytes())
     cloud = read_pcd(tmp_path / "0.pcd")
-    assert cloud.times_s == pytest.approx([0.0, 0.1]) and len(cloud) == 2
+    assert cloud.times_s == pytest.approx([0.0, 0.08, 0.1]) and len(cloud) == 3
     read = CloudFolderReader(units_per_metre=1000).open(tmp_path).frames[0].read_points
-    assert read is not None and read().times_s == pytest.approx([0.0, 0.1])  # in millimetres too
+    assert read is not None and read().times_s == pytest.approx([0.0, 0.08, 0.1])  # in millimetres too
     assert read().points_in_cam[1] == pytest.approx([0.004, 0.005, 0.006])
 
 

@@ -210,6 +210,15 @@ def test_an_mcap_file_is_read_by_mcap_ros2_support(tmp_path: Path) -> None:
     assert sorted(message.width for message in messages if hasattr(message, "width")) == [0, 3, 5]
 
 
+def test_times_of_points_come_back_from_an_mcap_file(tmp_path: Path) -> None:
+    cloud = PointCloud(np.ones((5, 3), np.float32), times_s=np.linspace(0, 0.1, 5, dtype=np.float32), first_s=1.6e9)
+    frame = Frame(0, 1.6e9, read_points=lambda: cloud, world_from_cam=np.eye(4))
+    McapWriter().write(tmp_path / "a.mcap", Source("a", tmp_path, (frame,)))
+    read = McapReader().open(tmp_path / "a.mcap").frames[0].read_points
+    assert read is not None and read().times_s == pytest.approx(cloud.times_s, abs=1e-6)
+    assert read().first_s == pytest.approx(1.6e9, abs=1e-6)
+
+
 def test_an_mcap_file_comes_back(tmp_path: Path) -> None:
     source = posed(tmp_path)
     McapWriter().write(tmp_path / "a.mcap", source)

@@ -20,6 +20,7 @@ from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, SpinningScanner
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame
 from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.sweeps import Sweeps, follow
@@ -89,6 +90,35 @@ def test_sweeps_after_a_hole_are_followed(clock: str, is_timed: bool) -> None:
     rows = [number for number in range(COUNT) if not 12 <= number < 17]
     found, _ = followed([frames[row] for row in rows])
     assert absolute_error(found.world_from_scan, true_poses(rows)).max_m < NEAR_M
+
+
+@cache
+def corner() -> list[Frame]:
+    """Revolutions around a corner of the street, by the seconds since 1970 at which they begin."""
+    own = SpinningScanner(Road(7.0), 0, beams=16, columns=240, noise=1.0)
+    frames = frames_of([own.sweep(number) for number in range(190, 214)])
+    return [replace(frame, stamp_s=UNIX_S + number * REVOLUTION_S) for number, frame in enumerate(frames, 190)]
+
+
+@pytest.mark.parametrize(
+    ("first_s", "is_last"),
+    [(-REVOLUTION_S, True), (UNIX_S, False), (UNIX_S, True), (5000.0, False)],
+    ids=["after the last point", "unix", "unix, of the last point", "another clock"],
+)
+def test_poses_are_those_at_the_stamps(first_s: float, is_last: bool) -> None:
+    late_s, frames = REVOLUTION_S * is_last, corner()
+    begins_s = np.array([frame.stamp_s for frame in frames]) - UNIX_S
+    own_s = first_s + begins_s * (first_s > 0)
+    clocked = [
+        changed(replace(frame, stamp_s=frame.stamp_s + late_s), lambda cloud, s=s: replace(cloud, first_s=s))
+        for frame, s in zip(frames, own_s.tolist(), strict=True)
+    ]
+    found, _ = followed(clocked)
+    assert absolute_error(found.world_from_scan, Road(7.0).world_from_car(begins_s + late_s)).max_m < 0.05  # not 0.5
+    velocity = found.velocity[12]
+    read, of_sensor = deskewed_frame(clocked[12], velocity).read_points, frames[12].read_points
+    assert read is not None and of_sensor is not None
+    assert read().points_in_cam == pytest.approx(deskewed(of_sensor(), velocity, late_s).points_in_cam, abs=1e-3)
 
 
 def test_every_third_sweep_is_deskewed_by_its_own_speed() -> None:

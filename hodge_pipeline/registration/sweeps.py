@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.scene import UNIX_STAMP_S
 from hodge_pipeline.types import Floats, Frame, PointCloud
 
 STEPS_A_SWEEP = 64
@@ -30,15 +31,28 @@ def deskewed(cloud: PointCloud, velocity: Floats, after_s: float = 0.0) -> Point
     return replace(cloud, points_in_cam=points, normals_in_cam=None, times_s=None)
 
 
+def first_after_s(cloud: PointCloud, stamp_s: float) -> float:
+    """Seconds from the stamp of a sweep to its first point, negative where the stamp is that of a later one; 0 where
+    the points are counted from another moment: then the stamp is taken as that of the first.
+    """
+    if cloud.times_s is None or not len(cloud):
+        return 0.0
+    after_s = cloud.first_s - (stamp_s if cloud.first_s > UNIX_STAMP_S else 0.0)
+    turn_s = float(cloud.times_s.max())
+    return after_s if abs(after_s + turn_s / 2) <= turn_s else 0.0
+
+
 def deskewed_frame(frame: Frame, velocity: Floats) -> Frame:
-    """The frame, its points deskewed whenever they are read."""
+    """The frame, its points deskewed to the moment of its stamp whenever they are read."""
     if frame.read_points is None:
         return frame
-    return replace(frame, read_points=partial(_read_deskewed, frame.read_points, tuple(velocity.tolist())))
+    read = partial(_read_deskewed, frame.read_points, frame.stamp_s, tuple(velocity.tolist()))
+    return replace(frame, read_points=read)
 
 
-def _read_deskewed(read: Callable[[], PointCloud], velocity: tuple[float, ...]) -> PointCloud:
-    return deskewed(read(), np.array(velocity))
+def _read_deskewed(read: Callable[[], PointCloud], stamp_s: float, velocity: tuple[float, ...]) -> PointCloud:
+    cloud = read()
+    return deskewed(cloud, np.array(velocity), -first_after_s(cloud, stamp_s))
 
 
 def velocities(poses: Floats, times_s: Floats) -> Floats:

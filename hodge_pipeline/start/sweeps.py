@@ -25,7 +25,7 @@ from hodge_pipeline.registration.clouds import (
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity
-from hodge_pipeline.registration.sweeps import deskewed_frame, velocities
+from hodge_pipeline.registration.sweeps import deskewed_frame, first_after_s, velocities
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,
@@ -63,7 +63,7 @@ NO_CLOCK_S = 1.0
 
 @plain_dataclass(frozen=True)
 class Sweeps:
-    """Poses (N, 4, 4) of all sweeps at their first points, their velocities (N, 6), and which (N,) were read.
+    """Poses (N, 4, 4) of all sweeps at their stamps, their velocities (N, 6), and which (N,) were read.
 
     `reach_m` is how far the scanner sees: 99 % of a usual sweep's points are nearer.
     """
@@ -117,7 +117,8 @@ def follow(
     """Step: the poses of all sweeps, each sequence by itself. Raises `SourceError` where none has points in range."""
     count = len(source.frames)
     poses, velocity, stamps = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), stamps_of(source)
-    found, turn_s, reaches_m = np.zeros(count, bool), np.zeros(count), []
+    found, middle_s, reaches_m = np.zeros(count, bool), np.zeros(count), []
+    is_timed = False
     loose = np.zeros(count, bool)
     odd: list[Oddity] = []
     for rows in sequences:
@@ -132,16 +133,18 @@ def follow(
         for place, (row, sweep) in enumerate(zip(rows, _sweeps(frames, clouds, reach_m), strict=True)):
             if sweep.cloud is not None:
                 tracker.follow(sweep.cloud, times[place])
-                loose[row] = tracker.is_loose
+                loose[row], is_timed = tracker.is_loose, is_timed or tracker.turn_s > 0
+                middle_s[row] = tracker.turn_s / 2 + first_after_s(sweep.cloud, frames[place].stamp_s)
                 followed.append(place)
-            poses[row], turn_s[row] = tracker.pose, tracker.turn_s
+            poses[row] = tracker.pose
             found[row] = sweep.cloud is not None or sweep.is_copy
             odd += [] if sweep.odd is None else [sweep.odd]
             step.advance(1)
         if followed:
             last = np.searchsorted(followed, np.arange(len(rows)), side="right") - 1
             velocity[rows] = velocities(poses[rows[followed]], times[followed])[np.maximum(last, 0)]
-            poses[rows] = poses[rows] @ se3.exp(-turn_s[rows, None] / 2 * velocity[rows])  # to the first point
+            middle_s[rows] = middle_s[rows[followed]][np.maximum(last, 0)]
+            poses[rows] = poses[rows] @ se3.exp(-middle_s[rows, None] * velocity[rows])  # to the stamp
     if not found.any():
         raise SourceError(f"{source.path}: none of the {count} sweeps gave points in range; the first: {odd[0]}")
     step.note(*notes_of("clouds", shortened(odd)))
@@ -150,7 +153,7 @@ def follow(
     if loose.any():
         kind = "path loose" if loose.sum() > MOST_LOOSE * found.sum() else "sweeps loose"
         step.note(Note(kind, int(loose.sum()), str(count)))
-    if not turn_s.any():
+    if not is_timed:
         step.note(Note("sweeps untimed"))
     return Sweeps(poses, velocity, found, min(reaches_m))
 

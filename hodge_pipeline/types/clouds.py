@@ -42,6 +42,7 @@ class PointCloud:
 
     `landmarks` are other points, of the frame's image; None where nobody asked for them. `times_s (N,)` is when each
     point was measured, seconds after the first, by a scanner that turns while it moves; None where nobody says.
+    `first_s` is the moment of the first as the sensor counts it: by a clock, or after the frame's stamp.
     `no_numbers` is how many more points the reader left out, whose coordinates are no numbers.
     """
 
@@ -50,6 +51,7 @@ class PointCloud:
     colours: Bytes | None = None
     landmarks: Landmarks | None = None
     times_s: Floats32 | None = None
+    first_s: float = 0.0
     no_numbers: int = 0
 
     def __len__(self) -> int:

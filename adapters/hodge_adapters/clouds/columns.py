@@ -54,11 +54,14 @@ def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
         time = next((name for name in TIMES if name in columns), None)
         if time:
             times.append(np.asarray(columns[time][finite], float))
+    joined = _joined(points)
+    times_s, first_s = seconds_after_first(_joined(times), joined.any(axis=1)) if times else (None, 0.0)
     return PointCloud(
-        _joined(points),
+        joined,
         _joined(normals) if normals else None,
         _eight_bits(_joined(colours)) if colours else None,
-        times_s=seconds_after_first(_joined(times)) if times else None,
+        times_s=times_s,
+        first_s=first_s,
         no_numbers=no_numbers,
     )
 
@@ -73,17 +76,19 @@ def unpacked(columns: dict[str, Any]) -> dict[str, Any]:
     return columns | {"red": words >> 16 & 255, "green": words >> 8 & 255, "blue": words & 255}
 
 
-def seconds_after_first(times: Floats) -> Floats32 | None:
-    """When each point (N,) was measured, seconds after the first, whatever unit a revolution is counted in; None where
-    no unit gives a revolution.
+def seconds_after_first(times: Floats, returned: Bools) -> tuple[Floats32 | None, float]:
+    """When each point (N,) was measured, seconds after the first, and when that was, whatever unit a revolution is
+    counted in; none where no unit gives a revolution. Points that did not return may have any time: they get 0.
     """
-    if not len(times) or not np.isfinite(times).all():
-        return None
-    after = times - times.min()
+    told = times[returned]
+    if not len(told) or not np.isfinite(told).all():
+        return None, 0.0
+    first, last = float(told.min()), float(told.max())
     for unit in (1.0, 1e-3, 1e-6, 1e-9):
-        if REVOLUTION_S[0] <= after.max() * unit <= REVOLUTION_S[1]:
-            return np.asarray(after * unit, np.float32)
-    return None
+        # Two moments are no revolution: float32 counts seconds since 1970 in steps of two minutes.
+        if REVOLUTION_S[0] <= (last - first) * unit <= REVOLUTION_S[1] and ((told > first) & (told < last)).any():
+            return np.where(returned, (times - first) * unit, 0).astype(np.float32), first * unit
+    return None, 0.0
 
 
 def number_rows(path: Path, lines: Iterable[bytes], count: int, width: int) -> Iterator[Floats]:

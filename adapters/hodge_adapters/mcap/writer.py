@@ -21,14 +21,14 @@ from hodge_pipeline.types.text import counted
 
 WORLD, CAMERA = "map", "camera"
 TF, POINTS = ("/tf", "tf2_msgs/msg/TFMessage"), ("/points", "sensor_msgs/msg/PointCloud2")
-FLOAT32, UINT32 = 7, 6
-"""Of `sensor_msgs/PointField`."""
+POINT_FIELDS = {"<u4": 6, "<f4": 7, "<f8": 8}
+"""The codes of `sensor_msgs/PointField`."""
 LATEST_S = 2**31
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class McapWriter:
-    """Writes poses as transforms from `camera` to `map`, clouds with their colours as PointCloud2 in `camera`."""
+    """Writes poses as transforms from `camera` to `map`, clouds with colours and times as PointCloud2 in `camera`."""
 
     def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically; stamps are kept to the nanosecond, as far as a double holds them."""
@@ -94,16 +94,21 @@ def _cloud(stamp_s: float, cloud: PointCloud) -> _Cdr:
     fields: list[tuple[str, np.dtype[Any]]] = [(axis, np.dtype("<f4")) for axis in "xyz"]
     if cloud.colours is not None:
         fields.append(("rgb", np.dtype("<u4")))
+    if cloud.times_s is not None:
+        fields.append(("timestamp", np.dtype("<f8")))
     columns = np.zeros(len(cloud), fields)
     for number, axis in enumerate("xyz"):
         columns[axis] = cloud.points_in_cam[:, number]
     if cloud.colours is not None:
         red, green, blue = np.asarray(cloud.colours, np.uint32).T
         columns["rgb"] = red << 16 | green << 8 | blue
+    if cloud.times_s is not None:
+        columns["timestamp"] = cloud.first_s + cloud.times_s.astype(float)
     message = _Cdr().header(stamp_s, CAMERA).numbers("I", 1, len(cloud), len(fields))
-    for offset, (name, kind) in enumerate(fields):
-        message.text(name).numbers("I", 4 * offset).numbers("B", UINT32 if kind.kind == "u" else FLOAT32)
-        message.numbers("I", 1)
+    offset = 0
+    for name, kind in fields:
+        message.text(name).numbers("I", offset).numbers("B", POINT_FIELDS[kind.str]).numbers("I", 1)
+        offset += kind.itemsize
     step = columns.itemsize
     message.numbers("B", 0).numbers("I", step, step * len(cloud), step * len(cloud))
     message.data += columns.tobytes()
