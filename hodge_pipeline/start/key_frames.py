@@ -149,14 +149,13 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     blocks = TrackedBlocks(folder / "blocks")
     _track_missing(blocks, cut, options, workers, step.advance)
     parts = [blocks.rows(number) for number in range(len(cut))]
-    fresh = [np.arange(int(block.warm_up), len(part.keys)) for block, part in zip(cut, parts, strict=True)]
     clouds = folder / "clouds"
     clouds.mkdir(exist_ok=True)
-    blocks.join_clouds(fresh, clouds)
+    blocks.join_clouds(clouds)
     if not CloudSet.open(clouds).sizes.any():
         reason = next((note for part in parts for note in part.notes), "no frame has depth")
         raise no_clouds(source.frames, reason)
-    key_rows = np.concatenate([part.keys[keep] for part, keep in zip(parts, fresh, strict=True)])
+    key_rows = np.concatenate([part.keys for part in parts])
     key_of_row = {int(row): key for key, row in enumerate(key_rows)}
     edges = Edges.joined([part.steps for part in parts])
     edges = replace(edges, pairs=_renumbered(edges.pairs, key_of_row))
