@@ -327,8 +327,10 @@ def test_real_frames_in_a_few_megabytes(data_dir: Path, tmp_path: Path) -> None:
     assert bytes(rows(merged, layout.COLOUR, "EncodedImage:blob")[0][0]) == first().contents
 
 
-@pytest.mark.parametrize("flushes", [False, True])
-def test_a_recording_without_room_is_one_line_and_never_waits_for_ever(tmp_path: Path, flushes: bool) -> None:
+@pytest.mark.parametrize(("flushes", "room"), [(False, 200_000), (True, 200_000), (False, 0)])
+def test_a_recording_without_room_is_one_line_and_never_waits_for_ever(
+    tmp_path: Path, flushes: bool, room: int
+) -> None:
     pytest.importorskip("resource", reason="this system has no limit on the size of a file")
     script = textwrap.dedent(f"""
         import resource, sys
@@ -338,7 +340,7 @@ def test_a_recording_without_room_is_one_line_and_never_waits_for_ever(tmp_path:
         from hodge_pipeline.errors import WorkspaceError
         from hodge_pipeline.recording import stream as streams
         streams.TURN_S, streams.STALLED_S = 0.2, 0.6
-        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, {room}))
         try:
             with streams.writing(Path(sys.argv[1]) / "000-frames.rrd", "test") as stream:
                 for _ in range(10):

@@ -20,6 +20,7 @@ from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, DistanceBlo
 from hodge_pipeline.pairs.overlap import pairwise_iou
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud
+from hodge_pipeline.types.arrays import evenly
 
 GraphKind: TypeAlias = Literal["distance", "iou"]
 GRAPH_KINDS: tuple[GraphKind, ...] = get_args(GraphKind)
@@ -57,7 +58,7 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind, 
     if len(usable) < 2:
         return np.zeros((0, 2), np.int64)
     find = _near_centroids if kind == "distance" else _overlapping_voxels
-    some = some_of(np.arange(len(usable)), MOST_FRAMES)
+    some = evenly(len(usable), MOST_FRAMES)
     found = find(clouds.read(usable), world_from_cam[usable], some, scale)
     pairs = np.unique(np.sort(found[found[:, 0] != found[:, 1]], axis=1), axis=0)
     return np.asarray(usable[pairs], np.int64)
@@ -77,13 +78,6 @@ def _overlapping_voxels(clouds: Iterable[PointCloud], world_from_cam: Floats, so
     """Pairs (P, 2) of one of `some` rows and any row."""
     iou = pairwise_iou(clouds, world_from_cam, scale * IOU_VOXEL_M, above=IOU, partners=some).tocoo()
     return np.stack([iou.row, iou.col], axis=1)
-
-
-def some_of(pairs: Ints, most: int) -> Ints:
-    """At most so many of the pairs (P, 2), or of other rows, spread evenly over their order."""
-    if len(pairs) <= most:
-        return pairs
-    return np.asarray(pairs[np.arange(most) * len(pairs) // most], np.int64)
 
 
 def edge_distances(
@@ -193,7 +187,8 @@ def score_table(
     if reference not in pose_sets:
         raise GraphError(f"reference poses {reference!r} are not among {', '.join(pose_sets)}")
     clouds = CloudSet.open(clouds_folder)
-    graphs = [some_of(evaluation_pairs(clouds, pose_sets[reference], kind, scale), MOST_PAIRS) for kind in kinds]
+    every = [evaluation_pairs(clouds, pose_sets[reference], kind, scale) for kind in kinds]
+    graphs = [pairs[evenly(len(pairs), MOST_PAIRS)] for pairs in every]
     union, rank = np.unique(np.concatenate(graphs), axis=0, return_inverse=True)
     poses = np.stack(list(pose_sets.values()))
     distances = edge_distances(clouds_folder, union, poses, workers, scale=scale)

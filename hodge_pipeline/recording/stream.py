@@ -72,7 +72,11 @@ def writing(
     """A stream into this file, which appears under its name only when all is in it."""
     partial = draft_of(path)
     stream = open_stream(recording_id, application)
-    stream.save(partial, default_blueprint=blueprint)
+    try:
+        stream.save(partial, default_blueprint=blueprint)
+    except RuntimeError as error:
+        partial.unlink(missing_ok=True)
+        raise _unwritable(partial) from error
     try:
         yield stream
         _finish(stream, partial)
@@ -104,12 +108,16 @@ def _finish(stream: rr.RecordingStream, partial: Path) -> None:
                 continue
             rr.unregister_shutdown()
             Thread(target=_hold, args=(stream,), daemon=True).start()
-            raise WorkspaceError(
-                f"{partial.parent}: the recording cannot be written (is the disk full?): what was finished stays; "
-                "make room and run the same command again"
-            ) from error
+            raise _unwritable(partial) from error
         stream.disconnect()
         return
+
+
+def _unwritable(partial: Path) -> WorkspaceError:
+    return WorkspaceError(
+        f"{partial.parent}: the recording cannot be written (is the disk full?): what was finished stays; "
+        "make room and run the same command again"
+    )
 
 
 def _hold(_: rr.RecordingStream) -> None:

@@ -135,7 +135,7 @@ class GivenStart:
 
     def _matched(self, source: Source, steps: Steps) -> tuple[Matched, GivenFile | None]:
         if self.path is None:
-            matched = own_poses(source.frames)
+            matched = own_poses(source)
             if not len(matched.pose_times):
                 raise SourceError(f"{source.path}: its frames have no poses: give a file of them (start.path)")
             return matched, None

@@ -11,8 +11,9 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.scene import given_poses
 from hodge_pipeline.sources.inspect import guess_reader, guesses
-from hodge_pipeline.types import Floats, Frame, Trajectory, number_of
+from hodge_pipeline.types import Floats, Frame, Source, Trajectory, number_of
 from hodge_pipeline.types.text import counted
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
@@ -52,13 +53,10 @@ class Matched:
     how: str
 
 
-def own_poses(frames: Sequence[Frame]) -> Matched:
+def own_poses(source: Source) -> Matched:
     """The frames' own poses."""
-    poses = np.full((len(frames), 4, 4), np.nan)
-    for row, frame in enumerate(frames):
-        if frame.world_from_cam is not None:
-            poses[row] = frame.world_from_cam
-    times = np.arange(len(frames), dtype=float)
+    poses = given_poses(source)
+    times = np.arange(len(poses), dtype=float)
     return Matched(times, times[se3.has_pose(poses)], poses, "the frames' own")
 
 

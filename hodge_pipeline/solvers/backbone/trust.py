@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
@@ -35,8 +36,7 @@ LOOPS_AT_A_STEP = 0.5
 """From there on loops may make a lattice, or a room, in which no edge needs to be trusted."""
 AGREEING = 0.05
 """Where loops are more than steps and no backbone confirms any, so large a share of the steps between loops that agree
-with each other says that the backbone is wrong. Fewer loops may be groups that take one place for another; among random
-ones hardly any agree.
+with each other says that the backbone may be wrong: loops at random hardly agree.
 """
 
 
@@ -47,6 +47,7 @@ class Backbone:
     - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
       the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
+    - `doubted`: whether many loops agree with each other, and none with the backbone, which may be what is wrong.
     """
 
     chain: Chain
@@ -56,6 +57,7 @@ class Backbone:
     right: Floats
     chi2: Floats
     world_from_cam: Floats
+    doubted: bool
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
         """The graph of the edges that count, with the information that their errors were found to have."""
@@ -120,9 +122,8 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
         return None
     chain, found = inferred
     doubted = trust == AUTO and not found.confirmed and loops > steps.sum()
-    if doubted and tested_by_pairs(chain, chain.poses).sum() > AGREEING * steps.sum():
-        return None  # many loops agree with each other, and none with the backbone: it is what is wrong
-    return _backbone(graph, chain, found, steps)
+    doubted = doubted and bool(tested_by_pairs(chain, chain.poses).sum() > AGREEING * steps.sum())
+    return _backbone(graph, chain, found, steps, doubted)
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
@@ -133,7 +134,7 @@ def _of_source(graph: ViewGraph, source: str) -> Bools:
     return chosen
 
 
-def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools) -> Backbone:
+def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools, doubted: bool) -> Backbone:
     used, right, chi2 = steps.copy(), np.full(graph.edge_count, np.nan), np.full(graph.edge_count, np.nan)
     used[chain.loop_edge] = found.used
     used[chain.step_edge[chain.bridged & (chain.step_edge >= 0)]] = False
@@ -142,7 +143,7 @@ def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools) -> 
     chi2[chain.loop_edge] = found.judged.chi2
     poses = np.empty((graph.vertex_count, 4, 4))
     poses[chain.order] = found.poses
-    return Backbone(chain, found, steps, used, right, chi2, poses)
+    return Backbone(chain, found, steps, used, right, chi2, poses, doubted)
 
 
 UNUSED = 0.49
@@ -176,17 +177,24 @@ def tested_steps(chain: Chain, poses: Floats) -> Bools:
     return out
 
 
-def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> Bools:
+def contradicted_from_afar(graph: ViewGraph, kept: Bools, *, by_pairs: bool = False) -> Bools:
     """Consecutive edges (E,) that are not kept, though no edge over few of them is kept which passes over them: where
-    one was measured wrong, those that begin or end beside it tell.
+    one was measured wrong, those that begin or end beside it tell. `by_pairs`: or two that do, one on either side, and
+    whose other ends lie as near, where nothing is left out.
     """
     steps = linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph))
     chain = make_chain(graph, steps)
-    near = kept[chain.loop_edge] & (np.diff(chain.ends, axis=1)[:, 0] <= LONGEST)
-    out = np.zeros(graph.edge_count, bool)
-    at = np.flatnonzero((chain.step_edge >= 0) & (chain.over(chain.ends[near]) == 0))
+    inner, out = chain.step_edge >= 0, np.zeros(graph.edge_count, bool)
+    ends = chain.ends[kept[chain.loop_edge]]
+    near = [ends[np.diff(ends, axis=1)[:, 0] <= LONGEST]]
+    left_out = ~np.append(kept, True)[chain.step_edge]
+    if by_pairs and len(ends):
+        two = np.sort(ends[cKDTree(ends).query_pairs(LONGEST, p=np.inf, output_type="ndarray")], axis=1)
+        low, high = np.diff(np.cumsum(left_out | ~inner)[two], axis=1)[:, 0].T
+        near += [two[(low == 1) & (high == 0), :, 0], two[(low == 0) & (high == 1), :, 1]]
+    at = np.flatnonzero(inner & left_out & (chain.over(np.concatenate(near)) == 0))
     out[chain.step_edge[at]] = True
-    return out & ~kept
+    return out
 
 
 def tested_by_pairs(chain: Chain, poses: Floats) -> Bools:

@@ -15,9 +15,9 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import Diagnosis
-from hodge_pipeline.evaluation.scores import some_of
 from hodge_pipeline.start.unordered.hypotheses import MOST_VIOLATION, ViewOf, violations
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 
 MOST_PAIRS = 5000
 """Pairs of frames looked at: about a second."""
@@ -70,7 +70,7 @@ def contradictions(
     every = np.stack([rows[i], rows[j]], axis=1)
     first, second = every.T
     chosen = (pieces.piece[first] == pieces.piece[second]) & (held[first] != held[second])
-    pairs = some_of(every[chosen], MOST_PAIRS)
+    pairs = every[np.flatnonzero(chosen)[evenly(int(chosen.sum()), MOST_PAIRS)]]
     motions = se3.inverse(pieces.poses[pairs[:, 0]]) @ pieces.poses[pairs[:, 1]]
     seen_through = violations(clouds, pairs, motions, view_of, room_m)
     certain = seen_through > CERTAIN * MOST_VIOLATION  # false for NaN

@@ -1,0 +1,37 @@
+"""Graphs of more loops than steps, none of which agrees with the odometry: wrong loops, or a wrong odometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from tests.backbone_graphs import broken, drive
+from tests.test_backbone import NEVER_WORSE
+
+
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize(("seed", "world"), [(5010, "town"), (5019, "town")])
+def test_groups_of_wrong_loops_as_many_as_steps_are_no_lattice(seed: int, world: str, stated: bool) -> None:
+    """Each holds together by itself, and a step left out for each lets all of them stand: 20 m."""
+    made = drive(seed=seed, count=120, dimension=2 + seed % 2, world=world, loops=150, wrong=1.0, in_groups=True)
+    graph = made.graph
+    if not stated:
+        graph = replace(graph, information=((graph.information != 0) & np.eye(6, dtype=bool)).astype(float))
+    found = diagnose(graph)
+    assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+    assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
+
+
+def test_a_lattice_whose_odometry_is_wrong_at_many_steps_needs_none() -> None:
+    """Loops that begin and end beside these steps contradict them, also where no single one passes over few."""
+    made = drive(seed=8, count=300, dimension=3, loops=450, wrong=0.0)
+    graph = made.graph
+    for step in range(5, 295, 12):
+        graph = broken(replace(made, graph=graph), step, seed=step)
+    found = diagnose(graph)
+    assert made.error_m(found.world_from_cam) < 0.2
+    wrong = np.flatnonzero((np.diff(graph.edges, axis=1)[:, 0] == 1) & (graph.edges[:, 0] % 12 == 5))
+    assert not found.kept[wrong].any()
