@@ -37,8 +37,8 @@ from hodge_pipeline.types.notes import Note, notes_of
 from hodge_pipeline.types.text import counted
 
 NOTES_SHOWN = 5
-WHOLE_VIDEO, WHOLE_STILLS = 50, 300
-"""Frames that are registered whole: tracking by optical flow is more exact at the rate of a video, and glues stills."""
+WHOLE_STILLS = 300
+"""Frames that are registered whole where they are no video: tracking by optical flow glues stills."""
 DOUBTED = 0.1
 """Share of the frames whose motion may be an object's, from which the whole path is in doubt: of fr1/rpy's every third
 frame, where nothing moves but much is blurred, 0.07 are.
@@ -75,8 +75,8 @@ class KeyFrameStart(OdometryStart):
     whole_up_to: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
         default=300,
         description="frames: a source of so many is registered whole; a longer one is tracked from key frame to key "
-        "frame, which are chosen by how far the camera moved and by what it still sees. auto: 50 where a clock says "
-        "that frames are at most 0.2 s apart, else 300",
+        "frame, which are chosen by how far the camera moved and by what it still sees. auto: a video, whose frames "
+        "a clock says to be at most 0.2 s apart, is tracked at any length, all else as 300",
     )
     distance_m: float = Field(
         default=0.1,
@@ -107,7 +107,7 @@ class KeyFrameStart(OdometryStart):
     def _whole_up_to(self, source: Source) -> int:
         if self.whole_up_to != "auto":
             return self.whole_up_to
-        return WHOLE_VIDEO if is_video(source) else WHOLE_STILLS
+        return 0 if is_video(source) else WHOLE_STILLS
 
     def _tracking(self, clouds: CloudOptions) -> TrackingOptions:
         """How frames are followed."""
