@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.fusion import tsdf
+from hodge_pipeline.fusion import block_grid, tsdf
 from hodge_pipeline.fusion.boxes import boxes_of
 from hodge_pipeline.fusion.cloud import CloudFuser, VoxelCloud
 from hodge_pipeline.fusion.tsdf import TsdfFuser
@@ -199,6 +199,13 @@ def corners(model: Model) -> set[tuple[float, ...]]:
     least = np.array([min(range(3), key=lambda k, row=row: tuple(row[k])) for row in rows])
     turned = rows[np.arange(len(rows))[:, None], (least[:, None] + np.arange(3)) % 3]
     return set(map(tuple, turned.reshape(len(rows), -1).tolist()))
+
+
+def test_a_grid_that_grows_keeps_what_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames, poses = box_frames(4)
+    whole = TsdfFuser(voxel_m=0.05).fuse(frames, poses)
+    monkeypatch.setattr(block_grid, "FIRST_BLOCKS", 10)
+    assert_same(TsdfFuser(voxel_m=0.05).fuse(frames, poses), whole)
 
 
 def test_the_mesh_is_coarser_where_memory_is_short(monkeypatch: pytest.MonkeyPatch) -> None:

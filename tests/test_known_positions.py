@@ -46,6 +46,12 @@ def test_a_table_of_metres_with_sigma(tmp_path: Path) -> None:
     assert isinstance(guess_reader(path), PositionsReader)
 
 
+def test_positions_by_seconds_since_1970_are_told_apart(tmp_path: Path) -> None:
+    path = table(tmp_path, "stamp,e,n,u\n1700000000.2,1,2,3\n1700000000.5,4,5,6\n")
+    found = PositionsReader().open(path).positions
+    assert found is not None and found.labels.tolist() == ["1700000000.200 s", "1700000000.500 s"]
+
+
 def test_a_table_of_degrees_is_east_north_up_of_its_first_row(tmp_path: Path) -> None:
     path = table(
         tmp_path, "timestamp,latitude,longitude,altitude\n10.5,49,8,100\n11.5,49.001,8,103\n12.5,49,8.001,100\n"

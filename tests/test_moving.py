@@ -16,7 +16,7 @@ from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.flow import find_corners, flow_image, follow
-from hodge_pipeline.registration.moving import Moments, contradicting, misplaced, rival_motion
+from hodge_pipeline.registration.moving import MUCH, Moments, contradicting, misplaced, rival_motion
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registration.tracking import _View
 from hodge_pipeline.stages import Step, no_progress
@@ -102,18 +102,20 @@ def test_depth_and_colour_of_different_moments_are_no_object_before_a_camera_tha
     swept = TumReader().open(make_sequence(tmp_path_factory.mktemp("swept") / "sequence", options))
     poses = [frame.true_world_from_cam for frame in swept.frames]
 
-    def shares(source: Source) -> tuple[float, float]:
+    def shares(source: Source, told: Callable[..., float] = contradicting, other: int = 6) -> tuple[float, float]:
         """Against the true motion, by itself and with the twists; colour is a place, a 60th of a second, late."""
-        frames = [replace(source.frames[row], read_colour=source.frames[row + 1].read_colour) for row in (2, 6)]
+        frames = [replace(source.frames[row], read_colour=source.frames[row + 1].read_colour) for row in (2, other)]
         key, view = (flow_image(frame, RANGE_M) for frame in frames)
         assert key is not None and view is not None
-        twists = [60 * se3.log(se3.inverse(poses[row]) @ poses[row + 1]) for row in (2, 6)]
-        motion = se3.inverse(poses[3]) @ poses[7]
-        return contradicting(key, view, motion), contradicting(key, view, motion, Moments(twists[0], twists[1]))
+        twists = [60 * se3.log(se3.inverse(poses[row]) @ poses[row + 1]) for row in (2, other)]
+        motion = se3.inverse(poses[3]) @ poses[other + 1]
+        return told(key, view, motion), told(key, view, motion, Moments(twists[0], twists[1]))
 
     by_itself, with_twists = shares(swept)
     assert by_itself > tracking.DOUBTFUL and with_twists < 0.05
     assert shares(with_block(swept, 0.4))[1] > tracking.DOUBTFUL
+    by_itself, with_twists = shares(swept, misplaced, 4)
+    assert by_itself > tracking.MISPLACED and with_twists < MUCH
 
 
 def test_stamps_that_err_take_no_frame_from_the_flow(tmp_path: Path) -> None:

@@ -182,6 +182,19 @@ def test_a_source_that_is_short_enough_is_registered_whole(sequence: Path, tmp_p
     assert scene.source.frames == scene.whole.frames
 
 
+@pytest.mark.parametrize(("apart_s", "whole"), [(0.1, False), (0.7, True)])
+def test_a_few_frames_of_a_video_are_tracked_and_stills_are_registered_whole(
+    sequence: Path, tmp_path: Path, apart_s: float, whole: bool
+) -> None:
+    recipe = small_recipe(sequence, "start.whole_up_to=auto")
+    steps, reader = Store(tmp_path), TumReader()
+    opened = reader.open(sequence)
+    frames = [replace(frame, stamp_s=1e9 + apart_s * row) for row, frame in enumerate(opened.frames[:12])]
+    source = remembered(replace(opened, frames=frames), reader, steps, fingerprints(opened.files))
+    scene = recipe.start.begin(source, recipe.clouds, steps, InProcess())
+    assert scene.key_frames.are_all == whole and (len(scene.clouds) == 12) == whole
+
+
 def test_frames_follow_their_key_frames(sequence: Path, tmp_path: Path) -> None:
     source = TumReader().open(sequence)
     found, _ = track(source, tmp_path / "t")

@@ -53,8 +53,8 @@ def rigid_consensus(points_in_i: Floats, points_in_j: Floats, tolerance_m: float
         return Consensus(np.eye(4), np.zeros(len(all_target), bool))
     groups, weights = _compatible_groups(target, source, tolerance_m)
     motions = se3.fit_rigid(target[groups], source[groups], weights)
-    moved = np.einsum("sij,mj->smi", motions[:, :3, :3], source) + motions[:, None, :3, 3]
-    squared = ((moved - target) ** 2).sum(axis=2) / tolerance_m**2
+    moved = motions[:, :3, :3] @ source.T + motions[:, :3, 3:]
+    squared = ((moved - target.T) ** 2).sum(axis=1) / tolerance_m**2
     support = np.maximum(0.0, 1 - squared)
     best = _refined(all_target, all_source, motions[int(support.sum(axis=1).argmax())], tolerance_m)
     left = ~best.inlier
@@ -68,7 +68,7 @@ def _compatible_groups(target: Floats, source: Floats, tolerance_m: float) -> tu
     near = np.maximum(np.float32(0), 1 - change**2)
     np.fill_diagonal(near, 0)
     hard = (near > 0).astype(np.float32)
-    second = hard * (near @ near)
+    second = hard * (near @ near.T)  # symmetric: half of the work
     order = np.argsort(-second.sum(axis=1), kind="stable")
     # seeds of all ranks: where most matches agree on a wrong motion, the right one is further down
     seeds = order[np.unique(np.linspace(0, len(order) - 1, min(SEEDS, len(order))).astype(np.int64))]

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types.notes import Note
 
 LONGEST_USUAL = 10.0
 """Times the median step of a sequence; cameras that drop some frames, or keep some of them, stay below it."""
+GAPS_TOLD = 5
 
 
 def longest_usual_step_s(stamps_s: Floats) -> float:
@@ -26,6 +29,13 @@ def over_gap(pairs: Ints, sequences: Sequence[Ints], stamps_s: Floats) -> Bools:
     for rows in sequences:
         longest[rows] = longest_usual_step_s(stamps_s[rows])
     return np.asarray(stamps_s[pairs[:, 1]] - stamps_s[pairs[:, 0]] > longest[pairs[:, 0]])
+
+
+def told_gaps(sequences: Sequence[Ints], stamps_s: Floats, ids: NDArray[np.generic]) -> tuple[Note, ...]:
+    """A note of the holes in the sequences of frames with these ids (N,), the first ones by the frame behind them."""
+    holes = gaps(sequences, stamps_s)
+    told = [f"{stamps_s[j] - stamps_s[i]:.1f} s before {ids[j]}" for i, j in holes[:GAPS_TOLD].tolist()]
+    return (Note("holes", len(holes), ", ".join(told) + ", …" * (len(holes) > GAPS_TOLD)),) if told else ()
 
 
 def gaps(sequences: Sequence[Ints], stamps_s: Floats) -> Ints:

@@ -91,24 +91,24 @@ def mutual_matches(target: DescribedCloud, source: DescribedCloud) -> Ints:
     """Rows (M, 2) of target and source points whose features are each other's nearest, the nearest first."""
     if not len(target) or not len(source):
         return np.zeros((0, 2), np.int64)
-    nearest, distance = _nearest(source.features, target.features)
-    back, _ = _nearest(target.features, source.features)
-    rows = np.flatnonzero(back[nearest] == np.arange(len(source)))
-    rows = rows[np.argsort(distance[rows], kind="stable")]
-    return np.stack([nearest[rows], rows], axis=1)
-
-
-def _nearest(queries: Floats32, features: Floats32) -> tuple[Ints, Floats32]:
-    """The nearest row to each query, and the squared distance."""
-    squared = (features**2).sum(axis=1)
-    rows, least = [], []
-    step = max(1, BLOCK_ENTRIES // len(features))
-    for start in range(0, len(queries), step):
-        block = queries[start : start + step]
-        distance = squared - 2 * (block @ features.T)
-        rows.append(distance.argmin(axis=1))
-        least.append(distance.min(axis=1) + (block**2).sum(axis=1))
-    return np.concatenate(rows).astype(np.int64), np.concatenate(least)
+    # |s|² − 2 s·t + |t|² of all pairs as one product
+    ones_i, ones_j = np.ones((len(target), 1), np.float32), np.ones((len(source), 1), np.float32)
+    middle = target.features.mean(axis=0)  # without it float32 rounds away what nearly equal features differ by
+    f_i, f_j = target.features - middle, source.features - middle
+    columns = np.hstack([f_i, ones_i, (f_i**2).sum(axis=1, keepdims=True)]).T
+    queries = np.hstack([-2 * f_j, (f_j**2).sum(axis=1, keepdims=True), ones_j])
+    to_source, nearest, distance = np.full(len(target), np.inf, np.float32), [], []
+    step = max(1, BLOCK_ENTRIES // len(target))
+    for start in range(0, len(source), step):
+        squared = queries[start : start + step] @ columns
+        nearest.append(squared.argmin(axis=1))
+        distance.append(squared.min(axis=1))
+        np.minimum(to_source, squared.min(axis=0), out=to_source)
+    rows_i, apart = np.concatenate(nearest), np.concatenate(distance)
+    rows = np.flatnonzero(apart == to_source[rows_i])
+    rows = np.sort(rows[np.unique(rows_i[rows], return_index=True)[1]])  # the first of equals
+    rows = rows[np.argsort(apart[rows], kind="stable")]
+    return np.stack([rows_i[rows], rows], axis=1).astype(np.int64)
 
 
 def _geometry(points: Floats, normals: Floats | None) -> Any:

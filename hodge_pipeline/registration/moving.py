@@ -26,6 +26,8 @@ MUCH = 0.1
 """Share of the tested pixels that contradict a motion, below which no other is sought: 0.05 would name 3 blurred frames
 of the 60 of fr1/rpy, where nothing moves.
 """
+MOST = 0.5
+"""Share of the tested pixels from which an object is suspected, even where a delay would explain it as well."""
 GREY_LEVELS = 20.0
 """Grey values, of 256, of the mean of a few pixels: more than noise and interpolation change in a static scene."""
 OFF_M, OFF_SIGMAS = 0.05, 3.0
@@ -75,10 +77,19 @@ def contradicting(key: FlowImage, view: FlowImage, key_from_view: Floats, moment
     return _compared(key, view, key_from_view, moments)[0]
 
 
-def misplaced(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
+def misplaced(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments = AT_REST) -> float:
     """The share of the tested pixels whose depth in the view is off what a motion predicts, by `OFF_M` and
-    `OFF_SIGMAS`: few where both see one rigid scene, most of a bare room where the motion is an object's.
+    `OFF_SIGMAS`: few where both see one rigid scene, most of a bare room where the motion is an object's. Where it is
+    much, but not most, of the image, the delay counts with which the least is, as in `_compared`.
     """
+    share = _off(key, view, key_from_view)
+    if not MUCH < share < MOST:
+        return share
+    return min(share, *(_off(key, view, moments.between_depths(key_from_view, delay)) for delay in (0.0, *UNTOLD_S)))
+
+
+def _off(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
+    """The share that `misplaced` tells, by the motion of the depth images."""
     expected = _expected(key, view, key_from_view)
     off = np.abs(_depth(view, expected[:, :2]) - expected[:, 2]) / view.unit_m
     seen = np.isfinite(off)

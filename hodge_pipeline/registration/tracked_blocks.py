@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,10 @@ COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doub
 
 @dataclass(frozen=True)
 class BlockRows:
-    """What became of a block's rows: its key frames, the steps from each to the next, and for every row the row
-    of the key frame that it was followed from, the motion, and its fitness: NaN where the motion is a guess; and the
-    rows `moving` of frames much of which moved otherwise than the camera, `doubtful` of those whose motion may be
-    that of an object, and `blank` of those that have depth but show nothing.
+    """What became of a block's rows: its key frames but one that the block before has too, the steps from each to the
+    next, and for every row the row of the key frame that it was followed from, the motion, and its fitness: NaN where
+    the motion is a guess; and the rows `moving` of frames much of which moved otherwise than the camera, `doubtful` of
+    those whose motion may be that of an object, and `blank` of those that have depth but show nothing.
 
     A step of fitness 0 is a guess too. The block's last row is the first of the next one.
     """
@@ -88,16 +87,17 @@ class TrackedBlocks:
         """Forget the blocks: what they held is written."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def join_clouds(self, chosen: Sequence[Ints], folder: Path) -> None:
-        """Write the clouds of the `chosen` key frames of each block as a `CloudSet` into a folder.
+    def join_clouds(self, folder: Path) -> None:
+        """Write the clouds of the key frames of all blocks as a `CloudSet` into a folder.
 
         Memory holds the clouds of one block at a time.
         """
         sizes, marks = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)]
-        for number, keep in enumerate(chosen):
-            with np.load(self._path(number)) as stored:
-                sizes.append(np.diff(stored[CLOUD + "offsets"])[keep])
-                marks.append(np.diff(stored[CLOUD + "marks"])[keep])
+        paths = sorted(self._folder.glob("[0-9]*.npz"))
+        for path in paths:
+            with np.load(path) as stored:
+                sizes.append(np.diff(stored[CLOUD + "offsets"]))
+                marks.append(np.diff(stored[CLOUD + "marks"]))
         ends = {"offsets": np.cumsum(np.concatenate(sizes)), "marks": np.cumsum(np.concatenate(marks))}
         nothing = CloudSet.from_clouds([])
         files: dict[str, NDArray[Any]] = {}
@@ -109,17 +109,12 @@ class TrackedBlocks:
             shape = (int(ends["marks" if name.startswith("mark_") else "offsets"][-1]), *like.shape[1:])
             files[name] = _empty_file(folder / f"{name}.npy", shape, like.dtype)
         filled = dict.fromkeys(files, 0)
-        for number, keep in enumerate(chosen):
-            part = self._cut(number, keep)
-            for name, file in files.items():
-                column = getattr(part, name)
-                file[filled[name] : filled[name] + len(column)] = column
-                filled[name] += len(column)
-
-    def _cut(self, number: int, keep: Ints) -> CloudSet:
-        with np.load(self._path(number)) as stored:
-            whole = CloudSet(*(stored[CLOUD + name] for name in CloudSet.FILES))
-        return CloudSet.from_clouds([whole[int(row)] for row in keep])
+        for path in paths:
+            with np.load(path) as stored:
+                for name, file in files.items():
+                    column = stored[CLOUD + name]
+                    file[filled[name] : filled[name] + len(column)] = column
+                    filled[name] += len(column)
 
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:06d}.npz"

@@ -219,8 +219,9 @@ class _Tracker:
         self._missed: _View | None = None
 
     def _keep_cloud(self, key: _View) -> None:
-        """All that is kept of a key frame that nothing follows any more."""
-        self._clouds[key.place] = key.cloud_and_note
+        """All that is kept of a key frame that nothing follows any more; of the first, the block before keeps it."""
+        if key.place > self._block.warm_up or not self._block.warm_up:
+            self._clouds[key.place] = key.cloud_and_note
 
     def _promote(self, view: _View, step: Registration) -> None:
         self._steps.append((self._keys[-1].place, view.place, step))
@@ -256,7 +257,7 @@ class _Tracker:
         found, against = self._of_most_area(key, view, found, guess)
         if len(found.rows) < FEWEST_FOLLOWED or found.share < self._limits.min_fitness:
             return None
-        off = misplaced(key.image, view.image, found.key_from_view)
+        off = misplaced(key.image, view.image, found.key_from_view, self._moments(key, view, found.key_from_view))
         if off > MISPLACED:
             by_clouds = self._registrar.register(key.prepared, view.prepared, guess)
             if self._good(by_clouds) and 2 * misplaced(key.image, view.image, by_clouds.i_from_j) < off:

@@ -142,19 +142,21 @@ def picture(scene: Points, view: View) -> Bytes:
     seen = in_view[:, 2] >= -min(view.near_m, view.eye_m - NEAR_M)
     if view.culled:
         seen &= facing <= 0.1
-    in_view, facing, colours = in_view[seen], facing[seen], scene.colours[seen]
+    rows = np.flatnonzero(seen)
+    in_view = in_view.take(rows, axis=0)  # a fifth of the time of a mask
     scale = 1.0 / view.metres_per_pixel
     across = in_view[:, :2] * scale
     if np.isfinite(view.eye_m):
         across *= (view.eye_m / (view.eye_m + in_view[:, 2]))[:, None]
     column, row = np.round(across + [width / 2, height / 2]).astype(np.int64).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    inside = np.flatnonzero((column >= 0) & (column < width) & (row >= 0) & (row < height))
     pixel, depth = (row * width + column)[inside], in_view[inside, 2]
     front = np.full(width * height, np.inf, np.float32)
     np.minimum.at(front, pixel, depth)
     deep = view.metres_per_pixel if view.surface_m is None else view.surface_m
-    surface = depth <= front[pixel] + deep
-    pixel, shades = pixel[surface], _shades(colours[inside][surface], facing[inside][surface])
+    surface = np.flatnonzero(depth <= front[pixel] + deep)
+    rows, pixel = rows[inside[surface]], pixel[surface]
+    shades = _shades(scene.colours.take(rows, axis=0), facing[rows])
     count = np.maximum(np.bincount(pixel, minlength=width * height), 1)
     sums = [np.bincount(pixel, shades[:, channel], minlength=width * height) for channel in range(3)]
     image = np.where(np.isfinite(front)[:, None], np.stack(sums, axis=1) / count[:, None], PAPER).astype(np.uint8)

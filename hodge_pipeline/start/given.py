@@ -37,6 +37,7 @@ from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_poses
 from hodge_pipeline.start.odometry import OPTIONS, chain
+from hodge_pipeline.start.sweeps import deskewed_along
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, Source, Trajectory
 from hodge_pipeline.types.notes import Note, notes_of
 from hodge_pipeline.types.text import counted
@@ -97,7 +98,7 @@ class GivenStart:
         )
         rows = np.union1d(rows, self._at_jumps(poses, list(sequences_of(source).values())))
         steps.note(Note("key frames", len(rows), str(len(source.frames))))
-        whole = given_away(source, poses, rows)
+        whole = deskewed_along(given_away(source, poses, rows), poses, clouds)
         count = len(poses)
         key_frames = KeyFrames(
             rows=rows,
@@ -111,9 +112,8 @@ class GivenStart:
             key_of_frame=np.clip(np.searchsorted(rows, np.arange(count), side="right") - 1, 0, None),
         )
         keys = replace(key_source(whole, rows), graph=None)
-        steps.remember(keys, steps.key([source, rows, poses]))
-        if whole is not source:
-            steps.remember(whole, steps.key([source, poses]))
+        steps.remember(keys, steps.key([source, rows, poses]) + "deskewed")
+        steps.remember(whole, steps.key([source, poses]) + "deskewed")
         made = make_clouds(keys, clouds, steps, workers)
         first = Round(Edges.of([]), vertex_ids(keys), poses[rows], name=START)
         return Scene(whole, keys, key_frames, made, first, is_given=True, given=file)

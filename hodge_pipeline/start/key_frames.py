@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions, no_clouds
-from hodge_pipeline.registration.gaps import gaps
+from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.readout import estimate_readout, with_readout
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
@@ -37,8 +37,8 @@ from hodge_pipeline.types.notes import Note, notes_of
 from hodge_pipeline.types.text import counted
 
 NOTES_SHOWN = 5
-WHOLE_VIDEO, WHOLE_STILLS = 50, 300
-"""Frames that are registered whole: tracking by optical flow is more exact at the rate of a video, and glues stills."""
+WHOLE_STILLS = 300
+"""Frames that are registered whole where they are no video: tracking by optical flow glues stills."""
 DOUBTED = 0.1
 """Share of the frames whose motion may be an object's, from which the whole path is in doubt: of fr1/rpy's every third
 frame, where nothing moves but much is blurred, 0.07 are.
@@ -75,8 +75,8 @@ class KeyFrameStart(OdometryStart):
     whole_up_to: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
         default=300,
         description="frames: a source of so many is registered whole; a longer one is tracked from key frame to key "
-        "frame, which are chosen by how far the camera moved and by what it still sees. auto: 50 where a clock says "
-        "that frames are at most 0.2 s apart, else 300",
+        "frame, which are chosen by how far the camera moved and by what it still sees. auto: a video, whose frames "
+        "a clock says to be at most 0.2 s apart, is tracked at any length, all else as 300",
     )
     distance_m: float = Field(
         default=0.1,
@@ -107,7 +107,7 @@ class KeyFrameStart(OdometryStart):
     def _whole_up_to(self, source: Source) -> int:
         if self.whole_up_to != "auto":
             return self.whole_up_to
-        return WHOLE_VIDEO if is_video(source) else WHOLE_STILLS
+        return 0 if is_video(source) else WHOLE_STILLS
 
     def _tracking(self, clouds: CloudOptions) -> TrackingOptions:
         """How frames are followed."""
@@ -149,14 +149,13 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     blocks = TrackedBlocks(folder / "blocks")
     _track_missing(blocks, cut, options, workers, step.advance)
     parts = [blocks.rows(number) for number in range(len(cut))]
-    fresh = [np.arange(int(block.warm_up), len(part.keys)) for block, part in zip(cut, parts, strict=True)]
     clouds = folder / "clouds"
     clouds.mkdir(exist_ok=True)
-    blocks.join_clouds(fresh, clouds)
+    blocks.join_clouds(clouds)
     if not CloudSet.open(clouds).sizes.any():
         reason = next((note for part in parts for note in part.notes), "no frame has depth")
         raise no_clouds(source.frames, reason)
-    key_rows = np.concatenate([part.keys[keep] for part, keep in zip(parts, fresh, strict=True)])
+    key_rows = np.concatenate([part.keys for part in parts])
     key_of_row = {int(row): key for key, row in enumerate(key_rows)}
     edges = Edges.joined([part.steps for part in parts])
     edges = replace(edges, pairs=_renumbered(edges.pairs, key_of_row))
@@ -248,10 +247,7 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[No
     back = [row for rows in sequences_of(source).values() for row in _where_the_clock_goes_back(source, rows)]
     if back:
         notes.append(Note("clock", len(back), in_runs(np.array(back), ids)))
-    holes, stamps = gaps(list(sequences_of(source).values()), stamps_of(source)), stamps_of(source)
-    if len(holes):
-        told = [f"{stamps[j] - stamps[i]:.1f} s before {ids[j]}" for i, j in holes[:NOTES_SHOWN].tolist()]
-        notes.append(Note("holes", len(holes), ", ".join(told) + ", …" * (len(holes) > NOTES_SHOWN)))
+    notes += told_gaps(list(sequences_of(source).values()), stamps_of(source), ids)
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
     blank = np.unique(np.concatenate([part.blank for part in parts]))

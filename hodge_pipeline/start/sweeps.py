@@ -22,6 +22,7 @@ from hodge_pipeline.registration.clouds import (
     out_of_range,
     shortened,
 )
+from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity
@@ -34,6 +35,7 @@ from hodge_pipeline.scene import (
     sequence_numbers,
     sequences_of,
     stamps_of,
+    vertex_ids,
 )
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
@@ -57,6 +59,8 @@ LOOKS = 9
 """Sweeps, spread over a sequence, that tell how far its scanner sees: any one may face a wall."""
 MOST_SKIPPED = 20
 """Revolutions, 2 s of most scanners: numbers of files that are farther apart as a rule count something else."""
+STEPS_AROUND = 5
+"""Before and after a sweep: half a second, within which a car hardly changes its speed."""
 NO_CLOCK_S = 1.0
 """Between two sweeps that neither stamps nor times of points tell apart: velocities are then a sweep's."""
 
@@ -153,9 +157,30 @@ def follow(
     if loose.any():
         kind = "path loose" if loose.sum() > MOST_LOOSE * found.sum() else "sweeps loose"
         step.note(Note(kind, int(loose.sum()), str(count)))
+    clocked = [rows for rows in sequences if is_clock(stamps[rows])]
+    step.note(*told_gaps(clocked, stamps, vertex_ids(source)))
     if not is_timed:
         step.note(Note("sweeps untimed"))
     return Sweeps(poses, velocity, found, min(reaches_m))
+
+
+def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions) -> Source:
+    """The source, sweeps whose points have times deskewed to their stamps by poses (N, 4, 4) that may be noisy: by the
+    median of the steps around each.
+    """
+    velocity, stamps = np.zeros((len(source.frames), 6)), stamps_of(source)
+    for rows in sequences_of(source).values():
+        middle = source.frames[rows[len(rows) // 2]]
+        turn_s = _first_look([middle], clouds)[1] if middle.read_points is not None else 0.0
+        if turn_s and len(rows) > 1:
+            steps = np.diff(_times(stamps[rows], turn_s))
+            moved = se3.log(se3.inverse(world_from_scan[rows[:-1]]) @ world_from_scan[rows[1:]]) / steps[:, None]
+            velocity[rows] = [
+                np.median(moved[max(0, row - STEPS_AROUND) : row + STEPS_AROUND], axis=0) for row in range(len(rows))
+            ]
+    if not velocity.any():
+        return source
+    return replace(source, frames=tuple(map(deskewed_frame, source.frames, velocity)))
 
 
 class _Sweep(NamedTuple):

@@ -34,7 +34,7 @@ class Positions:
     @property
     def labels(self) -> Words:
         """What each is called in a message: its frame's name, else its stamp."""
-        return np.where(self.names != "", self.names, [f"{stamp:.9g} s" for stamp in self.stamps_s])
+        return np.where(self.names != "", self.names, [f"{stamp:.3f} s" for stamp in self.stamps_s])
 
     def near_zero(self) -> Positions:
         """The same with whole kilometres taken off where they lie far from zero, which `origin` then says."""
