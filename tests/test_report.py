@@ -192,7 +192,7 @@ def test_tables_and_terminal_lines(report: Report) -> None:
 
 
 def test_the_terminal_gets_ten_lines_of_80_columns(report: Report) -> None:
-    notes = (Note("parts", 3), Note("carried", 7), Note("scale", detail="word " * 60))
+    notes = (Note("parts", 3), Note("carried", 7), Note("no decomposition", detail="word " * 60))
     for shown in (report, replace(report, notes=notes)):
         lines = brief(shown, "runs/a")
         assert len(lines) <= 10 and max(map(len, lines)) <= 80

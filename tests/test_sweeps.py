@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -22,9 +23,10 @@ from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame
 from hodge_pipeline.sources.frame_facts import frame_facts
-from hodge_pipeline.stages import Step, no_progress
-from hodge_pipeline.start.sweeps import Sweeps, follow
+from hodge_pipeline.stages import Step, Steps, no_progress
+from hodge_pipeline.start.sweeps import Sweeps, deskewed_along, follow
 from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
+from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.trajectory import refine_trajectory
 from lidar_worlds import CarFree
 
@@ -140,6 +142,20 @@ def test_sweeps_of_given_poses_are_deskewed_by_them() -> None:
     assert not refined.decision.keeps_input
     before, after = (absolute_error(poses, exact).rmse_m for poses in (given, refined.poses))
     assert after < 0.75 * before  # skewed around a corner, they fit each other where the scanner was not
+
+
+@pytest.mark.parametrize(("apart_s", "told"), [(0.1, ["sweeps untimed"]), (30.0, [])])
+def test_given_poses_of_sweeps_without_times_are_told_and_those_of_stations_are_not(
+    apart_s: float, told: list[str]
+) -> None:
+    frames = [
+        changed(replace(frame, stamp_s=UNIX_S + row * apart_s), lambda cloud: replace(cloud, times_s=None))
+        for row, frame in enumerate(corner()[:4])
+    ]
+    source, notes = Source("sweeps", Path("sweeps"), tuple(frames)), list[Note]()
+    steps = cast(Steps, SimpleNamespace(note=notes.append))
+    assert deskewed_along(source, np.tile(np.eye(4), (4, 1, 1)), CloudOptions(), steps) is source
+    assert [note.kind for note in notes] == told
 
 
 def test_every_third_sweep_is_deskewed_by_its_own_speed() -> None:

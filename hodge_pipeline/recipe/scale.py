@@ -34,6 +34,8 @@ POINTS_LOOKED_AT = 1_000_000
 MOST_STEPS = 40
 FULL = 0.5
 """Voxels over points, from which smaller voxels show nothing more."""
+MILLIMETRES = 100.0
+"""The factor from which the unit is doubted: no scanner reaches a hundred rooms."""
 POINTS_IN_VOXEL = 3
 """Wanted of a scan of few points: a voxel with one of them knows nothing of a surface."""
 
@@ -51,7 +53,7 @@ def scale_of_scans(source: Source, voxel_m: float, *, step: Step) -> float:
     """Step: the factor on lengths that suits the scans of a source."""
     factor = measured_scale(source.frames, voxel_m)
     if factor != 1.0:
-        step.note(Note("scale", detail=_said(factor, voxel_m)))
+        step.note(Note("millimetres" if factor > MILLIMETRES else "scale", detail=_said(factor, voxel_m)))
     return factor
 
 
@@ -143,4 +145,4 @@ def _said(factor: float, voxel_m: float) -> str:
         f"{voxel_m * factor:.3g} m); scale=1 leaves them as they are"
     )
     millimetres = "if their unit is the millimetre, set source.reader.units_per_metre=1000; else "
-    return (millimetres if factor > 100 else "") + text
+    return (millimetres if factor > MILLIMETRES else "") + text

@@ -98,7 +98,7 @@ class GivenStart:
         )
         rows = np.union1d(rows, self._at_jumps(poses, list(sequences_of(source).values())))
         steps.note(Note("key frames", len(rows), str(len(source.frames))))
-        whole = deskewed_along(given_away(source, poses, rows), poses, clouds)
+        whole = deskewed_along(given_away(source, poses, rows), poses, clouds, steps)
         count = len(poses)
         key_frames = KeyFrames(
             rows=rows,

@@ -164,20 +164,24 @@ def follow(
     return Sweeps(poses, velocity, found, min(reaches_m))
 
 
-def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions) -> Source:
+def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions, steps: Steps) -> Source:
     """The source, sweeps whose points have times deskewed to their stamps by poses (N, 4, 4) that may be noisy: by the
-    median of the steps around each.
+    median of the steps around each. Notes where the sweeps of a drive have no times.
     """
-    velocity, stamps = np.zeros((len(source.frames), 6)), stamps_of(source)
+    velocity, stamps, is_untimed = np.zeros((len(source.frames), 6)), stamps_of(source), False
     for rows in sequences_of(source).values():
         middle = source.frames[rows[len(rows) // 2]]
         turn_s = _first_look([middle], clouds)[1] if middle.read_points is not None else 0.0
+        turns = len(rows) > 1 and is_clock(stamps[rows]) and np.median(np.diff(stamps[rows])) < NO_CLOCK_S
+        is_untimed |= bool(turns and not turn_s and middle.read_points is not None)
         if turn_s and len(rows) > 1:
-            steps = np.diff(_times(stamps[rows], turn_s))
-            moved = se3.log(se3.inverse(world_from_scan[rows[:-1]]) @ world_from_scan[rows[1:]]) / steps[:, None]
+            apart_s = np.diff(_times(stamps[rows], turn_s))
+            moved = se3.log(se3.inverse(world_from_scan[rows[:-1]]) @ world_from_scan[rows[1:]]) / apart_s[:, None]
             velocity[rows] = [
                 np.median(moved[max(0, row - STEPS_AROUND) : row + STEPS_AROUND], axis=0) for row in range(len(rows))
             ]
+    if is_untimed:
+        steps.note(Note("sweeps untimed"))
     if not velocity.any():
         return source
     return replace(source, frames=tuple(map(deskewed_frame, source.frames, velocity)))

@@ -46,9 +46,9 @@ DOUBTS = {
 """What puts the result in doubt: the sentence of each kind of note; `{count}` and `{detail}` are the note's, and of
 `{count:is|are}` the side that suits the count."""
 LOOKS = {
+    "millimetres": "{detail}",
     "single frame": "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
-    "scale": "{detail}",
     "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "
     "{detail}",
     "depth range": "{detail}: is the depth scale right (source.reader.depth_scale)?",
@@ -67,6 +67,8 @@ LOOKS = {
     "the first: {detail}",
     "sweeps loose": "{count} of {detail} sweeps {count:tells|tell} little of how far the scanner went, as in a "
     "tunnel, and it goes on as before",
+    "sweeps untimed": "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an "
+    "instant, and unless it was deskewed before (KITTI's are), turns bend the path",
     "misfits": "{count} {count:frame fits|frames fit} nothing that the key frame saw ({detail}), and "
     "{count:follows|follow} its pose",
     "no truth near": "{detail}: no pose has a true one near in time: its error is not measured",
@@ -97,6 +99,7 @@ LOOKS = {
 """What needs a look."""
 FACTS = {
     "reader": "{detail}",
+    "scale": "{detail}",
     "clouds": "{detail}",
     "start": "{detail}",
     "measured": "{detail}",
@@ -108,8 +111,6 @@ FACTS = {
     "given file": "{detail}",
     "key frames": "{count} of {detail} frames {count:is a key frame|are key frames}: {count:this is|these are} "
     "registered, the others move as those around them",
-    "sweeps untimed": "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an "
-    "instant",
     "readout": "the camera's read-out (rolling shutter), estimated: {detail}; readout_s in the camera's file would be "
     "exact",
     "truth": "{count} of {detail} frames {count:has|have} a true pose, by the truth that was named",
