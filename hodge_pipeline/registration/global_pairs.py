@@ -75,15 +75,10 @@ def describe_clouds(
         advance(count)
 
 
-def match_pairs(
-    described: Path, registrar: GlobalRegistrar, pairs: Ints, workers: Workers, advance: Advance = no_progress
-) -> Matches:
-    """Every pair (P, 2) of the described clouds in a folder matched, in the order given; `advance` counts pairs."""
+def match_pairs(described: Path, registrar: GlobalRegistrar, pairs: Ints, workers: Workers) -> Matches:
+    """Every pair (P, 2) of the described clouds in a folder matched, in the order given."""
     cuts = [pairs[start : start + PAIRS_IN_BLOCK] for start in range(0, len(pairs), PAIRS_IN_BLOCK)]
-    found: dict[int, Matches] = {}
-    for number, result in workers.map(partial(_match_block, described, registrar), cuts):
-        found[number] = result
-        advance(len(result))
+    found = dict(workers.map(partial(_match_block, described, registrar), cuts))
     return Matches.joined([found[number] for number in range(len(cuts))])
 
 

@@ -14,7 +14,7 @@ from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView, violation
 from hodge_pipeline.registration.global_pairs import Matches
 from hodge_pipeline.registration.pairs import register_pairs, weak_directions
-from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
+from hodge_pipeline.stages import Registrar, Workers
 from hodge_pipeline.start.unordered.options import HypothesisLimits
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import REJECTED, USED
@@ -51,7 +51,6 @@ def weigh(
     refine: Registrar,
     limits: HypothesisLimits,
     workers: Workers,
-    advance: Advance = no_progress,
 ) -> Edges:
     """A row for each pair that was matched: its best motion, refined, which counts where it is good enough to be judged
     with the others.
@@ -69,7 +68,7 @@ def weigh(
     why[matches.inliers < limits.min_inliers] = "too few matches agree"
     worth = np.flatnonzero(why == "")
     chosen = Edges.of(matches.pairs[worth])
-    registered = register_pairs(folder, refine, chosen, matches.i_from_j[worth], workers, advance)
+    registered = register_pairs(folder, refine, chosen, matches.i_from_j[worth], workers)
     evidence = _evidence(clouds, registered, view_of, limits)
     score = np.full(len(why), -np.inf)
     score[worth] = evidence.overlap - np.nan_to_num(evidence.seen_through)
