@@ -280,3 +280,17 @@ def test_frames_in_order_once_each_and_every_nth(tmp_path: Path) -> None:
     assert f"{DEPTH}: 1 message with the stamp of an earlier one left out" in source.notes
     thinned = McapReader(camera=(10, 10, 4, 3), every=3).open(path)
     assert [(frame.frame_id, frame.stamp_s) for frame in thinned.frames] == [(0, 101.0), (3, 104.0)]
+
+
+def test_messages_stay_in_the_order_of_the_recording_where_its_clock_jumps_back(tmp_path: Path) -> None:
+    stamps_s = np.concatenate([100 + 0.1 * np.arange(15), 99.5 + 0.1 * np.arange(15)]).round(6)
+    log = Log()
+    for row, stamp in enumerate(stamps_s.tolist()):
+        head, grey = foxglove_header(stamp, OPTICAL), np.full((HEIGHT, WIDTH, 3), row, np.uint8)
+        log.add(DEPTH, RAW, {**head, **raw_image(depth_values(row), "16UC1")}, CDR, log_ns=int(stamp * SECOND))
+        log.add(COLOUR, RAW, {**head, **raw_image(grey, "rgb8")}, CDR, log_ns=int(stamp * SECOND))
+    source = McapReader(camera=(10, 10, 4, 3)).open(log.write(tmp_path / "log.mcap"))
+    assert [frame.stamp_s for frame in source.frames] == pytest.approx(stamps_s)
+    assert f"{DEPTH}: the clock jumps back 1 time: messages are taken in the order of the recording" in source.notes
+    colours = [frame.read_colour() for frame in source.frames if frame.read_colour is not None]
+    assert [int(image.max()) for image in colours] == list(range(30))  # not those of the same stamp before the jump

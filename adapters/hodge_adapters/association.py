@@ -1,13 +1,42 @@
-"""Which image belongs to which, by nearest stamp."""
+"""Which image belongs to which, by nearest stamp, and where a clock jumps back."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS = 4
 """How many stamps on each side are looked at; more would only matter where stamps crowd within the tolerance."""
+JUMP, FEWEST_OF_RUN = 10.0, 10
+"""Usual steps by which a clock jumps back, and stamps to a jump: more of either are stamps out of order."""
+
+
+def clock_runs(stamps_s: Floats, follows: Bools | None = None) -> Ints:
+    """The run (N,) of each stamp as written, ascending: a new one begins where the clock jumps back.
+
+    One run of all where they are shuffled. Only stamps that `follows (N - 1,)` says were written after the one before
+    tell of a jump.
+    """
+    steps = np.diff(stamps_s)
+    ahead = steps[steps > 0]
+    jumps = steps < -JUMP * np.median(ahead) if len(ahead) else np.zeros(len(steps), bool)
+    back = np.flatnonzero(jumps if follows is None else jumps & follows)
+    if len(back) * FEWEST_OF_RUN > len(stamps_s):
+        back = back[:0]
+    return np.asarray(np.searchsorted(back, np.arange(len(stamps_s)), side="left"), np.int64)
+
+
+def nearest_in_runs(
+    depth_stamps_s: Floats, depth_runs: Ints, colour_stamps_s: Floats, colour_runs: Ints, max_difference_s: float
+) -> Ints:
+    """As `nearest_pairs`, among the stamps of one run of the clock each; colour stamps ascend in each run."""
+    columns = np.full(len(depth_stamps_s), -1, np.int64)
+    for run in np.unique(depth_runs):
+        own, other = np.flatnonzero(depth_runs == run), np.flatnonzero(colour_runs == run)
+        found = nearest_pairs(depth_stamps_s[own], colour_stamps_s[other], max_difference_s)
+        columns[own] = np.where(found >= 0, np.append(other, -1)[found], -1)
+    return columns
 
 
 def nearest_pairs(depth_stamps_s: Floats, colour_stamps_s: Floats, max_difference_s: float) -> Ints:

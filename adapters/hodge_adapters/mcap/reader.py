@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.association import nearest_pairs
+from hodge_adapters.association import nearest_in_runs
 from hodge_adapters.images.camera_files import Intrinsics, checked
 from hodge_adapters.mcap.clouds import read_points
 from hodge_adapters.mcap.files import find_files, sniff_recording
@@ -176,7 +176,8 @@ class McapReader:
                 notes.append("no colour images: frames have no colour")
             return [None] * len(images)
         others = one_per_stamp(colour_topic, colour[colour_topic], notes)
-        columns = nearest_pairs(_stamps(images), _stamps(others), self.max_difference_s)
+        runs = [np.array([item.run for item in items]) for items in (images, others)]
+        columns = nearest_in_runs(_stamps(images), runs[0], _stamps(others), runs[1], self.max_difference_s)
         without = int((columns < 0).sum())
         if without:
             hint = ": are they on another clock?" if without == len(images) else ""

@@ -47,13 +47,16 @@ NO_PINHOLE = "a matrix K that is no pinhole camera's"
 
 @dataclass(frozen=True)
 class Seen(Generic[Layout]):
-    """One image or cloud of a topic: when, in which coordinate frame, how to read it and where."""
+    """One image or cloud of a topic: when, in which coordinate frame, how to read it and where; and how often the
+    clock had jumped back by then.
+    """
 
     stamp_s: float
     log_s: float
     frame_id: str
     layout: Layout
     payload: Payload
+    run: int = 0
 
 
 @dataclass(frozen=True)

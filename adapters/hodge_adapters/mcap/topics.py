@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TypeVar
 
+import numpy as np
+
+from hodge_adapters.association import clock_runs
 from hodge_adapters.images.camera_files import fit_note
 from hodge_adapters.mcap.images import ImageLayout
 from hodge_adapters.mcap.recording import Calibration, Recording, Seen
@@ -145,19 +149,25 @@ def _camera(name: str, calibration: Calibration, topic: str, layout: ImageLayout
 
 
 def one_per_stamp(topic: str, seen: Sequence[Seen[Item]], notes: list[str]) -> list[Seen[Item]]:
-    """The images or clouds of a topic by stamp, the first of those with the same stamp.
+    """The images or clouds of a topic by stamp, the first of those with the same stamp; where a file's clock jumps
+    back, those before the jump come first.
 
     A topic whose stamps are all the same has none that mean anything: there the log's time is taken.
     """
     if len(seen) > 1 and len({item.stamp_s for item in seen}) == 1:
         notes.append(f"{topic}: all {len(seen)} messages have the stamp {seen[0].stamp_s:.9g} s: log time is taken")
         seen = [replace(item, stamp_s=item.log_s) for item in seen]
-    first: dict[float, Seen[Item]] = {}
-    for item in seen:
-        first.setdefault(item.stamp_s, item)
+    in_one_file = np.array([a.payload.path == b.payload.path for a, b in pairwise(seen)], bool)
+    runs = clock_runs(np.array([item.stamp_s for item in seen]), in_one_file).tolist()
+    if any(runs):
+        jumps = counted(runs[-1], "time")
+        notes.append(f"{topic}: the clock jumps back {jumps}: messages are taken in the order of the recording")
+    first: dict[tuple[int, float], Seen[Item]] = {}
+    for run, item in zip(runs, seen, strict=True):
+        first.setdefault((run, item.stamp_s), replace(item, run=run))
     if len(first) < len(seen):
         notes.append(f"{topic}: {counted(len(seen) - len(first), 'message')} with the stamp of an earlier one left out")
-    return [first[stamp] for stamp in sorted(first)]
+    return [first[key] for key in sorted(first)]
 
 
 def _shares_grid(a: Seen[ImageLayout], b: Seen[ImageLayout]) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.association import nearest_pairs
+from hodge_adapters.association import clock_runs, nearest_in_runs
 from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
 from hodge_adapters.trajectories.text import in_seconds, is_stamp
 from hodge_pipeline.errors import SourceError
@@ -18,8 +18,6 @@ from hodge_pipeline.types.text import counted
 ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
 LONGEST_DELAY_S = 0.1
 """Between the images of one frame: stamps further apart are not of one clock."""
-JUMP, LINES_OF_RUN = 10.0, 10
-"""Usual steps by which a clock jumps back, and lines of a list to a jump: more of either are lines out of order."""
 _STAMP_NAME = re.compile(r"\d+\.\d+\.(png|jpg|jpeg)", re.IGNORECASE)
 _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
 
@@ -86,11 +84,7 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
     if not colour and not colour_list.is_file():
         notes.append("no rgb.txt: frames have no colour")
         return StampedImages(depth_stamps_s, depth, [None] * len(depth), np.zeros(len(depth)), lists, runs)
-    columns = np.full(len(depth), -1, np.int64)
-    for run in np.unique(runs):
-        own, other = np.flatnonzero(runs == run), np.flatnonzero(colour_runs == run)
-        found = nearest_pairs(depth_stamps_s[own], colour_stamps_s[other], max_difference_s)
-        columns[own] = np.where(found >= 0, np.append(other, -1)[found], -1)
+    columns = nearest_in_runs(depth_stamps_s, runs, colour_stamps_s, colour_runs, max_difference_s)
     alone = int((columns < 0).sum())
     if alone:
         notes.append(f"{alone} of {len(depth)} depth images have no colour image within {max_difference_s:g} s")
@@ -193,7 +187,7 @@ def _stamp(row: Row, column: int) -> float | None:
 def _in_order(stamps: Floats, name: str, notes: list[str]) -> tuple[Floats, list[int], Ints]:
     """Stamps in seconds, ascending and unique in each run, their rows and runs; of equal ones the first is kept."""
     stamps_s = in_seconds(stamps, name, notes)
-    runs = _runs(stamps_s)
+    runs = clock_runs(stamps_s)
     order = np.lexsort((stamps_s, runs))
     again = np.flatnonzero((np.diff(stamps_s[order]) == 0) & (np.diff(runs[order]) == 0)) + 1
     order = np.delete(order, again)
@@ -205,13 +199,3 @@ def _in_order(stamps: Floats, name: str, notes: list[str]) -> tuple[Floats, list
     elif (np.diff(stamps_s) < 0).any():
         notes.append(f"{name}: lines were not in order of time: sorted")
     return stamps_s[order], order.tolist(), runs[order]
-
-
-def _runs(stamps_s: Floats) -> Ints:
-    """The run (N,) of each line, ascending: a new one begins where the clock jumps back; one run of shuffled lines."""
-    steps = np.diff(stamps_s)
-    ahead = steps[steps > 0]
-    back = np.flatnonzero(steps < -JUMP * np.median(ahead)) if len(ahead) else np.zeros(0, np.int64)
-    if len(back) * LINES_OF_RUN > len(stamps_s):
-        back = back[:0]
-    return np.asarray(np.searchsorted(back, np.arange(len(stamps_s)), side="left"), np.int64)
