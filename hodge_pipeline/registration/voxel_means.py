@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
 from hodge_pipeline.types import Bytes, Floats, Floats32, Ints
 
@@ -33,5 +32,7 @@ def _summed(keys: Ints, values: Floats) -> tuple[Ints, Floats]:
     """The keys, ascending and each once, and the sums (K, c) of its rows of values (n, c)."""
     order = np.argsort(keys, kind="stable")
     starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    rows = csr_matrix((np.ones(len(order)), order, np.append(starts, len(order))), (len(starts), len(order)))
-    return keys[order[starts]], np.asarray(rows @ values)
+    rank = np.empty(len(keys), np.int64)
+    rank[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(keys)))
+    sums = np.stack([np.bincount(rank, column, len(starts)) for column in values.T], axis=1)
+    return keys[order[starts]], sums
