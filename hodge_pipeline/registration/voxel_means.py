@@ -34,5 +34,5 @@ def _summed(keys: Ints, values: Floats) -> tuple[Ints, Floats]:
     starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
     rank = np.empty(len(keys), np.int64)
     rank[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(keys)))
-    sums = np.stack([np.bincount(rank, column, len(starts)) for column in values.T], axis=1)
-    return keys[order[starts]], sums
+    sums = [np.bincount(rank, column, len(starts)) for column in values.T]
+    return keys[order[starts]], np.stack(sums, axis=1, dtype=float)
