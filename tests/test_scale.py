@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,11 +13,13 @@ import pytest
 import hodge_pipeline
 from hodge_adapters.clouds.ply import write_ply
 from hodge_pipeline import se3
-from hodge_pipeline.recipe.scale import measured_scale, scaled_recipe
+from hodge_pipeline.recipe.scale import measured_scale, scale_of_scans, scaled_recipe
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.in_units import InUnits
 from hodge_pipeline.review.opening import Review
-from hodge_pipeline.types import Floats, Frame, PointCloud
+from hodge_pipeline.stages import Step
+from hodge_pipeline.types import Floats, Frame, PointCloud, Source
+from hodge_pipeline.types.notes import Note
 from test_global_registration import furnished_corner
 
 VOXEL_M = 0.04
@@ -37,6 +41,16 @@ def test_the_factor_follows_the_size_of_the_scans(size: float) -> None:
     found = measured_scale(scans(*[size * corner] * 3), VOXEL_M)
     assert size / 2 < found < 2 * size
     assert measured_scale(scans(*[size * corner] * 3), VOXEL_M * found) == 1.0
+
+
+@pytest.mark.parametrize(("size", "kinds"), [(1.0, []), (30.0, ["scale"]), (1000.0, ["millimetres"])])
+def test_that_scans_are_large_is_a_fact_and_that_they_may_be_in_millimetres_needs_a_look(
+    size: float, kinds: list[str]
+) -> None:
+    notes = list[Note]()
+    source = Source("scans", Path("scans"), tuple(scans(*[size * furnished_corner(0, 20_000)] * 2)))
+    scale_of_scans(source, VOXEL_M, step=cast(Step, SimpleNamespace(note=notes.append)))
+    assert [note.kind for note in notes] == kinds
 
 
 def test_scans_that_show_no_size_do_not_count() -> None:

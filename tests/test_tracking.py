@@ -172,27 +172,18 @@ def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(sequence: Path,
     np.testing.assert_array_equal(again.result.world_from_cam, edited.result.world_from_cam)
 
 
-def test_a_source_that_is_short_enough_is_registered_whole(sequence: Path, tmp_path: Path) -> None:
-    recipe = small_recipe(sequence, "start.whole_up_to=64")
-    steps, reader = Store(tmp_path), TumReader()
-    opened = reader.open(sequence)
-    source = remembered(opened, reader, steps, fingerprints(opened.files))
-    scene = recipe.start.begin(source, recipe.clouds, steps, InProcess())
-    assert scene.key_frames.are_all and len(scene.first.world_from_cam) == len(scene.clouds) == FRAMES
-    assert scene.source.frames == scene.whole.frames
-
-
-@pytest.mark.parametrize(("apart_s", "whole"), [(0.1, False), (0.7, True)])
-def test_a_few_frames_of_a_video_are_tracked_and_stills_are_registered_whole(
-    sequence: Path, tmp_path: Path, apart_s: float, whole: bool
+@pytest.mark.parametrize(("up_to", "apart_s", "whole"), [("12", 0.1, True), ("auto", 0.7, True), ("auto", 0.1, False)])
+def test_what_is_short_enough_is_registered_whole_unless_it_is_a_video(
+    sequence: Path, tmp_path: Path, up_to: str, apart_s: float, whole: bool
 ) -> None:
-    recipe = small_recipe(sequence, "start.whole_up_to=auto")
+    recipe = small_recipe(sequence, f"start.whole_up_to={up_to}")
     steps, reader = Store(tmp_path), TumReader()
     opened = reader.open(sequence)
-    frames = [replace(frame, stamp_s=1e9 + apart_s * row) for row, frame in enumerate(opened.frames[:12])]
+    frames = tuple(replace(frame, stamp_s=1e9 + apart_s * row) for row, frame in enumerate(opened.frames[:12]))
     source = remembered(replace(opened, frames=frames), reader, steps, fingerprints(opened.files))
     scene = recipe.start.begin(source, recipe.clouds, steps, InProcess())
     assert scene.key_frames.are_all == whole and (len(scene.clouds) == 12) == whole
+    assert len(scene.first.world_from_cam) == len(scene.clouds)
 
 
 def test_frames_follow_their_key_frames(sequence: Path, tmp_path: Path) -> None:
