@@ -192,7 +192,7 @@ def test_a_wrong_edge_without_a_listed_cycle_says_what_is_against_it() -> None:
     rows = edge_table(PageContents("", "", graph, bare, ("",) * graph.edge_count, (), ())).rows
     against = {row[1]: row[3] for row in rows}
     assert "from the poses" in against["wrong"] and {row[3] for row in rows if row[1] == "consistent"} <= {"none"}
-    assert re.match(r"\d+ m, \d", rows[0][7]), rows[0]
+    assert re.match(r"[\d.]+ m, \d", rows[0][7]), rows[0]
 
 
 def test_json_has_every_edge(tmp_path: Path) -> None:
