@@ -20,8 +20,8 @@ from hodge_pipeline.solvers.elimination import (
 from hodge_pipeline.types import Floats, Ints
 
 MOST_NEIGHBOURS, FEWEST_IN_ROUND, SMALLEST_CORE = 24, 6, 64
-"""Of a vertex that is eliminated in a round, vertices of a round, and vertices that are inverted densely at once: rounds
-of fewer take longer.
+"""Of a vertex that is eliminated in a round, vertices of a round, and vertices that are inverted densely at once:
+rounds of fewer take longer.
 """
 
 
