@@ -1,14 +1,20 @@
-"""Where the real data lies: `HODGE_DATA`, else `shared/data` beside the checkout. It is never part of the project."""
+"""Where the real data lies: `HODGE_DATA`, else `shared/data` beside the checkout. It is never part of the project.
+
+And what keeps the tests cheap: the longest files begin first, and plots of one kind are drawn once a file.
+"""
 
 from __future__ import annotations
 
 import atexit
+import io
 import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -16,6 +22,7 @@ from hypothesis import settings
 from plugin_metadata import write_metadata
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, which says why
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each of many children compiles all that it imports
 settings.load_profile("ci")  # everywhere the same examples, and none has a deadline
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.append(str(REPOSITORY))  # for benchmarks/, which is no part of the package
@@ -38,3 +45,44 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"no real data at {path}: set HODGE_DATA to the folder that holds seven_scenes, tum, …")
     return path
+
+
+LONGEST = (
+    "review_browser", "backbone", "faults", "pipeline", "never_worse", "two_hosts", "golden", "notebooks", "new_plugin",
+    "diagnosis_real_data", "executors", "unordered", "stage_contracts", "security", "lidar", "recording_run",
+)  # fmt: skip
+"""Files that take longest: begun last, one would keep a processor alone."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    rank = {f"test_{name}": number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+_drawn: dict[tuple[object, ...], bytes] = {}
+
+
+@pytest.fixture(autouse=True)
+def plots_drawn_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """All plots are made; they are drawn in the tests of reports, and elsewhere the first of a kind in each file.
+
+    They are half of what a small run costs.
+    """
+    agg: Any = sys.modules.get("matplotlib.backends.backend_agg")
+    file = request.path.stem
+    if agg is not None and not file.startswith("test_report"):
+        draw = agg.FigureCanvasAgg.print_png
+
+        def print_png(canvas: Any, target: io.BytesIO, **options: Any) -> None:
+            kind = [
+                (axes.get_xlabel(), axes.get_ylabel(), axes.get_xscale(), axes.get_yscale(), axes.has_data())
+                + (len(axes.lines), len(axes.collections), len(axes.patches))
+                for axes in canvas.figure.axes
+            ]
+            if (file, *kind) not in _drawn:
+                draw(canvas, new := io.BytesIO(), **options)
+                _drawn[file, *kind] = new.getvalue()
+            target.write(_drawn[file, *kind])
+
+        monkeypatch.setattr(agg.FigureCanvasAgg, "print_png", print_png)
+    yield

@@ -19,6 +19,12 @@ FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--disable-background-networking",
 )  # fmt: skip
+SLOWER = """
+    const soon = window.requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = draw => window.setTimeout(() => soon(draw), 200);
+    window.cancelAnimationFrame = window.clearTimeout.bind(window);
+"""
+"""Five frames a second: without a GPU the scene, drawn as often as can be, leaves no processor to anything else."""
 
 
 def why_no_browser() -> str:
@@ -44,6 +50,7 @@ def start_browser(width: int = 1500, height: int = 1000, *flags: str) -> Any:
         options.add_argument(flag)
     browser = webdriver.Chrome(options=options, service=Service(str(shutil.which("chromedriver"))))
     browser.set_script_timeout(PATIENCE_S)
+    browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": SLOWER})
     return browser
 
 
@@ -74,6 +81,15 @@ class Page:
     def handle(self, name: str) -> Any:
         """What viser shows under a name; None while there is nothing."""
         return self.review.viewer.server.scene.get_handle_by_name(name) if self.review.viewer else None
+
+    def frames(self, count: int) -> None:
+        """Return when the scene has been drawn so many times more."""
+        script = """
+            const [count, done] = arguments, scene = document.getElementById('scene').contentWindow;
+            const wait = left => left ? scene.requestAnimationFrame(() => wait(left - 1)) : done();
+            wait(count);
+        """
+        self.browser.execute_async_script(script, count)
 
     def data(self, name: str) -> str | None:
         return self.browser.execute_script(f"return document.body.dataset.{name} ?? null")

@@ -12,6 +12,7 @@ from rerun.chunk import RrdReader
 from typer.testing import CliRunner
 
 import hodge_pipeline
+from backbone_graphs import drive
 from betti import betti_numbers
 from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_adapters.trajectories.text import parse_tum
@@ -24,7 +25,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.errors import GraphError, HodgeError
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.report import raster
-from hodge_pipeline.report.diagnosis_page import frames_table
+from hodge_pipeline.report.diagnosis_page import PageContents, edge_table, frames_table
 from hodge_pipeline.report.diagnosis_plots import side_by_side as pieces_apart
 from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views, side_by_side
 from hodge_pipeline.report.energy import energy_rows
@@ -181,6 +182,17 @@ def test_frames_that_several_bad_edges_share_are_named() -> None:
     table = frames_table(graph, replace(found, verdict=verdict))
     assert table.rows[0][:3] == ("104", "3", "6") and len(table.rows) == 1
     assert frames_table(graph, found).rows == ()
+
+
+def test_a_wrong_edge_without_a_listed_cycle_says_what_is_against_it() -> None:
+    graph = drive(loops=60, wrong=0.4).graph
+    found = diagnose(graph)
+    assert found.verdict.tolist().count("wrong") > 5
+    bare = replace(found, witnesses_against=np.full_like(found.witnesses_against, -1))
+    rows = edge_table(PageContents("", "", graph, bare, ("",) * graph.edge_count, (), ())).rows
+    against = {row[1]: row[3] for row in rows}
+    assert "from the poses" in against["wrong"] and {row[3] for row in rows if row[1] == "consistent"} <= {"none"}
+    assert re.match(r"[\d.]+ m, \d", rows[0][7]), rows[0]
 
 
 def test_json_has_every_edge(tmp_path: Path) -> None:

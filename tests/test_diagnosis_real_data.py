@@ -64,13 +64,20 @@ def test_hardly_an_edge_of_a_sound_pose_graph_is_blamed(data_dir: Path, name: st
 
 
 @pytest.mark.parametrize(
-    ("name", "share", "most_blamed"), [("gtsam/w20000.txt", 0.1, 0.015), ("sesync/cubicle.g2o", 0.3, 0.05)]
+    ("name", "vertices", "share", "most_blamed"),
+    [("gtsam/w20000.txt", 8000, 0.1, 0.015), ("sesync/cubicle.g2o", 5750, 0.3, 0.05)],
 )
 def test_wrong_loops_do_not_put_the_blame_on_what_drifted(
-    data_dir: Path, name: str, share: float, most_blamed: float
+    data_dir: Path, name: str, vertices: int, share: float, most_blamed: float
 ) -> None:
-    graph = read_graph(data_dir / "pose_graphs" / name).graph
-    assert graph is not None
+    """The first `vertices` of a path are long enough to drift by more than what is wrong."""
+    whole = read_graph(data_dir / "pose_graphs" / name).graph
+    assert whole is not None
+    rows = (whole.edges < vertices).all(axis=1)
+    graph = ViewGraph.from_edges(
+        whole.vertex_ids[:vertices], whole.edges[rows], whole.i_from_j[rows], whole.information[rows],
+        dimension=whole.dimension,
+    )  # fmt: skip
     loops = np.flatnonzero(np.abs(graph.edges[:, 1] - graph.edges[:, 0]) > 1)
     rng = np.random.default_rng(1)
     bad = rng.choice(loops, int(share * len(loops)), replace=False)

@@ -17,6 +17,7 @@ import pytest
 
 import hodge_pipeline
 from hodge_adapters.trajectories.text import parse_tum
+from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError, WorkspaceError
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.run_folder import Run
@@ -28,9 +29,26 @@ SMALL = (
     "edges.max_edges_per_frame=4",
 )  # fmt: skip
 
+SHORT = (
+    "clouds.voxel_m=0.1", "executor.workers=0", "evaluation.tables=false", "acceptance.min_fitness=0.05",
+    "start.min_fitness=0.05",
+)  # fmt: skip
+
 
 def small_recipe(source: Path, *overrides: str) -> Recipe:
     return load_recipe("demo", [*SMALL, *overrides], source)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run of eight frames, for what begins again and again."""
+    folder = tmp_path_factory.mktemp("short")
+    source = make_sequence(folder / "source", DemoOptions(frames=8, width=80, height=60, turns=0.03))
+    return hodge_pipeline.run(short_recipe(source), folder / "run")
+
+
+def short_recipe(source: Path, *overrides: str) -> Recipe:
+    return small_recipe(source, *SHORT, *overrides)
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +126,8 @@ def test_another_run_gives_the_same_poses_on_any_number_of_workers(run: Run, tmp
 @pytest.mark.parametrize(
     "title", ["odometry", "loops along the path", "registration, round 1", "solve, round 2", "fusion 1", "recording"]
 )
-def test_a_run_that_was_stopped_goes_on_where_it_stopped(run: Run, tmp_path: Path, title: str) -> None:
-    recipe = small_recipe(run.source.path, "executor.workers=0", "evaluation.tables=false")
+def test_a_run_that_was_stopped_goes_on_where_it_stopped(short: Run, tmp_path: Path, title: str) -> None:
+    recipe = short_recipe(short.source.path)
     first, second = Log(stop_at=title), Log()
     with pytest.raises(KeyboardInterrupt):
         hodge_pipeline.run(recipe, tmp_path / "run", watcher=first)
@@ -117,10 +135,10 @@ def test_a_run_that_was_stopped_goes_on_where_it_stopped(run: Run, tmp_path: Pat
     assert title in (second.stages[0], "recording")
     done = first.stages[: first.stages.index(title)]
     assert not set(done) & set(second.stages) - {"recording"}
-    np.testing.assert_array_equal(resumed.result.world_from_cam, run.result.world_from_cam)
+    np.testing.assert_array_equal(resumed.result.world_from_cam, short.result.world_from_cam)
 
 
-def test_a_killed_registration_keeps_its_blocks(run: Run, tmp_path: Path) -> None:
+def test_a_killed_registration_keeps_its_blocks(short: Run, tmp_path: Path) -> None:
     script = textwrap.dedent(f"""
         import os, signal, sys
         import hodge_pipeline
@@ -131,19 +149,18 @@ def test_a_killed_registration_keeps_its_blocks(run: Run, tmp_path: Path) -> Non
             keep(folder, block, result)
             os.kill(os.getpid(), signal.SIGKILL)
         register.keep_block = write
-        recipe = load_recipe("demo", {[*SMALL, "executor.workers=0"]!r}, {str(run.source.path)!r})
+        recipe = load_recipe("demo", {[*SMALL, *SHORT]!r}, {str(short.source.path)!r})
         hodge_pipeline.run(recipe, {str(tmp_path / "run")!r})
     """)
     killed = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True)
     assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
     assert len(list((tmp_path / "run/stages/register_edges-1.part/blocks").glob("*.npz"))) == 1
-    resumed = hodge_pipeline.run(small_recipe(run.source.path, "executor.workers=0"), tmp_path / "run")
-    np.testing.assert_array_equal(resumed.result.world_from_cam, run.result.world_from_cam)
+    resumed = hodge_pipeline.run(short_recipe(short.source.path), tmp_path / "run")
+    np.testing.assert_array_equal(resumed.result.world_from_cam, short.result.world_from_cam)
 
 
-def test_a_run_that_is_killed_again_and_again_ends_with_the_same_poses(run: Run, tmp_path: Path) -> None:
+def test_a_run_that_is_killed_again_and_again_ends_with_the_same_poses(short: Run, tmp_path: Path) -> None:
     """Killed while its third step, from where it went on, gets its name: in turn just before and just after."""
-    alone = ("executor.workers=0", "recording.level=off")
     script = textwrap.dedent(f"""
         import os, signal, sys
         import hodge_pipeline
@@ -157,7 +174,7 @@ def test_a_run_that_is_killed_again_and_again_ends_with_the_same_poses(run: Run,
             if not left[0]:
                 os.kill(os.getpid(), signal.SIGKILL)
         store._commit = commit_and_die
-        recipe = load_recipe("demo", {[*SMALL, *alone]!r}, {str(run.source.path)!r})
+        recipe = load_recipe("demo", {[*SMALL, *SHORT, "recording.level=off"]!r}, {str(short.source.path)!r})
         hodge_pipeline.run(recipe, {str(tmp_path / "run")!r})
     """)
     ended = list[int]()
@@ -169,15 +186,15 @@ def test_a_run_that_is_killed_again_and_again_ends_with_the_same_poses(run: Run,
         assert ended[-1] in (0, -signal.SIGKILL), done.stderr.decode()
     assert len(ended) > 3
     found = Run.load(tmp_path / "run")
-    np.testing.assert_array_equal(found.poses, run.poses)
-    np.testing.assert_array_equal(found.edges.i_from_j, run.edges.i_from_j)
+    np.testing.assert_array_equal(found.poses, short.poses)
+    np.testing.assert_array_equal(found.edges.i_from_j, short.edges.i_from_j)
     assert not [path for path in (tmp_path / "run").rglob("*") if path.suffix in (".part", ".draft")]
 
 
-def test_a_later_stage_alone_is_repeated_when_its_option_changes(run: Run, tmp_path: Path) -> None:
+def test_a_later_stage_alone_is_repeated_when_its_option_changes(short: Run, tmp_path: Path) -> None:
     folder, log = tmp_path / "copy", Log()
-    shutil.copytree(run.folder, folder)
-    recipe = small_recipe(run.source.path, "fusion=[{stage: cloud, voxel_m: 0.05}]")
+    shutil.copytree(short.folder, folder)
+    recipe = short_recipe(short.source.path, "fusion=[{stage: cloud, voxel_m: 0.05}]")
     with pytest.raises(WorkspaceError, match="--overwrite"):
         hodge_pipeline.run(recipe, folder)
     hodge_pipeline.run(recipe, folder, overwrite=True, watcher=log)

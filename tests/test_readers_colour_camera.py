@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from hodge_adapters.seven_scenes.reader import SevenScenesReader, colour_pixels
+from hodge_adapters.seven_scenes.colour import colour_pixels
+from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera
 from readers_data import seven_scenes_sequence
@@ -37,7 +40,47 @@ def test_pixels_without_depth_are_taken_for_the_median() -> None:
 def test_the_option_of_the_reader(tmp_path: Path) -> None:
     folder = seven_scenes_sequence(tmp_path / "seq-01")
     kinect = check_reader(SevenScenesReader(colour_camera="kinect"), folder)
-    assert kinect.frames[0].read_colour().shape == (6, 8, 3) and kinect.frames[0].encoded_colour is None
+    shown = cv2.imdecode(np.frombuffer(kinect.frames[0].encoded_colour().contents, np.uint8), cv2.IMREAD_COLOR)
+    assert kinect.frames[0].read_colour().shape == shown.shape == (6, 8, 3)
+
+
+def two_walls(folder: Path, seen_at: Callable[[int], int]) -> Path:
+    """A dark board 1 m away before a bright wall at 2 m, whose sides the colour image shows at columns `seen_at` those
+    of the depth image.
+    """
+    folder.mkdir(parents=True)
+    for number in range(4):
+        sides = 200 + 10 * number, 400
+        depth = np.full((480, 640), 2000, np.uint16)
+        depth[:, sides[0] : sides[1]] = 1000
+        colour = np.full((480, 640, 3), 200, np.uint8)
+        colour[:, seen_at(sides[0]) : seen_at(sides[1])] = 40
+        cv2.imwrite(str(folder / f"frame-{number:06d}.depth.png"), depth)
+        cv2.imwrite(str(folder / f"frame-{number:06d}.color.png"), colour)
+    return folder
+
+
+def test_edges_tell_where_colour_was_seen_from(tmp_path: Path) -> None:
+    beside = two_walls(tmp_path / "a/seq-01", lambda u: round(525 / 585 * (u - 320) + 320 - 13.125))
+    here = two_walls(tmp_path / "b/seq-01", lambda u: u)
+    found, same = (SevenScenesReader().open(folder) for folder in (beside, here))
+    assert any("of a camera 2.5 cm beside" in note for note in found.notes)
+    assert not any("beside" in note for note in same.notes)
+    depth, colour = found.frames[0].read_depth(), found.frames[0].read_colour()
+    dark = colour[240, :, 0] < 120
+    assert np.abs(np.flatnonzero(np.diff(dark)) - np.flatnonzero(np.diff(depth[240] < 1.5))).max() <= 8
+    np.testing.assert_array_equal(same.frames[0].read_colour()[240, :, 0] < 120, same.frames[0].read_depth()[240] < 1.5)
+
+
+def test_depth_is_read_again_where_its_file_has_changed(tmp_path: Path) -> None:
+    folder = two_walls(tmp_path / "seq-01", lambda u: u)
+    frame = SevenScenesReader(colour_camera="kinect").open(folder).frames[0]
+    before = frame.read_depth()
+    before[:] = 0  # no one else's
+    assert frame.read_depth().max() == pytest.approx(2)
+    cv2.imwrite(str(folder / "frame-000000.depth.png"), np.full((480, 640), 3000, np.uint16))
+    os.utime(folder / "frame-000000.depth.png", ns=(1, 1))
+    assert frame.read_depth().max() == pytest.approx(3)
 
 
 def edge_contrast(reader: SevenScenesReader, folder: Path) -> float:

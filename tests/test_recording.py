@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -288,6 +289,22 @@ def test_of_many_frames_few_images_are_read_to_know_their_size() -> None:
     picked, _ = image_rows(frames, RecordingOptions(max_megabytes=1.0))
     assert len(read) <= 64
     assert 0.7 * 0.85e6 < sum(1000 + row % 7 * 50 for row in picked.tolist()) <= 0.85e6
+
+
+def test_images_that_told_the_sizes_are_not_encoded_again(tmp_path: Path) -> None:
+    read: list[str] = []
+
+    def image(name: str) -> EncodedImage:
+        read.append(name)
+        return EncodedImage(png(0, 3), "image/png")
+
+    frames = [
+        replace(frame, encoded_colour=partial(image, f"c{row}"), encoded_depth=partial(image, f"d{row}"))
+        for row, frame in enumerate(make_frames(12))
+    ]
+    recording = record(tmp_path)
+    recording.frames("test", frames, [])
+    assert len(read) == len(set(read)) == 24
 
 
 def test_levels(tmp_path: Path) -> None:

@@ -396,8 +396,19 @@ def test_an_estimated_read_out_is_told_and_used_by_the_frames(
 
 
 @pytest.mark.parametrize(
-    ("step_s", "first_s", "is_tracked"), [(1 / 30, 0.5, True), (0.7, 0.5, False), (1.0, 0.0, False)]
+    ("step_s", "first_s", "numbered_hz", "is_tracked"),
+    [
+        (1 / 30, 0.5, 0.0, True),
+        (0.7, 0.5, 0.0, False),
+        (1.0, 0.0, 0.0, False),
+        (4.0, 0.0, 30.0, True),
+        (8.0, 0.0, 30.0, False),
+    ],
 )
-def test_stills_and_frames_without_a_clock_are_no_video(step_s: float, first_s: float, is_tracked: bool) -> None:
-    frames = tuple(Frame(row, first_s + row * step_s) for row in range(60))
-    assert is_video(Source("s", Path("s"), frames)) == is_tracked
+def test_stills_and_frames_without_a_clock_are_no_video(
+    step_s: float, first_s: float, numbered_hz: float, is_tracked: bool
+) -> None:
+    frames = tuple(Frame(row, first_s + row * step_s, read_depth=partial(np.ones, (6, 8))) for row in range(60))
+    assert is_video(Source("s", Path("s"), frames, numbered_hz=numbered_hz)) == is_tracked
+    scans = tuple(replace(frame, read_depth=None) for frame in frames)
+    assert not is_video(Source("s", Path("s"), scans, numbered_hz=numbered_hz))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import rerun as rr
@@ -29,6 +31,7 @@ the largest is 1.2 times the mean, and the mean of 16 is known to 3 %."""
 
 def log_frames(part: Part, name: str, frames: Sequence[Frame], notes: Sequence[str]) -> None:
     """Log encoded images, cameras and names of the frames; `notes` are the reader's."""
+    frames = _sized_once(frames)
     stream, (rows, thinned) = part.stream, image_rows(frames, part.options)
     log_markdown(
         stream, layout.SOURCE, "\n".join([f"# {name}", counted(len(frames), "frame"), *(f"- {n}" for n in notes)])
@@ -57,6 +60,17 @@ def image_rows(frames: Sequence[Frame], options: RecordingOptions) -> tuple[Ints
     rows = np.arange(0, len(frames), every) if every <= len(frames) else np.arange(0)
     told = f"images of {len(rows)} of {len(frames)} frames, to stay under {options.max_megabytes:g} MB"
     return rows, f"{told} (recording.max_megabytes)" if every > 1 else ""
+
+
+def _sized_once(frames: Sequence[Frame]) -> list[Frame]:
+    """The frames; those that tell the size of all images keep theirs, to be logged without being encoded anew."""
+    kept = list(frames)
+    for row in evenly(len(frames), SIZED_FRAMES):
+        depth, colour = kept[row].encoded_depth, kept[row].encoded_colour
+        kept[row] = replace(
+            kept[row], encoded_depth=depth and cache(depth), encoded_colour=colour and cache(colour)
+        )  # fmt: skip
+    return kept
 
 
 def _sizes(frames: Sequence[Frame]) -> Floats:

@@ -10,6 +10,7 @@ import numpy as np
 from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, in_unit, name_cycle, ranked
+from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.report.document import Banner, Document, Mark, Picture, Section, Table
 from hodge_pipeline.report.energy import CAVEAT, PARTS, EnergyRow
 from hodge_pipeline.report.tables import number
@@ -163,13 +164,13 @@ def _edge_row(contents: PageContents, row: int) -> tuple[str, ...]:
     graph, diagnosis = contents.graph, contents.diagnosis
     i, j = graph.vertex_ids[graph.edges[row]]
     far, degrees = diagnosis.residual_m[row], number(diagnosis.residual_deg[row], ".2f", "°")
-    off = number(far * 100, ".1f", " cm") if contents.has_metres else number(far, ".3g"), degrees
+    off = length(far) if contents.has_metres else number(far, ".3g"), degrees
     return (
         f"{i}–{j}",
         str(diagnosis.verdict[row]),
         contents.advice[row],
-        _cycles(contents, diagnosis.witnesses_against[row]),
-        _cycles(contents, diagnosis.witnesses_for[row]),
+        _cycles(contents, diagnosis.witnesses_against[row]) or _without_cycle(contents, row),
+        _cycles(contents, diagnosis.witnesses_for[row]) or "none",
         str(graph.source[row]),
         number(100 * diagnosis.probability[row], ".0f", " %"),
         ", ".join(off) if np.isfinite(diagnosis.residual_m[row]) else "–",
@@ -185,7 +186,13 @@ def _cycles(contents: PageContents, rows: Ints) -> str:
         edges = frozenset(cycles.loops.edge[cycles.loops.offsets[row] : cycles.loops.offsets[row + 1]].tolist())
         error = in_unit(cycle_error(cycles, row), contents.has_metres)
         told.setdefault(edges, f"{name_cycle(contents.graph, cycles, row)} {error}")
-    return "; ".join(list(told.values())[:CYCLES_EACH]) or "none"
+    return "; ".join(list(told.values())[:CYCLES_EACH])
+
+
+def _without_cycle(contents: PageContents, row: int) -> str:
+    """What speaks against an edge where no cycle is listed, such as a backbone."""
+    is_bad = contents.diagnosis.verdict[row] in (WRONG, SUSPECT)
+    return in_unit(contents.diagnosis.reason[row], contents.has_metres) if is_bad else "none"
 
 
 def _suggestions(contents: PageContents) -> Iterator[Section]:

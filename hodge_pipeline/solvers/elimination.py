@@ -115,11 +115,12 @@ def plan_elimination(
     core_order: Callable[[csc_matrix], Ordering],
     most_neighbours: int = MOST_NEIGHBOURS,
     fewest: int = FEWEST_IN_ROUND,
+    smallest_core: int = 0,
 ) -> Elimination:
     """The rounds for a graph of `count` vertices with edges (tail, head); those at or past `count` are pinned.
 
     `core_order` gives the elimination order of the core's pattern. A vertex of more than `most_neighbours` stays in the
-    core, and so do all when a round would have less than `fewest`.
+    core, and so do all when a round would have less than `fewest`, or where no more than `smallest_core` are left.
     """
     inside = (tail < count) & (head < count) & (tail != head)
     low, high = np.minimum(tail, head)[inside], np.maximum(tail, head)[inside]
@@ -128,7 +129,7 @@ def plan_elimination(
     priority = np.random.default_rng(0).permutation(count)
     rounds: list[tuple[Ints, Ints]] = []
     left = count
-    while left:
+    while left > smallest_core:
         low, high = np.divmod(pairs, count)
         chosen = _independent(low, high, alive, left, priority, most_neighbours, fewest)
         if chosen is None:

@@ -76,7 +76,7 @@ class KeyFrameStart(OdometryStart):
         default=300,
         description="frames: a source of so many is registered whole; a longer one is tracked from key frame to key "
         "frame, which are chosen by how far the camera moved and by what it still sees. auto: a video, whose frames "
-        "a clock says to be at most 0.2 s apart, is tracked at any length, all else as 300",
+        "are at most 0.2 s apart by a clock or by their numbers, is tracked at any length, all else as 300",
     )
     distance_m: float = Field(
         default=0.1,
@@ -120,9 +120,13 @@ class KeyFrameStart(OdometryStart):
 
 
 def is_video(source: Source) -> bool:
-    """Whether a clock says that most frames follow each other at the rate of a video."""
-    stamps = np.array([frame.stamp_s for frame in source.frames])
-    return len(stamps) > 1 and has_real_stamps(source.frames) and float(np.median(np.diff(stamps))) <= VIDEO_STEP_S
+    """Whether it has depth images most of which, by a clock or by numbers that count so many a second, follow each
+    other at the rate of a video.
+    """
+    a_second = 1.0 if has_real_stamps(source.frames) else source.numbered_hz
+    if len(source.frames) < 2 or not a_second or not any(frame.read_depth for frame in source.frames):
+        return False
+    return float(np.median(np.diff([frame.stamp_s for frame in source.frames]))) <= VIDEO_STEP_S * a_second
 
 
 def followers(source: Source, tracked: Tracked) -> KeyFrames:

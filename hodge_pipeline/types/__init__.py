@@ -129,6 +129,7 @@ class Source:
     - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
     - `of_cameras`: its format says that poses are cameras', z ahead and y down; a graph of others is a robot's, z up.
     - `in_metres`: False for a model of images alone, whose lengths are in a unit of its own.
+    - `numbered_hz`: how many of its frames' numbers, which are their stamps, make a second; 0: that is not known.
     """
 
     name: str
@@ -143,6 +144,7 @@ class Source:
     of_cameras: bool = False
     doubts: tuple[str, ...] = ()
     in_metres: bool = True
+    numbered_hz: float = 0.0
 
     def __repr__(self) -> str:
         parts = [f"{len(self.frames)} frames"]

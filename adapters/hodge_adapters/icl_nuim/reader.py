@@ -34,6 +34,8 @@ ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
 REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
 TRUTH_PATTERN = "*.gt.freiburg*"
 MAX_GAP_FRAMES = 1.0
+VIDEO_HZ = 30.0
+"""At which its frames are rendered, along a path that was walked."""
 SNIFFED_BYTES = 1 << 16
 
 
@@ -133,7 +135,9 @@ class IclNuimReader:
             notes.append(f"{without} of {len(poses)} frames have no truth")
         frames = self._frames(listing, ICL, poses, 5000.0, notes, is_true=True)
         files = (*listing.files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour))
-        return Source(path.resolve().name, path, frames, trajectory, notes=tuple(notes), files=files)
+        return Source(
+            path.resolve().name, path, frames, trajectory, notes=tuple(notes), files=files, numbered_hz=VIDEO_HZ
+        )
 
     def _frames(
         self,
@@ -170,7 +174,15 @@ class IclNuimReader:
         camera = own.camera_of(colours, notes) if colours else own.camera((640, 480))
         frames, files = pov_frames(pov, camera, self.depth_scale or 1.0, notes)
         every = tuple(frames[:: self.every])
-        return Source(path.resolve().name, path, every, posed_frames(frames), notes=tuple(notes), files=files)
+        return Source(
+            path.resolve().name,
+            path,
+            every,
+            posed_frames(frames),
+            notes=tuple(notes),
+            files=files,
+            numbered_hz=VIDEO_HZ,
+        )
 
     def _open_redwood(self, path: Path) -> Source:
         notes: list[str] = []
@@ -189,7 +201,9 @@ class IclNuimReader:
         default = read_intrinsics(own) if own else REDWOOD
         frames = self._frames(listing, default, poses, 1000.0, notes, is_true=False)
         files = (*filter(None, [log, own]), *listing.depth, *filter(None, listing.colour))
-        return Source(path.resolve().name, path, frames, notes=tuple(notes), files=files, doubts=doubts)
+        return Source(
+            path.resolve().name, path, frames, notes=tuple(notes), files=files, doubts=doubts, numbered_hz=VIDEO_HZ
+        )
 
 
 def _estimated(path: Path, numbers: list[int], notes: list[str]) -> tuple[Floats, Path | None]:

@@ -122,16 +122,17 @@ def encoded_straight_depth(read: Callable[[], Floats32], lens: Lens, units_per_m
 
 def encoded_straight_colour(read: Callable[[], Bytes], lens: Lens) -> EncodedImage:
     """The straight colour image as JPEG."""
-    return _jpeg(straight_colour(read, lens))
+    return as_jpeg(straight_colour(read, lens))
 
 
 def encoded_colour(path: Path, size: tuple[int, int]) -> EncodedImage:
     """The file's bytes untouched where it has the camera's (width, height), else the image of that size as JPEG."""
     fits = pixels.image_size(path) == size
-    return pixels.encoded(path) if fits else _jpeg(pixels.read_colour(path, size=size))
+    return pixels.encoded(path) if fits else as_jpeg(pixels.read_colour(path, size=size))
 
 
-def _jpeg(image: Bytes) -> EncodedImage:
+def as_jpeg(image: Bytes) -> EncodedImage:
+    """A colour image (H, W, 3) as JPEG."""
     contents = _encoded(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return EncodedImage(contents, "image/jpeg")
 

@@ -56,10 +56,10 @@ def read_colour(path: Path, *, size: tuple[int, int] | None = None) -> Bytes:
 
     Raises `SourceError` as `read_depth` does.
     """
-    stored = _decoded(path, size, cv2.IMREAD_COLOR, any_scale=True)
+    stored = _decoded(path, size, cv2.IMREAD_COLOR_RGB, any_scale=True)
     if size is not None and stored.shape[1::-1] != size:
         stored = cv2.resize(stored, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.cvtColor(stored, cv2.COLOR_BGR2RGB), np.uint8)
+    return np.asarray(stored, np.uint8)
 
 
 def _decoded(path: Path, size: tuple[int, int] | None, how: int, any_scale: bool = False) -> Any:

@@ -1,7 +1,8 @@
 """7-Scenes, and 3DMatch's copies of it: `seq-01/frame-000000.{color,depth,pose}.*`, poses camera to world.
 
 Depth is uint16 millimetres, where both 0 and 65535 mean no depth. Depth and colour are, as the data set's authors say,
-not calibrated to each other: the depth camera's intrinsics are used for both, unless an option says otherwise.
+not calibrated to each other: colour is brought onto the depth's pixels as a Kinect is built, unless edges speak for
+images that are calibrated, as those of re-exports.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -21,6 +21,13 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.frames import image_frame
+from hodge_adapters.seven_scenes.colour import (
+    DepthFile,
+    encoded_registered_colour,
+    is_beside,
+    read_depth,
+    read_registered_colour,
+)
 from hodge_adapters.seven_scenes.files import (
     FRAME_FILE,
     FrameFiles,
@@ -34,13 +41,11 @@ from hodge_adapters.seven_scenes.files import (
 from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source, Trajectory
+from hodge_pipeline.types import Camera, Floats, Frame, Source, Trajectory
 
+VIDEO_HZ = 30.0
+"""A Kinect's frames a second, which the files' numbers count."""
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0, (640, 480))
-KINECT_COLOUR_FOCAL, KINECT_BASELINE_M = 525.0, 0.025
-"""Of a Kinect's colour camera as built: parallel to the depth camera, which sees it at its left."""
-ASSUMED_DEPTH_M = 2.0
-"""Where a whole image has no depth."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -61,11 +66,11 @@ class SevenScenesReader:
     no_depth: tuple[int, ...] = Field(
         (0, 65535), description="stored values that mean no depth; 7-Scenes has 65535, its re-exports have 0 as well"
     )
-    colour_camera: Literal["same", "kinect"] = Field(
-        "same",
+    colour_camera: Literal["auto", "same", "kinect"] = Field(
+        "auto",
         description="where colour was seen from: same as depth, as if they were calibrated; kinect: 525 pixels and "
-        "2.5 cm beside, as the sensor is built (on red kitchen the colour gradient at edges of depth is then 2.3 times "
-        "that elsewhere instead of 1.3)",
+        "2.5 cm beside, as the sensor is built; auto: kinect where colour changes more at edges of depth then, which "
+        "a few images tell (red kitchen: 2.6 to 3.5 times as much as elsewhere, in place of 1.3)",
     )
 
     def sniff(self, path: Path) -> Sniff:
@@ -95,15 +100,19 @@ class SevenScenesReader:
         camera, camera_files = self._camera(path, usable, notes)
         colours = [files.paths.get("color") for files in usable]
         colour_size = pixels.colour_size(colours, (camera.width, camera.height), notes)
+        is_beside = self._is_beside(usable, camera, notes)
         poses = read_poses(usable, notes)
         several = len({files.sequence for files in usable}) > 1
         taken = [row for row, files in enumerate(usable) if files.rank % self.every == 0]
         return Source(
             name=path.resolve().name,
             path=path,
-            frames=tuple(self._frame(usable[row], camera, poses[row], several, colour_size) for row in taken),
+            frames=tuple(
+                self._frame(usable[row], camera, poses[row], several, colour_size, is_beside) for row in taken
+            ),
             trajectory=None if several else _trajectory(usable, poses),
             notes=tuple(notes),
+            numbered_hz=VIDEO_HZ,
             files=(*camera_files, *(file for files in usable for file in sorted(files.paths.values()))),
         )
 
@@ -145,8 +154,27 @@ class SevenScenesReader:
         camera = found.camera_of(depth, notes)
         return camera, tuple(beside[:1])
 
+    def _is_beside(self, usable: Sequence[FrameFiles], camera: Camera, notes: list[str]) -> bool:
+        """Whether colour is that of a camera beside the depth camera."""
+        if self.colour_camera != "auto":
+            return self.colour_camera == "kinect"
+        both = [files for files in usable if "color" in files.paths]
+        found = is_beside([files.paths["color"] for files in both], [self._depth(files, camera) for files in both])
+        if found:
+            notes.append(
+                "colour is of a camera 2.5 cm beside the depth camera, a Kinect's, which edges tell: it is brought "
+                "onto depth's pixels (colour_camera=same: it is not)"
+            )
+        return found
+
     def _frame(
-        self, files: FrameFiles, camera: Camera, pose: Floats, several: bool, colour_size: tuple[int, int]
+        self,
+        files: FrameFiles,
+        camera: Camera,
+        pose: Floats,
+        several: bool,
+        colour_size: tuple[int, int],
+        is_beside: bool,
     ) -> Frame:
         frame = image_frame(
             f"{files.sequence}/{files.number:06d}" if several else files.number,
@@ -161,46 +189,22 @@ class SevenScenesReader:
             sequence=files.sequence,
             colour_size=colour_size,
         )
-        if self.colour_camera == "same" or "color" not in files.paths:
+        if not is_beside or "color" not in files.paths:
             return frame
-        read = partial(
-            read_registered_colour,
-            files.paths["color"],
-            depth_path=files.paths["depth"],
-            camera=camera,
-            units_per_metre=self.depth_scale,
-            no_depth=self.no_depth,
+        colour, depth = files.paths["color"], self._depth(files, camera)
+        return replace(
+            frame,
+            read_depth=partial(read_depth, depth),
+            read_colour=partial(read_registered_colour, colour, depth),
+            encoded_colour=partial(encoded_registered_colour, colour, depth),
+            image=None,
         )
-        return replace(frame, read_colour=read, encoded_colour=None, image=None)
+
+    def _depth(self, files: FrameFiles, camera: Camera) -> DepthFile:
+        return DepthFile(files.paths["depth"], camera, self.depth_scale, self.no_depth)
 
 
 def _trajectory(usable: Sequence[FrameFiles], poses: Floats) -> Trajectory | None:
     good = np.isfinite(poses).all(axis=(1, 2))
     stamps = np.array([files.number for files in usable], np.float64)
     return Trajectory(stamps[good], poses[good]) if good.any() else None
-
-
-def read_registered_colour(
-    path: Path, *, depth_path: Path, camera: Camera, units_per_metre: float, no_depth: tuple[int, ...]
-) -> Bytes:
-    """Colour (H, W, 3) of a Kinect on the pixels of its depth image: black where the colour camera does not look.
-
-    Pixels without depth are taken to be as far as the median of the others. What the colour camera cannot see from
-    where it stands gets the colour of what hides it: at 2.5 cm beside, a rim of a few pixels.
-    """
-    size = camera.width, camera.height
-    image = pixels.read_colour(path, size=size)
-    depth = pixels.read_depth(depth_path, units_per_metre=units_per_metre, no_depth=no_depth, size=size)
-    return np.asarray(
-        cv2.remap(image, *colour_pixels(depth, camera), cv2.INTER_LINEAR, borderValue=(0, 0, 0)), np.uint8
-    )
-
-
-def colour_pixels(depth_m: Floats32, camera: Camera) -> tuple[Floats32, Floats32]:
-    """For each pixel of the depth image (H, W) the column and row where the colour camera sees it."""
-    valid = depth_m > 0
-    z = np.where(valid, depth_m, np.median(depth_m[valid]) if valid.any() else ASSUMED_DEPTH_M)
-    v, u = np.indices(depth_m.shape)
-    columns = KINECT_COLOUR_FOCAL * ((u - camera.cx) / camera.fx - KINECT_BASELINE_M / z) + camera.cx
-    rows = KINECT_COLOUR_FOCAL * (v - camera.cy) / camera.fy + camera.cy
-    return np.asarray(columns, np.float32), np.asarray(rows, np.float32)

@@ -19,8 +19,10 @@ from hodge_pipeline.solvers.elimination import (
 )
 from hodge_pipeline.types import Floats, Ints
 
-MOST_NEIGHBOURS, FEWEST_IN_ROUND = 24, 6
-"""Of a vertex that is eliminated in a round, and vertices of a round: what is left is inverted densely."""
+MOST_NEIGHBOURS, FEWEST_IN_ROUND, SMALLEST_CORE = 24, 6, 64
+"""Of a vertex that is eliminated in a round, vertices of a round, and vertices that are inverted densely at once:
+rounds of fewer take longer.
+"""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Network:
         place = np.empty(count, np.int64)
         place[free], place[held] = np.arange(len(free)), np.arange(len(free), count)
         tail, head = place[edges].T
-        plan = plan_elimination(tail, head, len(free), _as_they_are, MOST_NEIGHBOURS, FEWEST_IN_ROUND)
+        plan = plan_elimination(tail, head, len(free), _as_they_are, MOST_NEIGHBOURS, FEWEST_IN_ROUND, SMALLEST_CORE)
         place[free[plan.order]] = np.arange(len(free))
         low, high = np.sort(place[edges], axis=1).T
         slot = np.where(high < len(free), np.searchsorted(plan.keys, low * len(free) + high), -1)

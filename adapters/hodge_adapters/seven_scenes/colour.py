@@ -1,0 +1,150 @@
+"""Colour of a Kinect, whose camera is beside the depth camera: told by edges, and brought onto the depth's pixels."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hodge_adapters.images import pixels
+from hodge_adapters.images.frames import as_jpeg
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.types import Bytes, Camera, EncodedImage, Floats, Floats32
+from hodge_pipeline.types.arrays import evenly
+
+COLOUR_FOCAL, BASELINE_M = 525.0, 0.025
+"""Of a Kinect's colour camera as built: parallel to the depth camera, which sees it at its left."""
+SIZE = 640, 480
+ASSUMED_DEPTH_M = 2.0
+"""Where a whole image has no depth."""
+MEDIAN_STRIDE = 4
+"""Pixels between two of those whose median depth the others get: all of them would take as long as the rest."""
+FRAMES, FEWEST_FRAMES, FEWEST_EDGES = 8, 3, 100
+"""That are looked at, evenly spread, to tell the camera; the last: pixels of an image at edges of its depth."""
+EDGE_STEP = 0.05
+"""Share of the nearer depth by which neighbours at an edge differ."""
+LEAST_CHANGE = 1.0
+"""Grey levels, for noise: an image of one even shade says nothing."""
+SURE = 2.5
+"""Standard errors of the mean over the frames. Red kitchen's and stairs' frames have 7 to 10 for a camera beside;
+fr1/xyz, fr1/rpy, fr3/cabinet and ICL-NUIM, whose colour lies on depth, 0 to 13 against it.
+"""
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """A depth image, the depth camera, the stored units of a metre, and the values that mean no depth."""
+
+    path: Path
+    camera: Camera
+    units_per_metre: float
+    no_depth: tuple[int, ...]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.camera.width, self.camera.height
+
+    def read(self) -> Floats32:
+        """The image (H, W), metres."""
+        return pixels.read_depth(
+            self.path, units_per_metre=self.units_per_metre, no_depth=self.no_depth, size=self.size
+        )
+
+
+def is_beside(colour: Sequence[Path], depth: Sequence[DepthFile]) -> bool:
+    """Whether colour surely changes more where a Kinect's colour camera would see the edges of depth than where the
+    depth camera sees them. Images that cannot be read are left out; False where too few are left.
+    """
+    gains = []
+    for row in evenly(len(depth), FRAMES):
+        own = depth[row]
+        try:
+            gains.append(_gain(own.read(), pixels.read_colour(colour[row], size=own.size), own.camera))
+        except (SourceError, OSError):
+            continue
+    known = np.array(gains)[np.isfinite(gains)]
+    if len(known) < FEWEST_FRAMES or depth[0].size != SIZE:
+        return False
+    return bool(known.mean() > SURE * known.std() / np.sqrt(len(known)))
+
+
+def _gain(depth_m: Floats32, colour: Bytes, camera: Camera) -> float:
+    """Logarithm of the mean change of grey values along rows where the colour camera sees edges of depth, over that
+    where the depth camera sees them; NaN of too few edges.
+    """
+    grey = cv2.blur(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), (3, 3))
+    change = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))
+    left, right = depth_m[:, :-1], depth_m[:, 1:]
+    nearer = np.minimum(left, right)
+    v, u = np.nonzero((nearer > 0) & (np.abs(left - right) > EDGE_STEP * nearer))
+    far = _seen_far(np.asarray(u + 0.5, float), v.astype(float), camera)
+    columns = np.round(far[0] - COLOUR_FOCAL * BASELINE_M / nearer[v, u]).astype(np.int64)
+    rows = np.round(far[1]).astype(np.int64)
+    inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
+    if inside.sum() < FEWEST_EDGES:
+        return float("nan")
+    beside, here = change[rows[inside], columns[inside]].mean(), change[v[inside], u[inside]].mean()
+    return float(np.log((beside + LEAST_CHANGE) / (here + LEAST_CHANGE)))
+
+
+def _seen_far(u: Floats, v: Floats, camera: Camera) -> tuple[Floats, Floats]:
+    """Columns and rows at which the colour camera sees pixels of the depth camera that look at something far."""
+    wider_u, wider_v = COLOUR_FOCAL / camera.fx, COLOUR_FOCAL / camera.fy
+    return wider_u * (u - camera.cx) + camera.cx, wider_v * (v - camera.cy) + camera.cy
+
+
+def colour_pixels(depth_m: Floats32, camera: Camera) -> tuple[Floats32, Floats32]:
+    """For each pixel of the depth image (H, W) the column and row where the colour camera sees it."""
+    some = depth_m[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
+    known = some[some > 0]
+    middle = np.median(known) if len(known) else ASSUMED_DEPTH_M
+    columns, rows = _all_seen_far(camera)
+    parallax = np.float32(COLOUR_FOCAL * BASELINE_M) / np.where(depth_m > 0, depth_m, np.float32(middle))
+    return np.asarray(columns - parallax, np.float32), rows
+
+
+@lru_cache(maxsize=2)
+def _all_seen_far(camera: Camera) -> tuple[Floats32, Floats32]:
+    v, u = np.indices((camera.height, camera.width), dtype=float)
+    columns, rows = _seen_far(u, v, camera)
+    return columns.astype(np.float32), rows.astype(np.float32)
+
+
+def read_registered_colour(path: Path, depth: DepthFile) -> Bytes:
+    """Colour (H, W, 3) of a Kinect on the pixels of its depth image: black where the colour camera does not look.
+
+    Pixels without depth are taken to be as far as the median of the others. What the colour camera cannot see from
+    where it stands gets the colour of what hides it: at 2.5 cm beside, a rim of a few pixels.
+    """
+    image = pixels.read_colour(path, size=depth.size)
+    seen = colour_pixels(_read_last(depth, _changed(depth.path)), depth.camera)
+    return np.asarray(cv2.remap(image, *seen, cv2.INTER_LINEAR, borderValue=(0, 0, 0)), np.uint8)
+
+
+def encoded_registered_colour(path: Path, depth: DepthFile) -> EncodedImage:
+    """The same as JPEG."""
+    return as_jpeg(read_registered_colour(path, depth))
+
+
+def read_depth(depth: DepthFile) -> Floats32:
+    """The depth image (H, W), not decoded again where the frame's colour was read just now."""
+    return _read_last(depth, _changed(depth.path)).copy()
+
+
+@lru_cache(maxsize=1)
+def _read_last(depth: DepthFile, changed: int) -> Floats32:
+    return depth.read()
+
+
+def _changed(path: Path) -> int:
+    """When the file was last written, nanoseconds; 0 where that cannot be told: reading it says why."""
+    try:
+        return os.stat(path).st_mtime_ns
+    except (OSError, ValueError):
+        return 0
