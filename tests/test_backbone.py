@@ -71,6 +71,16 @@ def test_the_reduced_chain_ends_at_the_minimum_over_all_poses(dimension: int) ->
     assert again.metrics["objective_at_start"] == pytest.approx(exact.metrics["chi2"], rel=1e-3)
 
 
+def test_an_odometry_that_turns_wrongly_by_six_degrees_a_step_is_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.backbone_graphs.STEP", (0.1, 0.1))
+    monkeypatch.setattr("tests.backbone_graphs.LOOP", (0.1, 0.1))
+    made = drive(seed=2, count=800, loops=390, wrong=0.0, world="room")
+    found = find_backbone(made.graph)
+    assert found is not None
+    assert found.used.all()
+    assert made.error_m(found.world_from_cam) < 0.3
+
+
 def test_left_out_residuals_are_those_of_a_solve_without_the_loop() -> None:
     chain = chain_of(drive(wrong=0.0, loops=12).graph)
     found = settled(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses)), 30, 1e-12)

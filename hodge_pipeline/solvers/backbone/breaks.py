@@ -140,7 +140,7 @@ class Testimony:
 class Usual:
     """How a chain's steps usually are: the `centres (K, 4, 4)` of their kinds, as ahead and round a corner, the most
     frequent first, with their `shares (K,)` and one `covariance (p, p)`, which steps are of a `kind (n,)`, and how many
-    nats more `unusual (n,)` each is than the most unusual of as many should be.
+    nats more `unusual (n,)` each is, beside its nearest kind, than the most unusual of as many should be.
     """
 
     centres: Floats
@@ -161,12 +161,14 @@ class Usual:
             covariance += np.diag(LEAST * np.diag(covariance) + np.finfo(float).tiny ** 0.5)
             chi2 = gaussian(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[1]
             weight = (FREEDOM + left.shape[1]) / (FREEDOM + chi2)
+        centres, shares, of_one = _kinds(left, chi2, covariance)
+        white = np.linalg.inv(root(covariance[None])[0])
+        chi2 = np.min([(((left - centre) @ white.T) ** 2).sum(axis=1) for centre in centres], axis=0)
         size = np.log(np.maximum(chi2, np.finfo(float).tiny)) / 2
         floor = np.quantile(size, 1 - TAIL)
         mean = float(np.mean(size[size > floor] - floor)) if (size > floor).any() else np.inf
         unusual = np.full(chain.size, -np.inf)
         unusual[rows] = np.maximum((size - floor) / mean + np.log(1 / TAIL), 0.0) - np.log(len(rows))
-        centres, shares, of_one = _kinds(left, chi2, covariance)
         kind = np.zeros(chain.size, bool)
         kind[rows] = of_one
         return cls(chain.exp(centre + centres), shares, covariance, kind, unusual)

@@ -16,7 +16,8 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.sparse import Factored, Network
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 
 @dataclass(frozen=True)
@@ -280,6 +281,19 @@ def settled(fit: Fit, steps: int, least_won: float = LEAST_WON) -> Fit:
         if not fit.cost < before:
             break
     return fit
+
+
+def from_rotations(linear: Linear, rows: Ints) -> Linear:
+    """The chain at poses that begin at its chordal rotations with these loops, which need no start."""
+    chain, at = linear.chain, np.flatnonzero(linear.chain.inner)
+    edges = np.concatenate([np.stack([at - 1, at], axis=1), chain.ends[rows]])
+    information = np.zeros((len(edges), 6, 6))
+    of_axes = inverse(np.concatenate([chain.step_covariance[at], chain.covariance[rows]]))
+    information[:, chain.axes[:, None], chain.axes] = of_axes
+    motion = np.concatenate([chain.step[at], chain.motion[rows]])
+    graph = ViewGraph.from_edges(np.arange(chain.size), edges, motion, information)
+    found = solve(graph, start=linear.poses, objective="isotropic", dimension=2 if len(chain.axes) == 3 else 3)
+    return linearise(chain, found.world_from_cam)
 
 
 LEAST_LEFT = 1e-6

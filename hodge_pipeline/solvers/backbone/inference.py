@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, Scales, Wrong, learn_scales, mixture, student
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, linearise, root, settled, without
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, from_rotations, linearise, root, settled, without
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -116,6 +116,10 @@ def _inferred(
         if not thin and len(reduced.active) < len(rows):
             return None
         fit = settled(Fit(reduced, linear), MOST_STEPS)
+        if number == SETTLING and fit.cost > len(reduced.active) * len(chain.axes):
+            # more than right loops should leave: the descent may have ended in a valley beside
+            other = settled(Fit(reduced, from_rotations(linear, reduced.active)), MOST_STEPS)
+            fit = min(fit, other, key=lambda each: each.cost)
         linear = fit.linear
         judged = _judge(linear, fit, shares, wrong)
         shares, likelihood = mixture(judged.log_density)
