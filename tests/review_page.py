@@ -82,15 +82,6 @@ class Page:
         """What viser shows under a name; None while there is nothing."""
         return self.review.viewer.server.scene.get_handle_by_name(name) if self.review.viewer else None
 
-    def frames(self, count: int) -> None:
-        """Return when the scene has been drawn so many times more."""
-        script = """
-            const [count, done] = arguments, scene = document.getElementById('scene').contentWindow;
-            const wait = left => left ? scene.requestAnimationFrame(() => wait(left - 1)) : done();
-            wait(count);
-        """
-        self.browser.execute_async_script(script, count)
-
     def data(self, name: str) -> str | None:
         return self.browser.execute_script(f"return document.body.dataset.{name} ?? null")
 

@@ -182,7 +182,7 @@ def test_a_first_guess_by_the_handles_of_the_second_cloud(browser: Any, review: 
     handle = page.until(lambda: page.handle("/pair/second"))
     ways = np.outer([0.5, 0.6, 0.7, 0.9], [handle.scale, 0, 0])  # along the arrow of x
     pose = se3.from_quat_xyzw(np.array(handle.position), np.array(handle.wxyz)[[1, 2, 3, 0]])
-    page.frames(20)  # the handles are drawn a few frames after the server has made them
+    time.sleep(2)  # the handles are drawn a few frames after the server has made them
     arrow = se3.transform(pose, ways)
     page.click_scene(*arrow)
     page.until(lambda: "the place it was put at" in page.text("found"))
