@@ -6,6 +6,7 @@ And what keeps the tests cheap: the longest files begin first, and plots of one 
 from __future__ import annotations
 
 import atexit
+import functools
 import io
 import os
 import shutil
@@ -73,6 +74,7 @@ def plots_drawn_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
     if agg is not None and not file.startswith("test_report"):
         draw = agg.FigureCanvasAgg.print_png
 
+        @functools.wraps(draw)  # matplotlib passes what a signature has
         def print_png(canvas: Any, target: io.BytesIO, **options: Any) -> None:
             kind = [
                 (axes.get_xlabel(), axes.get_ylabel(), axes.get_xscale(), axes.get_yscale(), axes.has_data())

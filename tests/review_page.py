@@ -19,12 +19,6 @@ FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--disable-background-networking",
 )  # fmt: skip
-SLOWER = """
-    const soon = window.requestAnimationFrame.bind(window);
-    window.requestAnimationFrame = draw => window.setTimeout(() => soon(draw), 200);
-    window.cancelAnimationFrame = window.clearTimeout.bind(window);
-"""
-"""Five frames a second: without a GPU the scene, drawn as often as can be, leaves no processor to anything else."""
 
 
 def why_no_browser() -> str:
@@ -50,7 +44,6 @@ def start_browser(width: int = 1500, height: int = 1000, *flags: str) -> Any:
         options.add_argument(flag)
     browser = webdriver.Chrome(options=options, service=Service(str(shutil.which("chromedriver"))))
     browser.set_script_timeout(PATIENCE_S)
-    browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": SLOWER})
     return browser
 
 

@@ -66,10 +66,9 @@ def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]
         founds += [other for other in [judge(chain, scales=Scales())] if other is not None]
     for broken, least in [each for one in founds for each in _candidates(chain, one)]:
         tried = bridged(chain, broken)
-        for scales in (None, found.scales):  # as learned anew, and so that nothing but the step differs
-            other = judge(tried, scales=scales)
-            if other is not None and other.log_evidence > found.log_evidence + least:
-                return tried, other
+        same = judge(tried, scales=found.scales)  # so that nothing but the step differs
+        if same is not None and same.log_evidence > found.log_evidence + least:
+            return tried, judge(tried) or same
     return None
 
 
@@ -81,7 +80,7 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     usual, least, fold = Usual.of(chain), by_chance(len(right)), np.log(max(told.testimonies(), 1))
     agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
-    worth = [(each, least) for each in agreed[:MOST_TRIED]]
+    worth = [(each, least) for each in agreed[:MOST_TRIED] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
         fit = settled(Fit(found.reduced, linearise(linear.chain, found.poses)), MOST_STEPS)
         strained = strained_break(fit, usual)
