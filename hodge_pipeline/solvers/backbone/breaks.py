@@ -151,9 +151,12 @@ class Usual:
 
     @classmethod
     def of(cls, chain: Chain) -> Usual:
-        """By Student's distribution, which single steps hardly change, and the tail of the steps' own sizes."""
+        """By Student's distribution, which single steps hardly change, and the tail of the steps' own sizes: each step
+        stands for its mirror image too, since a turn to the right is no stranger than those to the left.
+        """
         rows = np.flatnonzero((chain.step_edge >= 0) & ~chain.bridged)
         twist = chain.log(chain.step[rows])
+        twist = np.concatenate([twist, twist @ _mirrored(chain, twist)])
         centre = np.median(twist, axis=0)
         left, weight = twist - centre, np.ones(len(twist))
         for _ in range(ROUNDS):
@@ -164,18 +167,26 @@ class Usual:
         centres, shares, of_one = _kinds(left, chi2, covariance)
         white = np.linalg.inv(root(covariance[None])[0])
         chi2 = np.min([(((left - centre) @ white.T) ** 2).sum(axis=1) for centre in centres], axis=0)
-        size = np.log(np.maximum(chi2, np.finfo(float).tiny)) / 2
+        size = np.log(np.maximum(chi2[: len(rows)], np.finfo(float).tiny)) / 2
         floor = np.quantile(size, 1 - TAIL)
         mean = float(np.mean(size[size > floor] - floor)) if (size > floor).any() else np.inf
         unusual = np.full(chain.size, -np.inf)
         unusual[rows] = np.maximum((size - floor) / mean + np.log(1 / TAIL), 0.0) - np.log(len(rows))
         kind = np.zeros(chain.size, bool)
-        kind[rows] = of_one
+        kind[rows] = of_one[: len(rows)]
         return cls(chain.exp(centre + centres), shares, covariance, kind, unusual)
 
     def off(self, chain: Chain, motion: Floats) -> Floats:
         """How far motions (M, 4, 4) are from each kind (K, M, p)."""
         return chain.log(se3.inverse(self.centres)[:, None] @ motion)
+
+
+def _mirrored(chain: Chain, twist: Floats) -> Floats:
+    """The symmetric (p, p) that turns twists (M, p) by 180° about the direction in which most of them move."""
+    ahead = np.zeros(6)
+    ahead[chain.axes] = np.median(twist, axis=0)
+    half = 2 * np.outer(ahead[3:], ahead[3:]) / max(float(ahead[3:] @ ahead[3:]), np.finfo(float).tiny) - np.eye(3)
+    return np.kron(np.eye(2), half)[np.ix_(chain.axes, chain.axes)]
 
 
 def _kinds(left: Floats, chi2: Floats, covariance: Floats) -> tuple[Floats, Floats, Bools]:
