@@ -14,7 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recording.shapes import up_and_ahead
 from hodge_pipeline.report import raster
-from hodge_pipeline.report.contents import EdgeRow, Path3D, Pictures, Report, SourceSummary, paths_of
+from hodge_pipeline.report.contents import EdgeRow, Pictures, Report, SourceSummary, paths_of
 from hodge_pipeline.report.painting import turns_deg
 from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud, Source
