@@ -1,6 +1,6 @@
 """Where the real data lies: `HODGE_DATA`, else `shared/data` beside the checkout. It is never part of the project.
 
-And what keeps the tests cheap: the longest files begin first, and plots of one kind are drawn once a file.
+And what keeps the tests cheap: the longest files begin first, and plots of one kind are drawn once a process.
 """
 
 from __future__ import annotations
@@ -65,13 +65,12 @@ _drawn: dict[tuple[object, ...], bytes] = {}
 
 @pytest.fixture(autouse=True)
 def plots_drawn_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """All plots are made; they are drawn in the tests of reports, and elsewhere the first of a kind in each file.
+    """All plots are made; they are drawn in the tests of reports, and elsewhere the first of a kind.
 
     They are half of what a small run costs.
     """
     agg: Any = sys.modules.get("matplotlib.backends.backend_agg")
-    file = request.path.stem
-    if agg is not None and not file.startswith("test_report"):
+    if agg is not None and not request.path.stem.startswith("test_report"):
         draw = agg.FigureCanvasAgg.print_png
 
         @functools.wraps(draw)  # matplotlib passes what a signature has
@@ -81,10 +80,10 @@ def plots_drawn_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
                 + (len(axes.lines), len(axes.collections), len(axes.patches))
                 for axes in canvas.figure.axes
             ]
-            if (file, *kind) not in _drawn:
+            if (*kind,) not in _drawn:
                 draw(canvas, new := io.BytesIO(), **options)
-                _drawn[file, *kind] = new.getvalue()
-            target.write(_drawn[file, *kind])
+                _drawn[*kind,] = new.getvalue()
+            target.write(_drawn[*kind,])
 
         monkeypatch.setattr(agg.FigureCanvasAgg, "print_png", print_png)
     yield

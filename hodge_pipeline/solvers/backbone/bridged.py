@@ -82,7 +82,7 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     worth = [(each, least) for each in agreed[:MOST_TRIED] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
-        fit = settled(Fit(found.reduced, linearise(linear.chain, found.poses)), MOST_STEPS)
+        fit = settled(Fit(found.reduced, found.linear), MOST_STEPS)
         strained = strained_break(fit, usual)
         if strained is not None and strained.log_evidence > BY_CHANCE:
             worth.append((strained, BY_CHANCE - strained.log_evidence))

@@ -94,8 +94,10 @@ def _floored(second_moment: Floats) -> Floats:
 
 def gaussian(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     """The log-density (M,) and χ² (M,) of residuals (M, p) with covariances (M, p, p)."""
-    factor = root(covariance)
-    white = np.linalg.solve(factor, residual[..., None])[..., 0]
+    factor, white = root(covariance), np.empty_like(residual)
+    for row in range(residual.shape[1]):  # by substitution, for all at once
+        above = np.einsum("mk,mk->m", factor[:, row, :row], white[:, :row])
+        white[:, row] = (residual[:, row] - above) / factor[:, row, row]
     chi2 = np.einsum("mi,mi->m", white, white)
     half_log = np.log(np.einsum("mii->mi", factor)).sum(axis=1) + 0.5 * residual.shape[1] * np.log(2 * np.pi)
     return -0.5 * chi2 - half_log, chi2
@@ -303,11 +305,11 @@ def _weighed(parts: Floats, turn: float, shift: float) -> Floats:
 
 def mixture(log_densities: Floats) -> tuple[Floats, float]:
     """The shares (k,) of classes with these log-densities (k, M) that are likeliest, and the log-likelihood."""
-    shares = np.full(len(log_densities), 1 / len(log_densities))
+    shares, top = np.full(len(log_densities), 1 / len(log_densities)), log_densities.max(axis=0)
+    density = np.exp(log_densities - top)
     for _ in range(30):
-        joint = log_densities + np.log(shares)[:, None]
-        total = np.logaddexp.reduce(joint, axis=0)
-        weight = np.exp(joint - total).sum(axis=1) + 0.5
+        total = shares @ density
+        weight = shares * (density @ (1 / total)) + 0.5
         shares = np.maximum(weight / weight.sum(), LEAST_SHARE)
         shares /= shares.sum()
-    return shares, float(total.sum())
+    return shares, float((np.log(total) + top).sum())

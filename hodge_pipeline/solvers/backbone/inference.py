@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -34,24 +34,36 @@ class Judged:
 
 @dataclass(frozen=True)
 class Inferred:
-    """The result: loops that are `used (M,)`, how all were judged, the poses of the used ones, and what their errors
-    were found to be: scales, and `loop_width (M,)`, factors on standard deviations for the last solve.
+    """The result: loops that are `used (M,)`, how all were judged, and the scales of errors that were learned.
 
-    - `start`: the bare chain with those scales; `reduced`: the network of the used loops, or of as many as `thinned`
-      leaves.
+    - `start`: the bare chain with those scales; `linear`: at the poses under which the loops were judged; `reduced`:
+      the network of the used loops, or of as many as `thinned` leaves.
     - `log_evidence`: of the loops as judged, against all being wrong. `confirmed`: whether they say more than chance;
       if not, none should be used: see `refused`.
     """
 
     used: Bools
     judged: Judged
-    poses: Floats
     scales: Scales
-    loop_width: Floats
     start: Linear
+    linear: Linear
     reduced: Reduced
     log_evidence: float
     confirmed: bool
+
+    @cached_property
+    def _polished(self) -> tuple[Linear, Floats]:
+        return polished(self.reduced, self.linear)
+
+    @property
+    def poses(self) -> Floats:
+        """World from each position (n, 4, 4) by the used loops."""
+        return self._polished[0].poses
+
+    @property
+    def loop_width(self) -> Floats:
+        """Factors (M,) on the loops' standard deviations for the last solve."""
+        return self._polished[1]
 
 
 def infer(
@@ -141,15 +153,13 @@ def _inferred(
         fit = settled(Fit(reduced, start), MOST_STEPS)
         linear, judged = fit.linear, _judge(fit.linear, fit, shares, wrong)
         top = mixture(judged.log_density)[1] - float(judged.log_density[1].sum())
-    linear, width = polished(reduced, linear if used.any() else start)
-    return Inferred(used, judged, linear.poses, scales, width, start, reduced, top, confirmed)
+    return Inferred(used, judged, scales, start, linear if used.any() else start, reduced, top, confirmed)
 
 
 def refused(found: Inferred, always: Bools) -> Inferred:
     """The result without the loops that nothing confirms: at the poses of the bare chain and of those of `always`."""
     reduced = thinned(found.start.chain, np.flatnonzero(always))
-    linear, width = polished(reduced, found.start)
-    return replace(found, used=always.copy(), poses=linear.poses, loop_width=width, reduced=reduced)
+    return replace(found, used=always.copy(), linear=found.start, reduced=reduced)
 
 
 SETTLING = 2
