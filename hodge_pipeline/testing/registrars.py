@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -80,6 +80,7 @@ def _keeps_nothing_of_a_pair(registrar: Registrar) -> None:
     assert kept == fresh, "prepared clouds that were registered before give other bits"
 
 
+@lru_cache(maxsize=1)  # two properties are of the same answers, and a process costs seconds
 def _answers(registrar: Registrar) -> list[bytes]:
     """The same pair registered twice from clouds prepared anew, and from clouds that met others before.
 
