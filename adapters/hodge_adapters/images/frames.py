@@ -92,26 +92,27 @@ class Lens:
 
 
 @lru_cache(maxsize=4)
-def _maps(lens: Lens) -> Maps:
-    """Where (H, W) in the distorted image each pixel of the pinhole's comes from: columns, rows."""
+def _maps(lens: Lens, nearest: bool) -> Maps:
+    """Where in the distorted image each pixel of the pinhole's comes from, as OpenCV's fixed-point maps, to 1/32 of a
+    pixel or the nearest one: a colour image is bent in half the time that maps of float take.
+    """
     size = lens.camera.width, lens.camera.height
     matrix = lens.camera.matrix
     columns, rows = cv2.initUndistortRectifyMap(
         matrix, np.array(lens.distortion), np.eye(3), matrix, size, cv2.CV_32FC1
     )
-    return columns, rows
+    return cv2.convertMaps(columns, rows, cv2.CV_16SC2, nninterpolation=nearest)
 
 
 def straight_depth(read: Callable[[], Floats32], lens: Lens) -> Floats32:
     """The depth image, straight; 0 where the pinhole sees past the edge of what was measured."""
-    columns, rows = _maps(lens)
-    return np.asarray(cv2.remap(read(), columns, rows, cv2.INTER_NEAREST, borderValue=0.0), np.float32)
+    maps = _maps(lens, nearest=True)
+    return np.asarray(cv2.remap(read(), *maps, cv2.INTER_NEAREST, borderValue=0.0), np.float32)
 
 
 def straight_colour(read: Callable[[], Bytes], lens: Lens) -> Bytes:
     """The colour image, straight; black past its edge."""
-    columns, rows = _maps(lens)
-    return np.asarray(cv2.remap(read(), columns, rows, cv2.INTER_LINEAR), np.uint8)
+    return np.asarray(cv2.remap(read(), *_maps(lens, nearest=False), cv2.INTER_LINEAR), np.uint8)
 
 
 def encoded_straight_depth(read: Callable[[], Floats32], lens: Lens, units_per_metre: float) -> EncodedImage:
