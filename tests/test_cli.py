@@ -11,7 +11,7 @@ import pytest
 
 from command import hodge
 from hodge_pipeline.cli import entry
-from synthetic import LIGHT, short_sequence, tiny_sequence  # noqa: F401 - fixtures
+from synthetic import LIGHT, short_sequence  # noqa: F401 - fixtures
 
 SETS = [word for change in ("fusion=[]", "recording.level=off", *LIGHT) for word in ("--set", change)]
 
@@ -118,27 +118,27 @@ def test_a_run_prints_a_summary_or_json_or_nothing(short_sequence: Path, tmp_pat
     assert (quiet.stdout, quiet.stderr) == ("", "")
 
 
-def test_inspect_says_what_a_folder_is(tiny_sequence: Path) -> None:  # noqa: F811
-    facts = json.loads(hodge("inspect", tiny_sequence, "--json").stdout)
+def test_inspect_says_what_a_folder_is(short_sequence: Path) -> None:  # noqa: F811
+    facts = json.loads(hodge("inspect", short_sequence, "--json").stdout)
     assert facts["formats"][0]["reader"] == "tum"
-    assert facts["frames"] == 24
+    assert facts["frames"] == 8
     assert 0.3 < facts["depth range in metres"][0] < facts["depth range in metres"][1] < 10
-    text = hodge("inspect", tiny_sequence).stdout
-    assert "160x120" in text
+    text = hodge("inspect", short_sequence).stdout
+    assert "80x60" in text
 
 
-def test_inspect_and_convert_take_a_reader_and_its_options(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
-    facts = json.loads(hodge("inspect", tiny_sequence, "--reader", "tum", "--set", "every=4", "--json").stdout)
-    assert facts["frames"] == 6
-    as_in_a_recipe = hodge("inspect", tiny_sequence, "--set", "source.reader.every=4").stdout
+def test_inspect_and_convert_take_a_reader_and_its_options(short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    facts = json.loads(hodge("inspect", short_sequence, "--reader", "tum", "--set", "every=4", "--json").stdout)
+    assert facts["frames"] == 2
+    as_in_a_recipe = hodge("inspect", short_sequence, "--set", "source.reader.every=4").stdout
     assert "--set source.reader.every=4 --out" in as_in_a_recipe
-    wrong = hodge("inspect", tiny_sequence, "--set", "evry=4")
+    wrong = hodge("inspect", short_sequence, "--set", "evry=4")
     assert wrong.returncode == 1 and "unknown option (did you mean 'every'?)" in wrong.stderr
     assert (
         "no stage 'tmu' of kind 'readers' (did you mean 'tum'?)"
-        in hodge("inspect", tiny_sequence, "--reader", "tmu").stderr
+        in hodge("inspect", short_sequence, "--reader", "tmu").stderr
     )
-    made = hodge("convert", tiny_sequence, tmp_path / "out.tum", "--set", 'truth=""')
+    made = hodge("convert", short_sequence, tmp_path / "out.tum", "--set", 'truth=""')
     assert made.returncode == 1 and "no poses to write" in made.stderr
 
 

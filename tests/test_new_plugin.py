@@ -78,12 +78,11 @@ def test_a_run_registers_with_it_and_its_error_names_it(
     module = package / "hodge_o3d_icp.py"
     module.write_text(module.read_text().replace("        steps = 0\n", '        raise ValueError("no\\nluck")\n'))
     line = module.read_text().splitlines().index('        raise ValueError("no\\nluck")') + 1
-    for workers in ("0", "1"):  # in this process, and in a worker, whose errors come back without frames
-        out = tmp_path / f"bad-{workers}"
-        done = hodge(package, *run, "--set", f"executor.workers={workers}", "--out", str(out), "--quiet")
-        assert done.returncode == 1
-        said = f"stage o3d_icp (hodge-o3d-icp 0.1.0) raised ValueError: no luck, at hodge_o3d_icp.py:{line}"
-        assert done.stderr == f"error: {said}\n"
+    # in a worker, whose errors come back without frames
+    done = hodge(package, *run, "--set", "executor.workers=1", "--out", str(tmp_path / "bad"), "--quiet")
+    assert done.returncode == 1
+    said = f"stage o3d_icp (hodge-o3d-icp 0.1.0) raised ValueError: no luck, at hodge_o3d_icp.py:{line}"
+    assert done.stderr == f"error: {said}\n"
 
 
 def test_a_reader_opens_its_format_and_its_error_names_it(tmp_path: Path) -> None:

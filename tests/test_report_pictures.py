@@ -19,6 +19,7 @@ from hodge_pipeline.report.painting import turns_deg
 from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud, Source
 
+pytestmark = pytest.mark.draws
 RED, BLUE = (200, 0, 0), (0, 0, 200)
 AHEAD = raster.View(np.eye(3), np.array([0.0, 0.0, 1.5]), 0.01)
 """Looks along +z with x to the right and y down; a pixel is 1 cm."""

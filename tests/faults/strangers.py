@@ -119,7 +119,7 @@ def _typed(name: str, scratch: Path) -> dict[str, int]:
     """The command that a refusal prints, of a folder of this name, typed into a shell."""
     theirs = scratch / f"touch {name.replace('/', '_')}; touch outside"
     shutil.rmtree(theirs, ignore_errors=True)
-    (theirs / "stages").mkdir(parents=True)
+    (theirs / "stages" / "begun.part").mkdir(parents=True)
     (theirs / "recipe.yaml").write_text("pace: 1")
     try:
         Workspace.reopen(theirs, {"pace": 2})
