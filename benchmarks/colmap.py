@@ -31,7 +31,7 @@ from synthetic_colmap import make
 
 from hodge_pipeline import se3
 
-KINDS = ("given", "noise", "big", "wrong", "halves", "renamed", "no_images", "no_database")
+KINDS = ("given", "noise", "big", "wrong", "carried", "halves", "renamed", "no_images", "no_database")
 MODELS = (
     "disturbed/mouse_good",
     "disturbed/maupertuis_good",
@@ -129,10 +129,12 @@ def disturbed(good: Path, out: Path, kind: str, seed: int) -> list[Path]:
             turn = rng.normal(size=3) * np.deg2rad(15) / 3**0.5
             _move(model, int(image_id), turn, away / np.linalg.norm(away) * 0.25 * size)
     else:
-        degrees, share = (8.0, 0.15) if kind == "big" else (0.5, 0.02)
+        degrees, share = (8.0, 0.15) if kind in ("big", "carried") else (0.5, 0.02)
         for image_id in ids:
             turn = rng.normal(size=3) * np.deg2rad(degrees) / 3**0.5
             _move(model, image_id, turn, rng.normal(size=3) * share * size / 3**0.5)
+    if kind == "carried":
+        _carry(model, pycolmap.Reconstruction(good))
     if kind == "renamed":
         for image in model.images.values():
             image.name = f"other/{image.name}"
@@ -160,6 +162,15 @@ def _move(model: pycolmap.Reconstruction, image_id: int, turn_rad: np.ndarray, s
     rotation = se3.so3_exp(turn_rad) @ image.cam_from_world().rotation.matrix()
     centre = image.projection_center() + shift
     model.frames[image.frame_id].rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centre)
+
+
+def _carry(model: pycolmap.Reconstruction, good: pycolmap.Reconstruction) -> None:
+    """Move each point by the mean of what moved its images: none is right any more."""
+    moves = {
+        key: image.cam_from_world().inverse() * good.images[key].cam_from_world() for key, image in model.images.items()
+    }
+    for point in model.points3D.values():
+        point.xyz = np.mean([moves[one.image_id] * point.xyz for one in point.track.elements], axis=0)
 
 
 def extent(model: pycolmap.Reconstruction) -> float:

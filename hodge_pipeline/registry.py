@@ -78,24 +78,11 @@ def origin(kind: str, name: str) -> str:
     return f"{dist.name} {dist.version}" if dist else "unknown package"
 
 
-FORMER_NAMES = {
-    "global": "unordered",
-    "hodge": "maximum_likelihood",
-    "given": "start",
-    "global_start": "start",
-    "key_frames": "start",
-    "odometry": "start",
-    "relocalise": "start",
-}
-"""Names of stages and options that became others, or part of them: an old recipe is told the new one."""
-
-
 def suggestion(given: str, known: list[str]) -> str:
     """`" (did you mean 'x'?)"`, or the known names where nothing is close."""
     if given.startswith("paper"):
         return " (the paper's own solver and recipes are a plugin: pip install ./benchmarks/paper/method)"
-    renamed = [name for name in (FORMER_NAMES.get(given),) if name in known]
-    close = renamed or difflib.get_close_matches(given, known, n=1)
+    close = difflib.get_close_matches(given, known, n=1)
     return f" (did you mean '{close[0]}'?)" if close else f" (known: {', '.join(known) or 'none'})"
 
 

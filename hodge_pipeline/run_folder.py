@@ -25,10 +25,9 @@ from hodge_pipeline.scene import KeyFrames, Round, Scene, given_poses, true_pose
 from hodge_pipeline.sources.opening import open_with_reader
 from hodge_pipeline.stages import FrameReader, Step
 from hodge_pipeline.store.store import stored, stored_clouds
-from hodge_pipeline.store.workspace import OLD_KEY_FILE, RECIPE_FILE, RUN, is_run_folder
+from hodge_pipeline.store.workspace import RECIPE_FILE, RUN, is_run_folder
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, Source
 from hodge_pipeline.types.notes import Note
-from hodge_pipeline.types.text import command
 
 
 @dataclass(frozen=True)
@@ -119,8 +118,7 @@ class Run:
     def load(cls, folder: Path | str) -> Run:
         """The run in a folder, as far as it came. Neither its source nor the libraries that made it are needed.
 
-        Raises `WorkspaceError` where the folder is none of a run, was made in another layout, or a file in it has
-        changed.
+        Raises `WorkspaceError` where the folder is none of a run, or a file in it has changed.
         """
         folder = Path(folder)
         check_layout(folder)
@@ -262,12 +260,9 @@ def opening_of(scene: Scene) -> tuple[Source, KeyFrames, Round]:
 
 
 def check_layout(folder: Path) -> None:
-    """Raise `WorkspaceError` where a folder is none of a run, or was left by a version with another layout."""
+    """Raise `WorkspaceError` where a folder is none of a run."""
     if not is_run_folder(folder):
         raise WorkspaceError(f"{folder}: is no run folder: there is no {RECIPE_FILE} with steps in it")
-    if any((folder / RUN).glob(f"*/{OLD_KEY_FILE}")):
-        again = command("hodge", "run", folder / RECIPE_FILE, "--out", folder, "--overwrite")
-        raise WorkspaceError(f"{folder}: was made in the layout of an earlier version: '{again}' makes it again")
 
 
 def _numbers(camera: Camera | None) -> list[float]:

@@ -1,6 +1,6 @@
 """Where the real data lies: `HODGE_DATA`, else `shared/data` beside the checkout. It is never part of the project.
 
-And what keeps the tests cheap: the longest files begin first, and plots of one kind are drawn once a file.
+And what keeps the tests cheap: the longest files begin first, and plots of one kind are drawn once a process.
 """
 
 from __future__ import annotations
@@ -49,8 +49,9 @@ def data_dir() -> Path:
 
 
 LONGEST = (
-    "review_browser", "backbone", "faults", "pipeline", "never_worse", "two_hosts", "golden", "notebooks", "new_plugin",
-    "diagnosis_real_data", "executors", "unordered", "stage_contracts", "security", "lidar", "recording_run",
+    "review_browser", "backbone", "pipeline", "stage_contracts", "lidar", "faults", "tracking", "solver_robust",
+    "refine_trajectory", "refined_trajectory", "recording_run", "never_worse", "diagnosis_real_data", "notebooks",
+    "recipe_mcap", "new_plugin", "backbone_breaks", "refine_colmap", "golden", "fitted_camera", "two_hosts", "docs",
 )  # fmt: skip
 """Files that take longest: begun last, one would keep a processor alone."""
 
@@ -63,28 +64,34 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 _drawn: dict[tuple[object, ...], bytes] = {}
 
 
-@pytest.fixture(autouse=True)
-def plots_drawn_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """All plots are made; they are drawn in the tests of reports, and elsewhere the first of a kind in each file.
+@pytest.hookimpl(wrapper=True)  # a fixture would come after those of a module, which make most of the runs
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """All plots are made; they are drawn in tests that are marked `draws`, and elsewhere the first of a kind.
 
-    They are half of what a small run costs.
+    They are half of what a small run costs, and gaps between the points of pictures, which stay open, a tenth.
     """
-    agg: Any = sys.modules.get("matplotlib.backends.backend_agg")
-    file = request.path.stem
-    if agg is not None and not file.startswith("test_report"):
-        draw = agg.FigureCanvasAgg.print_png
+    with pytest.MonkeyPatch.context() as patch:
+        if item.get_closest_marker("draws") is None:
+            patch.setattr("hodge_pipeline.report.raster._filled", lambda image, *_: image)
+            draw_once(patch)
+        return (yield)
 
-        @functools.wraps(draw)  # matplotlib passes what a signature has
-        def print_png(canvas: Any, target: io.BytesIO, **options: Any) -> None:
-            kind = [
-                (axes.get_xlabel(), axes.get_ylabel(), axes.get_xscale(), axes.get_yscale(), axes.has_data())
-                + (len(axes.lines), len(axes.collections), len(axes.patches))
-                for axes in canvas.figure.axes
-            ]
-            if (file, *kind) not in _drawn:
-                draw(canvas, new := io.BytesIO(), **options)
-                _drawn[file, *kind] = new.getvalue()
-            target.write(_drawn[file, *kind])
 
-        monkeypatch.setattr(agg.FigureCanvasAgg, "print_png", print_png)
-    yield
+def draw_once(patch: pytest.MonkeyPatch) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    draw = FigureCanvasAgg.print_png
+
+    @functools.wraps(draw)  # matplotlib passes what a signature has
+    def print_png(canvas: Any, target: io.BytesIO, **options: Any) -> None:
+        kind = tuple(
+            (axes.get_xlabel(), axes.get_ylabel(), axes.get_xscale(), axes.get_yscale(), axes.has_data())
+            + (len(axes.lines), len(axes.collections), len(axes.patches))
+            for axes in canvas.figure.axes
+        )
+        if kind not in _drawn:
+            draw(canvas, new := io.BytesIO(), **options)
+            _drawn[kind] = new.getvalue()
+        target.write(_drawn[kind])
+
+    patch.setattr(FigureCanvasAgg, "print_png", print_png)

@@ -110,8 +110,7 @@ def test_stated_errors_are_believed_up_to_a_scale(misstated: tuple[float, float]
     assert (found.kept & made.right).sum() >= made.right.sum() - 3
 
 
-@pytest.mark.parametrize("unit", [1e-6, 1e6])
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("dimension", "unit"), [(2, 1e-6), (3, 1e6)])
 def test_the_unit_of_the_stated_information_and_of_lengths_changes_no_verdict(dimension: int, unit: float) -> None:
     graph = drive(seed=dimension - 2, count=300, dimension=dimension, loops=80).graph
     information = graph.information
@@ -130,12 +129,11 @@ def test_the_unit_of_the_stated_information_and_of_lengths_changes_no_verdict(di
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("in_groups", [False, True])
 def test_where_all_loops_are_wrong_the_backbone_comes_back(dimension: int, in_groups: bool) -> None:
-    for seed in range(3):
-        made = drive(seed=seed, dimension=dimension, wrong=1.0, in_groups=in_groups)
-        found = diagnose(made.graph)
-        assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
-        assert any("100 loops that nothing confirms" in note for note in found.notes)
-        assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
+    made = drive(dimension=dimension, wrong=1.0, in_groups=in_groups)
+    found = diagnose(made.graph)
+    assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+    assert any("100 loops that nothing confirms" in note for note in found.notes)
+    assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
 
 
 MISLEADING = [
@@ -167,13 +165,6 @@ def test_where_nothing_is_stated_wrong_loops_do_not_discard_the_odometry(seed: i
     diagonal = (made.graph.information != 0) & np.eye(6, dtype=bool)
     found = diagnose(replace(made.graph, information=diagonal.astype(float)))
     assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
-
-
-def test_a_graph_is_not_parted_at_two_steps_that_share_the_blame(data_dir: Path) -> None:
-    graph = read_graph(data_dir / "pose_graphs/sesync/parking-garage.g2o").graph
-    assert graph is not None
-    found = diagnose(graph)
-    assert not found.piece.any() and (~found.kept).sum() < 23
 
 
 def test_a_covariance_that_sums_left_indefinite_has_a_root() -> None:
@@ -209,9 +200,8 @@ def test_loops_of_one_mistaken_place_close_no_path(dimension: int) -> None:
         assert not diagnose(made.graph).kept[~made.right].any()
 
 
-@pytest.mark.parametrize("name", ["manhattan", "MIT"])
-def test_loops_that_are_stated_to_be_exact_refute_no_others(name: str, data_dir: Path) -> None:
-    graph = read_graph(data_dir / f"pose_graphs/sesync/{name}.g2o").graph
+def test_loops_that_are_stated_to_be_exact_refute_no_others(data_dir: Path) -> None:
+    graph = read_graph(data_dir / "pose_graphs/sesync/MIT.g2o").graph
     assert graph is not None
     backbone = find_backbone(graph)
     assert backbone is not None and backbone.used.all()
@@ -221,11 +211,10 @@ def test_loops_that_are_stated_to_be_exact_refute_no_others(name: str, data_dir:
 def test_corridors_that_are_mistaken_neither_break_the_backbone_nor_make_a_lattice(
     world: str, count: int, loops: int, group: int
 ) -> None:
-    for seed in range(3):
-        made = drive(seed=seed, world=world, count=count, loops=loops, wrong=1.0, in_groups=True, group=group)
-        found = diagnose(made.graph)
-        assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
-        assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
+    made = drive(world=world, count=count, loops=loops, wrong=1.0, in_groups=True, group=group)
+    found = diagnose(made.graph)
+    assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+    assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
 
 
 @pytest.mark.filterwarnings("error")
@@ -384,7 +373,7 @@ def test_robots_whose_loops_are_all_wrong_stay_apart() -> None:
 
 def test_more_loops_than_can_be_inverted_are_judged_at_the_poses_of_some(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inference, "MOST_UNKNOWNS", 150)
-    made = drive(count=3000, dimension=3, world="town", loops=1400)
+    made = drive(count=1500, dimension=3, world="town", loops=700)
     chain = chain_of(made.graph)
     right = np.flatnonzero(made.right[chain.loop_edge])
     some = inference.thinned(chain, right)

@@ -33,10 +33,9 @@ def test_a_broken_step_is_named(where: str) -> None:
 
 
 BROKEN = [
-    ("ring", 2, 400, 80, 0.4),
     ("ring", 2, 400, 20, 0.4),
     ("room", 3, 400, 80, 0.4),
-    ("corridor", 2, 1000, 200, 0.0),
+    ("corridor", 2, 400, 80, 0.0),
     ("town", 2, 1000, 200, 0.6),
 ]
 

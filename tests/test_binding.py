@@ -74,12 +74,6 @@ def test_a_stage_by_name_has_its_defaults(tmp_path: Path) -> None:
             "source: {reader: tum, depth_scale: 1000}\n",
             "r.yaml:6: source.depth_scale: unknown option (did you mean 'source.reader.depth_scale'?)",
         ),
-        ("given: {poses: file}\n", "r.yaml:6: given: unknown option (did you mean 'start'?)"),
-        ("key_frames: {every: 3}\n", "r.yaml:6: key_frames: unknown option (did you mean 'start'?)"),
-        ("odometry: {max_drift: 1}\n", "r.yaml:6: odometry: unknown option (did you mean 'start'?)"),
-        ("relocalise: true\n", "r.yaml:6: relocalise: unknown option (did you mean 'start'?)"),
-        ("global_start: {use: images}\n", "r.yaml:6: global_start: unknown option (did you mean 'start'?)"),
-        ("start: global\n", "r.yaml:6: start: no stage 'global' of kind 'start' (did you mean 'unordered'?)"),
         ("scale: big\n", "r.yaml:6: scale: expected number or 'auto', got 'big'"),
         (
             "source: {reader: {stage: tum, camera: [525, 525]}}\n",

@@ -9,16 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from command import hodge
 from hodge_pipeline.cli import entry
-from synthetic import tiny_sequence  # noqa: F401 - a fixture
+from synthetic import LIGHT, short_sequence  # noqa: F401 - fixtures
 
-LIGHT = ["--set", "fusion=[]", "--set", "recording.level=off", "--set", "evaluation.tables=false"]
-LIGHT += ["--set", "executor.workers=0", "--set", "outer_iterations=1", "--set", "edges.max_edges_per_frame=3"]
-
-
-def hodge(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "hodge_pipeline.cli.main", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+SETS = [word for change in ("fusion=[]", "recording.level=off", *LIGHT) for word in ("--set", change)]
 
 
 def test_help_opens_with_examples_and_imports_nothing_heavy() -> None:
@@ -112,47 +107,47 @@ def test_version_and_the_schema_of_both_kinds_of_recipe() -> None:
     assert "model" in model["properties"] and "outer_iterations" not in model["properties"]
 
 
-def test_a_run_prints_a_summary_or_json_or_nothing(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
-    run = ["run", "tum", "--source", tiny_sequence, "--out", tmp_path / "run", *LIGHT]
+def test_a_run_prints_a_summary_or_json_or_nothing(short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    run = ["run", "tum", "--source", short_sequence, "--out", tmp_path / "run", *SETS]
     first = hodge(*run)
     assert first.returncode == 0, first.stderr
     assert "verdict" in first.stdout
     assert "\x1b[" not in first.stdout + first.stderr
-    assert json.loads(hodge(*run, "--json").stdout)["source"]["frames"] == 24
+    assert json.loads(hodge(*run, "--json").stdout)["source"]["frames"] == 8
     quiet = hodge(*run, "--quiet")
     assert (quiet.stdout, quiet.stderr) == ("", "")
 
 
-def test_inspect_says_what_a_folder_is(tiny_sequence: Path) -> None:  # noqa: F811
-    facts = json.loads(hodge("inspect", tiny_sequence, "--json").stdout)
+def test_inspect_says_what_a_folder_is(short_sequence: Path) -> None:  # noqa: F811
+    facts = json.loads(hodge("inspect", short_sequence, "--json").stdout)
     assert facts["formats"][0]["reader"] == "tum"
-    assert facts["frames"] == 24
+    assert facts["frames"] == 8
     assert 0.3 < facts["depth range in metres"][0] < facts["depth range in metres"][1] < 10
-    text = hodge("inspect", tiny_sequence).stdout
-    assert "160x120" in text
+    text = hodge("inspect", short_sequence).stdout
+    assert "80x60" in text
 
 
-def test_inspect_and_convert_take_a_reader_and_its_options(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
-    facts = json.loads(hodge("inspect", tiny_sequence, "--reader", "tum", "--set", "every=4", "--json").stdout)
-    assert facts["frames"] == 6
-    as_in_a_recipe = hodge("inspect", tiny_sequence, "--set", "source.reader.every=4").stdout
+def test_inspect_and_convert_take_a_reader_and_its_options(short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    facts = json.loads(hodge("inspect", short_sequence, "--reader", "tum", "--set", "every=4", "--json").stdout)
+    assert facts["frames"] == 2
+    as_in_a_recipe = hodge("inspect", short_sequence, "--set", "source.reader.every=4").stdout
     assert "--set source.reader.every=4 --out" in as_in_a_recipe
-    wrong = hodge("inspect", tiny_sequence, "--set", "evry=4")
+    wrong = hodge("inspect", short_sequence, "--set", "evry=4")
     assert wrong.returncode == 1 and "unknown option (did you mean 'every'?)" in wrong.stderr
     assert (
         "no stage 'tmu' of kind 'readers' (did you mean 'tum'?)"
-        in hodge("inspect", tiny_sequence, "--reader", "tmu").stderr
+        in hodge("inspect", short_sequence, "--reader", "tmu").stderr
     )
-    made = hodge("convert", tiny_sequence, tmp_path / "out.tum", "--set", 'truth=""')
+    made = hodge("convert", short_sequence, tmp_path / "out.tum", "--set", 'truth=""')
     assert made.returncode == 1 and "no poses to write" in made.stderr
 
 
-def test_a_full_disk_is_one_line_and_keeps_what_was_finished(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
-    command = [sys.executable, "-m", "hodge_pipeline.cli.main", "run", "tum", "--source", str(tiny_sequence)]
-    command += ["--out", str(tmp_path / "run"), *LIGHT, "--quiet"]
+def test_a_full_disk_is_one_line_and_keeps_what_was_finished(short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+    command = [sys.executable, "-m", "hodge_pipeline.cli.main", "run", "tum", "--source", str(short_sequence)]
+    command += ["--out", str(tmp_path / "run"), *SETS, "--quiet"]
 
     def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
 
     environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
     done = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=limit, env=environment)  # noqa: PLW1509

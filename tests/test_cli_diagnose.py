@@ -283,6 +283,7 @@ def test_a_graph_of_too_many_triangles_is_refused() -> None:
         unfilled_loops(edges, 9, most_triangles=10)
 
 
+@pytest.mark.draws
 def test_two_clouds_are_drawn_where_they_are() -> None:
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)), axis=-1).reshape(-1, 2)
     left = PointCloud(np.column_stack([grid, np.full(len(grid), 2.0)]).astype(np.float32))
@@ -314,7 +315,7 @@ def test_an_image_matches_itself_and_nothing_else() -> None:
 
 def test_a_run_is_diagnosed_with_pictures(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
     settings = ["clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1", "fusion=[]"]
-    recipe = load_recipe("demo", [*settings, "evaluation.tables=false"], tiny_sequence)
+    recipe = load_recipe("demo", [*settings, "evaluation.tables=false", "source.reader.every=2"], tiny_sequence)
     run = hodge_pipeline.run(recipe, tmp_path / "run")
     answer = json.loads(hodge(tmp_path / "run", "--out", tmp_path / "why", "--json"))
     assert sum(answer["counts"].values()) == run.result.graph.edge_count

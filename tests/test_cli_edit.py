@@ -25,7 +25,7 @@ from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
     "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary",
-    "outer_iterations=1", "acceptance.min_fitness=0.6",
+    "outer_iterations=1", "acceptance.min_fitness=0.6", "source.reader.every=2",
 )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import os
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -18,20 +19,14 @@ import typer.main
 import hodge_pipeline
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.recipe.schema import load_recipe
-from synthetic import tiny_sequence  # noqa: F401 - a fixture
+from plugin_metadata import write_metadata
+from synthetic import LIGHT, short_sequence  # noqa: F401 - a fixture
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
 PAGES = [REPOSITORY / "README.md", *sorted(DOCS.glob("*.md"))]
 EXAMPLE = DOCS / "examples" / "far_loops"
-SMALL = (
-    "clouds.voxel_m=0.06",
-    "fusion=[{stage: cloud}]",
-    "executor.workers=0",
-    "evaluation.tables=false",
-    "recording.level=summary",
-    "outer_iterations=1",
-)
+SMALL = (*LIGHT, "fusion=[{stage: cloud}]", "recording.level=summary")
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -72,12 +67,12 @@ def test_the_index_names_every_page() -> None:
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory: pytest.TempPathFactory, tiny_sequence: Path) -> Path:  # noqa: F811
+def workplace(tmp_path_factory: pytest.TempPathFactory, short_sequence: Path) -> Path:  # noqa: F811
     """A folder with a small run in place of the demo's, and a sequence under the name that the pages use."""
     folder = tmp_path_factory.mktemp("docs")
-    (folder / "SEQUENCE").symlink_to(tiny_sequence, target_is_directory=True)
+    (folder / "SEQUENCE").symlink_to(short_sequence, target_is_directory=True)
     (folder / "docs").symlink_to(DOCS, target_is_directory=True)
-    hodge_pipeline.run(load_recipe("demo", SMALL, tiny_sequence), folder / "runs" / "demo")
+    hodge_pipeline.run(load_recipe("demo", SMALL, short_sequence), folder / "runs" / "demo")
     return folder
 
 
@@ -106,7 +101,7 @@ def test_python_of_the_quick_start(workplace: Path, monkeypatch: pytest.MonkeyPa
     """As it stands, but for the recipe, which becomes that of the run that is there already."""
     monkeypatch.chdir(workplace)
     (code,) = blocks(DOCS / "quick-start.md", "python")
-    given = f"load_recipe('demo', {SMALL!r}), 'runs/demo', source={str(tiny(workplace))!r}"
+    given = f"load_recipe('demo', {SMALL!r}), 'runs/demo', source={str(short(workplace))!r}"
     shown = 'hodge_pipeline.run("tum", "runs/mine", source="SEQUENCE")'
     assert shown in code
     exec(code.replace(shown, f"hodge_pipeline.run({given})"), {"load_recipe": load_recipe})
@@ -122,7 +117,7 @@ def test_arrays_in_hand(capsys: pytest.CaptureFixture[str]) -> None:
     assert "globally optimal" in capsys.readouterr().out
 
 
-def tiny(workplace: Path) -> Path:
+def short(workplace: Path) -> Path:
     return (workplace / "SEQUENCE").resolve()
 
 
@@ -140,12 +135,15 @@ def test_the_page_shows_the_example_as_it_is(name: str, language: str) -> None:
 
 
 def test_the_example_package_is_installed_and_runs(workplace: Path, tmp_path: Path) -> None:
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target"]
-    subprocess.run([*pip, str(tmp_path / "site"), str(EXAMPLE)], check=True, capture_output=True)
+    site = tmp_path / "site"
+    site.mkdir()
+    shutil.copy(EXAMPLE / "far_loops.py", site)
+    write_metadata(EXAMPLE, site)
+    near = "edges.builders=[{stage: sequential}, {stage: far_loops, gap: 5, max_distance_m: 0.5}]"
     script = textwrap.dedent(f"""
         import hodge_pipeline
         from hodge_pipeline.recipe.schema import load_recipe
-        changes = {[*SMALL[:-2], "outer_iterations=1", "recording.level=off"]!r}
+        changes = {[*SMALL, "recording.level=off", near]!r}
         recipe = load_recipe({str(EXAMPLE / "far_loops.yaml")!r}, changes)
         hodge_pipeline.run(recipe, "run", source={str(workplace / "SEQUENCE")!r})
     """)

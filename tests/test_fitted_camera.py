@@ -19,29 +19,44 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import inspect
 from readers_data import linked
 
-FOCAL_PX = 525.0
+FOCAL_PX, FRAMES = 525.0, 16
 
 
 @pytest.fixture(scope="module")
-def office(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A film of 640x480 and 525 pixels of focal length, in Redwood's layout."""
-    folder = tmp_path_factory.mktemp("fitted")
-    film = make_sequence(folder / "film", DemoOptions(frames=30, width=640, height=480, stride=2, turns=0.2))
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A film of 640x480 and 525 pixels of focal length, rendered at half of that."""
+    options = DemoOptions(frames=FRAMES, width=320, height=240, stride=2, turns=0.1)
+    folder = make_sequence(tmp_path_factory.mktemp("fitted") / "film", options)
+    for kind, between in (("depth", cv2.INTER_NEAREST), ("rgb", cv2.INTER_LINEAR)):
+        for file in (folder / kind).iterdir():
+            image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(file), cv2.resize(image, (640, 480), interpolation=between))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def office(film: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The film in Redwood's layout."""
+    folder = tmp_path_factory.mktemp("office")
     for kind in ("depth", "rgb"):
-        (folder / "room" / kind).mkdir(parents=True)
+        (folder / kind).mkdir()
         for number, file in enumerate(sorted((film / kind).iterdir())):
-            shutil.copy(file, folder / "room" / kind / f"{number}{file.suffix}")
-    return folder / "room"
+            shutil.copy(file, folder / kind / f"{number}{file.suffix}")
+    return folder
 
 
-def test_the_focal_length_is_told_whatever_the_unit_of_depth(office: Path) -> None:
+def test_the_focal_length_is_told_whatever_the_unit_of_depth(office: Path, tmp_path: Path) -> None:
     source = IclNuimReader(camera=(1.0, 1.0, 1.0, 1.0)).open(office)
-    depth, colour = source.files[:30], source.files[30:]
-    stamps_s = np.arange(30) / 10
+    depth, colour = source.files[:FRAMES], source.files[FRAMES:]
+    stamps_s = np.arange(FRAMES) / 10
     for units in (5000.0, 6000.0):
         told = fitted_camera.focal_px((640, 480), depth, colour, stamps_s, units)
         assert told == pytest.approx(FOCAL_PX, rel=0.05)
-    assert fitted_camera.focal_px((640, 480), depth[:1] * 30, colour[:1] * 30, stamps_s, 5000.0) is None  # at rest
+    rng, image, at_rest = np.random.default_rng(0), cv2.imread(str(colour[0])).astype(float), []
+    for number in range(FRAMES):
+        at_rest.append(tmp_path / f"{number}.png")
+        cv2.imwrite(str(at_rest[-1]), np.clip(image + rng.normal(0, 3, image.shape), 0, 255).astype(np.uint8))
+    assert fitted_camera.focal_px((640, 480), depth[:1] * FRAMES, at_rest, stamps_s, 5000.0) is None
 
 
 def test_an_assumed_camera_that_images_contradict_is_told(office: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,7 +86,9 @@ def test_errors_count_in_each_camera_s_own_pixels(office: Path) -> None:
     """A longer focal length makes every error a smaller slope: it does not fit better for that."""
     source = IclNuimReader(camera=(1.0, 1.0, 1.0, 1.0)).open(office)
     longer = {name: Intrinsics(f, f, 319.5, 239.5, (640, 480)) for name, f in (("own", 525.0), ("longer", 640.0))}
-    found = fitted_camera.fitting(longer, "own", source.files[:30], source.files[30:], np.arange(30) / 10, 5000.0)
+    found = fitted_camera.fitting(
+        longer, "own", source.files[:FRAMES], source.files[FRAMES:], np.arange(FRAMES) / 10, 5000.0
+    )
     assert found == {}
 
 
@@ -82,3 +99,10 @@ def test_the_day_of_the_stamps_counts_more_than_the_images(
     source = TumReader().open(linked(data_dir / "tum/fr1_rpy_part", tmp_path))
     assert source.frames[0].camera.fx == CAMERAS["fr1"].fx
     assert "intrinsics of fr1 taken: by the day of the stamps, 2011-05-10" in source.notes
+
+
+def test_a_camera_without_distortion_is_not_taken_for_another(film: Path) -> None:
+    (film / "intrinsics.txt").unlink()
+    source = TumReader().open(film)
+    assert source.frames[0].camera.fx == FOCAL_PX
+    assert any("whose cameras fit no better" in note for note in source.notes)

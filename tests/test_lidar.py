@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from functools import partial
-from itertools import permutations
 from pathlib import Path
 from typing import cast
 
@@ -157,15 +156,13 @@ def kitti(data_dir: Path) -> tuple[list[Floats], list[Floats]]:
     return points, list(se3.from_quat_xyzw(values[:, :3], values[:, 3:]))
 
 
-@pytest.mark.parametrize("order", list(permutations(range(5)))[::53])
-def test_five_scans_of_a_street_in_any_order(
-    kitti: tuple[list[Floats], list[Floats]], order: tuple[int, ...], tmp_path: Path
-) -> None:
+def test_five_scans_of_a_street_out_of_order(kitti: tuple[list[Floats], list[Floats]], tmp_path: Path) -> None:
     points, poses = kitti
+    order = 4, 1, 3, 0, 2
     frames = tuple(
         Frame(name, float(name), read_points=partial(PointCloud, points[row])) for name, row in enumerate(order)
     )
-    recipe = "scans"
+    recipe = load_recipe("scans", OFF)
     found = run(recipe, tmp_path / "run", source=Source("street", tmp_path, frames)).poses
     for a in range(5):
         for b in range(a):
@@ -184,7 +181,7 @@ def test_a_street_is_followed_and_deskewed(tmp_path: Path) -> None:
     rows = [f"{name:06d},{x:.3f},{y:.3f},{z:.3f},0.1" for name, (x, y, z) in enumerate(known[:, :3, 3])]
     (tmp_path / "fixes.csv").write_text("\n".join(["name,e,n,u,sigma", *rows]))
     changes = {
-        "evaluation.truth": str(folder / TRUTH_FILE), "recording.level": "off", "fusion": [],
+        "evaluation.truth": str(folder / TRUTH_FILE), "recording.level": "off", "fusion": [], "executor.workers": 0,
         "positions.path": str(tmp_path / "fixes.csv"), "positions.antenna_m": [0.5, 0, 1.0],
     }  # fmt: skip
     recipe = load_recipe("lidar", [f"{key}={json.dumps(value)}" for key, value in changes.items()], folder)
@@ -223,7 +220,7 @@ class Flight(CarFree):
         return se3.from_parts(se3.so3_exp(turn), position)
 
 
-@pytest.mark.parametrize("path", [Flight(4.0), Flight(0.5), Road(25.0)], ids=["flown", "swung", "fast"])
+@pytest.mark.parametrize("path", [Flight(4.0), Road(25.0)], ids=["flown", "fast"])
 def test_sweeps_are_followed_from_the_first_at_any_speed(path: Flight | Road, tmp_path: Path) -> None:
     count = 25
     own = SpinningScanner(cast(Road, path), 0, beams=16, columns=360, noise=1.0)
@@ -237,14 +234,14 @@ def test_sweeps_are_followed_from_the_first_at_any_speed(path: Flight | Road, tm
 
 
 def test_only_clouds_that_poses_pair_are_described(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, seen = make_sequence(tmp_path / "street", StreetOptions(frames=12, beams=16, columns=180)), []
+    folder, seen = make_sequence(tmp_path / "street", StreetOptions(frames=8, beams=16, columns=180)), []
 
     def describe(clouds: Path, registrar: object, rows: Ints, **_: object) -> None:
         seen.extend(rows.tolist())
 
     monkeypatch.setattr("hodge_pipeline.start.unordered.start.describe_clouds", describe)
     run(load_recipe("lidar", SHORT, folder), tmp_path / "run")
-    assert not seen  # a straight road of 8 m has no loop
+    assert not seen  # a straight road of 5 m has no loop
 
 
 def test_a_point_at_the_scanner_itself_is_no_measurement() -> None:
@@ -254,9 +251,8 @@ def test_a_point_at_the_scanner_itself_is_no_measurement() -> None:
 
 
 def test_a_robot_that_stands_still_has_few_key_frames_and_stays(tmp_path: Path) -> None:
-    folder = make_sequence(tmp_path / "street", StreetOptions(frames=15, beams=16, columns=360, speed_m_s=1e-6))
-    recipe = load_recipe("lidar", ["recording.level=off", "fusion=[]", "evaluation.tables=false"], folder)
-    done = run(recipe, tmp_path / "run")
+    folder = make_sequence(tmp_path / "street", StreetOptions(frames=8, beams=16, columns=360, speed_m_s=1e-6))
+    done = run(load_recipe("lidar", SHORT, folder), tmp_path / "run")
     assert len(done.key_frames.rows) <= 2 and np.linalg.norm(done.poses[:, :3, 3], axis=1).max() < 0.5
 
 
@@ -272,7 +268,8 @@ def write_organised(path: Path, sweep: Sweep, rows: int, missing: float) -> None
     path.write_bytes(header.encode() + points.tobytes())
 
 
-SHORT = ["recording.level=off", "fusion=[]", "evaluation.tables=false"]
+OFF = ["recording.level=off", "evaluation.tables=false", "executor.workers=0"]
+SHORT = [*OFF, "fusion=[]"]
 
 
 def test_organised_clouds_with_holes_are_followed(tmp_path: Path) -> None:
@@ -334,14 +331,13 @@ def sweeps_as(layout: str, folder: Path, count: int, speed_m_s: float = 10.0) ->
     return folder / "velodyne" if layout == "kitti" else log.write(folder / "log.mcap")
 
 
-@pytest.mark.parametrize("layout", ["kitti", "recording"])
-def test_a_trajectory_of_sweeps_is_refined_by_default(layout: str, tmp_path: Path) -> None:
+def test_a_trajectory_of_sweeps_is_refined_by_default(tmp_path: Path) -> None:
     count = 16
     exact = Road(10.0).world_from_car(np.arange(count) * REVOLUTION_S)
     noise = np.random.default_rng(0).normal(0, [1e-3] * 3 + [0.06] * 3, (count, 6))
     given = exact @ se3.exp(np.cumsum(noise, axis=0))
-    frames = sweeps_as(layout, tmp_path, count)
-    refined = refine_trajectory(given, frames, overrides=["recording.level=off"])
+    frames = sweeps_as("recording", tmp_path, count)
+    refined = refine_trajectory(given, frames, overrides=OFF)
     before, after = (absolute_error(poses, exact).rmse_m for poses in (given, refined.poses))
     assert before > 0.1 and after < before / 2
 
@@ -354,21 +350,21 @@ def test_poses_of_sweeps_are_never_worse_than_they_came(kind: str, tmp_path: Pat
         given[8:, :3, 3] += [0.6, 0.8, 0.0]
     if kind == "axes of a camera":  # x right, y down, z ahead
         given = exact @ se3.from_parts(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
-    refined = refine_trajectory(given, sweeps_as("kitti", tmp_path, 16, 7.0), overrides=["recording.level=off"])
+    refined = refine_trajectory(given, sweeps_as("kitti", tmp_path, 16, 7.0), overrides=OFF)
     assert absolute_error(refined.poses, exact).max_m < 0.05
 
 
-FOLLOWED = [
-    ("forest", 0, 30, 0.02), ("hill", 0, 30, 0.02), ("field", 0, 30, 0.01), ("office", 0, 30, 0.02),
-    ("office", 1, 60, 0.02), ("office", 2, 60, 0.02), ("tunnel", 0, 60, 0.02),
-]  # fmt: skip
+FOLLOWED = [("forest", 0, 30, ""), ("hill", 0, 30, ""), ("office", 1, 60, None), ("tunnel", 0, 60, "sweeps loose")]
+"""Worlds, and the kind of note that a part of the path gets where little tells it (more: benchmarks/lidar.py)."""
 
 
-@pytest.mark.parametrize(("name", "seed", "count", "share"), FOLLOWED)
-def test_other_worlds_are_followed(name: str, seed: int, count: int, share: float, tmp_path: Path) -> None:
-    found, exact, _ = follow_in(name, seed, count, tmp_path)
+@pytest.mark.parametrize(("name", "seed", "count", "kind"), FOLLOWED)
+def test_other_worlds_are_followed(name: str, seed: int, count: int, kind: str | None, tmp_path: Path) -> None:
+    found, exact, notes = follow_in(name, seed, count, tmp_path)
     path_m = np.linalg.norm(np.diff(exact[:, :3, 3], axis=0), axis=1).sum()
-    assert absolute_error(found.world_from_scan, exact).rmse_m < share * path_m
+    assert absolute_error(found.world_from_scan, exact).rmse_m < 0.02 * path_m
+    if kind is not None:
+        assert [note.kind for note in notes if note.kind.endswith("loose")] == [kind] * bool(kind)
 
 
 def follow_in(name: str, seed: int, count: int, folder: Path) -> tuple[Sweeps, Floats, list[Note]]:
@@ -383,7 +379,6 @@ def follow_in(name: str, seed: int, count: int, folder: Path) -> tuple[Sweeps, F
     return found, own.road.world_from_car(every * REVOLUTION_S), notes
 
 
-@pytest.mark.parametrize(("name", "kind"), [("bare", "path loose"), ("tunnel", "sweeps loose"), ("forest", None)])
-def test_a_path_that_little_tells_is_said(name: str, kind: str | None, tmp_path: Path) -> None:
-    _, _, notes = follow_in(name, 0, 40, tmp_path)
-    assert [note.kind for note in notes if note.kind.endswith("loose")] == [kind] * (kind is not None)
+def test_a_path_that_little_tells_is_said(tmp_path: Path) -> None:
+    _, _, notes = follow_in("bare", 0, 30, tmp_path)
+    assert [note.kind for note in notes if note.kind.endswith("loose")] == ["path loose"]

@@ -19,16 +19,7 @@ from test_refine_colmap import FREE
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 from colmap import MOST_WORSE_PERCENT, PEER, compared, cpu_of, disturbed, same_bytes
 
-CASES = [
-    ("mouse_good", "given"),
-    ("mouse_good", "big"),
-    ("mouse_good", "wrong"),
-    ("mouse_good", "halves"),
-    ("mouse_good", "renamed"),
-    ("maupertuis_good", "noise"),
-    ("maupertuis_good", "wrong"),
-    ("maupertuis_good", "halves"),
-]
+CASES = [("maupertuis_good", kind) for kind in ("given", "big", "noise", "wrong", "halves", "renamed")]
 
 
 @pytest.mark.parametrize(("name", "kind"), CASES)
@@ -71,27 +62,25 @@ def test_a_join_is_as_exact_as_the_images_that_both_models_have(data_dir: Path) 
     assert found is not None and found[0].scale == pytest.approx(0.5, rel=1e-9)
 
 
-def carried_along(good: Path, start: Path) -> None:
-    """Move each point of the disturbed model by the mean of what moved its images: no point is right any more."""
-    old, new = pycolmap.Reconstruction(good), pycolmap.Reconstruction(start)
-    by_name = {image.name: image for image in old.images.values()}
-    moves = {
-        key: image.cam_from_world().inverse() * by_name[image.name].cam_from_world()
-        for key, image in new.images.items()
-    }
-    for point in new.points3D.values():
-        point.xyz = np.mean([moves[one.image_id] * point.xyz for one in point.track.elements], axis=0)
-    new.write(start)
+def thinned(good: Path, out: Path, keep: int) -> Path:
+    """The model with one of so many of its points; of all, poses come back to 0.01 % (benchmarks/colmap.py)."""
+    model = pycolmap.Reconstruction(good)
+    for number, key in enumerate(sorted(model.points3D)):
+        if number % keep:
+            model.delete_point3D(key)
+    out.mkdir()
+    model.write(out)
+    return out
 
 
 def test_poses_come_back_where_the_points_are_wrong_as_well(data_dir: Path, tmp_path: Path) -> None:
-    good, out = data_dir / "colmap/disturbed/mouse_good", tmp_path / "out"
-    (start,) = disturbed(good, tmp_path / "start", "big", 0)
-    carried_along(good, start)
+    good = thinned(data_dir / "colmap/disturbed/mouse_good", tmp_path / "good", 4)
+    out = tmp_path / "out"
+    (start,) = disturbed(good, tmp_path / "start", "carried", 0)
     (tmp_path / "peer").mkdir()
     cpu_of([sys.executable, "-c", PEER, str(start), str(tmp_path / "peer")])
     done = hodge_pipeline.refine_colmap(start, database="none", images="none", out=out, overrides=FREE)
-    assert compared(good, tmp_path / "peer", "big")[0] > 1.0 > 100 * compared(good, out / "sparse/0", "big")[0]
+    assert compared(good, tmp_path / "peer", "carried")[0] > 1.0 > 3 * compared(good, out / "sparse/0", "carried")[0]
     assert len(done.results[0].candidates) > 2
 
 

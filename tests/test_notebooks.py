@@ -17,12 +17,12 @@ from hodge_pipeline.cli.console import ProgressBars
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.report.notebook import as_html
 from hodge_pipeline.run_folder import Run
-from synthetic import tiny_sequence  # noqa: F401 - a fixture
+from synthetic import LIGHT, short_sequence  # noqa: F401 - a fixture
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
 LAST_WORDS = {
-    "sequence": "Run('runs/notebook': 24 frames",
+    "sequence": "Run('runs/notebook': 12 frames",
     "pose_graph": "[3, 23], [11, 34]]",
     "colmap_model": "refined - mean error",
     "open3d_script": "mm off",
@@ -50,10 +50,9 @@ def test_it_runs_as_it_is(path: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, tiny_sequence: Path) -> Run:  # noqa: F811
-    sets = ["clouds.voxel_m=0.08", "outer_iterations=1", "fusion=[]", "executor.workers=0", "recording.level=summary"]
-    recipe = hodge_pipeline.load_recipe("demo", sets)
-    return hodge_pipeline.run(recipe, tmp_path_factory.mktemp("notebook") / "run", source=tiny_sequence)
+def run(tmp_path_factory: pytest.TempPathFactory, short_sequence: Path) -> Run:  # noqa: F811
+    recipe = hodge_pipeline.load_recipe("demo", [*LIGHT, "fusion=[]", "recording.level=summary"])
+    return hodge_pipeline.run(recipe, tmp_path_factory.mktemp("notebook") / "run", source=short_sequence)
 
 
 def test_a_run_shows_verdict_picture_and_errors(run: Run) -> None:

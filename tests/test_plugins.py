@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hodge_pipeline import registry
-from synthetic import tiny_sequence  # noqa: F401 - a fixture
+from synthetic import LIGHT, short_sequence  # noqa: F401 - a fixture
 
 PACKAGE = Path(__file__).parent / "plugin_package"
 
@@ -37,16 +37,15 @@ def test_it_is_listed_and_the_broken_one_is_named(environment: dict[str, str]) -
     assert "overlap" in listed.stdout
 
 
-def test_it_runs_from_a_recipe(environment: dict[str, str], tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_it_runs_from_a_recipe(environment: dict[str, str], short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
     recipe = tmp_path / "ring.yaml"
-    recipe.write_text(
-        "extends: demo\nedges: {stage: ring, reach: 1}\nouter_iterations: 1\nfusion: []\n"
-        "evaluation: {tables: false}\nrecording: {level: off}\nexecutor: {stage: local, workers: 0}\n"
-    )
-    ran = hodge(environment, "run", str(recipe), "--source", str(tiny_sequence), "--out", str(tmp_path / "run"))
+    recipe.write_text("extends: demo\nedges: {stage: ring, reach: 1}\nfusion: []\nrecording: {level: off}\n")
+    sets = [word for change in LIGHT if not change.startswith("edges") for word in ("--set", change)]
+    run = ["run", str(recipe), "--source", str(short_sequence), "--out", str(tmp_path / "run"), *sets]
+    ran = hodge(environment, *run)
     assert ran.returncode == 0, ran.stderr
     rows = (tmp_path / "run/edges.csv").read_text().splitlines()[1:]
-    assert len(rows) == 24
+    assert len(rows) == 8
     assert all(row.split(",")[2] == "ring" for row in rows)
 
 

@@ -206,8 +206,3 @@ def large_graph() -> ViewGraph:
 def test_values_print_in_a_line(value: Any, shown: str) -> None:
     text = repr(value())
     assert text.startswith(shown) and len(text) < LONGEST
-
-
-def test_a_recipe_with_the_old_name_of_the_solver_is_told_the_new_one() -> None:
-    with pytest.raises(RecipeError, match=r"no stage 'hodge'.*did you mean 'maximum_likelihood'"):
-        hodge_pipeline.load_recipe("demo", ["solver=hodge"])

@@ -13,7 +13,6 @@ from hodge_adapters.tum import reader
 from hodge_adapters.tum.image_lists import StampedImages, read_pairs
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
-from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.testing import check_reader
@@ -332,14 +331,6 @@ def test_two_cameras_that_images_do_not_tell_apart_are_both_named(
     (note,) = (note for note in TumReader().open(folder).notes if "tried on the images" in note)
     taken, other = ("fr1", "fr2") if "of fr1 taken" in note else ("fr2", "fr1")
     assert f"of {taken} taken" in note and f"set camera={other} if it was that" in note
-
-
-def test_a_camera_without_distortion_is_not_taken_for_another(tmp_path: Path) -> None:
-    folder = make_sequence(tmp_path / "office", DemoOptions(frames=30, width=640, height=480, stride=2, turns=0.2))
-    (folder / "intrinsics.txt").unlink()
-    source = TumReader().open(folder)
-    assert source.frames[0].camera.fx == 525.0
-    assert any("whose cameras fit no better" in note for note in source.notes)
 
 
 @pytest.mark.parametrize("listed", ["lists", "association"])

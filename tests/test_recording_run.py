@@ -26,10 +26,10 @@ from hodge_pipeline.store.store import stored
 from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.uses.record_again import record_again
 from recording_data import rgb, rows
-from synthetic import tiny_sequence  # noqa: F401 - a fixture
-from test_pipeline import SMALL, Log, small_recipe
+from synthetic import short_sequence  # noqa: F401 - a fixture
+from test_pipeline import SHORT, SMALL, Log, short_recipe
 
-NORMAL = ("executor.workers=0", "recording.level=normal", "evaluation.tables=false")
+NORMAL = ("recording.level=normal",)
 
 
 def verify(path: Path, scratch: Path) -> None:
@@ -41,8 +41,8 @@ def entities(path: Path) -> set[str]:
 
 
 @pytest.fixture(scope="module")
-def run(tiny_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:  # noqa: F811
-    return hodge_pipeline.run(small_recipe(tiny_sequence, *NORMAL), tmp_path_factory.mktemp("runs") / "tiny")
+def run(short_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:  # noqa: F811
+    return hodge_pipeline.run(short_recipe(short_sequence, *NORMAL), tmp_path_factory.mktemp("runs") / "short")
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_a_run_that_was_stopped_leaves_a_recording_of_what_was_done(
     missing: str,
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
-        hodge_pipeline.run(small_recipe(run.source.path, *NORMAL), tmp_path / "run", watcher=Log(stop_at=title))
+        hodge_pipeline.run(short_recipe(run.source.path, *NORMAL), tmp_path / "run", watcher=Log(stop_at=title))
     verify(tmp_path / "run/recording.rrd", tmp_path)
     found = entities(tmp_path / "run/recording.rrd")
     assert there in found and layout.COLOUR in found and layout.RECIPE in found
@@ -74,8 +74,8 @@ def test_a_run_that_failed_leaves_a_recording_and_its_own_error(run: Run, tmp_pa
     shutil.copytree(run.source.path, folder)
     for path in (folder / "depth").iterdir():
         path.write_bytes(path.read_bytes()[:64])  # its header, which tells the size
-    with pytest.raises(SourceError, match="none of the 24 frames"):
-        hodge_pipeline.run(small_recipe(folder, *NORMAL), tmp_path / "run")
+    with pytest.raises(SourceError, match="none of the 8 frames"):
+        hodge_pipeline.run(short_recipe(folder, *NORMAL), tmp_path / "run")
     assert layout.COLOUR in entities(tmp_path / "run/recording.rrd")
 
 
@@ -93,7 +93,7 @@ def stopped(run: Run, out: Path, signal_name: str) -> subprocess.CompletedProces
             return solve(work, registered, *rest)
         Work.solve = solve_and_stop
         sys.argv[1:] = ["run", "demo", "--source", {str(run.source.path)!r}, "--out", {str(out)!r}, "--quiet"]
-        for change in {[*SMALL, *NORMAL]!r}:
+        for change in {[*SMALL, *SHORT, *NORMAL]!r}:
             sys.argv += ["--set", change]
         main()
     """)
@@ -109,7 +109,7 @@ def test_a_signal_ends_in_one_line_and_a_run_that_goes_on(run: Run, tmp_path: Pa
     assert ended.stderr.count("\n") == 1
     verify(tmp_path / "run/recording.rrd", tmp_path)
     log = Log()
-    resumed = hodge_pipeline.run(small_recipe(run.source.path, *NORMAL), tmp_path / "run", watcher=log)
+    resumed = hodge_pipeline.run(short_recipe(run.source.path, *NORMAL), tmp_path / "run", watcher=log)
     assert log.stages[0] == "solve, round 2"
     np.testing.assert_array_equal(resumed.result.world_from_cam, run.result.world_from_cam)
 
@@ -139,7 +139,7 @@ def test_a_recording_made_again_computes_nothing(run: Run, tmp_path: Path) -> No
     assert path.stat().st_size < (run.folder / "recording.rrd").stat().st_size
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.npz")} == before
     again = Log()
-    hodge_pipeline.run(small_recipe(run.source.path, *NORMAL), folder, watcher=again)  # back to the recipe's level
+    hodge_pipeline.run(short_recipe(run.source.path, *NORMAL), folder, watcher=again)  # back to the recipe's level
     assert again.stages == []
     assert layout.COLOUR in entities(folder / "recording.rrd")
 

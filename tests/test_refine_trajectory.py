@@ -24,6 +24,7 @@ from readers_data import points_in_cam
 
 SMALL = (
     "clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1", "start.every=2",
+    "evaluation.tables=false",
     "edges.builders=[{stage: sequential}, {stage: overlap, min_iou: 0.15}]",
 )  # fmt: skip
 ROOM = DemoOptions(frames=16, width=160, height=120, noise=0.3)

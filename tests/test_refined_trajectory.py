@@ -31,7 +31,8 @@ from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.match_poses import match_poses
 from hodge_pipeline.types import Floats, Frame, Source, Trajectory
 
-SMALL = ("clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1")
+OFF = ("executor.workers=0", "recording.level=off", "evaluation.tables=false")
+SMALL = ("clouds.voxel_m=0.06", "outer_iterations=1", *OFF)
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +246,7 @@ def test_the_loop_that_open3d_left_open_is_closed(data_dir: Path, tmp_path: Path
     if not folder.is_dir() or not truth.is_file():
         pytest.skip(f"no livingroom1_redwood or its gt.log in {data_dir}")
     start = np.array(list(read_log_file(folder / "test_scene" / "trajectory.log").poses.values()))
-    better = hodge_pipeline.refine_trajectory(start, folder, overrides=["recording.level=off"]).poses
+    better = hodge_pipeline.refine_trajectory(start, folder, overrides=OFF).poses
     true = read_log_file(truth)
     origin = se3.from_parts(np.eye(3), np.array([2.0, 2.0, -0.3]))
     for (i, j), motion in zip(true.pairs, true.i_from_j, strict=True):

@@ -38,6 +38,7 @@ def report() -> Report:
     return make_report()
 
 
+@pytest.mark.draws
 def test_the_page_is_small_well_formed_and_asks_for_nothing(report: Report, tmp_path: Path) -> None:
     page, _ = write_report(tmp_path, report)
     text, addresses = read_page(page)
@@ -62,6 +63,7 @@ def test_json_reads_back_with_the_numbers(report: Report, tmp_path: Path) -> Non
     assert found["stages"][1]["cpu_s"] == 3.5
 
 
+@pytest.mark.draws
 def test_the_same_report_gives_the_same_bytes(report: Report, tmp_path: Path) -> None:
     first, second = ([path.read_bytes() for path in write_report(tmp_path, report)] for _ in range(2))
     assert first == second

@@ -14,11 +14,12 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recording.shapes import up_and_ahead
 from hodge_pipeline.report import raster
-from hodge_pipeline.report.contents import EdgeRow, Path3D, Pictures, Report, SourceSummary
+from hodge_pipeline.report.contents import EdgeRow, Pictures, Report, SourceSummary, paths_of
 from hodge_pipeline.report.painting import turns_deg
 from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud, Source
 
+pytestmark = pytest.mark.draws
 RED, BLUE = (200, 0, 0), (0, 0, 200)
 AHEAD = raster.View(np.eye(3), np.array([0.0, 0.0, 1.5]), 0.01)
 """Looks along +z with x to the right and y down; a pixel is 1 cm."""
@@ -163,7 +164,7 @@ def test_the_rotation_error_of_each_frame_is_that_of_its_pose() -> None:
     truth = np.tile(np.eye(4), (5, 1, 1))
     turned = se3.exp(np.array(up) * 0.5) @ truth @ se3.exp(np.radians(np.outer(turns, up)))
     turned[3] = np.nan
-    paths = (Path3D.of("truth", truth), Path3D.of("odometry", turned), Path3D.of("result", truth))
+    paths = paths_of({"truth": truth, "odometry": turned, "result": truth})
     report = Report("", SourceSummary("", "", 5), before="odometry", after="result", pictures=Pictures(paths=paths))
     found = turns_deg(report)
     np.testing.assert_allclose(found["odometry"], [20, 10, 10, np.nan, 20], atol=1e-6)

@@ -179,23 +179,6 @@ def test_a_run_in_progress_is_read_as_far_as_it_came(recipe: Recipe, run: Run, t
         Run.load(tmp_path / "early")
 
 
-def test_the_layout_of_an_earlier_version_is_refused_and_made_again(recipe: Recipe, run: Run, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
-    shutil.rmtree(folder / "stages")
-    old = folder / "stages" / "clouds"
-    old.mkdir(parents=True)
-    (old / "key.json").write_text('{"key": "k"}')
-    again = f"'hodge run {folder / 'recipe.yaml'} --out {folder} --overwrite' makes it again"
-    for command in ("diagnose", "record", "solve"):
-        done = CliRunner().invoke(app, [command, str(folder)])
-        assert isinstance(done.exception, WorkspaceError) and again in str(done.exception), command
-        assert "layout of an earlier version" in str(done.exception)
-    assert old.is_dir()
-    hodge_pipeline.run(load_recipe(str(folder / "recipe.yaml")), folder, overwrite=True)
-    assert not old.exists()
-    np.testing.assert_array_equal(Run.load(folder).poses, run.poses)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [

@@ -27,12 +27,9 @@ from hodge_pipeline.run_folder import Run
 from hodge_pipeline.store import yaml_file
 from hodge_pipeline.types import Frame, Source
 from hodge_pipeline.uses.recipe_run import solve_again
-from synthetic import tiny_sequence  # noqa: F401 - a fixture
+from synthetic import LIGHT, short_sequence  # noqa: F401 - a fixture
 
-SMALL = (
-    "clouds.voxel_m=0.06", "fusion=[]", "executor.workers=0", "recording.level=off", "evaluation.tables=false",
-    "outer_iterations=1", "edges.max_edges_per_frame=3",
-)  # fmt: skip
+SMALL = (*LIGHT, "fusion=[]", "recording.level=off")
 LOCAL = "executor:\n  stage: local\n  workers: 0\n  retries: 2\n"
 
 
@@ -59,8 +56,8 @@ def stranger() -> Iterator[Stranger]:
 
 
 @pytest.fixture(scope="module")
-def made(tiny_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:  # noqa: F811
-    return hodge_pipeline.run(load_recipe("demo", SMALL, tiny_sequence), tmp_path_factory.mktemp("runs") / "tiny")
+def made(short_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:  # noqa: F811
+    return hodge_pipeline.run(load_recipe("demo", SMALL, short_sequence), tmp_path_factory.mktemp("runs") / "short")
 
 
 @pytest.fixture
@@ -153,14 +150,14 @@ def test_no_stage_of_the_package_takes_an_address() -> None:
 
 
 def test_the_command_line_or_the_environment_names_the_cluster(
-    tiny_sequence: Path,  # noqa: F811
+    short_sequence: Path,  # noqa: F811
     tmp_path: Path,
     stranger: Stranger,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("hodge_pipeline.executors.dask.TIMEOUT_S", 0.5)
     settings = [word for setting in SMALL for word in ("--set", setting)]
-    command = ["run", "demo", "--source", tiny_sequence, *settings]
+    command = ["run", "demo", "--source", short_sequence, *settings]
     for way in ("option", "environment"):
         option = ["--dask", stranger.address] if way == "option" else []
         environment = {"HODGE_DASK_ADDRESS": stranger.address} if way == "environment" else {}
@@ -171,19 +168,19 @@ def test_the_command_line_or_the_environment_names_the_cluster(
 
 
 def test_workers_that_start_elsewhere_find_source_and_run(
-    tiny_sequence: Path,  # noqa: F811
+    short_sequence: Path,  # noqa: F811
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from distributed import Client, LocalCluster
 
-    monkeypatch.chdir(tiny_sequence.parent)
+    monkeypatch.chdir(short_sequence.parent)
     out = os.path.relpath(tmp_path / "run")
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
         with Client(cluster) as client:
             client.run(os.chdir, "/")
         recipe = load_recipe("demo", SMALL)
-        run = hodge_pipeline.run(recipe, out, source=tiny_sequence.name, dask=cluster.scheduler_address)
+        run = hodge_pipeline.run(recipe, out, source=short_sequence.name, dask=cluster.scheduler_address)
     assert np.isfinite(run.poses).all()
 
 

@@ -30,7 +30,7 @@ from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.trajectory import refine_trajectory
 from lidar_worlds import CarFree
 
-COUNT, SPEED_M_S, UNIX_S = 30, 10.0, 1.7e9
+COUNT, SPEED_M_S, UNIX_S = 24, 10.0, 1.7e9
 NEAR_M = 0.1
 """Whole sequences are off by 0.02 m; a sweep followed from a wrong velocity by half a metre and more."""
 
@@ -76,9 +76,8 @@ def followed(
     return follow(source, every, CloudOptions(max_range_m=max_range_m, voxel_m=0.5), None, step=step), "\n".join(said)
 
 
-@pytest.mark.parametrize("lost", [1, 5])
-def test_sweeps_after_unread_ones_are_followed(lost: int) -> None:
-    frames = street().copy()
+def test_sweeps_after_unread_ones_are_followed() -> None:
+    frames, lost = street().copy(), 5
     frames[12 : 12 + lost] = [changed(frame, broken) for frame in frames[12 : 12 + lost]]
     found, said = followed(frames)
     assert found.found.sum() == COUNT - lost and "12.pcd: the sweep is left out: cut off" in said
@@ -87,8 +86,9 @@ def test_sweeps_after_unread_ones_are_followed(lost: int) -> None:
     assert np.linalg.norm(found.velocity[rows, 3:], axis=1) == pytest.approx(SPEED_M_S, abs=0.5)
 
 
-@pytest.mark.parametrize("clock", ["numbers", "seconds", "milliseconds from the first"])
-@pytest.mark.parametrize("is_timed", [True, False])
+@pytest.mark.parametrize(
+    ("clock", "is_timed"), [("numbers", True), ("seconds", False), ("milliseconds from the first", True)]
+)
 def test_sweeps_after_a_hole_are_followed(clock: str, is_timed: bool) -> None:
     stamp = {"numbers": (0.0, 1.0), "seconds": (UNIX_S, REVOLUTION_S)}.get(clock, (0.0, 100.0))
     frames = [replace(frame, stamp_s=stamp[0] + stamp[1] * frame.stamp_s) for frame in street()]
@@ -114,8 +114,8 @@ def true_at(seconds: Floats | list[float]) -> Floats:
 
 @pytest.mark.parametrize(
     ("first_s", "is_last"),
-    [(-REVOLUTION_S, True), (UNIX_S, False), (UNIX_S, True), (5000.0, False)],
-    ids=["after the last point", "unix", "unix, of the last point", "another clock"],
+    [(-REVOLUTION_S, True), (UNIX_S, True), (5000.0, False)],
+    ids=["after the last point", "unix, of the last point", "another clock"],
 )
 def test_poses_are_those_at_the_stamps(first_s: float, is_last: bool) -> None:
     late_s, frames = REVOLUTION_S * is_last, corner()
@@ -138,7 +138,7 @@ def test_sweeps_of_given_poses_are_deskewed_by_them() -> None:
     exact = true_at([frame.stamp_s - UNIX_S for frame in frames])
     noise = np.random.default_rng(0).normal(0, [5e-4] * 3 + [0.02] * 3, (len(frames), 6))
     given = exact @ se3.exp(np.cumsum(noise, axis=0))
-    refined = refine_trajectory(given, frames, overrides=["recording.level=off"])
+    refined = refine_trajectory(given, frames, overrides=["recording.level=off", "executor.workers=0"])
     assert not refined.decision.keeps_input
     before, after = (absolute_error(poses, exact).rmse_m for poses in (given, refined.poses))
     assert after < 0.75 * before  # skewed around a corner, they fit each other where the scanner was not

@@ -35,7 +35,7 @@ from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start import key_frames as tracked
 from hodge_pipeline.start import odometry as odometry_start
 from hodge_pipeline.start.clouds import make_clouds
-from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, followers, is_video
+from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, followers
 from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.start.unordered.join import _stays
 from hodge_pipeline.start.unordered.start import Start
@@ -44,7 +44,7 @@ from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Sourc
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.recipe_run import solve_again
 
-FRAMES, BLOCK = 64, 48
+FRAMES, BLOCK, FUSED = 64, 48, "fusion=[cloud]"
 SMALL = (
     "clouds.voxel_m=0.06", "fusion=[]", "executor.workers=0", "recording.level=off", "evaluation.tables=false",
     "outer_iterations=1", "edges.max_edges_per_frame=4", "start.whole_up_to=20",
@@ -71,7 +71,13 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> hodge_pipeline.Run:
-    return hodge_pipeline.run(small_recipe(sequence), tmp_path_factory.mktemp("runs") / "run")
+    return hodge_pipeline.run(small_recipe(sequence, FUSED), tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture(scope="module")
+def whole(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Tracked:
+    """The sequence tracked as it is."""
+    return track(TumReader().open(sequence), tmp_path_factory.mktemp("whole") / "t")[0]
 
 
 def tracking_options(recipe: Recipe) -> TrackingOptions:
@@ -159,15 +165,15 @@ def test_every_frame_that_was_found_is_fused(run: hodge_pipeline.Run) -> None:
     np.testing.assert_array_equal(np.isfinite(poses).all((1, 2)), found)
 
 
-def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(sequence: Path, tmp_path: Path) -> None:
-    recipe = small_recipe(sequence, "fusion=[cloud]")
-    before = hodge_pipeline.run(recipe, tmp_path / "run")
-    keys = len(before.result.world_from_cam)
-    i, j = before.result.graph.vertex_ids[before.result.graph.edges[0]]
-    write_history(before.folder, History((Edit(disable=(f"{i}-{j}",)),)))
-    edited = solve_again(before.folder)
+def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(
+    run: hodge_pipeline.Run, sequence: Path, tmp_path: Path
+) -> None:
+    folder, keys = Path(shutil.copytree(run.folder, tmp_path / "run")), len(run.result.world_from_cam)
+    i, j = run.result.graph.vertex_ids[run.result.graph.edges[0]]
+    write_history(folder, History((Edit(disable=(f"{i}-{j}",)),)))
+    edited = solve_again(folder)
     assert any(f"the {keys} key frames alone" in str(note) for note in edited.report.notes)
-    again = hodge_pipeline.run(recipe, before.folder)
+    again = hodge_pipeline.run(small_recipe(sequence, FUSED), folder)
     assert not any("key frames alone" in str(note) for note in again.report.notes)
     np.testing.assert_array_equal(again.result.world_from_cam, edited.result.world_from_cam)
 
@@ -186,9 +192,8 @@ def test_what_is_short_enough_is_registered_whole_unless_it_is_a_video(
     assert len(scene.first.world_from_cam) == len(scene.clouds)
 
 
-def test_frames_follow_their_key_frames(sequence: Path, tmp_path: Path) -> None:
-    source = TumReader().open(sequence)
-    found, _ = track(source, tmp_path / "t")
+def test_frames_follow_their_key_frames(sequence: Path, whole: Tracked) -> None:
+    source, found = TumReader().open(sequence), whole
     before = all_poses(source, found, found.world_from_key)
     np.testing.assert_allclose(before[found.key_rows], found.world_from_key, atol=1e-12)
     change = se3.exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -0.5]))
@@ -206,7 +211,7 @@ def test_blocks_share_their_border_and_nothing_else() -> None:
     assert [block.rows.tolist() for block in frame_blocks(np.array([3]), tuple(range(9)), np.arange(9.0))] == [[3]]  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("blank", [range(0, 3), range(20, 26), range(46, 51)])
+@pytest.mark.parametrize("blank", [range(0, 3), range(46, 51)])
 def test_frames_with_depth_and_a_black_image_are_said(sequence: Path, tmp_path: Path, blank: range) -> None:
     """Of several blocks each is counted once, and those without depth, or darker and brighter ones, are not."""
     source = with_dark(TumReader().open(sequence), blank, images=True, depth=False)
@@ -226,12 +231,15 @@ def test_a_sequence_without_any_depth_in_range_is_an_error(sequence: Path, tmp_p
         track(source, tmp_path / "dark")
 
 
-@pytest.mark.parametrize("images", [False, True])
-@pytest.mark.parametrize("dark", [range(20, 26), range(46, 51), range(60, 64)])
-def test_frames_without_depth_are_bridged_and_said(sequence: Path, tmp_path: Path, dark: range, images: bool) -> None:
+@pytest.mark.parametrize(
+    ("dark", "images"),
+    [(range(20, 26), True), (range(46, 51), False), (range(46, 51), True), (range(60, 64), False)],
+)
+def test_frames_without_depth_are_bridged_and_said(
+    sequence: Path, whole: Tracked, tmp_path: Path, dark: range, images: bool
+) -> None:
     """A frame whose image alone is left may still be placed by it; a black one is lost."""
     source = TumReader().open(sequence)
-    whole, _ = track(source, tmp_path / "whole")
     found, notes = track(with_dark(source, dark, images=images), tmp_path / "dark")
     lost = np.flatnonzero(~found.found).tolist()
     assert lost == list(dark) if images else set(lost) < set(dark)
@@ -320,11 +328,9 @@ def test_a_killed_tracking_keeps_its_blocks(
     assert not (again.folder / "stages" / "track-1" / "blocks").exists()
 
 
-def test_clouds_are_joined_without_the_border_twice(sequence: Path, tmp_path: Path) -> None:
-    source = TumReader().open(sequence)
-    found, _ = track(source, tmp_path / "t")
-    clouds = found.clouds
-    assert len(clouds) == len(found.key_rows) == len(set(found.key_rows.tolist()))
+def test_clouds_are_joined_without_the_border_twice(sequence: Path, whole: Tracked) -> None:
+    source, clouds = TumReader().open(sequence), whole.clouds
+    assert len(clouds) == len(whole.key_rows) == len(set(whole.key_rows.tolist()))
     options = tracking_options(small_recipe(sequence))
     (first, *_) = frame_blocks(np.arange(FRAMES), tuple(source.frames), tracked.stamps_of(source))
     block = track_block(options, first)
@@ -337,16 +343,17 @@ def test_the_same_command_again_computes_nothing(
     folder = tmp_path / "again"
     shutil.copytree(run.folder, folder)
     monkeypatch.setattr(tracked, "_track_missing", None)
-    again = hodge_pipeline.run(small_recipe(sequence), folder)
+    again = hodge_pipeline.run(small_recipe(sequence, FUSED), folder)
     np.testing.assert_array_equal(again.result.world_from_cam, run.result.world_from_cam)
     stages = [stage["name"] for stage in json.loads((folder / "report.json").read_text())["stages"]]
     assert "tracking" in stages
 
 
-def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(sequence: Path, tmp_path: Path) -> None:
+def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(
+    sequence: Path, whole: Tracked, tmp_path: Path
+) -> None:
     source = TumReader().open(sequence)
     frames = [replace(frame, stamp_s=frame.stamp_s + 3600.0 * (row >= 30)) for row, frame in enumerate(source.frames)]
-    whole, _ = track(source, tmp_path / "whole")
     found, notes = track(replace(source, frames=tuple(frames)), tmp_path / "stopped")
     assert found.found.all()
     assert any("the recording stops for 3600.0 s before 30:" in note for note in notes)
@@ -354,10 +361,9 @@ def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(sequ
     assert np.abs(poses - expected).max() < 0.06
 
 
-def test_a_clock_that_goes_back_is_said_and_costs_no_frame(sequence: Path, tmp_path: Path) -> None:
+def test_a_clock_that_goes_back_is_said_and_costs_no_frame(sequence: Path, whole: Tracked, tmp_path: Path) -> None:
     source = TumReader().open(sequence)
     frames = [replace(frame, stamp_s=frame.stamp_s - 5.0 * (row >= 30)) for row, frame in enumerate(source.frames)]
-    whole, _ = track(source, tmp_path / "whole")
     found, notes = track(replace(source, frames=tuple(frames)), tmp_path / "back")
     assert found.found.all()
     assert any("the clock goes back at 30:" in note for note in notes)
@@ -365,24 +371,10 @@ def test_a_clock_that_goes_back_is_said_and_costs_no_frame(sequence: Path, tmp_p
     assert np.abs(poses - expected).max() < 0.06
 
 
-@pytest.mark.parametrize("begin_s", [0.0, 1e9])
-def test_only_the_step_over_which_a_clock_goes_back_is_made_up(begin_s: float) -> None:
-    stamps = begin_s + np.array([0.25, 0.5, 1.0, 1.25, -7.0, -6.5, -6.25])
-    source = Source("s", Path("s"), tuple(Frame(row, stamp) for row, stamp in enumerate(stamps.tolist())))
-    np.testing.assert_allclose(tracked.stamps_of(source) - begin_s, [0.25, 0.5, 1.0, 1.25, 1.5, 2.0, 2.25])
-
-
-@pytest.mark.parametrize("stamps", [[0.5] * 5, [1.5, 1.5, 1.5, 2.5, 2.5], [3.0, 4.0, 1.0, 2.0, 3.0]])
-def test_stamps_that_are_no_clock_are_the_numbers_of_the_frames(stamps: list[float]) -> None:
-    source = Source("s", Path("s"), tuple(Frame(row, stamp) for row, stamp in enumerate(stamps)))
-    np.testing.assert_array_equal(tracked.stamps_of(source), np.arange(5))
-
-
 def test_an_estimated_read_out_is_told_and_used_by_the_frames(
-    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sequence: Path, whole: Tracked, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source = TumReader().open(sequence)
-    none, _ = track(source, tmp_path / "none")
+    source, none = TumReader().open(sequence), whole
     monkeypatch.setattr(tracked, "estimate_readout", lambda *_: Readout(0.022, 0.02, 0.0239))
     found, notes = track(source, tmp_path / "found")
     assert none.readout_s == 0.0 and followers(source, found).readout_s == 0.022
@@ -393,22 +385,3 @@ def test_an_estimated_read_out_is_told_and_used_by_the_frames(
         for one in (none, found)
     ]
     assert 0.001 < np.abs(posed[1] - posed[0]).max() < 0.1
-
-
-@pytest.mark.parametrize(
-    ("step_s", "first_s", "numbered_hz", "is_tracked"),
-    [
-        (1 / 30, 0.5, 0.0, True),
-        (0.7, 0.5, 0.0, False),
-        (1.0, 0.0, 0.0, False),
-        (4.0, 0.0, 30.0, True),
-        (8.0, 0.0, 30.0, False),
-    ],
-)
-def test_stills_and_frames_without_a_clock_are_no_video(
-    step_s: float, first_s: float, numbered_hz: float, is_tracked: bool
-) -> None:
-    frames = tuple(Frame(row, first_s + row * step_s, read_depth=partial(np.ones, (6, 8))) for row in range(60))
-    assert is_video(Source("s", Path("s"), frames, numbered_hz=numbered_hz)) == is_tracked
-    scans = tuple(replace(frame, read_depth=None) for frame in frames)
-    assert not is_video(Source("s", Path("s"), scans, numbered_hz=numbered_hz))

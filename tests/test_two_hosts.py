@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from synthetic import tiny_sequence  # noqa: F401
+from synthetic import LIGHT, short_sequence  # noqa: F401
 
 PATIENCE_S = 300
 HOSTS = Path(__file__).with_name("two_hosts.py")
@@ -73,17 +73,17 @@ def test_a_host_that_leaves_costs_a_retry(tmp_path: Path) -> None:
     assert "2 workers with 2 threads on 2 hosts" in told and "GB; dashboard: http" in told
 
 
-def test_a_run_on_two_hosts_gives_the_same_bits(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_a_run_on_two_hosts_gives_the_same_bits(short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
     on_two_hosts(
         f"""
         import hodge_pipeline
         from hodge_pipeline.recipe.schema import load_recipe
 
-        sets = ["start.whole_up_to=5", "recording.level=off", "outer_iterations=1", "fusion=[]"]
-        recipe = load_recipe("demo", [*sets, "executor.workers=0"])
-        hodge_pipeline.run(recipe, "local", source={str(tiny_sequence)!r})
+        sets = ["start.whole_up_to=5", "recording.level=off", "fusion=[]"]
+        recipe = load_recipe("demo", [*sets, *{LIGHT!r}])
+        hodge_pipeline.run(recipe, "local", source={str(short_sequence)!r})
         with Hosts() as hosts:
-            hodge_pipeline.run(recipe, "cluster", source={str(tiny_sequence)!r}, dask=hosts.address)
+            hodge_pipeline.run(recipe, "cluster", source={str(short_sequence)!r}, dask=hosts.address)
         """,
         tmp_path,
     )

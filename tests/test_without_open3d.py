@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -12,10 +13,11 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
+from command import Ended
 from hodge_pipeline import se3
 from hodge_pipeline.registry import load
 from hodge_pipeline.types import Source, Trajectory
-from synthetic import tiny_sequence  # noqa: F401 - a fixture
+from synthetic import short_sequence  # noqa: F401 - a fixture
 
 SCRIPT = Path(__file__).resolve().parents[1] / "tools" / "system-libraries.sh"
 DEBIAN = re.findall(r"^need \S+ (\S+)", SCRIPT.read_text("utf-8"), re.M)
@@ -28,7 +30,8 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     site = tmp_path_factory.mktemp("broken")
     (site / "open3d").mkdir()
     (site / "open3d" / "__init__.py").write_text(f'raise ImportError("{MESSAGE}")\n')
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])}
+    paths = [str(site), str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +51,16 @@ def graph(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def hodge(environment: dict[str, str], *words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "hodge_pipeline.cli.main", *map(str, words)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+def ended(environment: dict[str, str], *commands: tuple[object, ...]) -> list[Ended]:
+    """What commands left, one after the other in one process of that environment."""
+    script = "import json, sys; from command import hodge; from dataclasses import astuple\n"
+    script += "print(json.dumps([astuple(hodge(*words)) for words in json.loads(sys.argv[1])]))"
+    words = json.dumps([[*map(str, each)] for each in commands])
+    done = subprocess.run(
+        [sys.executable, "-c", script, words], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return [Ended(*each) for each in json.loads(done.stdout)]
 
 
 def test_open3d_does_not_load_there(broken: dict[str, str]) -> None:
@@ -62,7 +72,7 @@ def test_open3d_does_not_load_there(broken: dict[str, str]) -> None:
 
 def test_a_pose_graph_needs_no_open3d(broken: dict[str, str], graph: Path, tmp_path: Path) -> None:
     solved = tmp_path / "solved.g2o"
-    for words in (
+    commands: tuple[tuple[object, ...], ...] = (
         ("inspect", graph),
         ("solve", graph, "--out", solved, "--certificate", "--objective", "isotropic"),
         ("solve", graph, "--out", tmp_path / "robust.tum", "--robust"),
@@ -70,26 +80,29 @@ def test_a_pose_graph_needs_no_open3d(broken: dict[str, str], graph: Path, tmp_p
         ("convert", solved, tmp_path / "graph.json"),
         ("convert", solved, tmp_path / "poses.tum"),
         ("inspect", tmp_path / "poses.tum"),
-    ):
-        done = hodge(broken, *words)
+    )
+    for words, done in zip(commands, ended(broken, *commands), strict=True):
         assert done.returncode == 0, (words, done.stderr)
     assert (tmp_path / "why" / "diagnosis.html").is_file() and (tmp_path / "why" / "edges.csv").is_file()
 
 
-def test_a_sequence_is_inspected_and_converted_without_open3d(
+def test_a_sequence_is_inspected_and_converted_and_what_needs_open3d_says_so(
     broken: dict[str, str],
-    tiny_sequence: Path,  # noqa: F811
+    short_sequence: Path,  # noqa: F811
     tmp_path: Path,
 ) -> None:
-    for words in (("inspect", tiny_sequence), ("convert", tiny_sequence, tmp_path / "poses.kitti"), ("stages",)):
-        done = hodge(broken, *words)
+    sets = ("--set", "registration=point_to_plane")
+    commands: tuple[tuple[object, ...], ...] = (
+        ("inspect", short_sequence),
+        ("convert", short_sequence, tmp_path / "poses.kitti"),
+        ("stages",),
+        ("run", "demo", "--source", short_sequence, *sets, "--out", tmp_path / "run"),
+    )
+    *fine, needing = ended(broken, *commands)
+    for words, done in zip(commands, fine, strict=False):
         assert done.returncode == 0, (words, done.stderr)
-    assert "point_to_plane" in done.stdout and "gicp" in done.stdout and MESSAGE in done.stdout
-
-
-def test_what_needs_it_says_so_in_a_line(broken: dict[str, str], tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
-    sets = ["--set", "registration=point_to_plane"]
-    done = hodge(broken, "run", "demo", "--source", tiny_sequence, *sets, "--out", tmp_path / "run")
-    assert done.returncode == 1
-    assert MESSAGE in done.stderr and done.stderr.count("\n") == 1
-    assert all(package in done.stderr for package in DEBIAN)
+    stages = fine[-1].stdout
+    assert "point_to_plane" in stages and "gicp" in stages and MESSAGE in stages
+    assert needing.returncode == 1, "what needs it says so in a line"
+    assert MESSAGE in needing.stderr and needing.stderr.count("\n") == 1
+    assert all(package in needing.stderr for package in DEBIAN)

@@ -15,7 +15,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.json_files import motion, numbers, objects, read_json, whole, write_json
-from hodge_adapters.posed import trajectory_of, written
+from hodge_adapters.posed import graph_of, trajectory_of, written, written_graph
 from hodge_adapters.text_rows import first_text
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -62,12 +62,8 @@ class Open3dPoseGraphWriter:
 
     def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically. Edges of neighbouring vertices are certain, others uncertain, unless they came so."""
-        graph = source.graph
-        if graph is None:
-            raise SourceError(f"{source.path}: has no graph to write: convert one that has edges")
-        poses = None if source.trajectory is None else source.trajectory.world_from_cam
-        if poses is None or len(poses) != graph.vertex_count:
-            poses = np.broadcast_to(np.eye(4), (graph.vertex_count, 4, 4))
+        graph, known = graph_of(source)
+        poses = np.broadcast_to(np.eye(4), (graph.vertex_count, 4, 4)) if known is None else known
         content = {
             "class_name": GRAPH,
             "edges": _edge_objects(graph),
@@ -75,9 +71,7 @@ class Open3dPoseGraphWriter:
             **VERSION,
         }
         write_json(Path(path), content)
-        return written(
-            f"{counted(graph.vertex_count, 'vertex|vertices')}, {counted(graph.edge_count, 'edge')}", source, {"edges"}
-        )
+        return written_graph(source, graph)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

@@ -7,7 +7,8 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, Frame, Source, Trajectory
+from hodge_pipeline.types import Floats, Frame, Source, Trajectory, ViewGraph
+from hodge_pipeline.types.text import counted
 
 UNIT_TOLERANCE = 1e-3
 """Three decimals of a quaternion leave as much; more is another mistake."""
@@ -31,6 +32,23 @@ def trajectory_of(source: Source) -> Trajectory:
     if found is None:
         raise SourceError(f"{source.path}: has no poses to write: convert one that has a trajectory")
     return found
+
+
+def graph_of(source: Source) -> tuple[ViewGraph, Floats | None]:
+    """The source's measured graph, and the trajectory's poses (V, 4, 4) where it has one for each vertex.
+
+    Raises `SourceError` where it has no graph.
+    """
+    if source.graph is None:
+        raise SourceError(f"{source.path}: has no graph to write: convert one that has edges")
+    poses = None if source.trajectory is None else source.trajectory.world_from_cam
+    return source.graph, poses if poses is not None and len(poses) == source.graph.vertex_count else None
+
+
+def written_graph(source: Source, graph: ViewGraph) -> tuple[str, ...]:
+    """As `written`, of a graph."""
+    what = f"{counted(graph.vertex_count, 'vertex|vertices')}, {counted(graph.edge_count, 'edge')}"
+    return written(what, source, {"edges"})
 
 
 def written(what: str, source: Source, keeps: Collection[str] = ()) -> tuple[str, ...]:

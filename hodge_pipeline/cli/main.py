@@ -248,9 +248,11 @@ def review(
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
 ) -> None:
     """See edges and their clouds on a page that only this machine can open, decide by hand, and watch the map mend."""
-    from hodge_pipeline.cli import review as reviewing
+    from hodge_pipeline.review.opening import open_review
 
-    reviewing.review(path, port=port, browser=browser)
+    with open_review(path, port=port, browser=browser) as opened:
+        print(f"{opened.address}\nwhoever has this address can decide; Ctrl-C ends it", flush=True)
+        opened.wait()
 
 
 @app.command()

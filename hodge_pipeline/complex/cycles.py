@@ -70,6 +70,10 @@ class Loops:
         matrix.eliminate_zeros()
         return matrix
 
+    def vertices(self, edges: Ints) -> Ints:
+        """The vertices (N,) along the loops of edges (E, 2), one loop after the other."""
+        return np.asarray(edges[self.edge, np.where(self.sign > 0, 0, 1)])
+
     def select(self, rows: Ints) -> Loops:
         """These loops, in this order."""
         lengths = self.lengths[rows]

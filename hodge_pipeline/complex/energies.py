@@ -23,9 +23,15 @@ class Energies:
     harmonic: tuple[float, float]
 
     @property
+    def total(self) -> tuple[float, float]:
+        """The energy of all parts: rotation, translation."""
+        rotation, translation = np.sum((self.exact, self.coexact, self.harmonic), axis=0).tolist()
+        return rotation, translation
+
+    @property
     def shares(self) -> dict[str, tuple[float, float]]:
         """The share of each part in the rotation's and the translation's energy; 0 where there is none at all."""
         parts = {"exact": self.exact, "coexact": self.coexact, "harmonic": self.harmonic}
-        total = np.sum(list(parts.values()), axis=0)
+        total = np.array(self.total)
         scale = np.where(total > ROUNDING, total, np.inf)
         return {name: (float(part[0] / scale[0]), float(part[1] / scale[1])) for name, part in parts.items()}

@@ -35,9 +35,10 @@ MOST_PAIRS = 1500
 """Pairs of a graph that are scored: the mean of so many is known to a fifth of a millimetre (red kitchen)."""
 MOST_FRAMES = 500
 """Frames whose pairs with all others are looked for: 1500 pairs are taken of what they give."""
-MOST_POINTS, LEAST_POINTS = 3_000_000, 1000
-"""Points measured of all pairs together, and at least of each: of 1400 pairs of red kitchen a quarter, which changes
-their mean scores by a ten-thousandth; of 400 pairs all. Every set of poses is measured with the same.
+MOST_POINTS, LEAST_POINTS = 1_000_000, 500
+"""Points measured of all pairs together, and at least of each: of the 500 pairs of red kitchen a third, of the 1200 of
+fr1/rpy an eighth, which changes their mean scores by two ten-thousandths; of 150 pairs all. Every set of poses is
+measured with the same.
 """
 PAIRS_PER_BLOCK = 96
 """About half a second of work: long against the cost of sending a block, short against a whole run."""

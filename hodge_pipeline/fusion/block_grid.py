@@ -12,14 +12,14 @@ from hodge_pipeline.fusion.boxes import Box
 from hodge_pipeline.fusion.mesh import Mesh
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Ints
 
-BLOCK_SIDE = 16
+BLOCK_SIDE = 8
 VALUES = {"tsdf": 1, "weight": 1, "color": 3}
 """Of a voxel, open3d's names, and how many numbers each is."""
 BYTES_A_VOXEL = 4 + 4 + 12 + 16
 """Distance, weight, colour, and the vertex index that the extraction adds."""
 GROWTH_COPIES = 3
 """The old blocks are alive while the twice as many new ones are filled."""
-FIRST_BLOCKS = 1000
+FIRST_BLOCKS = 8000
 GREY = 128
 TOUCH_STRIDE = 4
 """Of a depth image open3d takes each fourth row and column to find the blocks that it touches."""

@@ -99,7 +99,7 @@ def _text(outer: int, complex_: SimplicialComplex, curl_m: Floats, energy: list[
 def log_tested_triangles(part: Part, graph: ViewGraph, world_from_cam: Floats, cycles: Cycles) -> None:
     """Log tested triangles coloured by √χ² of their curl, those that fail opaque."""
     rows = np.flatnonzero(cycles.loops.lengths == 3)
-    corners = vertices_along(graph, cycles.loops, rows).reshape(-1, 3)
+    corners = cycles.loops.select(rows).vertices(graph.edges).reshape(-1, 3)
     finite = np.asarray(np.isfinite(world_from_cam[corners][:, :, :3, 3]).all(axis=(1, 2)))
     rows, corners = rows[finite], corners[finite]
     worst = np.argsort(-cycles.chi2[rows], kind="stable")[:MOST_TRIANGLES]
@@ -110,9 +110,3 @@ def log_tested_triangles(part: Part, graph: ViewGraph, world_from_cam: Floats, c
     alpha = np.where(cycles.closes[rows], ALPHA, 255).astype(np.uint8)
     if len(rows):
         log_triangles(part.stream, layout.TRIANGLES, world_from_cam[corners, :3, 3], colours, alpha)
-
-
-def vertices_along(graph: ViewGraph, loops: Loops, rows: Ints) -> Ints:
-    """The vertices along these loops, one after the other."""
-    chosen = loops.select(rows)
-    return graph.edges[chosen.edge, np.where(chosen.sign > 0, 0, 1)]

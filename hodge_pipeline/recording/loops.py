@@ -10,7 +10,6 @@ from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.curl import vertices_along
 from hodge_pipeline.recording.stream import Part
 from hodge_pipeline.types import Bytes, Floats, Ints, ViewGraph
 
@@ -31,7 +30,7 @@ def log_loops(part: Part, graph: ViewGraph, world_from_cam: Floats) -> None:
         return
     chosen = holes.loops.select(np.arange(len(holes.loops))[::-1])
     starts = chosen.offsets[:-1]
-    corners = np.split(vertices_along(graph, chosen, np.arange(len(chosen))), starts[1:]) if len(chosen) else []
+    corners = np.split(chosen.vertices(graph.edges), starts[1:]) if len(chosen) else []
     lines = [world_from_cam[np.append(each, each[0]), :3, 3].astype(np.float32) for each in corners]
     kept = np.array([row for row, line in enumerate(lines) if np.isfinite(line).all()], np.int64)
     left = se3.log(loop_products(chosen, graph.i_from_j))

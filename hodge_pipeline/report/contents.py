@@ -8,9 +8,12 @@ from typing import Literal
 
 import numpy as np
 
+from hodge_pipeline.complex.energies import Energies
 from hodge_pipeline.evaluation.difference import length
+from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.refine.guard import Measure
+from hodge_pipeline.refine.judge import Cost
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.notes import Note
@@ -93,21 +96,6 @@ class LoopRow:
 
 
 @dataclass(frozen=True)
-class EnergyRow:
-    """The parts of ω before the solve of a round: how many vertices, edges and triangles its complex has, and the
-    shares (rotation, translation) of the exact, co-exact and harmonic part in its energy.
-    """
-
-    round: str
-    simplices: tuple[int, ...]
-    exact: tuple[float, float]
-    coexact: tuple[float, float]
-    harmonic: tuple[float, float]
-    rotation_rad2: float
-    translation_m2: float
-
-
-@dataclass(frozen=True)
 class EdgeRow:
     """One measured edge and how far it is from the final poses; frames as the source names them."""
 
@@ -173,24 +161,9 @@ class StageRow:
 
 
 @dataclass(frozen=True)
-class CandidateRow:
-    """What one candidate for a refined model costs: see `refine.judge.Cost`; `images_off` counts them."""
-
-    name: str
-    mean_px: float
-    median_px: float
-    observations: int
-    behind: int
-    distant: int
-    beyond: float
-    images_off: int
-    is_kept: bool
-
-
-@dataclass(frozen=True)
 class RefinementSummary:
     """What became of a refinement: `outcome` is refined, optimal, worse or forced; why; what it rests on; and why even
-    what is kept may be wrong, if anything says so.
+    what is kept may be wrong, if anything says so. Of a model: what each candidate costs, and which row is `kept`.
     """
 
     outcome: str
@@ -199,7 +172,8 @@ class RefinementSummary:
     measures: tuple[Measure, ...] = ()
     change: str = ""
     scale: str = ""
-    candidates: tuple[CandidateRow, ...] = ()
+    candidates: tuple[tuple[str, Cost], ...] = ()
+    kept: int = 0
     doubt: str = ""
 
 
@@ -212,11 +186,6 @@ class Path3D:
     name: str
     positions: Floats
     rotations: Floats | None = None
-
-    @classmethod
-    def of(cls, name: str, world_from_cam: Floats) -> Path3D:
-        """The path of poses (N, 4, 4)."""
-        return cls(name, world_from_cam[:, :3, 3], world_from_cam[:, :3, :3])
 
 
 @dataclass(frozen=True)
@@ -248,12 +217,24 @@ class Pictures:
     sides: tuple[Picture, ...] = ()
     worst_pairs: tuple[Picture, ...] = ()
 
+    @classmethod
+    def of_graph(cls, sets: Mapping[str, Floats], graph: ViewGraph, component: Ints) -> Pictures:
+        """The paths of these sets of poses, and what they leave of a graph's edges."""
+        residuals = tuple(Residuals(name, *edge_residuals(graph, poses)) for name, poses in sets.items())
+        return cls(paths_of(sets), component, residuals, graph)
+
+
+def paths_of(sets: Mapping[str, Floats]) -> tuple[Path3D, ...]:
+    """The paths of sets of poses (N, 4, 4)."""
+    return tuple(Path3D(name, poses[:, :3, 3], poses[:, :3, :3]) for name, poses in sets.items())
+
 
 @dataclass(frozen=True)
 class Report:
     """Everything that `report.html` and `report.json` say about one run.
 
     `before` and `after` name the sets of poses that the verdict compares, as in `scores` and `trajectories`.
+    `energies` are those of the parts of ω before the solve of each round.
     `last_shift_m` is how far the last round moved the positions (root mean square), None where it had none before it.
     `wrong_edges` is None where nobody judged; `unmeasured` says why no measure was taken; without `has_metres` lengths
     are in the source's own unit. `position_fit` is None without known positions. `shows_rejected`: the pictures and
@@ -268,7 +249,7 @@ class Report:
     scores: ScoreTable | None = None
     trajectories: tuple[TrajectoryRow, ...] = ()
     loops: tuple[LoopRow, ...] = ()
-    energies: tuple[EnergyRow, ...] = ()
+    energies: Mapping[str, Energies] = field(default_factory=dict)
     graph: GraphSummary | None = None
     worst_edges: tuple[EdgeRow, ...] = ()
     stages: tuple[StageRow, ...] = ()

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.energy import PARTS, EnergyRow
-from hodge_pipeline.report.painting import flattest_plane, painted
+from hodge_pipeline.report.painting import flattest_plane, matrix_axes, painted
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 
@@ -53,9 +53,7 @@ def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], 
 
 
 def _matrix(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
-    axes = figure.add_subplot()
-    low, high = graph.edges.min(axis=1), graph.edges.max(axis=1)
-    size = float(np.clip(60_000 / graph.vertex_count**2, 0.5, 30))
+    axes, low, high, size = matrix_axes(figure, graph, "frame", 0.5)
     for name in (CONSISTENT, UNTESTABLE, SUSPECT, WRONG):
         rows = np.flatnonzero(diagnosis.verdict == name)
         larger = size if name == CONSISTENT else size * (1 + 2 * _rarity(len(rows)))
@@ -67,10 +65,6 @@ def _matrix(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis) -> None:
         low[order], high[order], s=size, c=diagnosis.probability[order], cmap="cividis", vmin=0, vmax=1, linewidths=0
     )
     figure.colorbar(dots, ax=axes, label="probability of being right", shrink=0.8)
-    axes.set_xlim(-0.5, graph.vertex_count - 0.5)
-    axes.set_ylim(graph.vertex_count - 0.5, -0.5)
-    axes.set_aspect("equal")
-    axes.set_xlabel("frame (row)")
     _legend(figure, axes)
 
 

@@ -32,10 +32,9 @@ class EnergyRow:
     @property
     def kinds(self) -> dict[str, tuple[float, tuple[float, ...]]]:
         """Of rotation (rad²) and of translation (m²): the energy, and the shares of `PARTS`; zeros where it is none."""
-        parts = self.energies.exact, self.energies.coexact, self.energies.harmonic
         shares = tuple(self.energies.shares.values())
         return {
-            name: (sum(part[kind] for part in parts), tuple(share[kind] for share in shares))
+            name: (self.energies.total[kind], tuple(share[kind] for share in shares))
             for kind, name in enumerate(("rotation", "translation"))
         }
 

@@ -14,7 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.evaluation.difference import floor_of
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.types import Floats
+from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 DOTS_PER_INCH = 150
@@ -164,6 +164,19 @@ def map_axes(axes: Any, report: Report) -> None:
     unit = "m" if report.has_metres else UNKNOWN_UNIT
     axes.set(xlabel=unit, ylabel=unit)
     axes.locator_params(nbins=MOST_TICKS)
+
+
+def matrix_axes(figure: Figure, graph: ViewGraph, vertex: str, least: float) -> tuple[Any, Ints, Ints, float]:
+    """Axes of a viewing graph's matrix; the lower and higher vertex row (E,) of each edge; the size of a dot, `least`
+    in a large graph.
+    """
+    axes: Any = figure.add_subplot()
+    axes.set_xlim(-0.5, graph.vertex_count - 0.5)
+    axes.set_ylim(graph.vertex_count - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel(f"{vertex} (row)")
+    size = float(np.clip(60_000 / graph.vertex_count**2, least, 30))
+    return axes, graph.edges.min(axis=1), graph.edges.max(axis=1), size
 
 
 def flattest_plane(positions: Floats) -> tuple[Floats, Floats]:

@@ -12,7 +12,7 @@ from matplotlib.ticker import NullFormatter
 
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.report.painting import error_plots, flattest_plane, has_truth, map_axes, painted
+from hodge_pipeline.report.painting import error_plots, flattest_plane, has_truth, map_axes, matrix_axes, painted
 from hodge_pipeline.report.tables import counted_pairs
 from hodge_pipeline.types import Floats, Ints
 from hodge_pipeline.types.text import UNKNOWN_UNIT
@@ -159,19 +159,13 @@ def _count(axes: Any, what: str) -> None:
 def _matrix(figure: Figure, report: Report) -> None:
     graph = report.pictures.graph
     assert graph is not None
-    axes = figure.add_subplot()
-    low, high = graph.edges.min(axis=1), graph.edges.max(axis=1)
-    size = float(np.clip(60_000 / graph.vertex_count**2, 0.3, 30))
+    axes, low, high, size = matrix_axes(figure, graph, report.source.vertex, 0.3)
     for rank, name in enumerate(np.unique(graph.source)):
         rows = graph.source == name
         colour = STYLES[(2, 1, 3, 4, 5, 0)[rank % 6]]["color"]
         marker = MARKERS[rank % len(MARKERS)]
         axes.scatter(high[rows], low[rows], s=size, color=colour, marker=marker, linewidths=0, label=str(name))
     _residual_dots(figure, axes, report, low, high, size)
-    axes.set_xlim(-0.5, graph.vertex_count - 0.5)
-    axes.set_ylim(graph.vertex_count - 0.5, -0.5)
-    axes.set_aspect("equal")
-    axes.set_xlabel(f"{report.source.vertex} (row)")
     axes.legend(
         frameon=False,
         fontsize=8,

@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.recipe import binding
 from hodge_pipeline.refine.guard import Decision
 from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.report.contents import (
-    CandidateRow,
     EdgeRow,
-    Path3D,
     Pictures,
     RefinementSummary,
     Report,
-    Residuals,
     SourceSummary,
     StageRow,
+    paths_of,
 )
 from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.store import yaml_file
@@ -50,23 +47,6 @@ def _scales(result: RefinedModel) -> str:
     return f"Before: {before}{after}."
 
 
-def _candidates(result: RefinedModel) -> tuple[CandidateRow, ...]:
-    return tuple(
-        CandidateRow(
-            name=name,
-            mean_px=cost.px,
-            median_px=cost.median_px,
-            observations=cost.observations,
-            behind=cost.behind,
-            distant=cost.distant,
-            beyond=cost.beyond,
-            images_off=len(cost.images_off),
-            is_kept=row == result.kept_row,
-        )
-        for row, (name, cost) in enumerate(result.candidates)
-    )
-
-
 def model_report(results: Sequence[RefinedModel], options: ModelRefinement, source: str, cost: Cost) -> Report:
     """The report of the first result, which has most images; the others in its notes."""
     first = results[0]
@@ -79,22 +59,18 @@ def model_report(results: Sequence[RefinedModel], options: ModelRefinement, sour
     solved = first.solved
     sets = {"start": first.start.world_from_body, "result": first.model.world_from_body}
     quality = first.start.quality
-    pictures = Pictures(paths=tuple(Path3D.of(name, poses) for name, poses in sets.items()))
-    graph, worst = None, tuple[EdgeRow, ...]()
+    pictures, graph, worst = Pictures(paths_of(sets)), None, tuple[EdgeRow, ...]()
     if solved is not None:
         edges, names = solved.edges(first.model.world_from_body), solved.graph.vertex_ids
         graph, worst = graph_summary(edges, names, solved.solution.component), worst_edges(edges, names)
-        pictures = Pictures(
-            paths=pictures.paths,
-            component=solved.solution.component,
-            residuals=tuple(Residuals(name, *edge_residuals(solved.graph, poses)) for name, poses in sets.items()),
-            graph=solved.graph,
-        )
+        pictures = Pictures.of_graph(sets, solved.graph, solved.solution.component)
     return Report(
         title=f"{source}, refined",
         source=SourceSummary(counted(quality.points, "point"), source, quality.images, format="colmap", kind="images"),
         before="start",
-        refinement=replace(summary(first.decision), scale=_scales(first), candidates=_candidates(first)),
+        refinement=replace(
+            summary(first.decision), scale=_scales(first), candidates=tuple(first.candidates), kept=first.kept_row
+        ),
         graph=graph,
         worst_edges=worst,
         stages=(StageRow("refine", cost.wall_s, cost.cpu_s, cost.peak_mb),),

@@ -19,15 +19,14 @@ from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.refine.verdict import Refined
 from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import (
-    EnergyRow,
     LoopRow,
-    Path3D,
     Pictures,
     Report,
     Residuals,
     SourceSummary,
     StageRow,
     TrajectoryRow,
+    paths_of,
 )
 from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.report.refined import summary
@@ -129,7 +128,7 @@ def make_report(
         scores=scores,
         trajectories=_trajectories(recipe, scene, sets, world_from_cam, component, kept=kept),
         loops=_loop_rows(last.solution),
-        energies=_energy_rows(rounds),
+        energies={f"round {n}": one.energies for n, one in enumerate(rounds) if one.energies is not None},
         graph=graph_summary(last.edges, last.vertex_ids, component),
         worst_edges=worst,
         stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in store.costs()),
@@ -207,22 +206,6 @@ def _of_file(
     return tuple(dataclasses.replace(row, left_out=int((~known).sum()), of=what) for row in rows)
 
 
-def _energy_rows(rounds: Sequence[Round]) -> tuple[EnergyRow, ...]:
-    found = []
-    for number, one in enumerate(rounds):
-        if one.energies is not None:
-            parts = one.energies.exact, one.energies.coexact, one.energies.harmonic
-            rotation, translation = np.sum(parts, axis=0).tolist()
-            shares = one.energies.shares
-            found.append(
-                EnergyRow(
-                    f"round {number}", one.energies.simplices, shares["exact"], shares["coexact"], shares["harmonic"],
-                    rotation, translation,
-                )
-            )  # fmt: skip
-    return tuple(found)
-
-
 def _loop_rows(solution: Solution) -> tuple[LoopRow, ...]:
     loops = int(solution.metrics.get("loops", 0))
     measured = solution.metrics.get("measured_loop_deviation_sum")
@@ -246,7 +229,6 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
         shown = {"truth": truth, **aligned}
     else:
         shown[first] = absolute_error(shown[first], shown["result"], component).aligned
-    paths = [Path3D.of(name, poses) for name, poses in shown.items()]
     finite = next(name for name, poses in sets.items() if np.isfinite(poses).all())
     residuals = tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in (finite, "result"))
     convergence = {
@@ -256,7 +238,7 @@ def _pictures(source: Source, rounds: Sequence[Round], sets: dict[str, Floats]) 
     }
     names, is_clocked = tuple(str(frame.frame_id) for frame in source.frames), has_real_stamps(source.frames)
     stamps = np.array([frame.stamp_s for frame in source.frames if is_clocked])
-    return Pictures(tuple(paths), component, residuals, last.graph, convergence, names, stamps)
+    return Pictures(paths_of(shown), component, residuals, last.graph, convergence, names, stamps)
 
 
 def write(

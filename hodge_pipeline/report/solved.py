@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.evaluation.residuals import edge_residuals, with_residuals
+from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.recording.solved import record_graph
 from hodge_pipeline.refine.pose_graph import RUN_GRAPH, SolvedFile, write_solved
-from hodge_pipeline.report.contents import (
-    Path3D,
-    Pictures,
-    RefinementSummary,
-    Report,
-    Residuals,
-    SourceSummary,
-    StageRow,
-)
+from hodge_pipeline.report.contents import Pictures, RefinementSummary, Report, SourceSummary, StageRow
 from hodge_pipeline.report.diagnosis_page import LISTED
 from hodge_pipeline.report.summary import graph_summary, worst_edges
 from hodge_pipeline.report.write import write_report
@@ -85,11 +78,8 @@ def _report(solved: SolvedFile, edges: Edges) -> Report:
         stages=(StageRow("solve", solved.wall_s, solved.cpu_s, float("nan")),),
         notes=notes_of("solver", solution.notes),
         versions=versions(),
-        pictures=Pictures(
-            paths=tuple(Path3D.of(name, poses) for name, poses in sets.items()),
-            component=solution.component,
-            residuals=tuple(Residuals(name, *edge_residuals(graph, poses)) for name, poses in sets.items()),
-            graph=graph,
+        pictures=replace(
+            Pictures.of_graph(sets, graph, solution.component),
             convergence={"solve": tuple(step.objective for step in solution.history)},
         ),
     )

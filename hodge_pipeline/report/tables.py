@@ -71,13 +71,13 @@ def _measures(refinement: RefinementSummary, of: str) -> Table:
 
 def _candidates(refinement: RefinementSummary) -> Table:
     rows = tuple(
-        (f"{row.name}{' (kept)' if row.is_kept else ''}", f"{row.mean_px:.4g}", f"{row.median_px:.4g}", str(row.behind),
-         str(row.distant), f"{row.beyond:.2%}", str(row.images_off))
-        for row in refinement.candidates
+        (f"{name}{' (kept)' if row == refinement.kept else ''}", f"{cost.px:.4g}", f"{cost.median_px:.4g}",
+         str(cost.behind), str(cost.distant), f"{cost.beyond:.2%}", str(len(cost.images_off)))
+        for row, (name, cost) in enumerate(refinement.candidates)
     )  # fmt: skip
     header = ("candidate", "mean, px", "median, px", "behind", "distant", "beyond the cap", "images off")
     caption = (
-        f"Each on the same {counted(refinement.candidates[0].observations, 'observation')}; a mean is of "
+        f"Each on the same {counted(refinement.candidates[0][1].observations, 'observation')}; a mean is of "
         "errors up to the cap. "
         "Lost or behind a camera, or distant (with no parallax where most candidates have one) counts as the cap."
     )
@@ -161,9 +161,8 @@ def _graph(report: Report) -> Table:
 
 def _energies(report: Report) -> Table:
     rows = tuple(
-        (row.round, str(row.simplices[2]), *(f"{100 * part[0]:.1f} / {100 * part[1]:.1f} %" for part in parts))
-        for row in report.energies
-        for parts in [(row.exact, row.coexact, row.harmonic)]
+        (name, str(row.simplices[2]), *(f"{100 * part[0]:.1f} / {100 * part[1]:.1f} %" for part in row.shares.values()))
+        for name, row in report.energies.items()
     )
     caption = (
         "Helmholtz–Hodge parts of ω = log(T_i Z_ij T_j⁻¹) before the solve of each round: shares of the energy of "

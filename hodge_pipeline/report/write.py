@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from hodge_pipeline.complex.energies import Energies
 from hodge_pipeline.evaluation.scores import SIGMA_M, ScoreTable
 from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import RefinementSummary, Report
@@ -45,7 +46,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "scores": None if report.scores is None else _scores(report.scores),
         "trajectories": [asdict(row) for row in report.trajectories],
         "loops": [{**asdict(row), "mean": row.mean} for row in report.loops],
-        "energies": [asdict(row) for row in report.energies],
+        "energies": [_energies(name, row) for name, row in report.energies.items()],
         "positions": None if report.position_fit is None else known_positions.summary(report.position_fit),
         "graph": None if report.graph is None else asdict(report.graph),
         "wrong_edges": None if report.wrong_edges is None else asdict(report.wrong_edges),
@@ -58,9 +59,26 @@ def as_json(report: Report) -> dict[str, Any]:
     }
 
 
+def _energies(name: str, found: Energies) -> dict[str, Any]:
+    rotation, translation = found.total
+    total = {"rotation_rad2": rotation, "translation_m2": translation}
+    return {"round": name, "simplices": found.simplices, **found.shares, **total}
+
+
 def _refinement(refinement: RefinementSummary) -> dict[str, Any]:
     measures = [{**asdict(measure), "is_worse": measure.is_worse} for measure in refinement.measures]
-    return {**asdict(refinement), "measures": measures}
+    candidates = [
+        {
+            "name": name,
+            "mean_px": cost.px,
+            **{key: getattr(cost, key) for key in ("median_px", "observations", "behind", "distant", "beyond")},
+            "images_off": len(cost.images_off),
+            "is_kept": row == refinement.kept,
+        }
+        for row, (name, cost) in enumerate(refinement.candidates)
+    ]
+    told = {key: value for key, value in asdict(refinement).items() if key != "kept"}
+    return {**told, "measures": measures, "candidates": candidates}
 
 
 def _scores(table: ScoreTable) -> dict[str, Any]:

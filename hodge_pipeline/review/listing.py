@@ -146,9 +146,7 @@ def witnesses(session: Session, edge: int) -> list[tuple[bool, str, str, Ints]]:
     out = []
     for closes, telling in ((True, found.witnesses_for[row]), (False, found.witnesses_against[row])):
         for cycle in telling[telling >= 0].tolist():
-            loops = found.cycles.loops
-            entry = slice(loops.offsets[cycle], loops.offsets[cycle + 1])
-            along = graph.edges[loops.edge[entry], np.where(loops.sign[entry] > 0, 0, 1)]
+            along = found.cycles.loops.select(np.array([cycle])).vertices(graph.edges)
             out.append((closes, name_cycle(graph, found.cycles, cycle), cycle_error(found.cycles, cycle), along))
     return out
 

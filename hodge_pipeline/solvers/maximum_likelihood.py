@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -191,15 +191,5 @@ class MaximumLikelihoodSolver:
         return replace(final, weights=weights, notes=(*final.notes, *free))
 
     def _solved(self, graph: ViewGraph, start: Floats, initial: InitialName) -> Solution:
-        return solve(
-            graph,
-            start=start,
-            objective=self.objective,
-            initial=initial,
-            backend=self.backend,
-            certificate=self.certificate,
-            max_iterations=self.max_iterations,
-            relative_tolerance=self.relative_tolerance,
-            time_limit_s=self.time_limit_s,
-            keep_history=True,
-        )
+        options = {one.name: getattr(self, one.name) for one in fields(self) if one.name not in ("initial", "tails")}
+        return solve(graph, start=start, initial=initial, keep_history=True, **options)

@@ -22,7 +22,6 @@ RECIPE_FILE, LOCK_FILE = "recipe.yaml", ".lock"
 _DRAFT = re.compile(r"\.[^.].*\.(csv|g2o|html|json|kitti|npz|ply|rrd|tum|txt|yaml)\.[0-9]+\.draft")
 _DRAFT_FOLDER = re.compile(r"\.(recording-|sparse\.)[a-z0-9_]{8}")
 """What `output_files` and the recording call a file or folder that is not whole yet."""
-OLD_KEY_FILE = "key.json"
 """In each stage of the layout before `Store`."""
 RUN, REFINEMENT = "stages", "refinement"
 """The folder of the stages of a run, and of the refinement of a model."""
@@ -83,8 +82,6 @@ class Workspace:
                 _check_kind(folder, kind)
                 _check_recipe(folder, recipe, overwrite, refusal, kind)
                 (folder / kind).mkdir(exist_ok=True)
-                for old in (folder / kind).glob(f"*/{OLD_KEY_FILE}"):
-                    shutil.rmtree(old.parent)
         except BaseException:
             lock.close()
             raise

@@ -127,16 +127,8 @@ class ViewGraph:
 
     def select(self, rows: Ints | Bools) -> ViewGraph:
         """The graph with these edges only, in this order; every vertex is kept."""
-        return replace(
-            self,
-            edges=self.edges[rows],
-            i_from_j=self.i_from_j[rows],
-            information=self.information[rows],
-            fitness=self.fitness[rows],
-            rmse_m=self.rmse_m[rows],
-            source=self.source[rows],
-            correspondences=self.correspondences[rows],
-        )
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in ("edges", "source", *MEASURED)}
+        return replace(self, **columns)
 
     @classmethod
     def joined(cls, graphs: Sequence[ViewGraph]) -> ViewGraph:

@@ -15,7 +15,7 @@ from hodge_pipeline.evaluation.difference import floor_of, length, percent, sign
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recording.comparison import record_comparison
 from hodge_pipeline.report import raster
-from hodge_pipeline.report.contents import GraphSummary, Path3D, Pictures, Report, SourceSummary
+from hodge_pipeline.report.contents import GraphSummary, Pictures, Report, SourceSummary, paths_of
 from hodge_pipeline.report.document import Banner, Document, Picture, Section, Table, markdown, render
 from hodge_pipeline.report.photographs import sides
 from hodge_pipeline.report.plots import draw
@@ -251,8 +251,10 @@ def _page(comparison: Comparison, models: tuple[Model | None, Model | None]) -> 
 def _paths(comparison: Comparison) -> Report:
     """A report that holds nothing but what the plots need."""
     named = zip(comparison.names, (comparison.a_poses, comparison.b_poses), strict=True)
-    paths = tuple(Path3D.of(name, poses) for name, poses in named if len(poses))
-    pictures = Pictures(paths=paths, component=np.zeros(len(comparison.a_poses), np.int64))
+    pictures = Pictures(
+        paths_of({name: poses for name, poses in named if len(poses)}),
+        component=np.zeros(len(comparison.a_poses), np.int64),
+    )
     before, after = comparison.names
     return Report("", SourceSummary("", "", 0), before=before, after=after, pictures=pictures)
 

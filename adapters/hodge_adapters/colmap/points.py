@@ -38,15 +38,22 @@ def points_of_rays(model: Model, world_from_cam: Floats) -> Floats:
     old = np.array([one.world_from_cam for one in model.images])
     moves = world_from_cam @ se3.inverse(old)
     carried = _mean(se3.transform(moves[image], points.xyz[owner][:, None])[:, 0], owner, count)
+    met = nearest_to_rays(centre, ray, owner, count)
+    choices = np.stack([points.xyz, carried, np.where(np.isnan(met), carried, met)])
+    best = np.argmin([_off(xyz, centre, ray, owner) for xyz in choices], axis=0)
+    return np.asarray(choices[best, np.arange(count)])
+
+
+def nearest_to_rays(centre: Floats, ray: Floats, owner: Ints, count: int) -> Floats:
+    """The point (count, 3) nearest to the rays that it owns (N,), from these centres (N, 3) along these unit vectors
+    (N, 3); NaN where they are parallel.
+    """
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
     normal = _sum(across.reshape(-1, 9), owner, count).reshape(-1, 3, 3)
     right = _sum(np.einsum("nij,nj->ni", across, centre), owner, count)
     fixed = np.linalg.eigvalsh(normal)[:, 0] > LEAST_PARALLAX * np.maximum(np.bincount(owner, minlength=count), 1)
     normal[~fixed] = np.eye(3)
-    met = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], np.float64)
-    choices = np.stack([points.xyz, carried, np.where(fixed[:, None], met, carried)])
-    best = np.argmin([_off(xyz, centre, ray, owner) for xyz in choices], axis=0)
-    return np.asarray(choices[best, np.arange(count)])
+    return np.where(fixed[:, None], np.linalg.solve(normal, right[:, :, None])[:, :, 0], np.nan)
 
 
 def parallaxes(model: Model) -> Floats:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hodge_adapters.colmap.database import database_matches
-from hodge_adapters.colmap.points import LEAST_PARALLAX
+from hodge_adapters.colmap.points import nearest_to_rays
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import NO_POINT
 from hodge_pipeline.types import Floats, Ints
@@ -172,18 +172,17 @@ def _common_position(reconstruction: pycolmap.Reconstruction, first: int, second
 
 def _meeting(images: list[pycolmap.Image], pixels: list[Floats]) -> Floats | None:
     """The point nearest to the rays of these pixels; None where the rays are parallel."""
-    normal, right = np.zeros((3, 3)), np.zeros(3)
+    rays = []
     for image, pixel in zip(images, pixels, strict=True):
         camera = image.camera
         plane = None if camera is None else camera.cam_from_img(pixel)
         if plane is None:
             return None
         ray = np.asarray(image.cam_from_world().rotation.matrix()).T @ np.array([*plane, 1.0])
-        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
-        normal += across
-        right += across @ image.projection_center()
-    fixed = np.linalg.eigvalsh(normal)[0] > LEAST_PARALLAX * len(images)
-    return np.asarray(np.linalg.solve(normal, right)) if fixed else None
+        rays.append(ray / np.linalg.norm(ray))
+    centres = np.array([image.projection_center() for image in images])
+    found = nearest_to_rays(centres, np.array(rays), np.zeros(len(rays), np.int64), 1)[0]
+    return None if np.isnan(found).any() else found
 
 
 def _distance(reconstruction: pycolmap.Reconstruction) -> float:

@@ -13,17 +13,14 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
-from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.fitted_camera import UNSTAMPED_STEP_S, assumed_camera_doubts
-from hodge_adapters.images.frames import image_frame
 from hodge_adapters.posed import posed_frames
 from hodge_adapters.seven_scenes.files import FrameFiles, read_poses
 from hodge_adapters.text_rows import first_text, listed, names_in
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs
-from hodge_adapters.tum.reader import frame_ids
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -149,23 +146,8 @@ class IclNuimReader:
         *,
         is_true: bool,
     ) -> tuple[Frame, ...]:
-        camera = self._camera(default).camera_of(listing.depth, notes)
-        colour_size = pixels.colour_size(listing.colour, (camera.width, camera.height), notes)
-        ids = frame_ids(listing.stamps_s)
-        return tuple(
-            image_frame(
-                ids[row],
-                listing.stamps_s[row],
-                camera,
-                listing.depth[row],
-                listing.colour[row],
-                units_per_metre=self.depth_scale or units_per_metre,
-                world_from_cam=poses[row],
-                is_true=is_true,
-                colour_size=colour_size,
-            )
-            for row in range(0, len(ids), self.every)
-        )
+        camera, scale = self._camera(default).camera_of(listing.depth, notes), self.depth_scale or units_per_metre
+        return listing.frames(camera, poses, self.every, notes, units_per_metre=scale, is_true=is_true)
 
     def _open_pov(self, path: Path, pov: dict[int, Path]) -> Source:
         notes: list[str] = []
@@ -187,7 +169,7 @@ class IclNuimReader:
     def _open_redwood(self, path: Path) -> Source:
         notes: list[str] = []
         listing = list_images(path, notes)
-        poses, log = _estimated(path, frame_ids(listing.stamps_s), notes)
+        poses, log = _estimated(path, listing.ids, notes)
         own = None if self.camera else find_camera_file(path)
         if own:
             notes.append(f"intrinsics from {own.relative_to(path)}")

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass as stage
 
 from hodge_adapters.pose_graphs import g2o_priors
 from hodge_adapters.pose_graphs.text import LANDMARK_TAGS, Records, count_tags, read_records, write_lines
-from hodge_adapters.posed import length_notes, written
+from hodge_adapters.posed import graph_of, length_notes, written_graph
 from hodge_adapters.text_rows import write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -287,15 +287,9 @@ class G2oWriter:
 
     def write(self, path: Path, source: Source) -> tuple[str, ...]:
         """One file, atomically; see `write_g2o`."""
-        if source.graph is None:
-            raise SourceError(f"{source.path}: has no graph to write: convert one that has edges")
-        poses = None if source.trajectory is None else source.trajectory.world_from_cam
-        complete = poses is not None and len(poses) == source.graph.vertex_count
-        write_g2o(path, source.graph, poses if complete else None)
-        graph = source.graph
-        return written(
-            f"{counted(graph.vertex_count, 'vertex|vertices')}, {counted(graph.edge_count, 'edge')}", source, {"edges"}
-        )
+        graph, poses = graph_of(source)
+        write_g2o(path, graph, poses)
+        return written_graph(source, graph)
 
 
 def _pose_columns(motions: Floats, dimension: int) -> Floats:

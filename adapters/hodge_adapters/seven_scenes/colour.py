@@ -61,6 +61,8 @@ def is_beside(colour: Sequence[Path], depth: Sequence[DepthFile]) -> bool:
     """Whether colour surely changes more where a Kinect's colour camera would see the edges of depth than where the
     depth camera sees them. Images that cannot be read are left out; False where too few are left.
     """
+    if len(depth) < FEWEST_FRAMES or depth[0].size != SIZE:
+        return False
     gains = []
     for row in evenly(len(depth), FRAMES):
         own = depth[row]
@@ -69,9 +71,7 @@ def is_beside(colour: Sequence[Path], depth: Sequence[DepthFile]) -> bool:
         except (SourceError, OSError):
             continue
     known = np.array(gains)[np.isfinite(gains)]
-    if len(known) < FEWEST_FRAMES or depth[0].size != SIZE:
-        return False
-    return bool(known.mean() > SURE * known.std() / np.sqrt(len(known)))
+    return len(known) >= FEWEST_FRAMES and bool(known.mean() > SURE * known.std() / np.sqrt(len(known)))
 
 
 def _gain(depth_m: Floats32, colour: Bytes, camera: Camera) -> float:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hodge_adapters.association import clock_runs, nearest_in_runs
+from hodge_adapters.images import pixels
+from hodge_adapters.images.frames import image_frame
 from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
 from hodge_adapters.trajectories.text import in_seconds, is_stamp
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Camera, Floats, Frame, Ints
 from hodge_pipeline.types.text import counted
 
 ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
@@ -34,6 +37,31 @@ class StampedImages:
     colour_delays_s: Floats
     files: tuple[Path, ...]
     runs: Ints
+
+    @property
+    def ids(self) -> list[int]:
+        """The stamps where all are whole numbers (frame numbers), else the rows."""
+        whole = np.equal(np.mod(self.stamps_s, 1), 0).all()
+        return self.stamps_s.astype(np.int64).tolist() if whole else list(range(len(self.stamps_s)))
+
+    def frames(self, camera: Camera, poses: Floats, every: int, notes: list[str], **options: Any) -> tuple[Frame, ...]:
+        """Each `every`-th of them at its pose (N, 4, 4), with the `options` of `image_frame`."""
+        colour_size = pixels.colour_size(self.colour, (camera.width, camera.height), notes)
+        ids = self.ids
+        return tuple(
+            image_frame(
+                ids[row],
+                self.stamps_s[row],
+                camera,
+                self.depth[row],
+                self.colour[row],
+                world_from_cam=poses[row],
+                colour_delay_s=float(self.colour_delays_s[row]),
+                colour_size=colour_size,
+                **options,
+            )
+            for row in range(0, len(ids), every)
+        )
 
 
 def find_association_file(folder: Path) -> Path | None:

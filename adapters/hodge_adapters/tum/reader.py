@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.fitted_camera import assumed_camera_doubts, fitting
-from hodge_adapters.images.frames import Lens, image_frame
+from hodge_adapters.images.frames import Lens
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs, stamped_images
 from hodge_pipeline import se3
@@ -114,7 +114,6 @@ class TumReader:
         scale = self.depth_scale or found.units_per_metre or UNITS_PER_METRE
         doubts = self._doubts(found, listing, scale)
         camera = found.camera_of(listing.depth, notes)
-        colour_size = pixels.colour_size(listing.colour, (camera.width, camera.height), notes)
         lens = Lens(camera, found.distortion) if found.distortion and self.undistort else None
         if found.distortion:
             notes.append(
@@ -122,28 +121,11 @@ class TumReader:
             )
         trajectory, truth_file = self._truth(path, listing.stamps_s, notes)
         poses = self._poses(trajectory, listing, notes)
-        ids = frame_ids(listing.stamps_s)
-        rows = range(0, len(ids), self.every)
+        told = {"units_per_metre": scale, "no_depth": self.no_depth, "is_true": True, "lens": lens}
         return Source(
             name=path.resolve().name,
             path=path,
-            frames=tuple(
-                image_frame(
-                    ids[row],
-                    listing.stamps_s[row],
-                    camera,
-                    listing.depth[row],
-                    listing.colour[row],
-                    units_per_metre=scale,
-                    no_depth=self.no_depth,
-                    world_from_cam=poses[row],
-                    is_true=True,
-                    lens=lens,
-                    colour_delay_s=float(listing.colour_delays_s[row]),
-                    colour_size=colour_size,
-                )
-                for row in rows
-            ),
+            frames=listing.frames(camera, poses, self.every, notes, **told),
             trajectory=trajectory,
             notes=tuple(notes),
             doubts=doubts,
@@ -234,9 +216,3 @@ class TumReader:
             hint = ": are its stamps of another clock? see truth_match" if without == len(stamps_s) else ""
             notes.append(f"{without} of {len(stamps_s)} frames have no truth within {self.max_gap_s:g} s{hint}")
         return poses
-
-
-def frame_ids(stamps_s: Floats) -> list[int]:
-    """The stamps where all are whole numbers (frame numbers), else the rows."""
-    whole = np.equal(np.mod(stamps_s, 1), 0).all()
-    return [int(stamp) for stamp in stamps_s] if whole else list(range(len(stamps_s)))
