@@ -25,6 +25,15 @@ def test_groups_of_wrong_loops_as_many_as_steps_are_no_lattice(seed: int, world:
     assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
 
 
+def test_the_one_turn_to_the_right_is_no_broken_step() -> None:
+    """In a town of turns to the left: wrong loops in long groups agreed that it was, 32 m from the truth."""
+    made = drive(
+        seed=935122, count=300, world="town", loops=360, wrong=1.0, in_groups=True, group=50, misstated=(0.3, 2.0)
+    )
+    found = diagnose(made.graph)
+    assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+
+
 def test_a_lattice_whose_odometry_is_wrong_at_many_steps_needs_none() -> None:
     """Loops that begin and end beside these steps contradict them, also where no single one passes over few."""
     made = drive(seed=8, count=300, dimension=3, loops=450, wrong=0.0)

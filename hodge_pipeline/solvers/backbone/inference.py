@@ -8,7 +8,6 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, Scales, Wrong, learn_scales, mixture, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, from_rotations, linearise, root, settled, without
@@ -212,11 +211,6 @@ def _of_right_places(
     chain, ends, rows = start.chain, start.chain.places, np.flatnonzero(used)
     first = one_of_each_place(ends[rows])
     chosen, size = rows[first], loops_at_place(ends[rows])[first]
-    run = connected_components(cKDTree(ends[chosen]).query_pairs(ADJACENT, p=np.inf, output_type="ndarray"), len(chosen))
-    longest = np.lexsort((-size, run))[np.unique(np.sort(run), return_index=True)[1]]
-    goes_on = GOES_ON * (np.bincount(run) - 1)
-    member = run[cKDTree(ends[chosen]).query(ends, p=np.inf)[1]]
-    chosen, size = chosen[longest], size[longest]
     away = ends[cKDTree(ends[chosen]).query(ends, p=np.inf)[0] > 1.0]
     unused = loops_at_place(away)[one_of_each_place(away)]
 
@@ -224,11 +218,11 @@ def _of_right_places(
         sizes = np.sort(np.concatenate([unused, size[~right] / ALIKE]))
         return np.asarray(np.log(len(sizes) - np.searchsorted(sizes, size) + MISTAKEN_PLACES))
 
-    right, bare = np.ones(len(chosen), bool), alone.factor[chosen] + goes_on
+    right, bare = np.ones(len(chosen), bool), alone.factor[chosen]
     strongest = np.arange(len(chosen)) == np.argmax(bare - rivals(right))
     for number in range(ROUNDS):
         fit = settled(Fit(thinned(chain, chosen[right]), start if number else linear), MOST_STEPS)
-        factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals(right) + goes_on
+        factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals(right)
         if not number and together(factor) > enough:
             return used, True
         before, right = right, factor > enough if number else strongest
@@ -238,15 +232,13 @@ def _of_right_places(
             right = right | strongest
         if (before == right).all():
             break
-    return used & right[member], said > enough
+    nearest = cKDTree(ends[chosen]).query(ends, p=np.inf)[1]
+    return used & right[nearest], said > enough
 
 
 def together(log_odds: Floats) -> float:
     """The log-odds that all places are right: of what is expected beforehand, that of one counts."""
     return float(log_odds.sum()) + max(len(log_odds) - 1, 0) * float(np.log(MISTAKEN_PLACES))
-
-
-ADJACENT, GOES_ON = 2.0, float(np.log(2.0))
 
 
 ALIKE = 0.75
