@@ -186,7 +186,7 @@ def _mirrored(chain: Chain, twist: Floats) -> Floats:
     ahead = np.zeros(6)
     ahead[chain.axes] = np.median(twist, axis=0)
     half = 2 * np.outer(ahead[3:], ahead[3:]) / max(float(ahead[3:] @ ahead[3:]), np.finfo(float).tiny) - np.eye(3)
-    return np.kron(np.eye(2), half)[np.ix_(chain.axes, chain.axes)]
+    return np.asarray(np.kron(np.eye(2), half)[np.ix_(chain.axes, chain.axes)], float)
 
 
 def _kinds(left: Floats, chi2: Floats, covariance: Floats) -> tuple[Floats, Floats, Bools]:
