@@ -71,7 +71,7 @@ def cases() -> list[Case]:
     found.append(Case("lund_door", ("refine", "colmap", truth, "--out", "{out}"), model))
     graph = DATA / "pose_graphs/sesync/sphere2500.g2o"
     found.append(Case("sphere2500", ("solve", str(graph), "--out", "{out}/poses.tum", "--run", "{out}"), graph))
-    garage = graph.with_name("parking-garage.g2o")  # in one piece, with 22 edges left out at most
+    garage = graph.with_name("parking-garage.g2o")  # in one piece: it was parted once where two steps share a blame
     found.append(Case("parking-garage", ("diagnose", str(garage), "--out", "{out}"), garage))
     for log in sorted((DATA / PAIR_ESTIMATES).glob("*/*.log")):
         if log.name != "gt.log":
