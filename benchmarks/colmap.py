@@ -5,9 +5,10 @@
     python benchmarks/colmap.py --write                          # benchmarks/colmap.md
 
 Each model is taken for good and disturbed: `noise`: 0.5° and 2 % of the scene for each image; `big`: 8° and 15 %;
-`wrong`: 15 % of the images 15° and 25 % off; `halves`: two overlapping models, each in a gauge and unit of its own;
-`renamed`, `no_images`, `no_database`: noise, and images under other names than the database's, or without images or
-database. The peer is pycolmap's bundle adjustment with cameras held. Centres are root mean squares after a similarity,
+`carried`: so, and every point moved with its images; `wrong`: 15 % of the images 15° and 25 % off; `halves`: two
+overlapping models, each in a gauge and unit of its own; `renamed`, `no_images`, `no_database`: noise, and images under
+other names than the database's, or without images or database. The peer is pycolmap's bundle adjustment with cameras
+held. Centres are root mean squares after a similarity,
 in % of the extent of the good model's cameras; CPU seconds are those of whole processes.
 """
 

@@ -129,12 +129,12 @@ def test_the_tum_like_layout(tmp_path: Path) -> None:
     for number in range(3):
         write_depth(tmp_path / f"depth/{number}.png", depth_values(number))
         write_colour(tmp_path / f"rgb/{number}.png")
-    (tmp_path / "associations.txt").write_text("".join(f"{n} depth/{n}.png {n}.25 rgb/{n}.png\n" for n in range(3)))
+    (tmp_path / "associations.txt").write_text("".join(f"{n} depth/{n}.png {n}.02 rgb/{n}.png\n" for n in range(3)))
     poses = some_poses(2)
     (tmp_path / "livingRoom0.gt.freiburg").write_text("".join(tum_line(1 + n, pose) for n, pose in enumerate(poses)))
     source = check_reader(IclNuimReader(camera=SMALL), tmp_path)
     assert [frame.frame_id for frame in source.frames] == [0, 1, 2] and len(source.trajectory) == 2
-    assert [frame.colour_delay_s for frame in source.frames] == [0.25] * 3
+    assert [frame.colour_delay_s for frame in source.frames] == pytest.approx([0.02] * 3)
     assert source.frames[0].world_from_cam is None, "the truth starts at 1"
     assert "1 of 3 frames have no truth" in source.notes
     np.testing.assert_allclose(source.frames[2].world_from_cam, poses[1], atol=1e-6)
