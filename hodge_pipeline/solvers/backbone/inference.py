@@ -8,6 +8,7 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, Scales, Wrong, learn_scales, mixture, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, from_rotations, linearise, root, settled, without
@@ -85,19 +86,15 @@ def infer(
     if found is None or found.confirmed or not anew:
         return found
     # a lone wrong loop that chance favours may have refuted the others
-    others = [judge(place) for place in crowded(chain, alone.factor)]
+    others = [judge(place) for place in crowded(start, alone)]
     return max([found, *filter(None, others)], key=lambda each: (each.confirmed, each.log_evidence))
 
 
-def crowded(chain: Chain, factor: Floats) -> list[Bools]:
-    """The loops (M,) of each of the `MOST_PLACES` places at which most loops lie, two at least, that a factor (M,) > 0
-    speaks for.
-    """
-    told, ends = factor > 0, chain.places
-    rows = np.flatnonzero(told)
-    count, first = loops_at_place(ends[rows]), one_of_each_place(ends[rows])
-    first = first[np.argsort(-count[first], kind="stable")][:MOST_PLACES]
-    return [told & (np.abs(ends - ends[rows[row]]).max(axis=1) <= 1.0) for row in first[count[first] > 1]]
+def crowded(start: Linear, alone: Judged) -> list[Bools]:
+    """The loops (M,) of each of the `MOST_PLACES` largest groups, of two at least, that the chain does not refute."""
+    rows = np.flatnonzero(alone.factor > -BY_CHANCE)
+    groups = [group for group in agreeing_groups(start, alone, rows)[:MOST_PLACES] if len(group) > 1]
+    return [np.isin(np.arange(len(alone.factor)), group) for group in groups]
 
 
 MOST_PLACES = 3
@@ -211,8 +208,8 @@ def _of_right_places(
     chain, ends, rows = start.chain, start.chain.places, np.flatnonzero(used)
     first = one_of_each_place(ends[rows])
     chosen, size = rows[first], loops_at_place(ends[rows])[first]
-    away = ends[cKDTree(ends[chosen]).query(ends, p=np.inf)[0] > 1.0]
-    unused = loops_at_place(away)[one_of_each_place(away)]
+    away = np.flatnonzero(cKDTree(ends[chosen]).query(ends, p=np.inf)[0] > 1.0)
+    unused = [len(group) for group in agreeing_groups(start, alone, away)]
 
     def rivals(right: Bools) -> Floats:
         sizes = np.sort(np.concatenate([unused, size[~right] / ALIKE]))
@@ -234,6 +231,27 @@ def _of_right_places(
             break
     nearest = cKDTree(ends[chosen]).query(ends, p=np.inf)[1]
     return used & right[nearest], said > enough
+
+
+def agreeing_groups(start: Linear, alone: Judged, rows: Ints) -> list[Ints]:
+    """Groups of these loops, the largest first: each of one place, that agree with one of them as the steps between
+    their ends go. Where loops of a place contradict each other, few of them are one testimony.
+    """
+    if not len(rows):
+        return []
+    ends = start.chain.places[rows]
+    first, second = cKDTree(ends).query_pairs(1.0, p=np.inf, output_type="ndarray").T
+    told = Testimony(start.chain, start, alone.log_density[0], alone.log_density[1], np.zeros(len(alone.factor), bool))
+    pairs = np.stack([first, second], axis=1)[told.factor(rows[first], rows[second]) > 0]
+    both = np.concatenate([pairs, pairs[:, ::-1], np.repeat(np.arange(len(rows)), 2).reshape(-1, 2)])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    near = np.split(both[:, 1], np.cumsum(np.bincount(both[:, 0], minlength=len(rows)))[:-1])
+    free, out = np.ones(len(rows), bool), []
+    for row in np.argsort([-len(each) for each in near], kind="stable").tolist():
+        if free[row]:
+            out.append(rows[near[row]])
+            free[near[row]] = False
+    return out
 
 
 def together(log_odds: Floats) -> float:

@@ -38,6 +38,10 @@ AGREEING = 0.05
 """Where loops are more than steps and no backbone confirms any, so large a share of the steps between loops that agree
 with each other says that the backbone may be wrong: loops at random hardly agree.
 """
+REFUTING = 0.5
+"""Of the loops over few steps, that close: where fewer do, they are wrong, and not the odometry, which is right between
+its wrong steps.
+"""
 
 
 @dataclass(frozen=True)
@@ -123,6 +127,8 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     chain, found = inferred
     doubted = trust == AUTO and not found.confirmed and loops > steps.sum()
     doubted = doubted and bool(tested_by_pairs(chain, chain.poses).sum() > AGREEING * steps.sum())
+    closes = closing(chain, chain.poses)[1]
+    doubted = doubted and bool(closes.sum() >= REFUTING * len(closes))
     return _backbone(graph, chain, found, steps, doubted)
 
 
@@ -165,16 +171,19 @@ def is_tested(chain: Chain) -> bool:
 def tested_steps(chain: Chain, poses: Floats) -> Bools:
     """Steps (n,) that lie in a cycle with one loop that closes to less than a step."""
     out = np.zeros(chain.size, bool)
-    if not len(chain.ends):
-        return out
-    same = chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]]
-    low, high = chain.ends.T
-    short = np.flatnonzero(same & (high - low <= LONGEST))
-    good = short[_closes(chain.motion[short], _between(poses, low[short], high[short]), _gate(chain))]
+    short, closes = closing(chain, poses)
+    low, high = chain.ends[short[closes]].T
     for ahead in range(1, LONGEST + 1):
-        rows = good[high[good] - low[good] >= ahead]
-        out[low[rows] + ahead] = True
+        out[low[high - low >= ahead] + ahead] = True
     return out
+
+
+def closing(chain: Chain, poses: Floats) -> tuple[Ints, Bools]:
+    """The loops (K,) over few steps, and which of them close to less than a step."""
+    low, high = chain.ends.T
+    short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST))
+    closes = _closes(chain.motion[short], _between(poses, low[short], high[short]), _gate(chain))
+    return short, closes
 
 
 def contradicted_from_afar(graph: ViewGraph, kept: Bools, *, by_pairs: bool = False) -> Bools:
