@@ -117,6 +117,33 @@ def round_trip(
     return Drive(graph, truth, np.arange(len(edges)) < count - 1 + (0 if only_wrong else loops))
 
 
+def at_one_place(made: Drive, count: int, *, group: int = 1, spans: int | None = None, seed: int = 0) -> Drive:
+    """The graph with as many wrong loops besides that take two of its places for one, as a place recogniser does, in
+    groups of this size; `spans`: places up to so many steps apart, else any (the injections of Sünderhauf 2012).
+    """
+    rng, graph = np.random.default_rng(seed), made.graph
+    last = graph.vertex_count - 1 - group
+    edges, motion = [], []
+    while len(edges) < count:
+        first = int(rng.integers(0, last))
+        second = int(rng.integers(0, last)) if spans is None else min(last, first + int(rng.integers(0, spans + 1)))
+        first, second = min(first, second), max(first, second)
+        off = se3.exp(_noise(rng, np.array([[np.radians(10), 0.3]]), graph.dimension))[0]
+        if first != second:
+            edges += [(first + k, second + (second == first + 1) + k) for k in range(group)]
+            motion += [off] * group
+    loops = graph.information[np.abs(np.diff(graph.edges, axis=1)[:, 0]) > 1]
+    stated = np.median(loops if len(loops) else graph.information, axis=0)
+    whole = ViewGraph.from_edges(
+        graph.vertex_ids,
+        np.concatenate([graph.edges, edges[:count]]),
+        np.concatenate([graph.i_from_j, motion[:count]]),
+        np.concatenate([graph.information, np.tile(stated, (count, 1, 1))]),
+        dimension=graph.dimension,
+    )
+    return Drive(whole, made.truth, np.concatenate([made.right, np.zeros(count, bool)]))
+
+
 WORLDS = ("ring", "town", "corridor", "room")
 
 
