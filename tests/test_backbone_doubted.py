@@ -39,6 +39,13 @@ def test_groups_of_wrong_loops_at_one_place_are_as_many_testimonies() -> None:
     assert made.error_m(diagnose(made.graph).world_from_cam) < 0.6
 
 
+@pytest.mark.parametrize(("seed", "loops", "wrong"), [(2, 6, 1000), (0, 12, 2000)])
+def test_two_groups_that_agree_by_chance_agree_once(seed: int, loops: int, wrong: int) -> None:
+    """Of so many groups some do; each counted for the other, they outweighed the odometry: 18 and 14 m for 3."""
+    made = round_trip(seed, loops, dimension=2, wrong=wrong, group=5)
+    assert made.error_m(diagnose(made.graph).world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
+
+
 def test_the_one_turn_to_the_right_is_no_broken_step() -> None:
     """In a town of turns to the left: wrong loops in long groups agreed that it was, 32 m from the truth."""
     made = drive(

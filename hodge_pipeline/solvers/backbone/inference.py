@@ -91,8 +91,8 @@ def infer(
 
 
 def crowded(start: Linear, alone: Judged) -> list[Bools]:
-    """The loops (M,) of each of the `MOST_PLACES` largest groups, of two at least, that the chain does not refute."""
-    rows = np.flatnonzero(alone.factor > -BY_CHANCE)
+    """The loops (M,) of each of the `MOST_PLACES` largest groups, of two at least, that a factor > 0 speaks for."""
+    rows = np.flatnonzero(alone.factor > 0)
     groups = [group for group in agreeing_groups(start, alone, rows)[:MOST_PLACES] if len(group) > 1]
     return [np.isin(np.arange(len(alone.factor)), group) for group in groups]
 
@@ -215,16 +215,29 @@ def _of_right_places(
         sizes = np.sort(np.concatenate([unused, size[~right] / ALIKE]))
         return np.asarray(np.log(len(sizes) - np.searchsorted(sizes, size) + MISTAKEN_PLACES))
 
-    right, bare = np.ones(len(chosen), bool), alone.factor[chosen]
-    strongest = np.arange(len(chosen)) == np.argmax(bare - rivals(right))
+    def factors(right: Bools) -> Floats:
+        fit = settled(Fit(thinned(chain, chosen[right]), start), MOST_STEPS)
+        return _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen]
+
+    def said_by(right: Bools, factor: Floats) -> float:
+        """Where places are few, each counts by what those before it say, too: two that agree agree once."""
+        rows = np.flatnonzero(right)
+        if len(rows) <= FEW:
+            rows = rows[np.argsort(-bare[rows], kind="stable")]
+            before = [bare[row] if not k else factors(np.isin(each, rows[:k]))[row] for k, row in enumerate(rows)]
+            return together(np.minimum(factor[rows], np.array(before) - rivals(right)[rows]))
+        return together(factor[rows])
+
+    right, bare, each = np.ones(len(chosen), bool), alone.factor[chosen], np.arange(len(chosen))
+    strongest = each == np.argmax(bare - rivals(right))
     for number in range(ROUNDS):
         fit = settled(Fit(thinned(chain, chosen[right]), start if number else linear), MOST_STEPS)
         factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals(right)
-        if not number and together(factor) > enough:
+        if not number and said_by(right, factor) > enough:
             return used, True
         before, right = right, factor > enough if number else strongest
         by_itself = float((bare - rivals(strongest))[strongest][0])
-        said = max(together(factor[factor > enough]), by_itself)
+        said = max(said_by(factor > enough, factor), by_itself)
         if said == by_itself:
             right = right | strongest
         if (before == right).all():
@@ -264,6 +277,10 @@ ALIKE = 0.75
 MISTAKEN_PLACES = 0.2
 """To each right one, of places that loops agree on, beside the rivals that are not used. With more
 a path that closes once would stay open: its loops can say little more than that the drift is as stated.
+"""
+FEW = 6
+"""Places at the most that are held against those before them alone: a limit on cost. Of more, what the first say of
+each other hardly counts twice.
 """
 MISTAKEN = float(np.log(20.0))
 """The log-odds of right places against mistaken ones that are enough, where steps err as stated; where it takes larger
