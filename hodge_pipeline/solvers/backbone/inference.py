@@ -248,12 +248,17 @@ def _of_right_places(
 
 def agreeing_groups(start: Linear, alone: Judged, rows: Ints) -> list[Ints]:
     """Groups of these loops, the largest first: each of one place, that agree with one of them as the steps between
-    their ends go. Where loops of a place contradict each other, few of them are one testimony.
+    their ends go. Where loops of a place contradict each other, few of them are one testimony. All those of a place
+    where there are too many to compare.
     """
     if not len(rows):
         return []
     ends = start.chain.places[rows]
-    first, second = cKDTree(ends).query_pairs(1.0, p=np.inf, output_type="ndarray").T
+    tree = cKDTree(ends)
+    if loops_at_place(ends).sum() > MOST_PAIRS:
+        place = one_of_each_place(ends)
+        return sorted((rows[tree.query_ball_point(ends[at], 1.0, p=np.inf)] for at in place), key=len, reverse=True)
+    first, second = tree.query_pairs(1.0, p=np.inf, output_type="ndarray").T
     told = Testimony(start.chain, start, alone.log_density[0], alone.log_density[1], np.zeros(len(alone.factor), bool))
     pairs = np.stack([first, second], axis=1)[told.factor(rows[first], rows[second]) > 0]
     both = np.concatenate([pairs, pairs[:, ::-1], np.repeat(np.arange(len(rows)), 2).reshape(-1, 2)])
@@ -265,6 +270,10 @@ def agreeing_groups(start: Linear, alone: Judged, rows: Ints) -> list[Ints]:
             out.append(rows[near[row]])
             free[near[row]] = False
     return out
+
+
+MOST_PAIRS = 200_000
+"""Of loops that are compared, each with the other: a limit on memory."""
 
 
 def together(log_odds: Floats) -> float:
