@@ -215,24 +215,25 @@ def _of_right_places(
         sizes = np.sort(np.concatenate([unused, size[~right] / ALIKE]))
         return np.asarray(np.log(len(sizes) - np.searchsorted(sizes, size) + MISTAKEN_PLACES))
 
-    def factors(right: Bools) -> Floats:
-        fit = settled(Fit(thinned(chain, chosen[right]), start), MOST_STEPS)
+    def factors(right: Bools, at: Linear = start) -> Floats:
+        fit = settled(Fit(thinned(chain, chosen[right]), at), MOST_STEPS)
         return _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen]
 
     def said_by(right: Bools, factor: Floats) -> float:
-        """Where places are few, each counts by what those before it say, too: two that agree agree once."""
+        """Where places are few, each counts by the less of what all others and those before it say: two that agree,
+        agree once. By the latter alone a drifting lattice is taken for a backbone, 40 % of its wrong edges for right.
+        """
         rows = np.flatnonzero(right)
         if len(rows) <= FEW:
             rows = rows[np.argsort(-bare[rows], kind="stable")]
-            before = [bare[row] if not k else factors(np.isin(each, rows[:k]))[row] for k, row in enumerate(rows)]
-            return together(np.minimum(factor[rows], np.array(before) - rivals(right)[rows]))
+            after = [bare[row] if not k else factors(np.isin(each, rows[:k]))[row] for k, row in enumerate(rows)]
+            return together(np.minimum(factor[rows], np.array(after) - rivals(right)[rows]))
         return together(factor[rows])
 
     right, bare, each = np.ones(len(chosen), bool), alone.factor[chosen], np.arange(len(chosen))
     strongest = each == np.argmax(bare - rivals(right))
     for number in range(ROUNDS):
-        fit = settled(Fit(thinned(chain, chosen[right]), start if number else linear), MOST_STEPS)
-        factor = _judge(fit.linear, fit, EVEN, wrong, tense=True).factor[chosen] - rivals(right)
+        factor = factors(right, start if number else linear) - rivals(right)
         if not number and said_by(right, factor) > enough:
             return used, True
         before, right = right, factor > enough if number else strongest
@@ -273,7 +274,7 @@ def agreeing_groups(start: Linear, alone: Judged, rows: Ints) -> list[Ints]:
 
 
 MOST_PAIRS = 200_000
-"""Of loops that are compared, each with the other: a limit on memory."""
+"""Of loops that are compared: a limit on memory and time. All of 6000 at a few places took 2 GB and 22 CPU s."""
 
 
 def together(log_odds: Floats) -> float:
@@ -288,8 +289,8 @@ MISTAKEN_PLACES = 0.2
 a path that closes once would stay open: its loops can say little more than that the drift is as stated.
 """
 FEW = 6
-"""Places at the most that are held against those before them alone: a limit on cost. Of more, what the first say of
-each other hardly counts twice.
+"""Places at the most that are held against those before them alone: a limit on cost. Of 96 simulated graphs,
+most or all of whose loops are wrong, the same three are worse than their odometry with 2, 6 and 30; with 0 seven are.
 """
 MISTAKEN = float(np.log(20.0))
 """The log-odds of right places against mistaken ones that are enough, where steps err as stated; where it takes larger

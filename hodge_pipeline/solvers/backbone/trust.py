@@ -40,7 +40,7 @@ with each other says that the backbone may be wrong: loops at random hardly agre
 """
 REFUTING = 0.5
 """Of the loops over few steps, that close: where fewer do, they are wrong, and not the odometry, which is right between
-its wrong steps.
+its wrong steps. In simulated lattices with wrong steps .76 and more do, of loops that take two places for one none.
 """
 
 
@@ -127,8 +127,9 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     chain, found = inferred
     doubted = trust == AUTO and not found.confirmed and loops > steps.sum()
     doubted = doubted and bool(tested_by_pairs(chain, chain.poses).sum() > AGREEING * steps.sum())
-    closes = closing(chain, chain.poses)[1]
-    doubted = doubted and bool(closes.sum() >= REFUTING * len(closes))
+    if doubted:
+        closes = closing(chain, chain.poses)[1]
+        doubted = bool(closes.sum() >= REFUTING * len(closes))
     return _backbone(graph, chain, found, steps, doubted)
 
 
