@@ -21,7 +21,7 @@ from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import ViewGraph
-from tests.backbone_graphs import drive, round_trip
+from tests.backbone_graphs import Drive, drive, round_trip
 
 NEVER_WORSE = 1.02
 
@@ -173,15 +173,22 @@ def test_a_covariance_that_sums_left_indefinite_has_a_root() -> None:
     np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), covariance, atol=2e-3)
 
 
-def test_small_random_motions_confirm_nothing(data_dir: Path) -> None:
+@pytest.mark.parametrize(("size_m", "confirmed"), [(0.7, True), (1.5, False)])
+def test_random_motions_between_places_seen_again_are_never_worse(
+    data_dir: Path, size_m: float, confirmed: bool
+) -> None:
     graph = read_graph(data_dir / "pose_graphs/sesync/intel.g2o").graph
     assert graph is not None
     loops = np.flatnonzero(np.diff(graph.edges, axis=1)[:, 0] != 1)
-    size = [0.0, 0.0, 0.7, 0.7, 0.7, 0.0]  # of an error: rad, m
-    motion = graph.i_from_j.copy()
-    motion[loops] = se3.exp(np.random.default_rng(0).normal(size=(len(loops), 6)) * size)
-    backbone = find_backbone(replace(graph, i_from_j=motion))
-    assert backbone is not None and not backbone.used[loops].any()
+    truth = find_backbone(graph, "sequential")
+    assert truth is not None
+    for seed in range(2):  # small ones are right by chance here and there
+        motion, size = graph.i_from_j.copy(), [0.0, 0.0, 0.7, size_m, size_m, 0.0]
+        motion[loops] = se3.exp(np.random.default_rng(seed).normal(size=(len(loops), 6)) * size)
+        made = Drive(replace(graph, i_from_j=motion), truth.world_from_cam, np.ones(graph.edge_count, bool))
+        backbone = find_backbone(made.graph)
+        assert backbone is not None and (confirmed or not backbone.used[loops].any())
+        assert made.error_m(backbone.world_from_cam) <= 1.02 * made.error_m(made.odometry())
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
