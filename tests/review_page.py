@@ -126,9 +126,9 @@ class Page:
         self.until(lambda: self.review.session.decisions.revision > before)
         self.settled()
 
-    def place(self, point: Floats) -> tuple[float, float] | None:
-        """Where a point of the world is seen, in pixels of the window; None where it is not."""
-        camera, frame = self.scene.camera, self.find("#scene").rect
+    def place(self, point: Floats, frame: dict[str, float] | None = None) -> tuple[float, float] | None:
+        """Where a point of the world is seen, in pixels of the window; None where it is not. `frame`: the scene's."""
+        camera, frame = self.scene.camera, frame or self.find("#scene").rect
         forward = np.asarray(camera.look_at) - np.asarray(camera.position)
         forward /= np.linalg.norm(forward)
         across = np.cross(forward, np.asarray(camera.up_direction))

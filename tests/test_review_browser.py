@@ -20,6 +20,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.pairs.edits import read_history
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.review import scene
 from hodge_pipeline.review.closeup import SLICES
 from hodge_pipeline.review.looking import shown_pair
 from hodge_pipeline.review.opening import Review
@@ -56,14 +57,21 @@ def run_folder(spoiled_run: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def chromium() -> Iterator[Any]:
     found = start_browser()
     yield found
     found.quit()
 
 
 @pytest.fixture
-def review(run_folder: Path) -> Iterator[Review]:
+def browser(chromium: Any) -> Iterator[Any]:
+    yield chromium
+    chromium.get("about:blank")  # a scene that nobody looks at any more is drawn all the same
+
+
+@pytest.fixture
+def review(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Review]:
+    monkeypatch.setattr(scene, "MOST_POINTS", 20_000)  # drawn without a GPU
     with Review(run_folder, who="ada") as opened:
         opened.session.wait()
         yield opened
@@ -237,10 +245,10 @@ def matching(page: Page, i: int, j: int, i_from_j: Any) -> list[tuple[Any, Any]]
     first, second = (np.asarray(clouds[row].points_in_cam, float) for row in (i, j))
     distance, at = cKDTree(se3.transform(i_from_j, second)).query(first)
     shown = se3.transform(pair.world_from_i, first), se3.transform(pair.world_from_j, second)
-    eye = np.asarray(page.scene.camera.position)
+    eye, frame = np.asarray(page.scene.camera.position), page.find("#scene").rect
 
     def picked(points: Any, row: int) -> bool:
-        if page.place(points[row]) is None or nearest_point(eye, points[row] - eye, points) != row:
+        if page.place(points[row], frame) is None or nearest_point(eye, points[row] - eye, points) != row:
             return False
         away = points[row] - eye
         beside = [away + sign * np.cross(away, axis) * 1e-3 for sign in (-1, 1) for axis in np.eye(3)]  # a pixel off
