@@ -241,11 +241,12 @@ def test_clouds_on_disk_give_their_memory_back(tmp_path: Path) -> None:
     if not Path("/proc/self/smaps").is_file():
         pytest.skip("this system has no /proc/self/smaps, which tells the memory of a file")
     total = clouds.points.sum(dtype=float)
-    assert resident_kb() > 10_000
+    whole = resident_kb()
+    assert whole > 10_000
     clouds.forget()
     assert resident_kb() < 1_000
     assert sum(cloud.points_in_cam.sum(dtype=float) for cloud in clouds) == pytest.approx(total)
-    assert resident_kb() < 4_000
+    assert resident_kb() < whole / 2  # a system may map a file in pieces of megabytes
 
 
 @pytest.mark.parametrize(
