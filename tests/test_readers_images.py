@@ -9,8 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
-from hodge_adapters.images import pixels
+from hodge_adapters.images import pixels, png
+from hodge_adapters.images.png import inflated
 from hodge_pipeline.errors import SourceError
 from readers_data import HEIGHT, WIDTH, depth_values, write_colour, write_depth
 
@@ -138,3 +140,43 @@ def test_a_jpeg_that_was_overwritten_in_part_is_refused(tmp_path: Path) -> None:
         path.write_bytes(contents)
         with pytest.raises(SourceError, match="truncated or damaged"):
             pixels.read_colour(path)
+
+
+@pytest.mark.parametrize("kind", ["grey", "depth", "colour", "alpha", "one bit", "palette", "interlaced"])
+def test_a_png_inflated_before_decodes_to_the_same_pixels(tmp_path: Path, kind: str) -> None:
+    pytest.importorskip("isal", reason="the package isal is not installed")
+    picture = np.random.default_rng(0).integers(0, 255, (37, 53, 3)).astype(np.uint8)
+    image = Image.fromarray(picture)
+    named = {
+        "grey": image.convert("L"),
+        "depth": Image.fromarray(picture[..., 0].astype(np.uint16) * 257),
+        "colour": image,
+        "alpha": image.convert("RGBA"),
+        "one bit": image.convert("1"),
+        "palette": image.convert("P"),
+        "interlaced": image,
+    }[kind]
+    named.save(tmp_path / "x.png")
+    contents = (tmp_path / "x.png").read_bytes()
+    if kind == "interlaced":  # as the header says, though the data are not
+        contents = contents[:28] + b"\x01" + contents[29:]
+        assert inflated(contents) == contents
+        return
+    again = inflated(contents)
+    assert again != contents
+    for how in (cv2.IMREAD_UNCHANGED, cv2.IMREAD_COLOR_RGB):
+        decoded, expected = (cv2.imdecode(np.frombuffer(data, np.uint8), how) for data in (again, contents))
+        np.testing.assert_array_equal(decoded, expected)
+
+
+def test_what_cannot_be_inflated_is_left_to_the_decoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_depth(tmp_path / "a.png", depth_values())
+    contents = path.read_bytes()
+    at = contents.index(b"IDAT")
+    broken = contents[: at + 6] + b"\xff\xff" + contents[at + 8 :]
+    assert inflated(broken) == broken
+    assert inflated(b"\xff\xd8\xff\xe0 a jpeg") == b"\xff\xd8\xff\xe0 a jpeg"
+    expected = pixels.read_depth(path, units_per_metre=1000.0)
+    monkeypatch.setattr(png, "isal_zlib", None)
+    assert inflated(contents) == contents
+    np.testing.assert_array_equal(pixels.read_depth(path, units_per_metre=1000.0), expected)
