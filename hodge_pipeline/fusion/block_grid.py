@@ -21,6 +21,10 @@ GROWTH_COPIES = 3
 """The old blocks are alive while the twice as many new ones are filled."""
 FIRST_BLOCKS = 8000
 GREY = 128
+"""Of a voxel without a colour in a block without any."""
+SEEN = 1
+"""Added to the colours in a grid, so that black is not what no image has coloured: 0."""
+BLOCKS_AT_ONCE = 1000
 TOUCH_STRIDE = 4
 """Of a depth image open3d takes each fourth row and column to find the blocks that it touches."""
 
@@ -41,7 +45,8 @@ TRUNCATION_VOXELS = 4.0
 class BlockGrid:
     """Integrates depth images; `max_blocks` bounds it, `GridFull` is raised before it is passed.
 
-    It holds colours for all views or, without `colour`, for none; `views` of them were added, `coloured` with an image.
+    It holds colours or, without `colour`, none; `views` were added, `coloured` of them with an image, which must come
+    first: open3d counts all views of a voxel as if they had coloured it.
     Of a `box` it holds the blocks in it and those around them, which the surface at its faces needs.
     """
 
@@ -62,7 +67,7 @@ class BlockGrid:
         return int(self._grid.hashmap().size())
 
     def integrate(self, depth_m: Floats32, colour: Bytes | None, camera: Camera, world_from_cam: Floats) -> bool:
-        """Add one view: depth (H, W), 0 where there is none; colour (h, w, 3) of the same field of view, or none: grey.
+        """Add one view: depth (H, W), 0 where there is none; colour (h, w, 3) of the same field of view, or none.
 
         False where no depth is within reach: there was nothing to add.
         """
@@ -78,11 +83,10 @@ class BlockGrid:
         self._make_room(len(blocks))
         matrix = _floor_matrix(camera, depth_m.shape, depth_m.shape)
         self.views, self.coloured = self.views + 1, self.coloured + (colour is not None)
-        if not self.colour:
+        if not self.colour or colour is None:
             self._grid.integrate(blocks, depth, matrix, pose, 1.0, *reach)
         else:
-            colour = np.full((*depth_m.shape, 3), GREY, np.uint8) if colour is None else colour
-            image = o3d.t.geometry.Image(_tensor(colour, np.float32))
+            image = o3d.t.geometry.Image(_tensor(np.add(colour, SEEN, dtype=np.float32), np.float32))
             colour_matrix = _floor_matrix(camera, depth_m.shape, colour.shape)
             self._grid.integrate(blocks, depth, image, matrix, colour_matrix, pose, 1.0, *reach)
         return True
@@ -141,14 +145,28 @@ class BlockGrid:
         """The surface seen more than `min_weight` times, of a box the part of it that lies inside."""
         if len(self) == 0:
             return Mesh.joined([])
+        if self.coloured:
+            self._colour_the_rest()
         raw = self._grid.extract_triangle_mesh(min_weight)
         points, normals = raw.vertex.positions.numpy(), raw.vertex.normals.numpy()
-        colours = np.rint(np.clip(raw.vertex.colors.numpy(), 0, 255)).astype(np.uint8)
+        colours = np.rint(np.clip(raw.vertex.colors.numpy() - SEEN, 0, 255)).astype(np.uint8)
         mesh = Mesh(points, normals, colours, raw.triangle.indices.numpy())
         if self.box is not None:
             middles = points[mesh.triangles].mean(axis=1, dtype=float)
             mesh = mesh.with_triangles(self.box.holds(np.floor(middles / (self.voxel_m * BLOCK_SIDE))))
         return mesh.ordered()
+
+    def _colour_the_rest(self) -> None:
+        """Give voxels that no image has coloured the mean colour of their block."""
+        colours, weights = (self._grid.attribute(name).numpy() for name in ("color", "weight"))
+        rows = self._grid.hashmap().active_buf_indices().numpy().astype(np.int64)
+        for part in np.split(rows, range(BLOCKS_AT_ONCE, len(rows), BLOCKS_AT_ONCE)):
+            coloured = colours[part, ..., 0] > 0
+            bare = (weights[part, ..., 0] > 0) & ~coloured
+            for block in np.flatnonzero(bare.any(axis=(1, 2, 3))).tolist():
+                own = colours[part[block]]
+                known = own[coloured[block]]
+                own[bare[block]] = known.mean(axis=0) if len(known) else GREY + SEEN
 
 
 def _tensor(values: Any, kind: Any) -> Any:

@@ -19,7 +19,11 @@ from hodge_pipeline.types import Floats, Frame, Ints, Model
 
 BYTES_A_VERTEX = 150
 """Place, normal, colour and two triangles, thrice while they are put into order."""
-Views: TypeAlias = list[tuple[Frame, Floats]]
+MOST_BETWEEN, FEWEST_COLOURED = 3, 100
+"""Views from one whose colours are taken to the next, and how many are taken at least: colours are half of the cost of
+a view, and show the same."""
+Views: TypeAlias = list[tuple[Frame, Floats, bool]]
+"""Frame, pose, and whether its colours are taken."""
 _Made: TypeAlias = tuple[Mesh, float, bool]
 """A mesh, the weight that its surface needed, and whether any view had colours."""
 
@@ -76,7 +80,7 @@ class TsdfFuser:
                 f"fusion: tsdf: no frame, from {frames[0].frame_id} on, has a depth image: take fusion: cloud"
             )
         skipped, voxel_m, made = Skipped(), self.voxel_m, None
-        views = posed(frames, world_from_cam, self.every, skipped, self.min_motion_m)
+        views = _coloured_first(posed(frames, world_from_cam, self.every, skipped, self.min_motion_m))
         progress = _Progress(advance)
         while made is None:
             made = self._made(views, voxel_m, skipped, progress)
@@ -125,7 +129,7 @@ class TsdfFuser:
         return min(self.min_weight, max(views - 1.0, 0.0))
 
     def _grid(self, voxel_m: float, views: Views, box: Box | None) -> BlockGrid:
-        colour = self.colour and any(frame.read_colour for frame, _ in views)
+        colour = self.colour and any(frame.read_colour for frame, *_ in views)
         limit = blocks_within(self.memory_limit_mb)
         return BlockGrid(voxel_m, self.max_depth_m, limit, colour, box)
 
@@ -133,7 +137,7 @@ class TsdfFuser:
         """All blocks (M, 3), and each view's least and largest one (V, 2, 3), of one that has none the other way."""
         blocks: set[tuple[int, int, int]] = set()
         spans = np.broadcast_to(np.array([[1, 1, 1], [0, 0, 0]]), (len(views), 2, 3)).copy()
-        for row, (frame, pose) in enumerate(views):
+        for row, (frame, pose, _) in enumerate(views):
             with skipped.unreadable(frame):
                 if frame.camera is not None and frame.read_depth is not None:
                     own = grid.touched(frame.read_depth(), frame.camera, pose)
@@ -143,13 +147,13 @@ class TsdfFuser:
         return np.array(sorted(blocks), np.int64).reshape(-1, 3), spans
 
     def _integrate(self, grid: BlockGrid, views: Views, skipped: Skipped, progress: _Progress) -> None:
-        for row, (frame, pose) in enumerate(views):
+        for row, (frame, pose, is_coloured) in enumerate(views):
             if frame.camera is None or frame.read_depth is None:
                 skipped.add("no depth image", frame)
                 continue
             with skipped.unreadable(frame):
                 depth_m = frame.read_depth()
-                colour = skipped.colour(frame) if grid.colour else None
+                colour = skipped.colour(frame) if grid.colour and is_coloured else None
                 if not grid.integrate(depth_m, colour, frame.camera, pose):
                     skipped.add(f"no depth within max_depth_m = {self.max_depth_m:g}", frame)
             progress.reached(row + 1)
@@ -169,3 +173,10 @@ class TsdfFuser:
         if triangles == 0:
             notes.append(f"the mesh is empty: no surface was seen by more than min_weight = {min_weight:g} frames")
         return notes
+
+
+def _coloured_first(posed_frames: list[tuple[Frame, Floats]]) -> Views:
+    """The frames whose colours are taken, evenly spread, before the others, as a `BlockGrid` wants them."""
+    step = min(MOST_BETWEEN, max(1, len(posed_frames) // FEWEST_COLOURED))
+    views = [(frame, pose, row % step == 0) for row, (frame, pose) in enumerate(posed_frames)]
+    return sorted(views, key=lambda view: not view[2])
