@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 
 from hodge_adapters.images import pixels, png
-from hodge_adapters.images.png import inflated
 from hodge_pipeline.errors import SourceError
 from readers_data import HEIGHT, WIDTH, depth_values, write_colour, write_depth
 
@@ -143,7 +142,7 @@ def test_a_jpeg_that_was_overwritten_in_part_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["grey", "depth", "colour", "alpha", "one bit", "palette", "interlaced"])
-def test_a_png_inflated_before_decodes_to_the_same_pixels(tmp_path: Path, kind: str) -> None:
+def test_a_png_inflated_by_isal_decodes_to_the_same_pixels(tmp_path: Path, kind: str) -> None:
     pytest.importorskip("isal", reason="the package isal is not installed")
     picture = np.random.default_rng(0).integers(0, 255, (37, 53, 3)).astype(np.uint8)
     image = Image.fromarray(picture)
@@ -160,23 +159,50 @@ def test_a_png_inflated_before_decodes_to_the_same_pixels(tmp_path: Path, kind: 
     contents = (tmp_path / "x.png").read_bytes()
     if kind == "interlaced":  # as the header says, though the data are not
         contents = contents[:28] + b"\x01" + contents[29:]
-        assert inflated(contents) == contents
+        assert png._inflated(contents) is None
         return
-    again = inflated(contents)
-    assert again != contents
+    parts = png._inflated(contents)
+    assert parts is not None
     for how in (cv2.IMREAD_UNCHANGED, cv2.IMREAD_COLOR_RGB):
-        decoded, expected = (cv2.imdecode(np.frombuffer(data, np.uint8), how) for data in (again, contents))
-        np.testing.assert_array_equal(decoded, expected)
+        expected = cv2.imdecode(np.frombuffer(contents, np.uint8), how)
+        stored = cv2.imdecode(np.frombuffer(png._with_stored(*parts), np.uint8), how)
+        np.testing.assert_array_equal(stored, expected)
+        np.testing.assert_array_equal(png.decoded(contents, how), expected)
 
 
-def test_what_cannot_be_inflated_is_left_to_the_decoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "filters", [cv2.IMWRITE_PNG_FILTER_SUB, cv2.IMWRITE_PNG_FILTER_UP, cv2.IMWRITE_PNG_ALL_FILTERS]
+)
+@pytest.mark.parametrize("shape", [(37, 53), (37, 53, 3)])
+def test_every_filter_of_a_png_is_undone(shape: tuple[int, ...], filters: int) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint16 if len(shape) == 2 else np.uint8)
+    contents = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_FILTER, filters])[1].tobytes()
+    for how in (cv2.IMREAD_UNCHANGED, cv2.IMREAD_COLOR_RGB):
+        expected = cv2.imdecode(np.frombuffer(contents, np.uint8), how)
+        found = png.decoded(contents, how)
+        assert found.dtype == expected.dtype
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_what_cannot_be_inflated_is_left_to_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_depth(tmp_path / "a.png", depth_values())
     contents = path.read_bytes()
     at = contents.index(b"IDAT")
-    broken = contents[: at + 6] + b"\xff\xff" + contents[at + 8 :]
-    assert inflated(broken) == broken
-    assert inflated(b"\xff\xd8\xff\xe0 a jpeg") == b"\xff\xd8\xff\xe0 a jpeg"
+    assert png._inflated(contents[: at + 6] + b"\xff\xff" + contents[at + 8 :]) is None
+    assert png._inflated(b"\xff\xd8\xff\xe0 a jpeg") is None
     expected = pixels.read_depth(path, units_per_metre=1000.0)
     monkeypatch.setattr(png, "isal_zlib", None)
-    assert inflated(contents) == contents
+    assert png._inflated(contents) is None
     np.testing.assert_array_equal(pixels.read_depth(path, units_per_metre=1000.0), expected)
+
+
+def test_a_depth_image_that_is_packed_by_isal_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("isal", reason="the package isal is not installed")
+    stored = np.random.default_rng(0).integers(0, 65536, (31, 47)).astype(np.uint16)
+    contents = png.encoded_depth(stored)
+    assert contents is not None
+    (tmp_path / "x.png").write_bytes(contents)
+    assert pixels.read_whole_image(tmp_path / "x.png", (47, 31)) == contents
+    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(contents, np.uint8), cv2.IMREAD_UNCHANGED), stored)
+    monkeypatch.setattr(png, "isal_zlib", None)
+    assert png.encoded_depth(stored) is None

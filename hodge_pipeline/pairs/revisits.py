@@ -161,13 +161,16 @@ class _Path:
         return np.asarray(dijkstra(ways, directed=False, indices=row, limit=limit_m))
 
     def _try(self, row: int, near: Ints, allowed_m: Floats) -> None:
-        found = [self._register(int(one), row, float(most)) for one, most in zip(near, allowed_m, strict=True)]
-        if any(one is None for one in found):
-            return
-        places = [self._poses[at] @ one.i_from_j for at, one in zip(near, found, strict=True) if one is not None]
+        found = list[Registration]()
+        for at, most_m in zip(near, allowed_m, strict=True):
+            one = self._register(int(at), row, float(most_m))
+            if one is None:
+                return
+            found.append(one)
+        places = [self._poses[at] @ one.i_from_j for at, one in zip(near, found, strict=True)]
         if self._far(se3.inverse(places[0]) @ places[1]) > self._options.agree_m:
             return
-        self._loops += [(int(at), row, one) for at, one in zip(near, found, strict=True) if one is not None]
+        self._loops += [(int(at), row, one) for at, one in zip(near, found, strict=True)]
         self._poses[row] = places[0]
 
     def _register(self, target: int, source: int, allowed_m: float) -> Registration | None:

@@ -18,6 +18,7 @@ import numpy as np
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import resized
 from hodge_adapters.images.lens_models import image_file
+from hodge_adapters.images.png import encoded_depth
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, Camera, EncodedImage, Floats, Floats32, Frame, ImageFile
 
@@ -117,7 +118,7 @@ def straight_colour(read: Callable[[], Bytes], lens: Lens) -> Bytes:
 def encoded_straight_depth(read: Callable[[], Floats32], lens: Lens, units_per_metre: float) -> EncodedImage:
     """The straight depth image as PNG, in the units that the files have."""
     stored = np.clip(np.round(straight_depth(read, lens) * units_per_metre), 0, 65535).astype(np.uint16)
-    return EncodedImage(_encoded(".png", stored, []), "image/png", units_per_metre)
+    return EncodedImage(encoded_depth(stored) or _encoded(".png", stored, []), "image/png", units_per_metre)
 
 
 def encoded_straight_colour(read: Callable[[], Bytes], lens: Lens) -> EncodedImage:

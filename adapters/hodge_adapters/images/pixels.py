@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from hodge_adapters.images.headers import is_complete, parse_header
-from hodge_adapters.images.png import inflated
+from hodge_adapters.images.png import decoded
 from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, EncodedImage, Floats32
@@ -64,8 +64,7 @@ def read_colour(path: Path, *, size: tuple[int, int] | None = None) -> Bytes:
 
 
 def _decoded(path: Path, size: tuple[int, int] | None, how: int, any_scale: bool = False) -> Any:
-    contents = inflated(read_whole_image(path, size, any_scale))
-    stored = cv2.imdecode(np.frombuffer(contents, np.uint8), how)
+    stored = decoded(read_whole_image(path, size, any_scale), how)
     if stored is None:
         raise SourceError(f"{path}: the image cannot be decoded: copy it again from its source")
     return stored
