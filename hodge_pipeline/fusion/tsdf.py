@@ -19,7 +19,7 @@ from hodge_pipeline.types import Floats, Frame, Ints, Model
 
 BYTES_A_VERTEX = 150
 """Place, normal, colour and two triangles, thrice while they are put into order."""
-MOST_BETWEEN, FEWEST_COLOURED = 3, 100
+MOST_BETWEEN, FEWEST_COLOURED = 3, 30
 """Views from one whose colours are taken to the next, and how many are taken at least: colours are half of the cost of
 a view, and show the same."""
 Views: TypeAlias = list[tuple[Frame, Floats, bool]]
