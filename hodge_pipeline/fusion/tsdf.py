@@ -62,7 +62,9 @@ class TsdfFuser:
         description="metres, and radians at one metre: a frame that moved less since the last one fused is left out "
         "and not read; at frame rate 0.05 leaves out two of three, which show the same from the same side",
     )
-    colour: bool = Field(True, description="colour the mesh; without it fusion is a third faster")
+    colour: bool = Field(
+        True, description="colour the mesh, by every third view; without it fusion is a quarter faster"
+    )
     memory_limit_mb: float = Field(
         2000.0,
         ge=50,
