@@ -6,6 +6,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from PIL import Image
 
@@ -138,12 +139,11 @@ def picture(scene: Points, view: View) -> Bytes:
     width, height = view.size
     axes = view.axes.astype(np.float32)
     facing = scene.normals @ axes[2]
-    in_view = (scene.points - view.centre.astype(np.float32)) @ axes.T
-    seen = in_view[:, 2] >= -min(view.near_m, view.eye_m - NEAR_M)
-    if view.culled:
-        seen &= facing <= 0.1
-    rows = np.flatnonzero(seen)
-    in_view = in_view.take(rows, axis=0)  # a fifth of the time of a mask
+    rows = np.flatnonzero(facing <= 0.1) if view.culled else np.arange(len(facing))
+    in_view = (scene.points.take(rows, axis=0) - view.centre.astype(np.float32)) @ axes.T
+    near = in_view[:, 2] >= -min(view.near_m, view.eye_m - NEAR_M)
+    if not near.all():
+        rows, in_view = rows[near], in_view.take(np.flatnonzero(near), axis=0)  # a fifth of the time of a mask
     scale = 1.0 / view.metres_per_pixel
     across = in_view[:, :2] * scale
     if np.isfinite(view.eye_m):
@@ -172,19 +172,20 @@ def _shades(colours: Bytes, facing: Floats32) -> Floats32:
 def _filled(image: Bytes, depth: Floats32, passes: int) -> Bytes:
     """The picture with the gaps between points closed by their nearest neighbours."""
     height, width = depth.shape
+    image = np.pad(image, ((1, 1), (1, 1), (0, 0)))  # beyond the border there is nothing
+    depth = np.pad(depth, 1, constant_values=np.inf)
+    flat, steps = image.reshape(-1, 3), np.array([-1, -width - 2, 1, width + 2])
+    inside = np.s_[1 : height + 1, 1 : width + 1]
     for _ in range(passes):
-        # beyond the border there is nothing
-        best, near, colours = (
-            depth.copy(),
-            np.pad(depth, 1, constant_values=np.inf),
-            np.pad(image, ((1, 1), (1, 1), (0, 0))),
-        )
-        for row, column in ((1, 0), (0, 1), (1, 2), (2, 1)):
-            window = np.s_[row : row + height, column : column + width]
-            nearer = np.isinf(depth) & (near[window] < best)
-            best[nearer], image[nearer] = near[window][nearer], colours[window][nearer]
-        depth = best
-    return image
+        known = np.isfinite(depth)
+        beside = cv2.dilate(known.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))[inside]
+        row, column = np.nonzero((beside > 0) & ~known[inside])
+        gaps = (row + 1) * (width + 2) + column + 1
+        around = depth.ravel()[gaps[:, None] + steps]
+        nearest = around.argmin(axis=1)
+        flat[gaps] = flat[gaps + steps[nearest]]
+        depth.ravel()[gaps] = around.min(axis=1)
+    return image[inside]
 
 
 def beside(images: Sequence[Bytes]) -> Bytes:
