@@ -398,4 +398,4 @@ def test_what_no_image_has_coloured_has_the_colour_around_it_and_black_stays_bla
     assert np.percentile(np.abs(colours[:, None] - known).max(axis=2).min(axis=1), 80) < 10
     bare = BlockGrid(0.04, 6.0, 10_000, colour=True)
     bare.integrate(depth, None, CAMERA, poses[0])
-    assert bare.coloured == 0
+    assert bare.coloured == 0 and (bare.mesh(0.0).colours == block_grid.GREY).all()

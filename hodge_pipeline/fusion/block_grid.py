@@ -24,6 +24,8 @@ GREY = 128
 """Of a voxel without a colour in a block without any."""
 SEEN = 1
 """Added to the colours in a grid, so that black is not what no image has coloured: 0."""
+STORED = 255.0
+"""By which open3d multiplies the colours of a float image in a grid, and divides those of a mesh."""
 BLOCKS_AT_ONCE = 1000
 TOUCH_STRIDE = 4
 """Of a depth image open3d takes each fourth row and column to find the blocks that it touches."""
@@ -145,7 +147,7 @@ class BlockGrid:
         """The surface seen more than `min_weight` times, of a box the part of it that lies inside."""
         if len(self) == 0:
             return Mesh.joined([])
-        if self.coloured:
+        if self.colour:
             self._colour_the_rest()
         raw = self._grid.extract_triangle_mesh(min_weight)
         points, normals = raw.vertex.positions.numpy(), raw.vertex.normals.numpy()
@@ -166,7 +168,7 @@ class BlockGrid:
             for block in np.flatnonzero(bare.any(axis=(1, 2, 3))).tolist():
                 own = colours[part[block]]
                 known = own[coloured[block]]
-                own[bare[block]] = known.mean(axis=0) if len(known) else GREY + SEEN
+                own[bare[block]] = known.mean(axis=0) if len(known) else STORED * (GREY + SEEN)
 
 
 def _tensor(values: Any, kind: Any) -> Any:
