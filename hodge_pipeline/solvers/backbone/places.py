@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import gammaln
 
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, FREEDOM, Wrong
@@ -38,6 +39,8 @@ CLEARLY = float(np.log(20.0))
 """Log-odds that a change must win."""
 LEAST_WON = 0.1
 """Of χ², for which poses are improved where places are compared."""
+ADJACENT = 2.0
+"""Places between places that follow each other: a corridor that is mistaken for another is one testimony."""
 MOST_PAIRS = 200_000
 """Of loops that are compared: a limit on memory and time. All of 6000 at a few places took 2 GB and 22 CPU s."""
 
@@ -53,7 +56,7 @@ class Arrangement:
 
 @dataclass(frozen=True)
 class Places:
-    """Places that the loops of a chain join.
+    """Places that the loops of a chain join; those that follow each other are one, as long as a corridor may be.
 
     - `start`: the bare chain. `loop (K,)`: one loop of each place, ascending; `bare (K,)`: the log Bayes factor of each
       by itself; `size (K,)`: how many loops agree there; `used (K,)`: of used loops, not of unused ones that agree.
@@ -74,20 +77,33 @@ class Places:
     def of(cls, start: Linear, alone: Judged, used: Bools, wrong: Wrong) -> Places:
         """Those of the used loops (M,), and of the largest groups of unused ones that agree."""
         ends, rows = start.chain.places, np.flatnonzero(used)
-        first = one_of_each_place(ends[rows])
-        distance, nearest = cKDTree(ends[rows[first]]).query(ends, p=np.inf)
+        place = rows[one_of_each_place(ends[rows])]
+        distance, nearest = cKDTree(ends[place]).query(ends, p=np.inf)
+        loops = loops_at_place(ends[rows])[np.searchsorted(rows, place)]
+        adjacent = cKDTree(ends[place]).query_pairs(ADJACENT, p=np.inf, output_type="ndarray")
+        run = connected_components(adjacent, len(place))
+        by_size = np.lexsort((-loops, run))
+        first = by_size[np.unique(run[by_size], return_index=True)[1]]
         groups = agreeing_groups(start, alone, np.flatnonzero(distance > 1.0))
-        added = [group for group in groups[:MOST_TRIED] if len(group) > 1 and alone.factor[group[0]] > 0]
-        members = np.where(used, nearest, -1)
-        for place, group in enumerate(added, start=len(first)):
-            members[group] = place
-        loop = np.concatenate([rows[first], *[group[:1] for group in added]]).astype(np.int64)
-        size = np.concatenate([loops_at_place(ends[rows])[first], [len(group) for group in added]])
+        may_be_added = np.array([len(group) > 1 and alone.factor[group[0]] > 0 for group in groups], bool)
+        may_be_added[MOST_TRIED:] = False
+        added = [groups[each] for each in np.flatnonzero(may_be_added)]
+        members = np.where(used, run[nearest], -1)
+        for number, group in enumerate(added, start=len(first)):
+            members[group] = number
+        loop = np.concatenate([place[first], *[group[:1] for group in added]]).astype(np.int64)
+        size = np.concatenate([loops[first], [len(group) for group in added]])
         order = np.argsort(loop)
-        members = np.append(np.argsort(order), -1)[members]
-        own = np.arange(len(loop)) < len(first)
-        others = np.array([len(group) for group in groups if not any(group is each for each in added)], np.int64)
-        return cls(start, wrong, loop[order], alone.factor[loop[order]], size[order], own[order], members, others)
+        return cls(
+            start,
+            wrong,
+            loop=loop[order],
+            bare=alone.factor[loop[order]],
+            size=size[order],
+            used=order < len(first),
+            members=np.append(np.argsort(order), -1)[members],
+            unused=np.array([len(group) for group in groups], np.int64)[~may_be_added],
+        )
 
     def rivals(self, right: Bools) -> Floats:
         """The logarithm (K,) of how many mistaken places of as many loops there are to each."""
@@ -110,7 +126,8 @@ class Places:
     def _away(self, fit: Fit) -> Floats:
         """The log-density (L,) of each active loop if it is wrong."""
         rows = fit.reduced.active
-        return self.wrong.log_density(self.start.chain.with_loops(rows, self.start.chain.ends[rows]), fit.linear.poses)
+        chain = self.start.chain.with_loops(rows, self.start.chain.ends[rows])
+        return self.wrong.log_density(chain, fit.linear.poses)
 
     def best(self, linear: Linear, enough: float, widened: float) -> tuple[Arrangement, bool]:
         """The likeliest arrangement, from that of all used places on, whose poses are near `linear`, and whether its
@@ -136,7 +153,7 @@ class Places:
             before, right = right, (self.used & (factor > enough)) | strongest
             if (before == right).all():
                 break
-        return right
+        return np.asarray(right)
 
     def _by_chance(self, found: Arrangement, widened: float) -> float:
         """Twice the log-odds that as many loops between other places, at random, reach by bending the steps as far: 0
