@@ -35,6 +35,8 @@ STRAINED = 16.0
 """χ² to a number: errors four times as large as stated. Of right loops of Bicocca and RobotCar it is up to
 12, of wrong ones that bend a ring into themselves 300.
 """
+MOST_DECOYS = 30
+"""Loops between other places that say what chance reaches: a limit on cost."""
 CLEARLY = float(np.log(20.0))
 """Log-odds that a change must win."""
 LEAST_WON = 0.1
@@ -75,7 +77,7 @@ class Places:
 
     @classmethod
     def of(cls, start: Linear, alone: Judged, used: Bools, wrong: Wrong) -> Places:
-        """Those of the used loops (M,), and of the largest groups of unused ones that agree."""
+        """Those of the used loops (M,), and of unused ones that agree the groups as large as is usual."""
         ends, rows = start.chain.places, np.flatnonzero(used)
         place = rows[one_of_each_place(ends[rows])]
         distance, nearest = cKDTree(ends[place]).query(ends, p=np.inf)
@@ -85,7 +87,8 @@ class Places:
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
         groups = agreeing_groups(start, alone, np.flatnonzero(distance > 1.0))
-        may_be_added = np.array([len(group) > 1 and alone.factor[group[0]] > 0 for group in groups], bool)
+        usual = np.median(loops[first])
+        may_be_added = np.array([len(group) >= usual and alone.factor[group[0]] > 0 for group in groups], bool)
         may_be_added[MOST_TRIED:] = False
         added = [groups[each] for each in np.flatnonzero(may_be_added)]
         members = np.where(used, run[nearest], -1)
@@ -163,14 +166,14 @@ class Places:
         numbers = found.fit.reduced.active.size * len(chain.axes)
         if chain.stated and max(widened, 1.0) ** 2 * found.fit.cost < STRAINED * numbers:
             return 0.0
+        rng = np.random.default_rng(2)
+        some = np.sort(rng.choice(np.flatnonzero(found.right), min(len(rows), MOST_DECOYS), replace=False))
         of_path = chain.path == chain.path[chain.ends[rows[0], 0]]
-        ends = np.random.default_rng(2).choice(np.flatnonzero(of_path), (len(rows), 2))
-        start = linearise(chain.with_loops(rows, np.sort(ends, axis=1)), self.start.poses)
-        each, every = np.arange(len(rows)), np.ones(len(rows), bool)
-        others = Places(
-            start, self.wrong, each, self.bare[found.right], self.size[found.right], every, each, self.unused
-        )
-        return 2 * others._improved(others.arranged(every, start)).log_odds
+        ends = rng.choice(np.flatnonzero(of_path), (len(some), 2))
+        start = linearise(chain.with_loops(self.loop[some], np.sort(ends, axis=1)), self.start.poses)
+        each, every = np.arange(len(some)), np.ones(len(some), bool)
+        others = Places(start, self.wrong, each, self.bare[some], self.size[some], every, each, self.unused)
+        return 2 * len(rows) / len(some) * others._improved(others.arranged(every, start)).log_odds
 
     def _improved(self, found: Arrangement) -> Arrangement:
         """The arrangement after places that bend it are left out and others added, while the log-odds rise."""
