@@ -64,7 +64,7 @@ def test_cycles_of_two_loops_refute_steps_of_a_lattice_alone() -> None:
         clean, _ = rings(200, around)
         assert _refuted(clean) == 0
         assert _refuted(spoiled(clean, 0.1, 13)[0]) > 0.05
-    assert _refuted(at_one_place(drive(count=400, wrong=0.0), 400, group=10).graph) < 0.03
+    assert _refuted(at_one_place(drive(count=400, wrong=0.0, world="town"), 1000, group=10).graph) < 0.05
 
 
 def _refuted(graph: ViewGraph) -> float:

@@ -99,7 +99,8 @@ def _inferred(
 ) -> Inferred | None:
     """The loops judged, at first at the poses that those which are `used (M,)` lead to."""
     chain, linear, begun = start.chain, start, 0
-    enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0)
+    broken = int((chain.bridged & (chain.step_edge >= 0)).sum())  # any other step might have been the one
+    enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0) + broken * np.log(chain.size)
     for _ in range(REARRANGED):
         found = _agreed(start, linear, alone, used | always, shares, wrong, always, thin, begun)
         if found is None:

@@ -16,8 +16,8 @@ from scipy.special import gammaln
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import loops_at_place, one_of_each_place
-from hodge_pipeline.solvers.backbone.evidence import EVEN, FREEDOM, Wrong
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, root, settled, thinned
+from hodge_pipeline.solvers.backbone.evidence import EVEN, FREEDOM, Wrong, student
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, settled, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge, left_out
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -185,24 +185,18 @@ class Places:
         return found
 
     def _changes(self, found: Arrangement) -> list[Bools]:
-        """Arrangements (K,) that differ in one place and may be likelier."""
+        """Arrangements (K,) that differ in one place and may be likelier: without one that is likelier mistaken by all
+        others, those that bend most first; with one more.
+        """
         each, out = np.arange(len(self.loop)), []
         if found.right.sum() > 1:
             active = np.searchsorted(self.loop, found.fit.reduced.active)
-            won = self._won_without(found.fit) + self.rivals(found.right)[active] - np.log(MISTAKEN_PLACES)
-            worst = np.argsort(-won, kind="stable")[:MOST_TRIED]
-            out = [found.right & (each != place) for place in active[worst[won[worst] > 0]]]
+            residual, covariance = left_out(found.fit)
+            log_density, chi2 = student(residual, covariance)
+            worth = log_density - self._away(found.fit) - self.rivals(found.right)[active] + np.log(MISTAKEN_PLACES)
+            bent = np.argsort(-chi2, kind="stable")
+            out = [found.right & (each != place) for place in active[bent[worth[bent] < 0][:MOST_TRIED]]]
         return out + [found.right | (each == place) for place in np.flatnonzero(~self.used & ~found.right)]
-
-    def _won_without(self, fit: Fit) -> Floats:
-        """What the log-density of all is higher by without each active loop (L,), to first order."""
-        residual, covariance = left_out(fit)
-        size, factor = residual.shape[1], root(covariance)
-        white = np.linalg.solve(factor, residual[..., None])[..., 0]
-        left = np.maximum(fit.cost - np.einsum("li,li->l", white, white), 0.0)
-        count = len(residual) * size
-        own = np.log(np.einsum("lii->li", factor)).sum(axis=1)
-        return np.asarray(_log_student(left, count - size) - _log_student(fit.cost, count) + own + self._away(fit))
 
 
 def _log_student(chi2: Floats | float, count: int) -> Floats:

@@ -37,10 +37,10 @@ REFUTING = 0.5
 """Of the loops over few steps, that close: where fewer do, they are wrong, and not the odometry, which is right between
 its wrong steps. In simulated lattices with wrong steps .76 and more do, of loops that take two places for one none.
 """
-REFUTED = 0.03
+REFUTED = 0.05
 """Of the steps that cycles of two loops test: where so many are wrong, the loops are a lattice that judges itself. In
-simulated lattices of 200 and 1000 poses a twentieth of whose edges is wrong .04 to .06, with a fifth .06 to .16; in
-ring, ringCity, Manhattan and INTEL with 1000 wrong loops in groups of five or ten .027 at the most.
+simulated lattices of 200 and 1000 poses a tenth of whose edges is wrong .06 to .11; in simulated graphs with 500 to
+2000 wrong loops in groups of five or ten, and in ring, ringCity, Manhattan and INTEL with 1000, .043 at the most.
 """
 
 
