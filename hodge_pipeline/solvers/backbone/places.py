@@ -117,8 +117,9 @@ class Places:
     def arranged(self, right: Bools, linear: Linear) -> Arrangement:
         """These places (K,) taken for right, at the poses that are reached from some others."""
         fit = settled(Fit(thinned(self.start.chain, self.loop[right]), linear), MOST_STEPS, LEAST_WON)
+        active = np.searchsorted(self.loop, fit.reduced.active)
         # of what is expected beforehand, that of one counts
-        prior = -float(self.rivals(right)[right].sum()) + max(int(right.sum()) - 1, 0) * float(np.log(MISTAKEN_PLACES))
+        prior = max(len(active) - 1, 0) * float(np.log(MISTAKEN_PLACES)) - float(self.rivals(right)[active].sum())
         return Arrangement(right, fit, self._density(fit) + prior)
 
     def _density(self, fit: Fit) -> float:
