@@ -13,10 +13,10 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.pose_graph import read_graph
-from hodge_pipeline.solvers.backbone import inference
+from hodge_pipeline.solvers.backbone import fit
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, root, settled
-from hodge_pipeline.solvers.backbone.inference import left_out, uncertainty
+from hodge_pipeline.solvers.backbone.judge import left_out
 from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -84,7 +84,7 @@ def test_an_odometry_that_turns_wrongly_by_six_degrees_a_step_is_solved(monkeypa
 def test_left_out_residuals_are_those_of_a_solve_without_the_loop() -> None:
     chain = chain_of(drive(wrong=0.0, loops=12).graph)
     found = settled(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses)), 30, 1e-12)
-    without = left_out(found, uncertainty(found.linear, found))
+    without = left_out(found)[0]
     for row in (0, 5, 11):
         others = Reduced.of(chain, np.delete(np.arange(12), row))
         actual = settled(Fit(others, found.linear), 30, 1e-12).linear.loops[0][row]
@@ -379,11 +379,11 @@ def test_robots_whose_loops_are_all_wrong_stay_apart() -> None:
 
 
 def test_more_loops_than_can_be_inverted_are_judged_at_the_poses_of_some(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inference, "MOST_UNKNOWNS", 150)
+    monkeypatch.setattr(fit, "MOST_UNKNOWNS", 150)
     made = drive(count=1500, dimension=3, world="town", loops=700)
     chain = chain_of(made.graph)
     right = np.flatnonzero(made.right[chain.loop_edge])
-    some = inference.thinned(chain, right)
+    some = fit.thinned(chain, right)
     assert 0 < len(some.active) < len(right)
     assert some.network.core_size * 6 <= 150
     found = find_backbone(made.graph)

@@ -28,7 +28,8 @@ from hodge_pipeline.diagnosis.result import (
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.short_cycles import cycle_errors, judge_cycles, with_cycles_of, witnesses
 from hodge_pipeline.diagnosis.wording import reasons
-from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, contradicted_from_afar, find_backbone, is_tested
+from hodge_pipeline.solvers.backbone.step_tests import contradicted_from_afar, is_tested
+from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 

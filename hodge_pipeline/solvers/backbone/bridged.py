@@ -22,12 +22,12 @@ from hodge_pipeline.solvers.backbone.evidence import Scales, Wrong, learn_scales
 from hodge_pipeline.solvers.backbone.fit import Fit, linearise, settled
 from hodge_pipeline.solvers.backbone.inference import (
     BY_CHANCE,
-    MOST_STEPS,
     Inferred,
     by_chance,
     infer,
     refused,
 )
+from hodge_pipeline.solvers.backbone.places import MOST_STEPS
 from hodge_pipeline.types import Bools
 
 MOST_BREAKS, MOST_TRIED = 10, 2

@@ -174,6 +174,26 @@ class Reduced:
         return np.where(has_left, left, right), has_left | (chain.path[self.ends[right]] == chain.path)
 
 
+def thinned(chain: Chain, rows: Ints) -> Reduced:
+    """The network of these loops, or of as many of them, spread evenly over their ends, as can be inverted."""
+    spread, count = rows[np.argsort(chain.ends[rows, 0], kind="stable")], min(len(rows), MOST_ACTIVE)
+    while True:
+        chosen = spread[np.linspace(0, len(spread) - 1, count).astype(np.int64)]
+        reduced = Reduced.of(chain, np.sort(chosen))
+        unknowns = reduced.network.core_size * len(chain.axes)
+        if unknowns <= MOST_UNKNOWNS:
+            return reduced
+        count = round(THINNING * count * MOST_UNKNOWNS / unknowns)
+
+
+MOST_UNKNOWNS = 1500
+"""In a dense matrix, which takes .5 CPU s to invert."""
+MOST_ACTIVE = 2000
+"""Loops at the most: between their ends even a long path drifts by little."""
+THINNING = 0.8
+"""Of as many loops as would leave `MOST_UNKNOWNS` if these grew in proportion to the loops."""
+
+
 @dataclass(frozen=True)
 class Fit:
     """The network of some loops at some poses: its runs and, after them, its loops."""
@@ -233,6 +253,11 @@ class Fit:
     def cost(self) -> float:
         """χ² of the chain and the active loops."""
         return float(np.einsum("mi,mij,mj->", self.residual, self.precision, self.residual))
+
+    @cached_property
+    def log_det(self) -> float:
+        """The logarithm of the determinant of the covariance of all active loops' closing errors together."""
+        return self.factor.log_det - float(np.linalg.slogdet(self.precision)[1].sum())
 
     def moves(self) -> tuple[Floats, float]:
         """The Gauss–Newton move (R, p) of the ends, about the world's origin, and how much of χ² it should win."""

@@ -94,6 +94,13 @@ class Factored:
     blocks: BlockFactor
     core: Floats
 
+    @property
+    def log_det(self) -> float:
+        """The logarithm of the determinant of the normal equations."""
+        pivots = self.blocks.pivots
+        inverted = float(np.linalg.slogdet(pivots)[1].sum()) if len(pivots) else 0.0
+        return (float(np.linalg.slogdet(self.core)[1]) if self.core.size else 0.0) - inverted
+
     def solve(self, force: Floats) -> Floats:
         """The x (N, p, c) of forces (N, p, c); 0 where held still."""
         network = self.network

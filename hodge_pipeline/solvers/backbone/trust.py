@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import infer_bridged
 from hodge_pipeline.solvers.backbone.chain import (
@@ -19,7 +17,8 @@ from hodge_pipeline.solvers.backbone.chain import (
 )
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.polish import LOCAL
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.solvers.backbone.step_tests import PairCycles, closing, is_tested
+from hodge_pipeline.types import Bools, Floats, ViewGraph
 from hodge_pipeline.types.text import counted
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
@@ -28,10 +27,6 @@ FEWEST_STEPS = 100
 edges test each other."""
 COVERED = 0.9
 """Of the vertices that consecutive edges must join, so that a sequence is a backbone."""
-TESTED = 0.3
-"""Of the steps in short cycles that close: from there on every edge is judged, none trusted at first. On graphs of
-rooms .77 to .98 are, on those of places visited again 0 to .1, and as many as there are edges over two steps or three.
-"""
 LOOPS_AT_A_STEP = 0.5
 """From there on loops may make a lattice, or a room, in which no edge needs to be trusted."""
 AGREEING = 0.05
@@ -42,6 +37,11 @@ REFUTING = 0.5
 """Of the loops over few steps, that close: where fewer do, they are wrong, and not the odometry, which is right between
 its wrong steps. In simulated lattices with wrong steps .76 and more do, of loops that take two places for one none.
 """
+REFUTED = 0.05
+"""Of the steps that cycles of two loops test: where so many are wrong, the loops are a lattice that judges itself. In
+simulated lattices of 200 and 1000 poses a tenth of whose edges is wrong .06 to .11; in simulated graphs with 500 to
+2000 wrong loops in groups of five or ten, and in ring, ringCity, Manhattan and INTEL with 1000, .043 at the most.
+"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class Backbone:
     - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
       the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
-    - `doubted`: whether many loops agree with each other, and none with the backbone, which may be what is wrong.
+    - `doubted`: whether many loops agree with each other, and none with the backbone, which may be what is wrong; or
+      cycles of them refute many of its steps.
     """
 
     chain: Chain
@@ -126,10 +127,12 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
         return None
     chain, found = inferred
     doubted = trust == AUTO and not found.confirmed and loops > steps.sum()
-    doubted = doubted and bool(tested_by_pairs(chain, chain.poses).sum() > AGREEING * steps.sum())
+    pairs = PairCycles.of(chain, chain.poses) if trust == AUTO and many_loops else None
+    doubted = doubted and pairs is not None and bool(pairs.tested(chain.size).sum() > AGREEING * steps.sum())
     if doubted:
         closes = closing(chain, chain.poses)[1]
         doubted = bool(closes.sum() >= REFUTING * len(closes))
+    doubted = doubted or (pairs is not None and pairs.refuted(chain.size) > REFUTED)
     return _backbone(graph, chain, found, steps, doubted)
 
 
@@ -155,97 +158,3 @@ def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools, dou
 
 UNUSED = 0.49
 """The most probable that a loop which does not count is: too little speaks for it."""
-
-LONGEST = 3
-"""Steps of a cycle with one loop: cycles of several loops close too where these agree on a place that is wrong."""
-OF_STEPS = 3.0
-"""Of the usual displacement and angle of steps: a cycle of right edges closes to less, and one of places at random
-seldom does.
-"""
-
-
-def is_tested(chain: Chain) -> bool:
-    """Whether short cycles test so many of the steps that none needs to be trusted."""
-    return bool(tested_steps(chain, chain.poses).sum() > TESTED * (chain.step_edge >= 0).sum())
-
-
-def tested_steps(chain: Chain, poses: Floats) -> Bools:
-    """Steps (n,) that lie in a cycle with one loop that closes to less than a step."""
-    out = np.zeros(chain.size, bool)
-    short, closes = closing(chain, poses)
-    low, high = chain.ends[short[closes]].T
-    for ahead in range(1, LONGEST + 1):
-        out[low[high - low >= ahead] + ahead] = True
-    return out
-
-
-def closing(chain: Chain, poses: Floats) -> tuple[Ints, Bools]:
-    """The loops (K,) over few steps, and which of them close to less than a step."""
-    low, high = chain.ends.T
-    short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST))
-    closes = _closes(chain.motion[short], _between(poses, low[short], high[short]), _gate(chain))
-    return short, closes
-
-
-def contradicted_from_afar(graph: ViewGraph, kept: Bools, *, by_pairs: bool = False) -> Bools:
-    """Consecutive edges (E,) that are not kept, though no edge over few of them is kept which passes over them: where
-    one was measured wrong, those that begin or end beside it tell. `by_pairs`: or two that do, one on either side, and
-    whose other ends lie as near, where nothing is left out.
-    """
-    steps = linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph))
-    chain = make_chain(graph, steps)
-    inner, out = chain.step_edge >= 0, np.zeros(graph.edge_count, bool)
-    ends = chain.ends[kept[chain.loop_edge]]
-    near = [ends[np.diff(ends, axis=1)[:, 0] <= LONGEST]]
-    left_out = ~np.append(kept, True)[chain.step_edge]
-    if by_pairs and len(ends):
-        two = np.sort(ends[cKDTree(ends).query_pairs(LONGEST, p=np.inf, output_type="ndarray")], axis=1)
-        low, high = np.diff(np.cumsum(left_out | ~inner)[two], axis=1)[:, 0].T
-        near += [two[(low == 1) & (high == 0), :, 0], two[(low == 0) & (high == 1), :, 1]]
-    at = np.flatnonzero(inner & left_out & (chain.over(np.concatenate(near)) == 0))
-    out[chain.step_edge[at]] = True
-    return out
-
-
-def tested_by_pairs(chain: Chain, poses: Floats) -> Bools:
-    """Steps (n,) in cycles of two loops and the steps between neighbouring ends of them that close."""
-    out = np.zeros(chain.size, bool)
-    low, high = chain.ends.T
-    keys = low * chain.size + high
-    order, path, gate = np.argsort(keys, kind="stable"), chain.path, _gate(chain)
-    for down, up in ((0, 1), (1, 0), (1, 1), (1, -1)) if len(keys) else ():
-        moved = low + down, high + up
-        at = np.minimum(np.searchsorted(keys, moved[0] * chain.size + moved[1], sorter=order), len(keys) - 1)
-        other = order[at]
-        fits = (low[other] == moved[0]) & (high[other] == moved[1])
-        first = np.flatnonzero(fits & (path[low] == path[low[other]]) & (path[high] == path[high[other]]))
-        second = other[first]
-        before, after = _between(poses, low[first], low[second]), _between(poses, high[second], high[first])
-        good = first[_closes(chain.motion[first], before @ chain.motion[second] @ after, gate)]
-        if down:
-            out[low[good] + 1] = True
-        if up:
-            out[high[good] + (1 if up > 0 else 0)] = True
-    return out
-
-
-def _gate(chain: Chain) -> tuple[float, float]:
-    """Metres and radians to which cycles of right edges close."""
-    inner = np.flatnonzero(chain.step_edge >= 0)
-    shift = np.linalg.norm(chain.step[inner, :3, 3], axis=1)
-    turn = np.linalg.norm(se3.so3_log(chain.step[inner, :3, :3]), axis=1)
-    return float(np.median(shift)) / OF_STEPS, max(float(np.median(turn)), TURN_RAD) / OF_STEPS
-
-
-TURN_RAD = 0.1
-"""Where a backbone goes straight on, the angle that counts as a usual one."""
-
-
-def _between(poses: Floats, a: Ints, b: Ints) -> Floats:
-    return np.asarray(se3.inverse(poses[a]) @ poses[b])
-
-
-def _closes(motion: Floats, other: Floats, gate: tuple[float, float]) -> Bools:
-    left = se3.inverse(motion) @ other
-    near = np.linalg.norm(left[:, :3, 3], axis=1) < gate[0]
-    return np.asarray(near & (np.linalg.norm(se3.so3_log(left[:, :3, :3]), axis=1) < gate[1]))

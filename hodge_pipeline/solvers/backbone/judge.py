@@ -1,0 +1,105 @@
+"""Loops judged at some poses: the densities of their residuals, right and wrong, at poses solved without each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline.solvers.backbone.evidence import Wrong, student
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, root, without
+from hodge_pipeline.types import Floats
+
+SAMPLES = 64
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Loops judged at some poses: `log_odds (M,)` that each is right, by all others; `factor (M,)` its log Bayes factor
+    without the share of right ones; `chi2 (M,)` of its residual at poses solved without it; `log_density
+    (2, M)` of it, right and wrong.
+    """
+
+    log_odds: Floats
+    factor: Floats
+    chi2: Floats
+    log_density: Floats
+
+
+def judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong, tense: bool = False) -> Judged:
+    """The loops at a fit, or at the bare chain; `tense`: with errors by which half of those in the fit are usual."""
+    covariance, residual = uncertainty(linear, fit), linear.loops[0].copy()
+    if fit is not None and len(fit.reduced.active):
+        residual[fit.reduced.active], covariance[fit.reduced.active] = left_out(fit)
+    known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
+    if tense and fit is not None and len(fit.reduced.active):
+        usual = student(residual[fit.reduced.active], covariance[fit.reduced.active])[1]
+        covariance = covariance * max(1.0, float(np.median(usual)) / len(linear.chain.axes))
+    log_density = np.zeros((2, len(covariance)))
+    chi2 = np.full(len(covariance), np.nan)
+    log_density[0, known], chi2[known] = student(residual[known], covariance[known])
+    log_density[1, known] = wrong.log_density(linear.chain, linear.poses)[known]
+    factor = log_density[0] - log_density[1]
+    return Judged(factor + np.log(shares[0] / shares[1]), factor, chi2, log_density)
+
+
+def left_out(fit: Fit) -> tuple[Floats, Floats]:
+    """Residuals (L, p) of the active loops at poses solved without each, `V S⁻¹ r` with the covariances V there and S
+    of r, and V (L, p, p).
+    """
+    residual, own = fit.loops
+    covariance = without(own, fit.factor.across()[len(fit.reduced.runs) :])
+    return np.asarray((covariance @ np.linalg.solve(own, residual[..., None]))[..., 0]), covariance
+
+
+def uncertainty(linear: Linear, fit: Fit | None) -> Floats:
+    """The covariance (M, p, p) of each loop's residual at the poses of a fit; infinite where nothing tells."""
+    chain, own = linear.chain, linear.loops[1]
+    a, b = chain.ends.T
+    same = chain.path[a] == chain.path[b]
+    out = np.where(same[:, None, None], linear.path(a, b), np.inf)
+    if fit is None or not len(fit.reduced.active):
+        return out + own
+    through = _between(fit)
+    return np.asarray(np.where((_size(through) < _size(out))[:, None, None], through, out) + own)
+
+
+def _size(covariance: Floats) -> Floats:
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(covariance[:, 0, 0]), np.einsum("mii->m", covariance), np.inf)
+
+
+def _between(fit: Fit) -> Floats:
+    """The covariance of the motion between the ends of every loop by the nearest ends of active ones."""
+    linear, reduced, samples = fit.linear, fit.reduced, _samples(fit)
+    chain, near, gap = linear.chain, [], np.zeros_like(linear.loops[1])
+    for end in chain.ends.T:
+        right = np.clip(np.searchsorted(reduced.ends, end), 0, len(reduced.ends) - 1)
+        left = np.maximum(right - 1, 0)
+        distance = [
+            np.where(chain.path[reduced.ends[k]] == chain.path[end], np.abs(reduced.ends[k] - end), np.inf)
+            for k in (left, right)
+        ]
+        nearest = np.where(distance[0] < distance[1], left, right)
+        apart = np.isinf(np.minimum(*distance))
+        along = linear.path(end, reduced.ends[nearest], chain.ends[:, 1])
+        gap += np.where(apart[:, None, None], np.inf, along)
+        near.append(nearest)
+    component = reduced.network.component
+    at = chain.ends[:, 1]
+    for rows in np.split(np.arange(len(gap)), np.arange(BATCH, len(gap), BATCH)):
+        first, second = (linear.carry(reduced.ends[end[rows]], at[rows]) @ samples[end[rows]] for end in near)
+        difference = second - first
+        gap[rows] += difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
+    gap[component[near[0]] != component[near[1]]] = np.inf
+    return gap
+
+
+BATCH = 500
+"""Loops whose samples fit in a processor's cache."""
+
+
+def _samples(fit: Fit) -> Floats:
+    """Moves (R, p, SAMPLES) of the ends drawn from their joint distribution: solves with noisy measurements."""
+    size = (len(fit.precision), fit.precision.shape[-1], SAMPLES)
+    return fit.factor.solve(fit.force(root(fit.precision) @ np.random.default_rng(0).standard_normal(size)))

@@ -1,0 +1,81 @@
+"""Places of loops judged together: those that bend the others are left out, and lost ones are found again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise
+from hodge_pipeline.solvers.backbone.step_tests import PairCycles
+from hodge_pipeline.types import ViewGraph
+from tests.backbone_graphs import Drive, at_one_place, drive
+from tests.test_backbone import NEVER_WORSE, chain_of
+from tests.test_solver_robust import rings, spoiled
+
+
+def city(monkeypatch: pytest.MonkeyPatch, seed: int) -> Drive:
+    """A long drive whose odometry turns by .7 degrees a step too much or too little, with wrong loops in groups."""
+    monkeypatch.setattr("tests.backbone_graphs.STEP", (0.012, 0.03))
+    return at_one_place(drive(seed=seed, count=1200, world="town", wrong=0.0, loops=250), 600, group=5, seed=seed)
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_mistaken_place_that_bends_the_others_is_left_out(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """Its loops vouch for each other where they bent the path: 29 m for 4 of odometry, and 5.6."""
+    made = city(monkeypatch, seed)
+    found = diagnose(made.graph)
+    assert not (found.kept & ~made.right).any()
+    assert found.kept[made.right].all()
+    assert made.error_m(found.world_from_cam) < 2.5
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        # steps would err by more than they move: 55 m
+        lambda: at_one_place(drive(seed=12167, world="town", wrong=0.0, loops=60), 200, group=10, seed=12167),
+        # a corridor of 50 steps that is mistaken for another is one testimony: 5 m
+        lambda: drive(seed=12143, dimension=3, world="room", wrong=1.0, in_groups=True, group=50, loops=280),
+    ],
+)
+def test_wrong_loops_alone_never_move_the_odometry(made: Callable[[], Drive]) -> None:
+    graph = made()
+    found = diagnose(graph.graph)
+    assert graph.error_m(found.world_from_cam) <= NEVER_WORSE * graph.error_m(graph.odometry())
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_closing_errors_have_the_covariance_of_their_paths_and_loops(dimension: int) -> None:
+    """By the factorised normal equations, for loops over parts of the path that are apart: their sum."""
+    chain = chain_of(drive(dimension=dimension, wrong=0.0, loops=60).graph)
+    linear = linearise(chain, chain.poses)
+    first = int(np.argmin(chain.ends[:, 1]))
+    apart = np.flatnonzero(chain.ends[:, 0] > chain.ends[first, 1])
+    rows = np.sort(np.array([first, *apart[:1]]))
+    expected = np.linalg.slogdet(linear.path(*chain.ends[rows].T) + linear.loops[1][rows])[1].sum()
+    assert Fit(Reduced.of(chain, rows), linear).log_det == pytest.approx(expected, rel=1e-6)
+
+
+def test_cycles_of_two_loops_refute_steps_of_a_lattice_alone() -> None:
+    for around in (30, 50):
+        clean, _ = rings(200, around)
+        assert _refuted(clean) == 0
+        assert _refuted(spoiled(clean, 0.1, 13)[0]) > 0.05
+    assert _refuted(at_one_place(drive(count=400, wrong=0.0, world="town"), 1000, group=10).graph) < 0.05
+
+
+def _refuted(graph: ViewGraph) -> float:
+    chain = chain_of(graph)
+    return PairCycles.of(chain, chain.poses).refuted(chain.size)
+
+
+def test_a_lattice_with_wrong_steps_is_judged_by_its_cycles() -> None:
+    """A backbone kept a fifth of its wrong edges, and lost a third of the right ones."""
+    graph, _ = rings(200, 30)
+    graph, wrong = spoiled(graph, 0.1, 13)
+    kept = diagnose(graph).kept
+    assert kept[wrong].mean() < 0.05
+    assert kept[~wrong].all()
