@@ -8,12 +8,13 @@ import pytest
 from diagnosis_graphs import every_pair_tried
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis import consensus
+from hodge_pipeline.diagnosis.consensus import best_arrangement
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.placement import arrangement_log_evidence
-from hodge_pipeline.diagnosis.rearrange import best_arrangement, rearranged
 from hodge_pipeline.diagnosis.robust_poses import Fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
+from hodge_pipeline.diagnosis.search import searched
 
 PART = np.arange(50) < 15
 ASIDE = se3.exp(np.array([[0.0, 0.0, 1.0, 4.0, 1.0, 0.0]]))[0]
@@ -38,14 +39,14 @@ def solved() -> tuple[Evidence, Fit]:
 
 def test_a_scene_is_worth_less_with_a_part_of_it_elsewhere_or_apart(solved: tuple[Evidence, Fit]) -> None:
     evidence, found = solved
-    models = [learn_scene_model(evidence, found)]
-    value = arrangement_log_evidence(evidence, found.poses, found.piece, models)
+    model = learn_scene_model(evidence, found)
+    value = arrangement_log_evidence(evidence, found, model)
     moved = np.where(PART[:, None, None], ASIDE @ found.poses, found.poses)
-    assert arrangement_log_evidence(evidence, moved, found.piece, models) < value - 5
+    assert arrangement_log_evidence(evidence, replace(found, poses=moved), model) < value - 5
     apart = np.where(PART, 1, 0)
-    assert arrangement_log_evidence(evidence, found.poses, apart, models) < value - 5
-    assert arrangement_log_evidence(evidence, moved, apart, models) == pytest.approx(
-        arrangement_log_evidence(evidence, found.poses, apart, models)
+    assert arrangement_log_evidence(evidence, replace(found, piece=apart), model) < value - 5
+    assert arrangement_log_evidence(evidence, replace(found, poses=moved, piece=apart), model) == pytest.approx(
+        arrangement_log_evidence(evidence, replace(found, piece=apart), model)
     )
 
 
@@ -55,7 +56,7 @@ def test_a_part_that_lies_elsewhere_is_laid_back(solved: tuple[Evidence, Fit], i
     moved = np.where(PART[:, None, None], ASIDE @ found.poses, found.poses)
     i, j = evidence.graph.edges.T
     wrong = replace(found, poses=moved, piece=PART * int(not in_one_piece), used=found.used & (PART[i] == PART[j]))
-    back = rearranged(evidence, wrong)
+    back = searched(evidence, wrong)
     assert np.ptp(back.piece) == 0
     relative = se3.inverse(back.poses[:1]) @ back.poses, se3.inverse(found.poses[:1]) @ found.poses
     assert np.linalg.norm((relative[0] - relative[1])[:, :3, 3], axis=1).max() < 0.3

@@ -8,7 +8,6 @@ from diagnosis_graphs import every_pair_tried, measured, poses_on_a_ring, spoile
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.evidence import order_prior, prior_by_cycles
-from hodge_pipeline.diagnosis.placement import run_sums, sums_of
 from hodge_pipeline.diagnosis.scene_model import Joining, learn_joining
 from hodge_pipeline.types import Floats
 
@@ -24,14 +23,6 @@ def test_the_law_of_joining_is_found_again() -> None:
     found = learn_joining(poses, np.zeros(80, int), joined | joined.T, 1.0)
     assert np.abs(found.between(poses, poses) - true.between(poses, poses)).mean() < 0.03
     assert abs(found.x[2] - 2.0) < 0.5, "the point that is seen lies in front"
-
-
-def test_run_sums_are_the_sums_of_each_run() -> None:
-    layers = np.random.default_rng(0).normal(size=(3, 7, 7)) * ~np.eye(7, dtype=bool)
-    sums = run_sums(layers)
-    for low, high in zip(*np.triu_indices(8, 1), strict=True):
-        inside = (np.arange(7) >= low) & (np.arange(7) < high)
-        np.testing.assert_allclose(sums[:, low, high], sums_of(layers, inside), atol=1e-12)
 
 
 @pytest.mark.parametrize("joined", [0.3, 0.6, 0.8])
