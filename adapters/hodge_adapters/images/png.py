@@ -108,7 +108,7 @@ def _data_bytes(contents: bytes) -> int:
 def _parts(contents: bytes) -> tuple[bytes, bytes, bytes]:
     """The chunks before the data, the data, and the chunks after them."""
     at, begin, end, data = len(_SIGNATURE), 0, 0, []
-    while at < len(contents):
+    while at + _CHUNK_FRAME <= len(contents):  # bytes behind that make no chunk are OpenCV's to judge
         (length,) = struct.unpack_from(">I", contents, at)
         after = at + _CHUNK_FRAME + length
         if contents[at + 4 : at + 8] == b"IDAT":

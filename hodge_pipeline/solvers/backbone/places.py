@@ -42,7 +42,9 @@ CLEARLY = float(np.log(20.0))
 LEAST_WON = 0.1
 """Of χ², for which poses are improved where places are compared."""
 ADJACENT = 2.0
-"""Places between places that follow each other: a corridor that is mistaken for another is one testimony."""
+"""Places between places that follow each other: a corridor that is mistaken for another is one testimony, as has to be
+reckoned with where a tenth of the loops is not used.
+"""
 MOST_PAIRS = 200_000
 """Of loops that are compared: a limit on memory and time. All of 6000 at a few places took 2 GB and 22 CPU s."""
 
@@ -82,7 +84,8 @@ class Places:
         place = rows[one_of_each_place(ends[rows])]
         distance, nearest = cKDTree(ends[place]).query(ends, p=np.inf)
         loops = loops_at_place(ends[rows])[np.searchsorted(rows, place)]
-        adjacent = cKDTree(ends[place]).query_pairs(ADJACENT, p=np.inf, output_type="ndarray")
+        some_are_mistaken = len(rows) < 0.9 * len(used)
+        adjacent = cKDTree(ends[place]).query_pairs(ADJACENT * some_are_mistaken, p=np.inf, output_type="ndarray")
         run = connected_components(adjacent, len(place))
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
