@@ -220,6 +220,12 @@ def test_a_large_cloud_is_averaged_in_parts_as_it_is_whole(monkeypatch: pytest.M
     assert len(whole[0]) == len(np.unique(np.floor(points / 0.3), axis=0))
 
 
+def test_voxels_that_are_near_the_least_of_their_cloud_are_apart() -> None:
+    points = np.array([[0.05, 0.05, 0.15], [0.05, 0.05, 0.16], [0.25, 0.05, 0.35]], np.float32)
+    means, _ = voxel_means.voxel_means(points, None, 0.1)
+    np.testing.assert_allclose(means, [[0.05, 0.05, 0.155], [0.25, 0.05, 0.35]], atol=1e-6)
+
+
 def test_a_scan_of_many_points_is_said_to_be_down_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clouds_module, "MANY_POINTS", 1000)
     points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)).astype(np.float32)

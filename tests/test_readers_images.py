@@ -196,6 +196,15 @@ def test_what_cannot_be_inflated_is_left_to_opencv(tmp_path: Path, monkeypatch: 
     np.testing.assert_array_equal(pixels.read_depth(path, units_per_metre=1000.0), expected)
 
 
+def test_bytes_behind_a_png_are_left_to_opencv() -> None:
+    """A chunk of two bytes behind the last one ended the run with the parser's own error."""
+    whole = png.encoded_depth(np.arange(12, dtype=np.uint16).reshape(3, 4))
+    if whole is None:
+        pytest.skip("isal is not installed")
+    expected = cv2.imdecode(np.frombuffer(whole + b"ab", np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(png.decoded(whole + b"ab", cv2.IMREAD_UNCHANGED), expected)
+
+
 def test_a_depth_image_that_is_packed_by_isal_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("isal", reason="the package isal is not installed")
     stored = np.random.default_rng(0).integers(0, 65536, (31, 47)).astype(np.uint16)

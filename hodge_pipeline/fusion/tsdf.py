@@ -149,13 +149,17 @@ class TsdfFuser:
         return np.array(sorted(blocks), np.int64).reshape(-1, 3), spans
 
     def _integrate(self, grid: BlockGrid, views: Views, skipped: Skipped, progress: _Progress) -> None:
-        for row, (frame, pose, is_coloured) in enumerate(views):
+        views = list(views)
+        for row, (frame, pose, is_coloured) in enumerate(views):  # which grows
             if frame.camera is None or frame.read_depth is None:
                 skipped.add("no depth image", frame)
                 continue
+            colour = skipped.colour(frame) if grid.colour and is_coloured else None
+            if grid.colour and is_coloured and colour is None:  # after those that have one
+                views.append((frame, pose, False))
+                continue
             with skipped.unreadable(frame):
                 depth_m = frame.read_depth()
-                colour = skipped.colour(frame) if grid.colour and is_coloured else None
                 if not grid.integrate(depth_m, colour, frame.camera, pose):
                     skipped.add(f"no depth within max_depth_m = {self.max_depth_m:g}", frame)
             progress.reached(row + 1)

@@ -19,9 +19,8 @@ def voxel_means(points: Floats32, colours: Bytes | None, voxel_m: float) -> tupl
     """The mean point and colour of every occupied voxel, ordered by voxel, so the same for any order of the input."""
     if not len(points):
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    columns = [
-        np.ascontiguousarray(column) for column in points.T
-    ]  # numpy takes ten times as long along the first axis
+    # numpy takes ten times as long along the first axis
+    columns = [np.ascontiguousarray(column) for column in points.T]
     low = [int(np.floor(column.min() / voxel_m)) for column in columns]
     counts = [int(np.floor(column.max() / voxel_m)) - least + 1 for column, least in zip(columns, low, strict=True)]
     keys, sums = np.zeros(0, np.int64), [np.zeros(0)] * 7
@@ -33,7 +32,7 @@ def voxel_means(points: Floats32, colours: Bytes | None, voxel_m: float) -> tupl
         )
         shades = [np.broadcast_to(0.0, len(x))] * 3 if colours is None else list(colours[part].T)
         own = [*(column[part] for column in columns), *shades, np.broadcast_to(1.0, len(x))]
-        found = _summed(((x - low[0]) * counts[1] + y - low[1]) * counts[2] + z - low[2], own)
+        found = _summed((x * counts[1] + y) * counts[2] + z, own)
         keys, sums = _summed(*_joined((keys, sums), found)) if start else found
     sizes = sums[6]
     means = np.stack([column / sizes for column in sums[:3]], axis=1, dtype=np.float32, casting="same_kind")

@@ -42,8 +42,10 @@ CLEARLY = float(np.log(20.0))
 LEAST_WON = 0.1
 """Of χ², for which poses are improved where places are compared."""
 ADJACENT = 2.0
-"""Places between places that follow each other: a corridor that is mistaken for another is one testimony, as has to be
-reckoned with where a tenth of the loops is not used.
+"""Places between places that follow each other: a corridor that is mistaken for another is one testimony."""
+FEW_UNUSED = 0.1
+"""Of the loops: with fewer, mistaken corridors are not reckoned with, and each place counts. Looked at on a walk all of
+whose loops are right, and on graphs of which four fifths or half are wrong, not between.
 """
 MOST_PAIRS = 200_000
 """Of loops that are compared: a limit on memory and time. All of 6000 at a few places took 2 GB and 22 CPU s."""
@@ -84,9 +86,10 @@ class Places:
         place = rows[one_of_each_place(ends[rows])]
         distance, nearest = cKDTree(ends[place]).query(ends, p=np.inf)
         loops = loops_at_place(ends[rows])[np.searchsorted(rows, place)]
-        some_are_mistaken = len(rows) < 0.9 * len(used)
-        adjacent = cKDTree(ends[place]).query_pairs(ADJACENT * some_are_mistaken, p=np.inf, output_type="ndarray")
-        run = connected_components(adjacent, len(place))
+        run = np.arange(len(place))
+        if len(used) - len(rows) > FEW_UNUSED * len(used):
+            adjacent = cKDTree(ends[place]).query_pairs(ADJACENT, p=np.inf, output_type="ndarray")
+            run = connected_components(adjacent, len(place))
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
         groups = agreeing_groups(start, alone, np.flatnonzero(distance > 1.0))
