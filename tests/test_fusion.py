@@ -131,8 +131,9 @@ def test_frames_that_cannot_be_used_are_counted(fuser: TsdfFuser | CloudFuser) -
     model = fuser.fuse(frames, poses, done.append)
     assert sum(done) == 8
     assert model.notes[0] == "1 frame skipped: nothing says where it is (the first: 2)"
-    assert model.notes[1] == "2 frames skipped: cannot be read (the first: 4: x.png: cut short)"
-    assert "bare" in model.notes[2] and len(model.notes) == 3
+    bare, unread = sorted(model.notes[1:])
+    assert unread == "2 frames skipped: cannot be read (the first: 4: x.png: cut short)"
+    assert bare.startswith("1 frame skipped: ") and bare.endswith("(the first: bare)")
     kept = [0, 1, 3, 7]
     assert_same(model, fuser.fuse([frames[k] for k in kept], poses[kept]))
 
@@ -268,7 +269,7 @@ def test_a_frame_whose_image_is_damaged_is_fused_without_its_colour(fuser: TsdfF
     frames[1] = Frame(1, 0.0, CAMERA, frames[1].read_depth, damaged)
     model = fuser.fuse(frames, poses)
     assert model.notes == ("1 frame fused without colour: its image cannot be read (the first: 1: x.jpg: cut short)",)
-    np.testing.assert_array_equal(model.points_in_world, whole.points_in_world)
+    np.testing.assert_allclose(model.points_in_world, whole.points_in_world, atol=1e-6)  # in another order
     assert model.colours is not None
     blind = [Frame(f.frame_id, 0.0, CAMERA, f.read_depth, damaged) for f in frames]
     bare = fuser.fuse(blind, poses)
