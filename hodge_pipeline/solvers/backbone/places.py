@@ -193,9 +193,12 @@ class Places:
 
     def _changes(self, found: Arrangement) -> list[Bools]:
         """Arrangements (K,) that differ in one place and may be likelier: without one that is likelier mistaken by all
-        others, those that bend most first; with one more.
+        others, those that bend most first; with one more. None where there are more places than are solved together,
+        since other ones would be then.
         """
-        each, out = np.arange(len(self.loop)), []
+        each, out = np.arange(len(self.loop)), list[Bools]()
+        if len(found.fit.reduced.active) < found.right.sum():
+            return out
         if found.right.sum() > 1:
             active = np.searchsorted(self.loop, found.fit.reduced.active)
             residual, covariance = left_out(found.fit)
