@@ -265,37 +265,61 @@ def unusual_breaks(usual: Usual) -> list[Break]:
     return [Break(int(at), usual.centres[0], usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
 
 
-def strained_break(fit: Fit, usual: Usual) -> Break | None:
-    """The likeliest broken step of the runs between used loops, each run held against all else; None where none is
-    strained. Loops hide a break where they are many: each agrees with those beside it, and the run gives way.
+@dataclass(frozen=True)
+class Runs:
+    """The runs between used loops, each held against all else: `told` has the motion of each at poses solved without
+    it, in place of loops; `high (S,)` are their later ends, ascending, `strain (S,)` nats that the error of each costs.
     """
-    chain, used, linear = fit.linear.chain, fit.reduced, fit.linear
-    low, high = used.ends[used.runs].T
-    residual, total, prior = without_run(fit)
-    chi2, size = student(residual, total)[1], residual.shape[1]
-    tense = max(1.0, float(np.median(chi2)) / size)  # as if the steps' scale were too small by the usual run
-    total, prior = tense * total, tense * prior
-    log_density, chi2 = student(residual, total)
-    strained = np.flatnonzero(0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM) > STRAIN)
-    if not len(strained):
-        return None
-    poses, turned = chain.poses, linear.poses[high].copy()
-    turned[:, :3, 3] = 0.0
-    ahead = chain.exp((chain.adjoint(se3.inverse(turned)) @ residual[..., None])[..., 0])
-    motion = se3.inverse(poses[low]) @ poses[high] @ ahead
-    others = replace(
-        chain,
-        loop_edge=np.full(len(low), -1),
-        ends=used.ends[used.runs],
-        motion=motion,
-        covariance=chain.carried(se3.inverse(turned), prior),
-    )
-    told = Testimony(others, linearise(others, poses), log_density, np.zeros(len(low)), np.zeros(len(low), bool))
-    owner = np.repeat(strained, (high - low)[strained])
-    first = np.cumsum((high - low)[strained]) - (high - low)[strained]
-    at = low[owner] + 1 + np.arange(len(owner)) - np.repeat(first, (high - low)[strained])
-    score = _fits(told, usual, owner, at) - log_density[owner] + usual.unusual[at]
-    return _break(told, usual, int(owner[np.argmax(score)]), at, score)
+
+    told: Testimony
+    usual: Usual
+    high: Ints
+    strain: Floats
+
+    @classmethod
+    def of(cls, fit: Fit, usual: Usual) -> Runs:
+        """Those of a fit, one at least, with errors as large as the usual run has."""
+        chain, used, linear = fit.linear.chain, fit.reduced, fit.linear
+        low, high = used.ends[used.runs].T
+        residual, total, prior = without_run(fit)
+        chi2, size = student(residual, total)[1], residual.shape[1]
+        tense = max(1.0, float(np.median(chi2)) / size)  # as if the steps' scale were too small by the usual run
+        log_density, chi2 = student(residual, tense * total)
+        poses, turned = chain.poses, linear.poses[high].copy()
+        turned[:, :3, 3] = 0.0
+        ahead = chain.exp((chain.adjoint(se3.inverse(turned)) @ residual[..., None])[..., 0])
+        others = replace(
+            chain,
+            loop_edge=np.full(len(low), -1),
+            ends=used.ends[used.runs],
+            motion=se3.inverse(poses[low]) @ poses[high] @ ahead,
+            covariance=chain.carried(se3.inverse(turned), tense * prior),
+        )
+        told = Testimony(others, linearise(others, poses), log_density, np.zeros(len(low)), np.zeros(len(low), bool))
+        return cls(told, usual, high, 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM))
+
+    def score(self, at: Ints) -> Floats:
+        """The nats (K,) by which a usual step at these positions is likelier than the step that is there; infinite
+        where no run leads over one, so that nothing speaks for it.
+        """
+        run = np.minimum(np.searchsorted(self.high, at), len(self.high) - 1)
+        low, high = self.told.chain.ends[run].T
+        inside, out = (low < at) & (at <= high), np.full(len(at), np.inf)
+        at, run = at[inside], run[inside]
+        out[inside] = _fits(self.told, self.usual, run, at) - self.told.explained[run] + self.usual.unusual[at]
+        return out
+
+    def strained_break(self) -> Break | None:
+        """The likeliest broken step, None where no run is strained. Loops hide a break where they are many: each agrees
+        with those beside it, and the run gives way.
+        """
+        strained = np.flatnonzero(self.strain > STRAIN)
+        if not len(strained):
+            return None
+        at = np.concatenate([np.arange(low + 1, high + 1) for low, high in self.told.chain.ends[strained].tolist()])
+        score = self.score(at)
+        run = int(np.searchsorted(self.high, at[np.argmax(score)]))
+        return _break(self.told, self.usual, run, at, score)
 
 
 STRAIN = 4.0

@@ -11,10 +11,10 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.breaks import (
     Break,
+    Runs,
     Testimony,
     Usual,
     agreed_breaks,
-    strained_break,
     unusual_breaks,
 )
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
@@ -82,8 +82,9 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     worth = [(each, least) for each in agreed[:MOST_TRIED] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
-        fit = settled(Fit(found.reduced, found.linear), MOST_STEPS)
-        strained = strained_break(fit, usual)
+        runs = Runs.of(settled(Fit(found.reduced, found.linear), MOST_STEPS), usual)
+        strained, speaks = runs.strained_break(), runs.score(np.array([each.at for each in unlike], np.int64))
+        unlike = [each for each, score in zip(unlike, speaks, strict=True) if score > BY_CHANCE]
         if strained is not None and strained.log_evidence > BY_CHANCE:
             worth.append((strained, BY_CHANCE - strained.log_evidence))
     return worth + [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
