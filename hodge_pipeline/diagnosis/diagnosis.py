@@ -72,10 +72,11 @@ def backbone_anyway(
     backbone = doubted or find_backbone(graph, anyway=True)
     if backbone is None:
         return None
+    against = backbone.places(kept & ~backbone.used)
     if not backbone.found.confirmed:
-        from_afar = contradicted_from_afar(graph, kept, by_pairs=True).sum()
-        return backbone if from_afar > FROM_AFAR * (backbone.steps & ~kept).sum() else None
-    for_it, against = backbone.places(backbone.used & ~kept), backbone.places(kept & ~backbone.used)
+        from_afar, out = contradicted_from_afar(graph, kept, by_pairs=True).sum(), (backbone.steps & ~kept).sum()
+        return backbone if from_afar > FROM_AFAR * out and against < OF_BACKBONE * out else None
+    for_it = backbone.places(backbone.used & ~kept)
     worth = OF_BACKBONE if is_tested(backbone.chain) else 1.0
     return backbone if worth * for_it > against else None
 

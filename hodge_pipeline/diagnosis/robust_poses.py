@@ -14,7 +14,7 @@ from hodge_pipeline.diagnosis.growth import Alignment
 from hodge_pipeline.diagnosis.resistance import Network, effective_resistance
 from hodge_pipeline.solvers.minimise import descend_isotropic
 from hodge_pipeline.solvers.newton import Limits
-from hodge_pipeline.solvers.setup import prepare
+from hodge_pipeline.solvers.setup import InitialName, prepare
 from hodge_pipeline.types import Bools, Floats, Ints
 
 GATE, UNSETTLED = 90.0, 60.0
@@ -50,10 +50,18 @@ class Fit(Alignment):
         return self.used & np.isinf(self.resistance)
 
 
-def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], *, rough: bool = False) -> Fit:
+def fit(
+    evidence: Evidence,
+    alignment: Alignment,
+    gates: tuple[float, ...],
+    *,
+    rough: bool = False,
+    initial: InitialName = "given",
+) -> Fit:
     """The robust solution that an alignment leads to: for each gate in turn, the edges of a smaller χ² are solved.
 
-    `rough`: quickly and with errors as large as each gate allows, which leads near it whatever the drift.
+    `rough`: quickly and with errors as large as each gate allows, which leads near it whatever the drift. `initial`:
+    the poses that each solve begins at, the alignment's or chordal ones of the edges of its gate.
     """
     apart = np.not_equal(*alignment.piece[evidence.graph.edges.T])
     found = _judged(evidence, alignment.poses, alignment.piece, ~apart, 0.0)
@@ -64,7 +72,7 @@ def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], *, r
         widened = gate / GATE if rough else 1.0
         first = found.chi2 / widened if rough else np.full(len(used), DIMENSION)
         limits = QUICKLY if rough or len(used) > LARGE else FULLY
-        poses, squares = _solve(evidence, found.poses, used, first, limits, widened)
+        poses, squares = _solve(evidence, found.poses, used, first, limits, widened, initial)
         piece = connected_components(evidence.graph.edges[used], evidence.graph.vertex_count)
         found = _judged(evidence, poses, piece, used, np.where(used, FREEDOM / (FREEDOM + squares), 0.0))
     return found
@@ -78,7 +86,13 @@ def _judged(evidence: Evidence, poses: Floats, piece: Ints, used: Bools, student
 
 
 def _solve(
-    evidence: Evidence, poses: Floats, used: Bools, squares: Floats, limits: Limits, widened: float
+    evidence: Evidence,
+    poses: Floats,
+    used: Bools,
+    squares: Floats,
+    limits: Limits,
+    widened: float,
+    initial: InitialName,
 ) -> tuple[Floats, Floats]:
     """The poses (V, 4, 4) that the used edges (E,) lead to, weighed by Student's t, at first for χ² of `squares (E,)`;
     and the χ² (E,) by the noise of the edges alone.
@@ -86,7 +100,7 @@ def _solve(
     `widened`: how much larger than noise squared errors may be.
     """
     setup = prepare(evidence.graph.select(np.flatnonzero(used)), poses, dimension=3)
-    rotations, translations = setup.initial("given")
+    rotations, translations = setup.initial(initial)
     exact = np.zeros(len(poses), np.int64), np.zeros(len(used))
     for _ in range(ROUNDS):
         share = ((FREEDOM + DIMENSION) / (FREEDOM + squares[used]))[setup.weights.used]
