@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.diagnosis import backbone_anyway, diagnose
+from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone import fit
+from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, root, settled
 from hodge_pipeline.solvers.backbone.judge import left_out
@@ -238,13 +239,12 @@ def test_many_loops_of_one_mistaken_place_do_not_outvote_few_of_several_places()
 def test_groups_of_wrong_loops_do_not_outvote_the_backbone_of_a_lattice() -> None:
     made = drive(world="room", loops=300, wrong=0.1, in_groups=True)
     steps = np.abs(np.diff(made.graph.edges, axis=1)[:, 0]) == 1
-    found = diagnose(made.graph, DiagnosisOptions(trust="none"))
     cut = np.flatnonzero(steps)[40:400:60]
     kept = ~np.isin(np.arange(made.graph.edge_count), cut)  # more edges than are right, and six steps fewer
-    backbone = backbone_anyway(made.graph, replace(found, kept=kept), DiagnosisOptions())
+    backbone = backbone_anyway(made.graph, kept)
     assert backbone is not None
     np.testing.assert_array_equal(backbone.used, made.right)
-    assert backbone_anyway(made.graph, replace(found, kept=made.right | ~steps), DiagnosisOptions()) is None
+    assert backbone_anyway(made.graph, made.right | ~steps) is None
 
 
 @pytest.mark.parametrize("wrong", [0.3, 1.0])

@@ -9,10 +9,10 @@ from benchmarks.edge_scores import area_under_roc
 from benchmarks.simulated_edges import simulated
 from diagnosis_graphs import measured, near_pairs, poses_on_a_ring
 from hodge_pipeline import se3
+from hodge_pipeline.complex.short_cycles import short_cycles
+from hodge_pipeline.diagnosis.cycles import Cycles
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.evidence import right_by_gap
-from hodge_pipeline.diagnosis.result import Cycles
-from hodge_pipeline.diagnosis.short_cycles import short_cycles
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 VIEWS, REACH = 120, 9

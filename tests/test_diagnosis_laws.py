@@ -12,11 +12,11 @@ from benchmarks.edge_scores import area_under_roc
 from diagnosis_graphs import SIGMA, every_pair_tried, measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import chi2_by_information, left_over, mean_variances, squares_at_both_ends
+from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
 from hodge_pipeline.diagnosis.robust import solve_robust
-from hodge_pipeline.diagnosis.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.wording import name_cycle
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.trust import NONE

@@ -17,12 +17,12 @@ def _poses(count: int, seed: int) -> Floats:
 
 
 def test_the_law_of_joining_is_found_again() -> None:
-    true = Joining(1.0, np.array([0.0, 0.0, 2.0, 5.0, np.log(2.0), np.log(3.0)]))
+    true = Joining(1.0, np.array([5.0, np.log(2.0), np.log(3.0)]))
     poses = _poses(80, 0)
     joined = np.triu(np.random.default_rng(1).random((80, 80)) < true.between(poses, poses), 1)
     found = learn_joining(poses, np.zeros(80, int), joined | joined.T, 1.0)
     assert np.abs(found.between(poses, poses) - true.between(poses, poses)).mean() < 0.03
-    assert abs(found.x[2] - 2.0) < 0.5, "the point that is seen lies in front"
+    np.testing.assert_allclose(found.x[1:], true.x[1:], atol=0.2)
 
 
 @pytest.mark.parametrize("joined", [0.3, 0.6, 0.8])

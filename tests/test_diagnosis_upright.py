@@ -29,7 +29,7 @@ def _groups(count: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 def test_the_way_cameras_are_held_is_found() -> None:
     rotations = _carried(60)
-    law = learn_upright(rotations, np.zeros(60, int), _groups(60))
+    law = learn_upright(rotations, _groups(60))
     assert abs(law.up @ DOWN) > 0.97 and law.share > 0.95
     up = law.world_up(rotations, np.zeros(60, int))
     assert np.degrees(np.arccos(np.abs(up[0, 2]))) < 5, "z is up or down"
@@ -41,7 +41,7 @@ def test_a_part_laid_on_its_head_stands_out_of_what_its_neighbourhoods_show() ->
     rotations = _carried(60)
     over = np.arange(60) >= 40
     rotations[over] = se3.so3_exp(np.array([[0.0, np.pi, 0.0]])) @ rotations[over]
-    law = learn_upright(rotations, np.zeros(60, int), _groups(60))
+    law = learn_upright(rotations, _groups(60))
     nats = law.log_evidence(rotations, law.world_up(rotations, np.zeros(60, int)))
     assert nats[over].max() < -3 and np.median(nats[~over]) > -1.5
     apart = law.log_evidence(rotations, law.world_up(rotations, over.astype(int)))
@@ -50,7 +50,7 @@ def test_a_part_laid_on_its_head_stands_out_of_what_its_neighbourhoods_show() ->
 
 def test_cameras_that_turn_freely_say_nothing() -> None:
     rotations = se3.so3_exp(np.random.default_rng(1).normal(0, 2, (60, 3)))
-    law = learn_upright(rotations, np.zeros(60, int), _groups(60))
+    law = learn_upright(rotations, _groups(60))
     assert law.share == 0
     np.testing.assert_array_equal(law.log_evidence(rotations, law.world_up(rotations, np.zeros(60, int))), 0)
 
@@ -58,7 +58,7 @@ def test_cameras_that_turn_freely_say_nothing() -> None:
 def test_single_views_and_frames_of_one_rotation_are_no_trouble() -> None:
     rotations = np.tile(np.eye(3), (4, 1, 1))
     for piece in (np.arange(4), np.zeros(4, int)):
-        law = learn_upright(rotations, piece, piece)
+        law = learn_upright(rotations, piece)
         assert np.abs(law.log_evidence(rotations, law.world_up(rotations, piece))).max() < 0.1
 
 

@@ -15,8 +15,8 @@ from diagnosis_graphs import measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
+from hodge_pipeline.complex import short_cycles
 from hodge_pipeline.complex.series import series_classes
-from hodge_pipeline.diagnosis import short_cycles
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.wording import TOO_LONG

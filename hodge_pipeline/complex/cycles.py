@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,15 @@ class Loops:
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
+    @classmethod
+    def joined(cls, parts: Sequence[Loops]) -> Loops:
+        """The loops of all parts, one after the other."""
+        lengths = np.concatenate([part.lengths for part in parts])
+        offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+        return cls(
+            offsets, np.concatenate([part.edge for part in parts]), np.concatenate([part.sign for part in parts])
+        )
+
     @property
     def lengths(self) -> Ints:
         """Edges of each loop, (L,)."""
@@ -62,6 +72,12 @@ class Loops:
     def sums_at_edges(self, of_loop: Floats | Bools, edge_count: int) -> Floats:
         """The sum (E,) of `of_loop (L,)` over the loops that pass each edge."""
         return np.bincount(self.edge, of_loop[self.rows], edge_count).astype(float)
+
+    def missing(self, edge_count: int) -> Bools:
+        """The edges (E,) that no loop passes."""
+        out = np.ones(edge_count, bool)
+        out[self.edge] = False
+        return out
 
     def incidence(self, edge_count: int) -> csr_matrix:
         """The loops as 1-chains, (L, E): how often each passes each edge, with sign."""
@@ -180,7 +196,7 @@ def root_from_vertex(forest: SpanningForest, i_from_j: Floats) -> Floats:
     """Motions (V, 4, 4) chained along the forest; the identity at each root."""
     child = np.flatnonzero(forest.parent >= 0)
     motion = _identities(len(forest.parent))
-    motion[child] = _directed(i_from_j, forest.parent_edge[child], forest.sign[child])
+    motion[child] = directed(i_from_j, forest.parent_edge[child], forest.sign[child])
     above = forest.parent.copy()
     active = child
     while len(active):
@@ -215,7 +231,7 @@ def loop_products(loops: Loops, i_from_j: Floats) -> Floats:
 
 
 def _batch_products(loops: Loops, i_from_j: Floats) -> Floats:
-    motion = _directed(i_from_j, loops.edge, loops.sign)
+    motion = directed(i_from_j, loops.edge, loops.sign)
     row = loops.rows
     place = np.arange(len(row)) - loops.offsets[:-1][row]
     while len(place) and place.max() > 0:
@@ -233,7 +249,8 @@ def _identities(count: int) -> Floats:
     return np.asarray(np.broadcast_to(np.eye(4), (count, 4, 4)).copy())
 
 
-def _directed(i_from_j: Floats, edge: Ints, sign: Ints) -> Floats:
+def directed(i_from_j: Floats, edge: Ints, sign: Ints) -> Floats:
+    """The motions (N, 4, 4) of edges (N,), inverse where `sign (N,)` is −1."""
     motion = np.asarray(i_from_j[edge])
     backwards: Bools = sign < 0
     motion[backwards] = se3.inverse(motion[backwards])

@@ -9,27 +9,28 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
+from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.judging import in_vertex_order
+from hodge_pipeline.complex.short_cycles import with_cycles_of
 from hodge_pipeline.diagnosis.consensus import find_consensus
+from hodge_pipeline.diagnosis.cycles import Cycles, judge_cycles, witnesses
 from hodge_pipeline.diagnosis.evidence import Evidence, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
 from hodge_pipeline.diagnosis.options import CONSISTENT_FROM, WRONG_BELOW, DiagnosisOptions
-from hodge_pipeline.diagnosis.resistance import Network
 from hodge_pipeline.diagnosis.result import (
     CONSISTENT,
     SUSPECT,
     UNTESTABLE,
     WRONG,
-    Cycles,
     Diagnosis,
 )
 from hodge_pipeline.diagnosis.shared_blame import share_blame
-from hodge_pipeline.diagnosis.short_cycles import cycle_errors, judge_cycles, with_cycles_of, witnesses
 from hodge_pipeline.diagnosis.wording import reasons
-from hodge_pipeline.solvers.backbone.step_tests import contradicted_from_afar, is_tested
+from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
+from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
@@ -56,41 +57,7 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     if backbone is not None and not backbone.doubted:
         return backbone
     found = _by_cycles(graph, options)
-    return backbone_anyway(graph, found, options, backbone) or found
-
-
-def backbone_anyway(
-    graph: ViewGraph, found: Diagnosis, options: DiagnosisOptions, doubted: Backbone | None = None
-) -> Backbone | None:
-    """The backbone of a lattice or a room in whose place `found` keeps edges of few other places, or one that is
-    `doubted` or confirms no loop, of which it leaves out steps that nothing near them contradicts. None elsewhere, and
-    where of the consecutive edges those alone are left out which kept ones over few of them contradict.
-    """
-    kept = found.kept
-    if options.trust != AUTO or not contradicted_from_afar(graph, kept).any():
-        return None
-    backbone = doubted or find_backbone(graph, anyway=True)
-    if backbone is None:
-        return None
-    against = backbone.places(kept & ~backbone.used)
-    if not backbone.found.confirmed:
-        from_afar, out = contradicted_from_afar(graph, kept, by_pairs=True).sum(), (backbone.steps & ~kept).sum()
-        return backbone if from_afar > FROM_AFAR * out and against < OF_BACKBONE * out else None
-    for_it = backbone.places(backbone.used & ~kept)
-    worth = OF_BACKBONE if is_tested(backbone.chain) else 1.0
-    return backbone if worth * for_it > against else None
-
-
-FROM_AFAR = 0.5
-"""Of the steps that are left out. A step that was measured wrong is contradicted by loops beside it; one is left out
-somewhere between the places of a mistake. In simulated lattices whose odometry is wrong at 5 to 30 steps up to .13 are
-contradicted from afar where the lattice is right; of groups of wrong loops .69 to 1.
-"""
-OF_BACKBONE = 4.0
-"""Mistaken places that are as likely as one wrong edge of a backbone that short cycles test, where none refutes that
-edge. In 28 simulated graphs of a right odometry and 100 to 800 right edges over two to four steps, with 40 loops
-of mistaken places, these are up to 2.3 times as many, but for four of the graphs. In a lattice none is tested so.
-"""
+    return (backbone_anyway(graph, found.kept, backbone) if options.trust == AUTO else None) or found
 
 
 def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:

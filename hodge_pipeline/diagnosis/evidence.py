@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hodge_pipeline.complex.closing import cycle_errors
+from hodge_pipeline.complex.short_cycles import short_cycles
+from hodge_pipeline.diagnosis.cycles import Cycles, closing_support, judge_cycles, usual_share
 from hodge_pipeline.diagnosis.noise import Noise, edge_noise, recentred
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.result import Cycles
-from hodge_pipeline.diagnosis.short_cycles import closing_support, cycle_errors, judge_cycles, short_cycles, usual_share
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 FLOOR, CEILING = 0.05, 0.98
@@ -179,13 +180,11 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
         # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
         usual = usual_share(cycles)
         prior = right_by_gap(edges, count, cycles, usual) if options.order_prior else np.minimum(prior, usual)
-    unlisted = np.ones(len(edges), bool)
-    unlisted[loops.edge] = False
     support = closing_support(cycles, prior)
     weight = prior / (1 - prior) * (0.5 + support) / (1 + support)
     weight *= 1 + TIE_BREAK * np.random.default_rng(options.seed).random(len(weight))
     known = replace(there, information=noise.information)
-    found = Evidence(known, noise, reach_m, prior, support, unlisted, weight, exhaustive)
+    found = Evidence(known, noise, reach_m, prior, support, loops.missing(len(edges)), weight, exhaustive)
     return found, cycles, point
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.cycles import GATE
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.short_cycles import GATE
 from hodge_pipeline.types import Bools, Floats, Ints
 
 SINGLE_VOTE_FROM = 0.3

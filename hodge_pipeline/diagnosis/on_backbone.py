@@ -8,23 +8,22 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import fundamental_loops, fundamental_products, spanning_forest
 from hodge_pipeline.complex.series import series_classes
+from hodge_pipeline.diagnosis.cycles import WITNESSES, Cycles
 from hodge_pipeline.diagnosis.options import WRONG_BELOW
-from hodge_pipeline.diagnosis.resistance import Network, effective_resistance
 from hodge_pipeline.diagnosis.result import (
     CONSISTENT,
     SUSPECT,
     UNTESTABLE,
-    WITNESSES,
     WRONG,
-    Cycles,
     Diagnosis,
 )
-from hodge_pipeline.diagnosis.short_cycles import cycle_errors
 from hodge_pipeline.diagnosis.wording import distance
 from hodge_pipeline.solvers.backbone.trust import Backbone
+from hodge_pipeline.solvers.resistance import Network, effective_resistance
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 MOST_ENTRIES = 500_000

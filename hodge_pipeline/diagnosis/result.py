@@ -10,26 +10,12 @@ from numpy import str_
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import describe_components
-from hodge_pipeline.complex.cycles import Loops
-from hodge_pipeline.diagnosis.resistance import Network
+from hodge_pipeline.diagnosis.cycles import Cycles
 from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, ViewGraph
 
 CONSISTENT, SUSPECT, WRONG, UNTESTABLE = "consistent", "suspect", "wrong", "untestable"
-WITNESSES = 3
-
-
-@dataclass(frozen=True)
-class Cycles:
-    """The cycles that were listed: their edges, the angle (L,) and displacement (L,) that each leaves, its χ² (L,) in
-    the noise of its edges, and whether it closes (L,).
-    """
-
-    loops: Loops
-    angle_rad: Floats
-    displacement_m: Floats
-    chi2: Floats
-    closes: Bools
 
 
 @dataclass(frozen=True)

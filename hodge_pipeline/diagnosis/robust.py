@@ -10,31 +10,25 @@ from typing import Literal, TypeAlias
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
-from scipy.special import gammainc, gammaln
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
+from hodge_pipeline.complex.closing import closes_better_than_chance
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.cycles import Loops, loop_products
 from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.short_cycles import tree_loops
 from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import check_choice, held_rows
 from hodge_pipeline.solvers.weights import edge_weights, is_planar
-from hodge_pipeline.types import Bools, Floats, Ints, Solution, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
 from hodge_pipeline.types.text import counted
 
-LEVEL = 0.01
-"""Choices of edges that agree so well by chance, expected among all: as the gate of the edges, which 1 % miss."""
 SIGMAS = 3.0
 """Standard deviations of χ², √(2 degrees of freedom), by which it may exceed these where stated errors explain it."""
-UNIFORM_RAD2 = (8 * math.pi**2) ** (2 / 3) / (2 * math.pi)
-"""Variance of an axis at which a Gaussian is as dense at 0 as uniform rotations, which spread no wider."""
 Solver: TypeAlias = Callable[[ViewGraph, Floats], Solution]
 """The maximum-likelihood solution of a graph, from poses (V, 4, 4)."""
 
@@ -154,7 +148,7 @@ def _with_confirmation(graph: ViewGraph, usable: Bools, solution: Solution) -> S
     Edges that no solve can use (not `usable`, (E,)) are none that the judgement left out.
     """
     weights = solution.weights[usable]
-    if confirmed(graph.select(np.flatnonzero(usable)), np.flatnonzero(weights)):
+    if closes_better_than_chance(graph.select(np.flatnonzero(usable)), np.flatnonzero(weights)):
         return replace(solution, confirmed=True)
     if left_out := int((weights == 0).sum()):
         why = (
@@ -165,47 +159,6 @@ def _with_confirmation(graph: ViewGraph, usable: Bools, solution: Solution) -> S
         return replace(solution, confirmed=False, notes=(note, *solution.notes))
     note = "no edge is left out, and no cycles close better than by chance: nothing tests the edges"
     return replace(solution, notes=(*solution.notes, note))
-
-
-def confirmed(graph: ViewGraph, kept: Ints) -> bool:
-    """Whether the cycles of the kept edges (rows) close so well that no choice of random edges is expected to.
-
-    Around a cycle of edges in random directions the motion is a walk of their lengths, and the probability of a nearer
-    end is uniform; of C cycles, minus the sum of the logarithms is gamma distributed. Every choice of as many
-    of the edges counts, whichever the solver made: so that it chose the best makes nothing look better than it is.
-    """
-    graph, every = graph.select(kept), graph.edge_count
-    loops = tree_loops(graph.edges, graph.vertex_count)
-    if not len(loops):
-        return False
-    left, squares = se3.log(loop_products(loops, graph.i_from_j)), se3.log(graph.i_from_j) ** 2
-    usual = np.median(squares, axis=0)
-    most = np.repeat(usual.reshape(2, 3).max(axis=1), 3)
-    limit = np.repeat([UNIFORM_RAD2, np.inf], 3)
-    moving = usual > 0, usual > most / FLAT  # out of a plane there may be noise alone, which says nothing
-    out, cycles = every - len(kept), len(loops)
-    log_choices = gammaln(every + 1) - gammaln(out + 1) - gammaln(len(kept) + 1) + math.log(len(moving) * every)
-    mean = max(
-        -float(_log_chance(loops, left[:, axes], squares[:, axes], limit[axes]).sum()) / cycles for axes in moving
-    )
-    # Chernoff's bound of the gamma distribution's tail
-    return mean > 1 and cycles * (1 + math.log(mean) - mean) + log_choices < math.log(LEVEL)
-
-
-FLAT = 100.0
-"""Times as large as usual along the axis that moves most are squares of motions along one that holds noise alone."""
-
-
-def _log_chance(loops: Loops, left: Floats, squares: Floats, most: Floats) -> Floats:
-    """The logarithm of how likely (L,) a cycle of edges in random directions leaves less than `left (L, a)` along some
-    axes; `squares (E, a)` of the edges' own motions, and the largest variances `most (a,)`.
-    """
-    if not left.shape[1]:
-        return np.zeros(len(left))
-    spread = np.add.reduceat(squares[loops.edge], loops.offsets[:-1], axis=0)
-    spread = np.clip(spread, np.finfo(float).tiny, most)
-    chance = gammainc(left.shape[1] / 2, (left**2 / spread).sum(axis=1) / 2)
-    return np.asarray(np.log(np.maximum(chance, np.finfo(float).tiny)))
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

@@ -11,9 +11,9 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.judging import FREEDOM, left_over, squares_at_both_ends
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment
-from hodge_pipeline.diagnosis.resistance import Network, effective_resistance
 from hodge_pipeline.solvers.minimise import descend_isotropic
 from hodge_pipeline.solvers.newton import Limits
+from hodge_pipeline.solvers.resistance import Network, effective_resistance
 from hodge_pipeline.solvers.setup import InitialName, prepare
 from hodge_pipeline.types import Bools, Floats, Ints
 

@@ -1,7 +1,8 @@
 """A model of the scene fitted to a solution, by which other arrangements of the views are then judged.
 
 - Joining: where every pair was tried, nearly all views that look at the same place are joined, and few others are. The
-  probability is logistic in the distance between the points that two views look at, and in the angle between them.
+  probability is logistic in the distance between the points that two views look at, which are the origins of frames at
+  the working point, and in the angle between them.
 - Upright: people and vehicles carry cameras much the same way throughout, so that a part of the scene placed upside
   down is nearly always wrong. Each piece has a direction that is up in the world; in the axes of its cameras it follows
   one mixture for all pieces, von Mises and Fisher's distribution about its mean and, for the other cameras, the uniform
@@ -10,7 +11,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -22,19 +23,15 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 CEILING = 0.97
 """Even views that lie upon each other are not always joined."""
-USUAL = np.array([0.0, 0.0, 0.0, 6.0, np.log(2.5), np.log(2.7)])
-"""The means of the prior on the parameters of `Joining`; their standard deviations follow."""
-SPREAD = np.array([2.0, 2.0, 2.0, 2.0, 0.5, 0.5])
-DEPTHS = (0.0, 2.0, -2.0)
-"""Of the point that is seen, along the viewing axis, to begin with."""
-JOINING_STEPS = 40
+USUAL, SPREAD = np.array([6.0, np.log(2.5), np.log(2.7)]), np.array([2.0, 0.5, 0.5])
+"""The means of the prior on the parameters of `Joining`, and their standard deviations."""
 LEAST_SPREAD_RAD = 0.2
 """Poses drift: chained edges are not upright to less, however the cameras were."""
 FEWEST = 6
-"""Views of a piece that the model is fitted to: with fewer, the unknown up of the piece fits too well."""
+"""Views of a group that the model is fitted to: with fewer, the unknown up of the group fits too well."""
 ROUNDS, STEPS = 8, 5
 CLEAR_SHARE, CLEAR_SPREAD_RAD = 0.8, 0.42
-"""Of neighbours, the least share and the largest spread of a model that is used; else its share becomes 0."""
+"""The least share and the largest spread of a model that is used; else its share becomes 0."""
 STARTS = np.concatenate([np.eye(3), np.array([[0, 1, 1], [0, -1, 1]]) / np.sqrt(2)])
 """Directions in camera axes from which the fit starts."""
 NEIGHBOURS = 12
@@ -43,56 +40,44 @@ NEIGHBOURS = 12
 
 @dataclass(frozen=True)
 class Joining:
-    """The model: `x` holds the point that a view looks at (in units of `reach_m`), the log odds of two views in one
-    place, and the logarithms of how they fall with each reach and each radian.
+    """The model: `x (3,)` holds the log odds of two views in one place, and the logarithms of how these fall with each
+    reach between the two and each radian.
     """
 
     reach_m: float
-    x: Floats = field(default_factory=USUAL.copy)
+    x: Floats
 
     def between(self, first: Floats, second: Floats) -> Floats:
         """The probability (A, B) of a right edge for poses (A, 4, 4) and (B, 4, 4)."""
-        a, b = self._seen(first), self._seen(second)
-        squares = (a * a).sum(1)[:, None] + (b * b).sum(1)[None] - 2 * a @ b.T
-        apart = np.sqrt(np.maximum(squares, 0.0)) / self.reach_m
-        odds = self.x[3] - np.exp(self.x[4]) * apart - np.exp(self.x[5]) * _angles(first, second)
-        return np.asarray(CEILING * expit(odds))
-
-    def _seen(self, poses: Floats) -> Floats:
-        return np.asarray(poses[:, :3, :3] @ (self.reach_m * self.x[:3]) + poses[:, :3, 3])
+        fall = np.exp(self.x[1:, None, None]) * _differences(first, second, self.reach_m)
+        return np.asarray(CEILING * expit(self.x[0] - fall.sum(axis=0)))
 
 
-def learn_joining(poses: Floats, piece: Ints, joined: Bools, reach_m: float, before: Joining | None = None) -> Joining:
-    """The most probable model for poses (V, 4, 4) in pieces (V,), of which the pairs `joined (V, V)` have an edge.
-
-    The search starts at `before`, where it is given.
-    """
+def learn_joining(poses: Floats, piece: Ints, joined: Bools, reach_m: float) -> Joining:
+    """The most probable model for poses (V, 4, 4) in pieces (V,), of which the pairs `joined (V, V)` have an edge."""
     a, b = np.triu_indices(len(piece), 1)
     inside = piece[a] == piece[b]
     a, b = a[inside], b[inside]
-    turned, shifted = poses[a, :3, :3] - poses[b, :3, :3], (poses[a, :3, 3] - poses[b, :3, 3]) / reach_m
-    angle, there = _angles(poses, poses)[a, b], joined[a, b].astype(float)
+    apart, there = _differences(poses, poses, reach_m)[:, a, b], joined[a, b].astype(float)
 
     def cost(x: Floats) -> tuple[float, Floats]:
         """−log of the posterior, and its gradient."""
-        apart = turned @ x[:3] + shifted
-        distance = np.sqrt((apart * apart).sum(1) + 1e-12)
-        far, turn = np.exp(x[4]) * distance, np.exp(x[5]) * angle
-        odds = x[3] - far - turn
+        fall, off = np.exp(x[1:, None]) * apart, (x - USUAL) / SPREAD
+        odds = x[0] - fall.sum(axis=0)
         left = expit(odds) - there
-        at_point = -np.exp(x[4]) * np.einsum("n,nij,ni->j", left / distance, turned, apart)
-        gradient = np.array([*at_point, left.sum(), -left @ far, -left @ turn]) + (x - USUAL) / SPREAD**2
-        prior = float((((x - USUAL) / SPREAD) ** 2).sum()) / 2
-        return float((np.logaddexp(0, odds) - there * odds).sum()) + prior, gradient
+        value = (np.logaddexp(0, odds) - there * odds).sum() + off @ off / 2
+        return float(value), np.array([left.sum(), *(-fall @ left)]) + off / SPREAD
 
-    starts = [before.x] if before else [USUAL + np.array([0, 0, depth, 0, 0, 0]) for depth in DEPTHS]
-    found = [minimize(cost, x, jac=True, method="L-BFGS-B", options={"maxiter": JOINING_STEPS}) for x in starts]
-    return Joining(reach_m, min(found, key=lambda result: float(result.fun)).x)
+    return Joining(reach_m, minimize(cost, USUAL, jac=True, method="L-BFGS-B").x)
 
 
-def _angles(first: Floats, second: Floats) -> Floats:
+def _differences(first: Floats, second: Floats, reach_m: float) -> Floats:
+    """How far (2, A, B) poses (A, 4, 4) are from poses (B, 4, 4): in reaches, and in radians."""
+    a, b = first[:, :3, 3], second[:, :3, 3]
+    squares = (a * a).sum(1)[:, None] + (b * b).sum(1)[None] - 2 * a @ b.T
     trace = first[:, :3, :3].reshape(-1, 9) @ second[:, :3, :3].reshape(-1, 9).T
-    return np.asarray(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    return np.stack([np.sqrt(np.maximum(squares, 0.0)) / reach_m, angle])
 
 
 @dataclass(frozen=True)
@@ -133,14 +118,14 @@ class Upright:
         return np.asarray(np.log(1 - self.share + self.share * peak * np.exp(self.concentration * (cosine - 1))))
 
 
-def learn_upright(rotations: Floats, piece: Ints, neighbours: Ints) -> Upright:
-    """The model of cameras (V, 3, 3) in pieces (V,); its share is 0 unless groups (V,) of neighbours confirm it.
+def learn_upright(rotations: Floats, neighbours: Ints) -> Upright:
+    """The model of cameras (V, 3, 3) in groups (V,) of neighbours; its share is 0 where these do not confirm it.
 
     Pieces may be placed wrongly, so that all cameras together fit none; and cameras that turn freely may fit one by
     chance. Groups of neighbours do neither.
     """
-    model, nearby = _fitted(rotations, piece), _fitted(rotations, neighbours)
-    clear = nearby.share >= CLEAR_SHARE and nearby.concentration >= CLEAR_SPREAD_RAD**-2
+    model = _fitted(rotations, neighbours)
+    clear = model.share >= CLEAR_SHARE and model.concentration >= CLEAR_SPREAD_RAD**-2
     return model if clear else replace(model, share=0.0)
 
 
@@ -177,13 +162,13 @@ class SceneModel:
     upright: Upright
 
 
-def learn_scene_model(evidence: Evidence, found: Fit, before: SceneModel | None = None) -> SceneModel:
-    """The model fitted to the poses of a solution and the edges it uses, started at `before`."""
-    joined = np.zeros((evidence.graph.vertex_count, evidence.graph.vertex_count), bool)
+def learn_scene_model(evidence: Evidence, found: Fit) -> SceneModel:
+    """The model fitted to the poses of a solution and the edges it uses."""
+    count = len(found.piece)
+    joined = np.zeros((count, count), bool)
     i, j = evidence.graph.edges[found.used].T
     joined[i, j] = joined[j, i] = True
-    joining = learn_joining(found.poses, found.piece, joined, evidence.reach_m, before.joining if before else None)
     # consecutive views of a piece, which are placed rightly more often than all of it
-    groups = found.piece * len(found.piece) + np.arange(len(found.piece)) // NEIGHBOURS
-    groups = np.unique(groups, return_inverse=True)[1].reshape(-1)
-    return SceneModel(joining, learn_upright(found.poses[:, :3, :3], found.piece, groups))
+    groups = np.unique(found.piece * count + np.arange(count) // NEIGHBOURS, return_inverse=True)[1].reshape(-1)
+    joining = learn_joining(found.poses, found.piece, joined, evidence.reach_m)
+    return SceneModel(joining, learn_upright(found.poses[:, :3, :3], groups))

@@ -58,9 +58,9 @@ def searched(evidence: Evidence, found: Fit) -> Fit:
     Without a scene model, by which the cuts are weighed, the poses that moves lead to must make more edges agree, each
     counting 1 nat and −log of its probability of being wrong.
     """
-    model, each = None, 1 - np.log1p(-evidence.prior)
+    each = 1 - np.log1p(-evidence.prior)
     for _ in range(ROUNDS):
-        model = learn_scene_model(evidence, found, model) if evidence.exhaustive else None
+        model = learn_scene_model(evidence, found) if evidence.exhaustive else None
         moves = _moves(Placements.of(evidence, found, model))
         tried = fit(evidence, _made(found, moves), ONCE) if moves else found
         if tried is found or (model is None and each[tried.used].sum() <= each[found.used].sum()):

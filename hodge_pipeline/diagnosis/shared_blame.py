@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.complex.series import series_classes
+from hodge_pipeline.diagnosis.cycles import Cycles
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.result import Cycles
 from hodge_pipeline.diagnosis.robust_poses import Fit
 from hodge_pipeline.types import Bools, Floats, Ints
 

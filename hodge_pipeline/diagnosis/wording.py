@@ -2,57 +2,13 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.series import series_classes
-from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Cycles, Diagnosis
+from hodge_pipeline.diagnosis.cycles import Cycles
+from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
-from hodge_pipeline.types.text import UNKNOWN_UNIT
-
-ORDER = (WRONG, SUSPECT, UNTESTABLE, CONSISTENT)
-SPLITS = 1 - 1e-6
-
-
-def ranked(diagnosis: Diagnosis) -> Ints:
-    """Rows of all edges, the worst first: wrong, suspect, untestable, consistent; in each the least probable."""
-    place = np.argmax(diagnosis.verdict[:, None] == np.array(ORDER), axis=1)
-    probability = np.nan_to_num(diagnosis.probability, nan=0.5)
-    return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), probability.round(1), place))
-
-
-def advice(diagnosis: Diagnosis, disabled: Bools, harmless: Bools) -> tuple[str, ...]:
-    """What to do about each edge, in a few words; `disabled (E,)` are off already, `harmless (E,)` bend no pose."""
-    in_no_listed_cycle = np.ones(len(disabled), bool)
-    in_no_listed_cycle[diagnosis.cycles.loops.edge] = False
-    columns = zip(
-        diagnosis.verdict.tolist(),
-        disabled.tolist(),
-        harmless.tolist(),
-        in_no_listed_cycle.tolist(),
-        diagnosis.leverage,
-        strict=True,
-    )
-    return tuple(_advice(*each) for each in columns)
-
-
-def _advice(verdict: str, is_disabled: bool, is_harmless: bool, in_no_listed_cycle: bool, leverage: float) -> str:
-    if is_disabled:
-        return "is disabled; nothing speaks against it: enable it again" if verdict == CONSISTENT else "is disabled"
-    if verdict == WRONG:
-        return "nothing: no pose hangs on it" if is_harmless else "disable it"
-    if verdict == SUSPECT:
-        return "look at it; disable it where the views do not meet"
-    if verdict == UNTESTABLE:
-        return (
-            "register another pair across it"
-            if in_no_listed_cycle
-            else "look at the loop's edges, or register a pair across it"
-        )
-    return "keep it: without it the scene falls apart" if leverage >= SPLITS else "keep it"
-
 
 LONGEST_NAMED = 12
 ROUNDING = 1e-9
@@ -163,11 +119,6 @@ def distance(metres: float, degrees: float) -> str:
     if not np.isfinite(metres):
         return "its ends lie in different pieces"
     return f"{_amount(metres, degrees)} from the poses"
-
-
-def in_unit(sentence: str, has_metres: bool) -> str:
-    """A sentence of a diagnosis, which speaks of metres, with the unit that its lengths have."""
-    return sentence if has_metres else re.sub(r"(?<=\d) m\b", f" {UNKNOWN_UNIT}", sentence)
 
 
 def _amount(metres: float, degrees: float) -> str:

@@ -12,11 +12,12 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import registry
 from hodge_pipeline.complex.parts import ComplexOptions
-from hodge_pipeline.diagnosis.options import DiagnosisOptions, SolveWith, SuggestionOptions
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.pairs.held_out import GuardOptions
 from hodge_pipeline.recipe import binding, recipe_file
 from hodge_pipeline.recipe.recording_options import RecordingOptions
+from hodge_pipeline.recipe.round_options import SolveWith, SuggestionOptions
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.sources.inspect import guess_reader

@@ -9,7 +9,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import SimplicialComplex
 from hodge_pipeline.complex.cycles import Loops, edge_between, loop_products
 from hodge_pipeline.complex.parts import decompose, flag_of, one_form
-from hodge_pipeline.diagnosis.result import Cycles
+from hodge_pipeline.diagnosis.cycles import Cycles
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.stream import Part, log_markdown

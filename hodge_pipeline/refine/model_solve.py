@@ -8,7 +8,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import chi2_by_information
-from hodge_pipeline.diagnosis.short_cycles import short_cycles
+from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.solvers.covariance import marginal_covariances

@@ -9,8 +9,9 @@ import numpy as np
 
 from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, in_unit, name_cycle, ranked
+from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle
 from hodge_pipeline.evaluation.difference import length
+from hodge_pipeline.report.advice import in_unit, ranked
 from hodge_pipeline.report.document import Banner, Document, Mark, Picture, Section, Table
 from hodge_pipeline.report.energy import CAVEAT, PARTS, EnergyRow
 from hodge_pipeline.report.tables import number

@@ -8,9 +8,10 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.diagnosis.wording import ORDER, cycle_error, name_cycle
+from hodge_pipeline.diagnosis.wording import cycle_error, name_cycle
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import pair_names
+from hodge_pipeline.report.advice import ORDER
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.settle import Judged
 from hodge_pipeline.types import Bools, Floats, Ints

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline.diagnosis.wording import in_unit
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.pairs.edits import FILE
 from hodge_pipeline.recipe.schema import Recipe
@@ -18,6 +17,7 @@ from hodge_pipeline.refine.model import refinable
 from hodge_pipeline.refine.model_options import load_model_refinement
 from hodge_pipeline.refine.model_solve import solve_bodies
 from hodge_pipeline.refine.pose_graph import read_graph
+from hodge_pipeline.report.advice import in_unit
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.maximum_likelihood import solve

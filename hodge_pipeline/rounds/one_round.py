@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.complex.energies import Energies
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.options import DiagnosisOptions, SolveWith
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.pairs.candidates import merge
 from hodge_pipeline.pairs.held_out import HeldOut
 from hodge_pipeline.pairs.revisits import REVISIT
+from hodge_pipeline.recipe.round_options import SolveWith
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.registration.acceptance import accepted, with_odometry
 from hodge_pipeline.registration.register import register_edges

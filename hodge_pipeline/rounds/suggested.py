@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.options import DiagnosisOptions, SuggestionOptions
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.pairs.held_out import held_out_pairs
+from hodge_pipeline.recipe.round_options import SuggestionOptions
 from hodge_pipeline.rounds.more import Placed, register_more
 from hodge_pipeline.rounds.one_round import Registered, Work
 from hodge_pipeline.rounds.suggestions import suggest_pairs

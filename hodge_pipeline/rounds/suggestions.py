@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from hodge_pipeline.diagnosis.resistance import Network
 from hodge_pipeline.diagnosis.result import UNTESTABLE, Diagnosis
+from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 

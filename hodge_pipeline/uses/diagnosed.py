@@ -11,11 +11,12 @@ import numpy as np
 
 from hodge_pipeline import registry
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.options import DiagnosisOptions, SuggestionOptions
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
-from hodge_pipeline.diagnosis.wording import advice, in_unit, ranked
 from hodge_pipeline.pairs.edits import EDGES, joining, pair_names, read_history
+from hodge_pipeline.recipe.round_options import SuggestionOptions
 from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
+from hodge_pipeline.report.advice import advice, in_unit, ranked
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.diagnosis_page import PageContents, document, sentence
 from hodge_pipeline.report.diagnosis_plots import draw, side_by_side

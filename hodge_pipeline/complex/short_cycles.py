@@ -1,24 +1,19 @@
-"""The cycles that test edges: triangles where there are any, then squares, then the shortest loops of a tree; which of
-them close, and which are evidence for or against each edge.
+"""A list of cycles that passes every edge which lies in one: triangles where there are any, then squares, then the
+shortest loops of a tree.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.cech import flag_complex, orient_edges
-from hodge_pipeline.complex.cycles import Loops, fundamental_loops, loop_products, spanning_forest
-from hodge_pipeline.diagnosis.noise import Noise
-from hodge_pipeline.diagnosis.result import WITNESSES, Cycles
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.complex.cycles import Loops, fundamental_loops, spanning_forest
+from hodge_pipeline.types import Bools, Ints
 
 NEIGHBOURS = 8
 """Of each end of an edge that are tried for a square."""
 EDGES_AT_ONCE = 20_000
 LONGEST_ENTRIES = 5_000_000
-GATE = 30.0
-"""χ² over six dimensions of a cycle that closes, and of two edges that agree. Generous, since tails are heavy."""
 
 
 def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
@@ -27,11 +22,11 @@ def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
     Pairs of parallel edges, triangles (thinned evenly where there are very many), squares for edges that have none
     of these, and for the rest the loops that their chords close in a breadth-first tree.
     """
-    loops = _joined([_parallel_pairs(edges, vertex_count), _triangles(edges, vertex_count, most_per_edge)])
-    if (bare := _uncovered(loops, len(edges))).any():
-        loops = _joined([loops, _squares(edges, vertex_count, np.flatnonzero(bare))])
-    if _uncovered(loops, len(edges)).any():
-        loops = _joined([loops, tree_loops(edges, vertex_count)])
+    loops = Loops.joined([_parallel_pairs(edges, vertex_count), _triangles(edges, vertex_count, most_per_edge)])
+    if (bare := loops.missing(len(edges))).any():
+        loops = Loops.joined([loops, _squares(edges, vertex_count, np.flatnonzero(bare))])
+    if loops.missing(len(edges)).any():
+        loops = Loops.joined([loops, loops_of_chords(edges, vertex_count)])
     return _distinct(loops, len(edges))
 
 
@@ -41,48 +36,9 @@ def with_cycles_of(chosen: Bools, loops: Loops, edges: Ints, vertex_count: int, 
     Two cycles that fail over one edge make a third without it, which may be the only one that closes.
     """
     rows = np.flatnonzero(chosen)
-    more = tree_loops(edges[rows], vertex_count)
+    more = loops_of_chords(edges[rows], vertex_count)
     more = Loops(more.offsets, rows[more.edge], more.sign)
-    return _distinct(_joined([loops, more.select(np.flatnonzero(more.sums(wanted)))]), len(edges))
-
-
-def cycle_errors(loops: Loops, i_from_j: Floats, products: Floats | None = None) -> tuple[Floats, Floats]:
-    """The angle (L,) in radians and the displacement (L,) in metres that the product of motions along each cycle
-    leaves, the latter at the middle of the cycle's frames; `products (L, 4, 4)` where they are known.
-    """
-    products = loop_products(loops, i_from_j) if products is None else products
-    middle = _middles(loops, i_from_j)
-    displacement_m = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
-    return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(displacement_m, axis=1)
-
-
-def _middles(loops: Loops, i_from_j: Floats) -> Floats:
-    """The mean (L, 3) of the positions of the first few frames of each cycle, seen from its first."""
-    lengths = loops.lengths
-    total, here = np.zeros((len(loops), 3)), np.broadcast_to(np.eye(4), (len(loops), 4, 4)).copy()
-    for step in range(int(min(lengths.max(initial=0), 4))):
-        rows = np.flatnonzero(lengths > step)
-        entry = loops.offsets[rows] + step
-        motion = i_from_j[loops.edge[entry]].copy()
-        back = loops.sign[entry] < 0
-        motion[back] = se3.inverse(motion[back])
-        total[rows] += here[rows, :3, 3]
-        here[rows] = here[rows] @ motion
-    return total / np.maximum(np.minimum(lengths, 4), 1)[:, None]
-
-
-def _uncovered(loops: Loops, edge_count: int) -> Bools:
-    out = np.ones(edge_count, bool)
-    out[loops.edge] = False
-    return out
-
-
-def _joined(found: list[Loops]) -> Loops:
-    lengths = np.concatenate([loops.lengths for loops in found])
-    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-    return Loops(
-        offsets, np.concatenate([loops.edge for loops in found]), np.concatenate([loops.sign for loops in found])
-    )
+    return _distinct(Loops.joined([loops, more.select(np.flatnonzero(more.sums(wanted)))]), len(edges))
 
 
 def _distinct(loops: Loops, edge_count: int) -> Loops:
@@ -146,7 +102,7 @@ def _squares(edges: Ints, vertex_count: int, wanted: Ints) -> Loops:
         )
         possible = (a >= 0) & (b >= 0) & (a != j) & (b != i) & (a != b) & (i != j)
         found.append(_along(np.stack([i, j, b, a], axis=1)[possible], edges, vertex_count))
-    return _joined(found)
+    return Loops.joined(found)
 
 
 def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
@@ -161,7 +117,7 @@ def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
     return out
 
 
-def tree_loops(edges: Ints, vertex_count: int) -> Loops:
+def loops_of_chords(edges: Ints, vertex_count: int) -> Loops:
     """The loops of the chords of a tree, the shortest of them, as long as together they are not too long."""
     forest = spanning_forest(edges, vertex_count)
     chords = forest.chords[edges[forest.chords, 0] != edges[forest.chords, 1]]
@@ -169,44 +125,3 @@ def tree_loops(edges: Ints, vertex_count: int) -> Loops:
     affordable = np.cumsum(np.sort(depth + 1)) <= LONGEST_ENTRIES
     order = np.argsort(depth, kind="stable")[affordable]
     return fundamental_loops(forest, chords[np.sort(order)])
-
-
-def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
-    """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
-    turn, shift = loops.sums(noise.rotation_rad**2), loops.sums(noise.translation_m**2)
-    swing = turn * (reach_m * loops.lengths) ** 2 / 12
-    chi2 = angle**2 / np.maximum(turn, 1e-300) + displacement_m**2 / np.maximum(shift + swing, 1e-300)
-    return Cycles(loops, angle, displacement_m, chi2, chi2 < GATE)
-
-
-def usual_share(cycles: Cycles) -> float:
-    """The share of right edges, estimated from the share of closing cycles; 1 where there is no cycle.
-
-    A cycle closes where all its edges are right: p to the power of its length.
-    """
-    if not len(cycles.loops):
-        return 1.0
-    closing = float(cycles.closes.mean())
-    return float(max(closing, 1 / (len(cycles.loops) + 1)) ** (1 / float(cycles.loops.lengths.mean())))
-
-
-def closing_support(cycles: Cycles, prior: Floats) -> Floats:
-    """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
-    strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)
-    return cycles.loops.sums_at_edges(strength * np.exp(cycles.loops.sums(np.log(prior))), len(prior)) / prior
-
-
-def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
-    """For each edge (E, 3) the closing, or failing, cycles whose other edges are the likeliest; −1 for none."""
-    wanted = np.flatnonzero(cycles.closes == closing)
-    loops = cycles.loops.select(wanted)
-    row, edge = loops.rows, loops.edge
-    logs = np.log(np.clip(np.nan_to_num(probability, nan=0.5), 1e-3, 1.0))
-    others = loops.sums(logs)[row] - logs[edge]
-    order = np.lexsort((row, -others, edge))
-    ranked = edge[order]
-    rank = np.arange(len(order)) - np.searchsorted(ranked, ranked)
-    out = np.full((len(probability), WITNESSES), -1, np.int64)
-    top = rank < WITNESSES
-    out[ranked[top], rank[top]] = wanted[row[order[top]]]
-    return out

@@ -1,0 +1,69 @@
+"""Which of the listed cycles close, and which are evidence for or against each edge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline.complex.cycles import Loops
+from hodge_pipeline.diagnosis.noise import Noise
+from hodge_pipeline.types import Bools, Floats, Ints
+
+GATE = 30.0
+"""χ² over six dimensions of a cycle that closes, and of two edges that agree. Generous, since tails are heavy."""
+WITNESSES = 3
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """The cycles that were listed: their edges, the angle (L,) and displacement (L,) that each leaves, its χ² (L,) in
+    the noise of its edges, and whether it closes (L,).
+    """
+
+    loops: Loops
+    angle_rad: Floats
+    displacement_m: Floats
+    chi2: Floats
+    closes: Bools
+
+
+def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
+    """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
+    turn, shift = loops.sums(noise.rotation_rad**2), loops.sums(noise.translation_m**2)
+    swing = turn * (reach_m * loops.lengths) ** 2 / 12
+    chi2 = angle**2 / np.maximum(turn, 1e-300) + displacement_m**2 / np.maximum(shift + swing, 1e-300)
+    return Cycles(loops, angle, displacement_m, chi2, chi2 < GATE)
+
+
+def usual_share(cycles: Cycles) -> float:
+    """The share of right edges, estimated from the share of closing cycles; 1 where there is no cycle.
+
+    A cycle closes where all its edges are right: p to the power of its length.
+    """
+    if not len(cycles.loops):
+        return 1.0
+    closing = float(cycles.closes.mean())
+    return float(max(closing, 1 / (len(cycles.loops) + 1)) ** (1 / float(cycles.loops.lengths.mean())))
+
+
+def closing_support(cycles: Cycles, prior: Floats) -> Floats:
+    """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
+    strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)
+    return cycles.loops.sums_at_edges(strength * np.exp(cycles.loops.sums(np.log(prior))), len(prior)) / prior
+
+
+def witnesses(cycles: Cycles, probability: Floats, closing: bool) -> Ints:
+    """For each edge (E, 3) the closing, or failing, cycles whose other edges are the likeliest; −1 for none."""
+    wanted = np.flatnonzero(cycles.closes == closing)
+    loops = cycles.loops.select(wanted)
+    row, edge = loops.rows, loops.edge
+    logs = np.log(np.clip(np.nan_to_num(probability, nan=0.5), 1e-3, 1.0))
+    others = loops.sums(logs)[row] - logs[edge]
+    order = np.lexsort((row, -others, edge))
+    ranked = edge[order]
+    rank = np.arange(len(order)) - np.searchsorted(ranked, ranked)
+    out = np.full((len(probability), WITNESSES), -1, np.int64)
+    top = rank < WITNESSES
+    out[ranked[top], rank[top]] = wanted[row[order[top]]]
+    return out

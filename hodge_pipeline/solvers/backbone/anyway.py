@@ -1,0 +1,37 @@
+"""The backbone of a lattice or a room, whose edges test each other, where it explains more than what these keep."""
+
+from __future__ import annotations
+
+from hodge_pipeline.solvers.backbone.step_tests import contradicted_from_afar, is_tested
+from hodge_pipeline.solvers.backbone.trust import Backbone, find_backbone
+from hodge_pipeline.types import Bools, ViewGraph
+
+FROM_AFAR = 0.5
+"""Of the steps that are left out. A step that was measured wrong is contradicted by loops beside it; one is left out
+somewhere between the places of a mistake. In simulated lattices whose odometry is wrong at 5 to 30 steps up to .13 are
+contradicted from afar where the lattice is right; of groups of wrong loops .69 to 1.
+"""
+OF_BACKBONE = 4.0
+"""Mistaken places that are as likely as one wrong edge of a backbone that short cycles test, where none refutes that
+edge. In 28 simulated graphs of a right odometry and 100 to 800 right edges over two to four steps, with 40 loops
+of mistaken places, these are up to 2.3 times as many, but for four of the graphs. In a lattice none is tested so.
+"""
+
+
+def backbone_anyway(graph: ViewGraph, kept: Bools, doubted: Backbone | None = None) -> Backbone | None:
+    """The backbone of a lattice or a room of which edges `kept (E,)` join fewer places than it, or one that is
+    `doubted` or confirms no loop, of which they leave out steps that nothing near them contradicts. None elsewhere, and
+    where of the consecutive edges those alone are left out which kept ones over few of them contradict.
+    """
+    if not contradicted_from_afar(graph, kept).any():
+        return None
+    backbone = doubted or find_backbone(graph, anyway=True)
+    if backbone is None:
+        return None
+    against = backbone.places(kept & ~backbone.used)
+    if not backbone.found.confirmed:
+        from_afar, out = contradicted_from_afar(graph, kept, by_pairs=True).sum(), (backbone.steps & ~kept).sum()
+        return backbone if from_afar > FROM_AFAR * out and against < OF_BACKBONE * out else None
+    for_it = backbone.places(backbone.used & ~kept)
+    worth = OF_BACKBONE if is_tested(backbone.chain) else 1.0
+    return backbone if worth * for_it > against else None
