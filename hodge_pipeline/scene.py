@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -75,8 +75,9 @@ class KeyFrames:
     `first (N, 4, 4)` are the first poses of all frames, `world_from_key (K, 4, 4)` those of the key frames; `part (N,)`
     is the part of the source that the start held together; `times (N,)` ascend within a part; `found (N,)` says which
     frames the start could place: the others lie between their neighbours by `stamps_s (N,)` in each `sequence (N,)`.
-    `key_of_frame (N,)` is the key frame, counted among the K, that each frame belongs to; `readout_s` is the estimated
-    read-out time of cameras that do not say theirs, 0 where there is no estimate.
+    `key_of_frame (N,)` is the key frame, counted among the K, that each frame belongs to; the rows `apart (A,)` are of
+    frames with black images that move with it alone, since clouds placed them, but flow the next key frame; `readout_s`
+    is the estimated read-out time of cameras that do not say theirs, 0 where there is no estimate.
     """
 
     rows: Ints
@@ -89,6 +90,7 @@ class KeyFrames:
     sequence: Ints
     key_of_frame: Ints
     readout_s: float = 0.0
+    apart: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @classmethod
     def all_of(cls, source: Source, world_from_cam: Floats) -> KeyFrames:
@@ -107,7 +109,7 @@ class KeyFrames:
     def expand(self, world_from_key: Floats) -> Floats:
         """Poses (N, 4, 4) of all frames that follow from those (K, 4, 4) of the key frames.
 
-        Between two key frames the change that these went through is interpolated.
+        Between two key frames the change that these went through is interpolated, but for what is `apart`.
         """
         if self.are_all:
             return world_from_key
@@ -119,6 +121,8 @@ class KeyFrames:
                 self.times[rows], self.first[rows], self.times[self.rows[keys]], self.world_from_key[keys],
                 world_from_key[keys],
             )  # fmt: skip
+        own = self.key_of_frame[self.apart]
+        after[self.apart] = world_from_key[own] @ se3.inverse(self.world_from_key[own]) @ self.first[self.apart]
         for name in np.unique(self.sequence):
             rows = np.flatnonzero(self.sequence == name)
             after[rows] = _filled(after[rows], self.found[rows], self.stamps_s[rows])

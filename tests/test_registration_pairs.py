@@ -13,11 +13,11 @@ from hodge_pipeline.executors.local import InProcess, LocalExecutor
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
 from hodge_pipeline.registration.gaps import gaps, over_gap
-from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.gicp import Gicp, Vgicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.registration.pairs import Acceptance, register_pairs
 from hodge_pipeline.registration.register import register_edges
-from hodge_pipeline.stages import Step, Workers
+from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.types import CloudSet, Edges, Floats, PointCloud
 from test_executors import dask_workers
 from test_registration import corner
@@ -131,6 +131,37 @@ def test_a_pair_is_registered_again_only_where_the_poses_moved_it(folder: Path, 
     assert same_bits(registered(poses, rejected), first)
     unguessed = replace(rejected, iterations=np.zeros(len(PAIRS), np.int64), converged=np.ones(len(PAIRS), bool))
     assert same_bits(registered(moved, unguessed), replace(unguessed, status=first.status))
+
+
+def test_a_pair_is_not_registered_again_from_a_guess_nearer_to_where_it_was(folder: Path, tmp_path: Path) -> None:
+    """GICP goes down from a guess: half way down it ends where it did. Another registrar may see more from there."""
+    poses, pairs = path_of(FRAMES), Edges.of(PAIRS, "sequential")
+    first_guess, nearer = poses.copy(), poses.copy()
+    first_guess[-1, :3, 3] += 0.04
+    nearer[-1, :3, 3] += 0.02
+
+    def registered(where: Floats, earlier: Edges | None, start: Floats | None, registrar: Registrar) -> Edges:
+        step = Step(tmp_path, lambda _: None, lambda *notes: None)
+        clouds = CloudSet.open(folder)
+        return register_edges(
+            pairs, clouds, registrar, where, earlier, 1.0, 0.01, start, workers=InProcess(), step=step
+        )
+
+    motions = se3.inverse(poses[PAIRS[:, 0]]) @ poses[PAIRS[:, 1]]
+    found = registered(first_guess, None, None, Gicp())
+    marked = replace(found, i_from_j=motions, fitness=found.fitness + 1.0, status=np.full(len(PAIRS), "used"))
+    last = (PAIRS == FRAMES - 1).any(axis=1)
+    assert found.converged[last].all()
+    np.testing.assert_array_equal(registered(nearer, marked, first_guess, Gicp()).fitness > 1.0, True)
+    farther = registered(first_guess, marked, nearer, Gicp())
+    np.testing.assert_array_equal(farther.fitness > 1.0, ~last)
+    np.testing.assert_array_equal(registered(nearer, marked, first_guess, Vgicp()).fitness > 1.0, ~last)
+    flat = marked.information.copy()
+    flat[:, 3:, 3:] = np.diag([1.0, 1.0, 0.0])
+    sliding = replace(marked, information=flat)
+    np.testing.assert_array_equal(registered(nearer, sliding, first_guess, Gicp()).fitness > 1.0, ~last)
+    lost = replace(marked, converged=np.zeros(len(PAIRS), bool))
+    np.testing.assert_array_equal(registered(nearer, lost, first_guess, Gicp()).fitness > 1.0, ~last)
 
 
 def test_no_pairs_are_no_edges(folder: Path) -> None:

@@ -223,6 +223,40 @@ def test_frames_with_depth_and_a_black_image_are_said(sequence: Path, tmp_path: 
     assert f"({blank[0]}–{blank[-1]})" in said[0]
 
 
+def test_frames_that_clouds_place_move_with_their_key_frame_where_flow_goes_on(sequence: Path, tmp_path: Path) -> None:
+    """Key frame, black frames, key frame that flow sees from the first: what that one is off is none of theirs."""
+    source = with_dark(TumReader().open(sequence), range(26, 29), images=True, depth=False)
+    found, _ = track(source, tmp_path / "black")
+    np.testing.assert_array_equal(found.apart, range(26, 29))
+    moved = se3.exp(np.outer(np.arange(len(found.key_rows)), [0, 0.01, 0, 0.02, 0, 0.01]))
+    before, keys = all_poses(source, found, found.world_from_key), moved @ found.world_from_key
+    after = all_poses(source, found, keys)
+    key = found.anchors[found.apart]
+    np.testing.assert_allclose(
+        se3.inverse(keys[key]) @ after[found.apart],
+        se3.inverse(found.world_from_key[key]) @ before[found.apart],
+        atol=1e-12,
+    )
+    others = np.setdiff1d(np.arange(FRAMES), np.concatenate([found.apart, found.key_rows]))
+    rigid = keys[found.anchors] @ found.key_from_frame
+    assert not np.allclose(after[others], rigid[others], atol=1e-3), "their change is interpolated"
+
+
+@pytest.mark.parametrize("black", [range(25, 35), range(20, 30)])
+def test_black_frames_of_a_kinect_end_no_worse_than_odometry(data_dir: Path, tmp_path: Path, black: range) -> None:
+    path = data_dir / "tum" / "rgbd_dataset_freiburg1_xyz_60"
+    recipe = load_recipe(
+        "tum", ["executor.workers=0", "recording.level=off", "evaluation.tables=false", "fusion=[]"], path
+    )
+    frames = list(TumReader().open(path).frames)
+    for row in black:
+        frames[row] = replace(frames[row], read_colour=partial(np.zeros, (480, 640, 3), np.uint8))
+    source = replace(TumReader().open(path), frames=tuple(frames))
+    rows = {row.name: row for row in hodge_pipeline.run(recipe, tmp_path / "run", source=source).report.trajectories}
+    assert rows["result"].ate_rmse_m < 0.75 * rows["odometry"].ate_rmse_m
+    assert rows["result"].ate_max_m < rows["odometry"].ate_max_m
+
+
 def test_a_sequence_without_any_depth_in_range_is_an_error(sequence: Path, tmp_path: Path) -> None:
     source = with_dark(TumReader().open(sequence), range(FRAMES), images=False)
     with pytest.raises(

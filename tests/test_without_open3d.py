@@ -1,4 +1,4 @@
-"""What works where importing open3d fails, as on a bare machine: solve, diagnose, convert, inspect."""
+"""What works where importing open3d fails, as on a bare machine: solve, diagnose, convert, inspect; its lean import."""
 
 from __future__ import annotations
 
@@ -106,3 +106,21 @@ def test_a_sequence_is_inspected_and_converted_and_what_needs_open3d_says_so(
     assert needing.returncode == 1, "what needs it says so in a line"
     assert MESSAGE in needing.stderr and needing.stderr.count("\n") == 1
     assert all(package in needing.stderr for package in DEBIAN)
+
+
+LEAN = """
+import sys
+from hodge_pipeline.lean_open3d import o3d
+assert not {"dash", "plotly", "IPython"} & sys.modules.keys()
+before = o3d.visualization.draw_plotly
+figures = [o3d.visualization.get_plotly_fig([]) for _ in range(2)]
+assert "plotly" in sys.modules and type(figures[1]).__name__ == "Figure"
+assert o3d.visualization.draw_plotly is before and callable(before)
+from open3d.visualization.draw_plotly import get_plotly_fig
+assert get_plotly_fig.__module__ == "open3d.visualization.draw_plotly"
+"""
+
+
+def test_open3d_comes_without_what_draws_in_a_browser_until_that_is_called() -> None:
+    done = subprocess.run([sys.executable, "-c", LEAN], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import open3d as o3d
 
 from hodge_pipeline import se3
 from hodge_pipeline.demo.room import Room
+from hodge_pipeline.lean_open3d import o3d
 from hodge_pipeline.types import Camera, Floats, Floats32, Ints
 
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])

@@ -6,12 +6,12 @@ from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.demo.street import CAR, Road, build_street
+from hodge_pipeline.lean_open3d import o3d
 from hodge_pipeline.stages import Advance
 from hodge_pipeline.types import Floats, Floats32, Ints
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import pickle
@@ -25,6 +26,8 @@ from hodge_pipeline.stages import Workers
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
+COLLECT_AFTER = 10_000
+"""Objects made and kept before cycles are looked for."""
 SINGLE_THREADED = {
     name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 }
@@ -115,7 +118,7 @@ class SpawnedWorkers:
         with _environment(SINGLE_THREADED), _hidden_main():
             if self._pool is None:
                 spawn = multiprocessing.get_context("spawn")
-                self._pool = ProcessPoolExecutor(self._count, mp_context=spawn, initializer=_end_with_parent)
+                self._pool = ProcessPoolExecutor(self._count, mp_context=spawn, initializer=_begin_worker)
             return self._pool.submit(task, block)
 
     def kill(self) -> None:
@@ -134,6 +137,12 @@ class SpawnedWorkers:
 def _cores() -> int:
     """Cores that this process may use; macOS and Windows only say how many there are."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def _begin_worker() -> None:
+    """A worker makes few objects and no cycles, so it looks for these as seldom as the command does."""
+    gc.set_threshold(COLLECT_AFTER)
+    _end_with_parent()
 
 
 def _end_with_parent() -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 
 from hodge_pipeline import se3
 from hodge_pipeline.fusion.boxes import Box
 from hodge_pipeline.fusion.mesh import Mesh
+from hodge_pipeline.lean_open3d import o3d
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Ints
 
 BLOCK_SIDE = 8

@@ -29,7 +29,7 @@ def _one_processor() -> Iterator[None]:
 
 
 with _one_processor():
-    import open3d as o3d
+    from hodge_pipeline.lean_open3d import o3d
 
     _cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.random.default_rng(0).uniform(size=(100, 3))))
     _cloud.estimate_normals()

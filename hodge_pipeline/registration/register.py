@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.pairs import held_where_sliding, register_pairs
+from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.pairs import HELD_SPREADS, held_where_sliding, register_pairs, weak_directions
 from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import HELD_OUT, MEASURED, USED
 
 REUSE_WITHIN_M = 0.01
@@ -27,6 +28,7 @@ def register_edges(
     earlier: Edges | None = None,
     scale: float = 1.0,
     min_spread: float = 0.0,
+    earlier_from: Floats | None = None,
     *,
     workers: Workers,
     step: Step,
@@ -34,14 +36,17 @@ def register_edges(
     """Step: the table with its candidates registered from these poses; a killed run goes on at its last block.
 
     A pair that was registered `earlier`, without its guess or to where the poses put it still, keeps that registration;
-    lengths are multiplied by `scale`. `min_spread`: see `Acceptance`.
+    lengths are multiplied by `scale`. `min_spread`: see `Acceptance`. By GICP it also keeps one that the poses lie
+    nearer to than `earlier_from (N, 4, 4)` did, from which it was registered: its descent leads there again.
     """
     assert clouds.folder is not None
     held_out = edges.status == HELD_OUT
     candidates = edges.select(~held_out)
     i, j = candidates.pairs.T
     guesses = se3.inverse(world_from_cam[i]) @ world_from_cam[j]
-    rows, known = _reusable(candidates, guesses, earlier, scale)
+    before = guesses if earlier_from is None else se3.inverse(earlier_from[i]) @ earlier_from[j]
+    least = HELD_SPREADS * min_spread if isinstance(registrar, Gicp) else np.inf
+    rows, known = _reusable(candidates, guesses, before, earlier, scale, least)
     missing = np.setdiff1d(np.arange(len(candidates)), rows)
     step.advance(len(rows))
     blocks = step.folder / "blocks"
@@ -66,8 +71,13 @@ def keep_block(folder: Path, block: int, result: Edges) -> None:
     artifacts.save(folder / f"{block:06d}.npz", result)
 
 
-def _reusable(candidates: Edges, guesses: Floats, earlier: Edges | None, scale: float) -> tuple[Ints, Ints]:
-    """Rows of the candidates whose earlier registration stands, and its rows in that table."""
+def _reusable(
+    candidates: Edges, guesses: Floats, before: Floats, earlier: Edges | None, scale: float, least_spread: float
+) -> tuple[Ints, Ints]:
+    """Rows of the candidates whose earlier registration stands, and its rows in that table: one that the guesses
+    (P, 4, 4) lie near to, or nearer than those of `before (P, 4, 4)`, and whose clouds hold each other by
+    `least_spread` in all directions.
+    """
     if earlier is None:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     unguessed = earlier.converged & (earlier.iterations == 0)
@@ -75,7 +85,20 @@ def _reusable(candidates: Edges, guesses: Floats, earlier: Edges | None, scale: 
     by_pair = dict(zip(map(tuple, earlier.pairs[standing].tolist()), standing.tolist(), strict=True))  # the last one's
     both = [(row, by_pair[a, b]) for row, (a, b) in enumerate(candidates.pairs.tolist()) if (a, b) in by_pair]
     rows, known = np.array(both, np.int64).reshape(-1, 2).T
-    apart = se3.log(se3.inverse(earlier.i_from_j[known]) @ guesses[rows])
-    moved = np.linalg.norm(apart[:, 3:], axis=1) + se3.ARM_M * scale * np.linalg.norm(apart[:, :3], axis=1)
-    kept = unguessed[known] | (moved < REUSE_WITHIN_M * scale)
+    registered = earlier.select(known)
+    moved, moved_before = (_apart(registered, where[rows], scale) for where in (guesses, before))
+    nearer = (moved < moved_before) & registered.converged & _is_held(registered, least_spread)
+    kept = unguessed[known] | (moved < REUSE_WITHIN_M * scale) | nearer
     return rows[kept], known[kept]
+
+
+def _apart(registered: Edges, i_from_j: Floats, scale: float) -> Floats:
+    """How far (P,) motions (P, 4, 4) lie from those registered, turns at an arm's length."""
+    twist = se3.log(se3.inverse(registered.i_from_j) @ i_from_j)
+    return np.asarray(np.linalg.norm(twist[:, 3:], axis=1) + se3.ARM_M * scale * np.linalg.norm(twist[:, :3], axis=1))
+
+
+def _is_held(registered: Edges, least_spread: float) -> Bools:
+    """Where (P,) no direction is one that the two clouds may slide in."""
+    weak, _ = weak_directions(registered, least_spread)
+    return np.asarray(~weak.any(axis=1))

@@ -15,7 +15,7 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, PointCloud
 
 STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
-COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful", "blank")
+COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful", "blank", "apart")
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,8 @@ class BlockRows:
     """What became of a block's rows: its key frames but one that the block before has too, the steps from each to the
     next, and for every row the row of the key frame that it was followed from, the motion, and its fitness: NaN where
     the motion is a guess; and the rows `moving` of frames much of which moved otherwise than the camera, `doubtful` of
-    those whose motion may be that of an object, and `blank` of those that have depth but show nothing.
+    those whose motion may be that of an object, `blank` of those that have depth but show nothing, and `apart` of those
+    of these whose key frame flow joins with the next one: they do not share the error of that step.
 
     A step of fitness 0 is a guess too. The block's last row is the first of the next one.
     """
@@ -37,6 +38,7 @@ class BlockRows:
     moving: Ints
     doubtful: Ints
     blank: Ints
+    apart: Ints
     notes: tuple[str, ...]
 
 

@@ -191,9 +191,15 @@ class _Tracker:
             moving=self._rows_at(self._moving),
             doubtful=self._rows_at(self._doubtful),
             blank=self._rows_at(self._blank),
+            apart=self._rows_at(self._apart()),
             notes=tuple(note for _, note in self._clouds.values() if note),
             sightings=self._kept_sightings(first),
         )
+
+    def _apart(self) -> set[int]:
+        """The places of blank frames that clouds placed, whose key frame flow has joined with the next one."""
+        flowed = {key for key, following, _ in self._steps if (key, following) in self._sightings}
+        return {place for place in self._blank if self._rows[place][0] in flowed - {place}}
 
     def _rows_at(self, places: set[int]) -> Ints:
         """The rows at these places, the one of the warm-up left out."""

@@ -112,7 +112,7 @@ class Work:
             earlier = before.edges.select(np.abs(np.diff(before.edges.pairs, axis=1)[:, 0]) == 1)
         registered = self.steps.step(
             register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,
-            self.recipe.acceptance.min_spread,
+            self.recipe.acceptance.min_spread, before.before if number > 1 else None,
             title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
         )  # fmt: skip
         fresh = np.flatnonzero(registered.status != HELD_OUT)

@@ -53,7 +53,8 @@ class Tracked:
 
     `anchors (N,)` counts among the K, `key_from_frame (N, 4, 4)` is the motion, `found (N,)` whether there is one;
     `world_from_key (K, 4, 4)` are the poses that `steps` led to, `piece (K,)` the part that they hold together;
-    `sightings` is the folder of what the frames of each block saw of their key frames; `readout_s` as of `KeyFrames`.
+    `sightings` is the folder of what the frames of each block saw of their key frames; `apart` and `readout_s` as of
+    `KeyFrames`.
     """
 
     clouds: CloudSet
@@ -65,6 +66,7 @@ class Tracked:
     piece: Ints
     steps: Edges
     sightings: Path
+    apart: Ints
     readout_s: float = 0.0
 
 
@@ -141,6 +143,7 @@ def followers(source: Source, tracked: Tracked) -> KeyFrames:
         stamps_s=stamps_of(source),
         sequence=sequence_numbers(source),
         key_of_frame=tracked.anchors,
+        apart=tracked.apart,
         readout_s=tracked.readout_s,
     )
 
@@ -176,6 +179,7 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
         world_from_key=poses,
         piece=connected_components(held.pairs, len(key_rows)),
         steps=held,
+        apart=np.unique(np.concatenate([part.apart for part in parts])),
         **_anchored(parts, cut, key_of_row),
     )
     tracked = _without_lonely(tracked)
