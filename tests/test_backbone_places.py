@@ -9,7 +9,6 @@ import pytest
 
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise
-from hodge_pipeline.solvers.backbone.step_tests import PairCycles
 from hodge_pipeline.types import ViewGraph
 from tests.backbone_graphs import Drive, at_one_place, drive
 from tests.test_backbone import NEVER_WORSE, chain_of
@@ -57,19 +56,6 @@ def test_closing_errors_have_the_covariance_of_their_paths_and_loops(dimension: 
     rows = np.sort(np.array([first, *apart[:1]]))
     expected = np.linalg.slogdet(linear.path(*chain.ends[rows].T) + linear.loops[1][rows])[1].sum()
     assert Fit(Reduced.of(chain, rows), linear).log_det == pytest.approx(expected, rel=1e-6)
-
-
-def test_cycles_of_two_loops_refute_steps_of_a_lattice_alone() -> None:
-    for around in (30, 50):
-        clean, _ = rings(200, around)
-        assert _refuted(clean) == 0
-        assert _refuted(spoiled(clean, 0.1, 13)[0]) > 0.05
-    assert _refuted(at_one_place(drive(count=400, wrong=0.0, world="town"), 1000, group=10).graph) < 0.05
-
-
-def _refuted(graph: ViewGraph) -> float:
-    chain = chain_of(graph)
-    return PairCycles.of(chain, chain.poses).refuted(chain.size)
 
 
 def test_a_lattice_with_wrong_steps_is_judged_by_its_cycles() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -67,63 +65,29 @@ def contradicted_from_afar(graph: ViewGraph, kept: Bools, *, by_pairs: bool = Fa
     return out
 
 
-@dataclass(frozen=True)
-class PairCycles:
-    """Cycles (C,) of two loops and the steps between neighbouring ends of them.
-
-    - `loops (C, 2)`; `steps (C, 2)`: positions that the steps lead to, −1 for none; `near (C,)`: whether one closes to
-      less than a step; `closes (C,)`: or within what its edges state.
+def agreeing_loops(chain: Chain, poses: Floats, among: Bools) -> int:
+    """How many of these loops (M,) close a cycle with another of them and the steps between their neighbouring ends,
+    which lead from pose to pose: to less than a step, or within what the cycle's edges state.
     """
-
-    loops: Ints
-    steps: Ints
-    near: Bools
-    closes: Bools
-
-    @classmethod
-    def of(cls, chain: Chain, poses: Floats) -> PairCycles:
-        """All of a chain, whose steps lead from pose to pose."""
-        low, high = chain.ends.T
-        keys, gate = low * chain.size + high, _gate(chain)
-        order, path, found = np.argsort(keys, kind="stable"), chain.path, []
-        for down, up in ((0, 1), (1, 0), (1, 1), (1, -1)) if len(keys) else ():
-            moved = low + down, high + up
-            at = np.minimum(np.searchsorted(keys, moved[0] * chain.size + moved[1], sorter=order), len(keys) - 1)
-            other = order[at]
-            fits = (low[other] == moved[0]) & (high[other] == moved[1])
-            first = np.flatnonzero(fits & (path[low] == path[low[other]]) & (path[high] == path[high[other]]))
-            second, none = other[first], np.full(len(first), -1)
-            before, after = _between(poses, low[first], low[second]), _between(poses, high[second], high[first])
-            ahead = before @ chain.motion[second] @ after
-            steps = low[second] if down else none, high[first] + max(up, 0) if up else none
-            spread = chain.covariance[first] + chain.covariance[second]
-            for step in steps:
-                spread = spread + np.where(step[:, None, None] < 0, 0.0, chain.step_covariance[step])
-            chi2 = gaussian(chain.log(se3.inverse(chain.motion[first]) @ ahead), spread)[1]
-            near = _closes(chain.motion[first], ahead, gate)
-            closes = near | (chi2 < AS_STATED * len(chain.axes))
-            found.append((np.stack([first, second], axis=1), np.stack(steps, axis=1), near, closes))
-        none_found = np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros(0, bool), np.zeros(0, bool)
-        return cls(*(np.concatenate(each) for each in zip(none_found, *found, strict=True)))
-
-    def tested(self, size: int) -> Bools:
-        """Steps (n,) in those that close to less than a step."""
-        out = np.zeros(size + 1, bool)
-        out[self.steps[self.near]] = True
-        return out[:-1]
-
-    def refuted(self, size: int) -> float:
-        """The share of wrong steps among those that these cycles test: in none that closes, and alone in one or in two
-        that do not though both loops are in others that do.
-        """
-        sound = np.bincount(self.loops[self.closes].ravel(), minlength=int(self.loops.max(initial=0)) + 1) > 0
-        fails = ~self.closes & sound[self.loops].all(axis=1)
-        worth = np.where((self.steps < 0).any(axis=1), 2, 1)
-        closing, failing = np.zeros(size + 1), np.zeros(size + 1)
-        np.add.at(closing, self.steps[self.closes], 1)
-        np.add.at(failing, self.steps[fails], worth[fails, None])
-        right, wrong = closing[:-1] > 0, (failing[:-1] >= 2) & (closing[:-1] == 0)
-        return float(wrong.sum() / max((right | wrong).sum(), 1))
+    rows = np.flatnonzero(among)
+    low, high = chain.ends[rows].T
+    keys, gate, out = low * chain.size + high, _gate(chain), np.zeros(len(rows), bool)
+    order, path = np.argsort(keys, kind="stable"), chain.path
+    for down, up in ((0, 1), (1, 0), (1, 1), (1, -1)) if len(keys) else ():
+        moved = low + down, high + up
+        other = order[np.minimum(np.searchsorted(keys, moved[0] * chain.size + moved[1], sorter=order), len(keys) - 1)]
+        fits = (low[other] == moved[0]) & (high[other] == moved[1])
+        first = np.flatnonzero(fits & (path[low] == path[low[other]]) & (path[high] == path[high[other]]))
+        second = other[first]
+        before, after = _between(poses, low[first], low[second]), _between(poses, high[second], high[first])
+        ahead, motion = before @ chain.motion[rows[second]] @ after, chain.motion[rows[first]]
+        spread = chain.covariance[rows[first]] + chain.covariance[rows[second]]
+        spread = spread + (chain.step_covariance[low[second]] if down else 0.0)
+        spread = spread + (chain.step_covariance[high[first] + max(up, 0)] if up else 0.0)
+        chi2 = gaussian(chain.log(se3.inverse(motion) @ ahead), spread)[1]
+        closes = _closes(motion, ahead, gate) | (chi2 < AS_STATED * len(chain.axes))
+        out[first[closes]] = out[second[closes]] = True
+    return int(out.sum())
 
 
 AS_STATED = 3.0

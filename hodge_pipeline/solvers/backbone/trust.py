@@ -17,7 +17,7 @@ from hodge_pipeline.solvers.backbone.chain import (
 )
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.polish import LOCAL
-from hodge_pipeline.solvers.backbone.step_tests import PairCycles, closing, is_tested
+from hodge_pipeline.solvers.backbone.step_tests import agreeing_loops, is_tested
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -30,17 +30,8 @@ COVERED = 0.9
 LOOPS_AT_A_STEP = 0.5
 """From there on loops may make a lattice, or a room, in which no edge needs to be trusted."""
 AGREEING = 0.05
-"""Where loops are more than steps and no backbone confirms any, so large a share of the steps between loops that agree
-with each other says that the backbone may be wrong: loops at random hardly agree.
-"""
-REFUTING = 0.5
-"""Of the loops over few steps, that close: where fewer do, they are wrong, and not the odometry, which is right between
-its wrong steps. In simulated lattices with wrong steps .76 and more do, of loops that take two places for one none.
-"""
-REFUTED = 0.05
-"""Of the steps that cycles of two loops test: where so many are wrong, the loops are a lattice that judges itself. In
-simulated lattices of 200 and 1000 poses a tenth of whose edges is wrong .06 to .11; in simulated graphs with 500 to
-2000 wrong loops in groups of five or ten, and in ring, ringCity, Manhattan and INTEL with 1000, .043 at the most.
+"""Where loops are many: to each step, loops that the backbone refuses though they agree with each other, from where on
+it may be the backbone that is wrong: see `backbone_anyway`.
 """
 
 
@@ -51,8 +42,7 @@ class Backbone:
     - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
       the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
-    - `doubted`: whether many loops agree with each other, and none with the backbone, which may be what is wrong; or
-      cycles of them refute many of its steps.
+    - `doubted`: whether many loops agree with each other and not with the backbone, which may be what is wrong.
     """
 
     chain: Chain
@@ -126,13 +116,8 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     if inferred is None:
         return None
     chain, found = inferred
-    doubted = trust == AUTO and not found.confirmed and loops > steps.sum()
-    pairs = PairCycles.of(chain, chain.poses) if trust == AUTO and many_loops else None
-    doubted = doubted and pairs is not None and bool(pairs.tested(chain.size).sum() > AGREEING * steps.sum())
-    if doubted:
-        closes = closing(chain, chain.poses)[1]
-        doubted = bool(closes.sum() >= REFUTING * len(closes))
-    doubted = doubted or (pairs is not None and pairs.refuted(chain.size) > REFUTED)
+    doubted = trust == AUTO and many_loops
+    doubted = doubted and agreeing_loops(chain, chain.poses, ~found.used) > AGREEING * steps.sum()
     return _backbone(graph, chain, found, steps, doubted)
 
 
