@@ -9,7 +9,6 @@ import pytest
 
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise
-from hodge_pipeline.types import ViewGraph
 from tests.backbone_graphs import Drive, at_one_place, drive
 from tests.test_backbone import NEVER_WORSE, chain_of
 from tests.test_solver_robust import rings, spoiled
@@ -58,10 +57,17 @@ def test_closing_errors_have_the_covariance_of_their_paths_and_loops(dimension: 
     assert Fit(Reduced.of(chain, rows), linear).log_det == pytest.approx(expected, rel=1e-6)
 
 
-def test_a_lattice_with_wrong_steps_is_judged_by_its_cycles() -> None:
-    """A backbone kept a fifth of its wrong edges, and lost a third of the right ones."""
-    graph, _ = rings(200, 30)
-    graph, wrong = spoiled(graph, 0.1, 13)
-    kept = diagnose(graph).kept
-    assert kept[wrong].mean() < 0.05
-    assert kept[~wrong].all()
+LATTICES = {"triangles": (1, 30, 31), "squares": (1, 30), "squares, wide": (1, 50)}
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1])
+@pytest.mark.parametrize("spans", LATTICES)
+def test_a_lattice_with_wrong_steps_is_judged_by_its_cycles(spans: str, share: float) -> None:
+    """A backbone kept up to half of its wrong edges, lost half of the right ones and was 4 to 16 m off."""
+    whole, truth = rings(200, LATTICES[spans][1])
+    graph = whole.select(np.flatnonzero(np.isin(np.diff(whole.edges, axis=1)[:, 0], LATTICES[spans])))
+    graph, wrong = spoiled(graph, share, 13)
+    found = diagnose(graph)
+    assert found.kept[wrong].sum() <= 1 + 0.2 * wrong.sum()  # some are the only edges of a vertex that may be right
+    assert found.kept[~wrong].mean() > 0.99
+    assert Drive(graph, truth, ~wrong).error_m(found.world_from_cam) < 0.5

@@ -6,10 +6,10 @@ from hodge_pipeline.solvers.backbone.step_tests import contradicted_from_afar, i
 from hodge_pipeline.solvers.backbone.trust import Backbone, find_backbone
 from hodge_pipeline.types import Bools, ViewGraph
 
-FROM_AFAR = 0.5
+FROM_AFAR = 0.2
 """Of the steps that are left out. A step that was measured wrong is contradicted by loops beside it; one is left out
 somewhere between the places of a mistake. In simulated lattices 2 to 20 % of whose edges are wrong, of 200 to 1000
-poses with and without triangles, up to .13 are contradicted from afar; with groups of wrong loops .64 to 1.
+poses with and without triangles, up to .13 are contradicted from afar; with groups of wrong loops .33 to 1.
 """
 MOST_WRONG = 0.25
 """Of the steps. In these lattices up to .2 are left out; where hundreds of wrong loops join places near each other and
@@ -23,20 +23,19 @@ of mistaken places, these are up to 2.3 times as many, but for four of the graph
 
 
 def backbone_anyway(graph: ViewGraph, kept: Bools, doubted: Backbone | None = None) -> Backbone | None:
-    """The backbone of a lattice or a room of which edges `kept (E,)` join fewer places than it, or one that is
-    `doubted` or confirms no loop, of which they leave out too many steps, or steps that nothing near them contradicts.
-    None elsewhere, and where of the consecutive edges those alone are left out which kept ones over few of them
-    contradict.
+    """The backbone of a lattice or a room of which edges `kept (E,)` leave out steps that nothing near these
+    contradicts, where it confirms loops of more places than they keep in its stead, or none; None elsewhere. One that
+    is `doubted` also where they leave out too many steps for a backbone that is wrong.
     """
-    if not contradicted_from_afar(graph, kept).any():
+    from_afar, out, steps = contradicted_from_afar(graph, kept)
+    hidden = doubted is not None and out > MOST_WRONG * steps
+    if from_afar < max(FROM_AFAR * out, 1) and not hidden:
         return None
     backbone = doubted or find_backbone(graph, anyway=True)
     if backbone is None:
         return None
     for_it, against = backbone.places(backbone.used & ~kept), backbone.places(kept & ~backbone.used)
-    if doubted or not backbone.found.confirmed:
-        out, from_afar = (backbone.steps & ~kept).sum(), contradicted_from_afar(graph, kept, by_pairs=True).sum()
-        if (from_afar >= FROM_AFAR * out or out > MOST_WRONG * backbone.steps.sum()) and against < OF_BACKBONE * out:
-            return backbone
+    if (doubted or not backbone.found.confirmed) and against < OF_BACKBONE * out:
+        return backbone
     worth = OF_BACKBONE if is_tested(backbone.chain) else 1.0
     return backbone if backbone.found.confirmed and worth * for_it > against else None

@@ -34,8 +34,8 @@ MOST_BREAKS, MOST_TRIED = 10, 2
 """That are bridged one after the other, and that are tried each time."""
 
 
-def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Inferred] | None:
-    """The chain with its paths joined and its broken steps bridged, and its loops judged; None as in `infer`.
+def infer_bridged(chain: Chain, always: Bools, thin: bool, most: int = MOST_BREAKS) -> tuple[Chain, Inferred] | None:
+    """The chain with its paths joined and up to `most` broken steps bridged, and its loops judged; None as in `infer`.
 
     A step is tried where loops of several places agree that it is broken, or where it is unlike all others. It is
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
@@ -47,7 +47,7 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool) -> tuple[Chain, Infer
     if first is None:
         return None
     found = first
-    for _ in range(MOST_BREAKS):
+    for _ in range(most):
         better = _better(chain, found, judge)
         if better is None:
             break

@@ -45,24 +45,23 @@ def closing(chain: Chain, poses: Floats) -> tuple[Ints, Bools]:
     return short, closes
 
 
-def contradicted_from_afar(graph: ViewGraph, kept: Bools, *, by_pairs: bool = False) -> Bools:
-    """Consecutive edges (E,) that are not kept, though no edge over few of them is kept which passes over them: where
-    one was measured wrong, those that begin or end beside it tell. `by_pairs`: or two that do, one on either side, and
-    whose other ends lie as near, where nothing is left out.
+def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> tuple[int, int, int]:
+    """How many consecutive edges are not kept (E,) though nothing near contradicts them, how many are not kept, and how
+    many there are. Where one was measured wrong, kept edges over few of them tell, and two that begin beside it, one on
+    either side, whose other ends lie as near, where nothing is left out.
     """
     steps = linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph))
     chain = make_chain(graph, steps)
-    inner, out = chain.step_edge >= 0, np.zeros(graph.edge_count, bool)
+    inner = chain.step_edge >= 0
     ends = chain.ends[kept[chain.loop_edge]]
     near = [ends[np.diff(ends, axis=1)[:, 0] <= LONGEST]]
     left_out = ~np.append(kept, True)[chain.step_edge]
-    if by_pairs and len(ends):
+    if len(ends):
         two = np.sort(ends[cKDTree(ends).query_pairs(LONGEST, p=np.inf, output_type="ndarray")], axis=1)
         low, high = np.diff(np.cumsum(left_out | ~inner)[two], axis=1)[:, 0].T
         near += [two[(low == 1) & (high == 0), :, 0], two[(low == 0) & (high == 1), :, 1]]
-    at = np.flatnonzero(inner & left_out & (chain.over(np.concatenate(near)) == 0))
-    out[chain.step_edge[at]] = True
-    return out
+    out = inner & left_out
+    return int((out & (chain.over(np.concatenate(near)) == 0)).sum()), int(out.sum()), int(inner.sum())
 
 
 def agreeing_loops(chain: Chain, poses: Floats, among: Bools) -> int:

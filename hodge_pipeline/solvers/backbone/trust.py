@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.backbone.bridged import infer_bridged
+from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import (
     Chain,
     linear_forest,
@@ -33,6 +33,8 @@ AGREEING = 0.05
 """Where loops are many: to each step, loops that the backbone refuses though they agree with each other, from where on
 it may be the backbone that is wrong: see `backbone_anyway`.
 """
+FEW_BREAKS = 3
+"""Of a backbone with as many loops: with these or more they judge each other, without the time that each takes."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class Backbone:
     - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
       the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
-    - `doubted`: whether many loops agree with each other and not with the backbone, which may be what is wrong.
+    - `doubted`: whether many loops agree with each other and not with the backbone, which may be what is wrong, or say
+      that it is broken at several steps.
     """
 
     chain: Chain
@@ -112,12 +115,15 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     if trust == AUTO and many_loops and not anyway and is_tested(chain):
         return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
-    inferred = infer_bridged(chain, always, trust != AUTO or anyway or not many_loops)
+    most = FEW_BREAKS if trust == AUTO and many_loops else MOST_BREAKS
+    inferred = infer_bridged(chain, always, trust != AUTO or anyway or not many_loops, most)
     if inferred is None:
         return None
     chain, found = inferred
     doubted = trust == AUTO and many_loops
-    doubted = doubted and agreeing_loops(chain, chain.poses, ~found.used) > AGREEING * steps.sum()
+    broken = int((chain.bridged & (chain.step_edge >= 0)).sum())
+    agreeing = agreeing_loops(chain, chain.poses, ~found.used) if doubted and broken < FEW_BREAKS else 0
+    doubted = doubted and (broken >= FEW_BREAKS or agreeing > AGREEING * steps.sum())
     return _backbone(graph, chain, found, steps, doubted)
 
 
