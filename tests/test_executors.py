@@ -1,5 +1,6 @@
 """Executors: the same results everywhere, a dead worker costs a retry, errors and orphans."""
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
@@ -32,6 +34,28 @@ def thread_limit(_: int) -> str:
 
 def process_id(_: int) -> int:
     return os.getpid()
+
+
+class Heap(ctypes.Structure):
+    """What glibc's `mallinfo2` gives; `mapped` counts the arrays that are taken from the system each for itself."""
+
+    _fields_ = [(name, ctypes.c_size_t) for name in ("arena", "free", "fast", "mapped", *"abcdef")]
+
+
+def mapped_arrays(megabytes: int) -> int:
+    """How many arrays of so many megabytes, of two, are taken from the system in this process and given back to it."""
+    mallinfo2 = ctypes.CDLL(None).mallinfo2
+    mallinfo2.restype = Heap
+    before = mallinfo2().mapped
+    arrays = [np.zeros(megabytes * 1_000_000, np.uint8) for _ in range(2)]
+    return int(mallinfo2().mapped - before) if arrays else -1
+
+
+def has_mallinfo2() -> bool:
+    try:
+        return hasattr(ctypes.CDLL(None), "mallinfo2")
+    except TypeError:
+        return False
 
 
 def fail_on_three(number: int) -> int:
@@ -196,3 +220,10 @@ def test_workers_of_tracking_pairs_and_scores_load_no_scipy() -> None:
     code = f"import sys, hodge_pipeline.{tasks}\nprint({{'scipy', 'open3d', 'matplotlib', 'rerun'}} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.skipif(not has_mallinfo2(), reason="not glibc 2.33 or newer")
+def test_a_worker_uses_the_memory_of_images_again() -> None:
+    with LocalExecutor(workers=1).open() as workers:
+        found = dict(workers.map(mapped_arrays, [40, 200]))
+    assert found == {0: 0, 1: 2}  # what is larger than any image is given back

@@ -16,7 +16,9 @@ def main() -> None:
     gc.set_threshold(COLLECT_AFTER)
     try:
         from hodge_pipeline.cli.main import main as command
+        from hodge_pipeline.executors.memory import keep_freed_memory
 
+        keep_freed_memory()
         command()
     except KeyboardInterrupt:
         sys.exit(130)

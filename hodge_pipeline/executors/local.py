@@ -21,6 +21,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import WorkerError
+from hodge_pipeline.executors.memory import keep_freed_memory
 from hodge_pipeline.stages import Workers
 
 Task = TypeVar("Task")
@@ -142,6 +143,7 @@ def _cores() -> int:
 def _begin_worker() -> None:
     """A worker makes few objects and no cycles, so it looks for these as seldom as the command does."""
     gc.set_threshold(COLLECT_AFTER)
+    keep_freed_memory()
     _end_with_parent()
 
 
