@@ -31,14 +31,11 @@ CONSECUTIVE_S = 0.05
 """Seconds between the frames of a camera that delivers 20 a second, below which they count as consecutive."""
 
 SCRIPT = """
-import gc
 import sys
 from pathlib import Path
 import hodge_pipeline
-from hodge_pipeline.cli.entry import COLLECT_AFTER
-from hodge_pipeline.executors.memory import keep_freed_memory
-gc.set_threshold(COLLECT_AFTER)  # as the command does
-keep_freed_memory()
+from hodge_pipeline.executors.memory import keep_memory
+keep_memory()  # as the command does
 from benchmarks.back_and_forth import first_frames
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.sources.opening import open_with_reader

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import multiprocessing
 import os
 import pickle
@@ -21,14 +20,12 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import WorkerError
-from hodge_pipeline.executors.memory import keep_freed_memory
+from hodge_pipeline.executors.memory import keep_memory
 from hodge_pipeline.stages import Workers
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-COLLECT_AFTER = 10_000
-"""Objects made and kept before cycles are looked for."""
 SINGLE_THREADED = {
     name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 }
@@ -141,9 +138,7 @@ def _cores() -> int:
 
 
 def _begin_worker() -> None:
-    """A worker makes few objects and no cycles, so it looks for these as seldom as the command does."""
-    gc.set_threshold(COLLECT_AFTER)
-    keep_freed_memory()
+    keep_memory()
     _end_with_parent()
 
 
