@@ -342,9 +342,11 @@ def test_parts_that_nothing_joins_stay_where_they_are_guessed_to_be_unless_over_
     assert not _stays(hole, known, apart)
 
 
+@pytest.mark.parametrize("earlier", [False, True])
 def test_a_killed_tracking_keeps_its_blocks(
-    sequence: Path, tmp_path: Path, run: hodge_pipeline.Run, monkeypatch: pytest.MonkeyPatch
+    sequence: Path, tmp_path: Path, run: hodge_pipeline.Run, monkeypatch: pytest.MonkeyPatch, earlier: bool
 ) -> None:
+    """But for one that an `earlier` version wrote with fewer columns, which is tracked again."""
     keep, written = TrackedBlocks.write, list[int]()
 
     def write(self: TrackedBlocks, number: int, block: object) -> None:
@@ -356,8 +358,12 @@ def test_a_killed_tracking_keeps_its_blocks(
     monkeypatch.setattr(TrackedBlocks, "write", write)
     with pytest.raises(KeyboardInterrupt):
         hodge_pipeline.run(small_recipe(sequence), tmp_path / "run")
+    if earlier:
+        (block,) = (tmp_path / "run").rglob("blocks/000000.npz")
+        with np.load(block) as stored:
+            np.savez(block, **{name: stored[name] for name in stored.files if name != "apart"})
     again = hodge_pipeline.run(small_recipe(sequence), tmp_path / "run")
-    assert written == [0, 1]
+    assert written == ([0, 0, 1] if earlier else [0, 1])
     np.testing.assert_array_equal(again.result.world_from_cam, run.result.world_from_cam)
     assert not (again.folder / "stages" / "track-1" / "blocks").exists()
 

@@ -58,8 +58,8 @@ class TrackedBlocks:
         self._folder = folder
 
     def finished(self) -> set[int]:
-        """The numbers of the blocks that are there."""
-        return {int(path.stem) for path in self._folder.glob("[0-9]*.npz")}
+        """The numbers of the blocks that are there, but for those that an earlier version wrote with fewer columns."""
+        return {int(path.stem) for path in self._folder.glob("[0-9]*.npz") if _is_whole(path)}
 
     def write(self, number: int, block: TrackedBlock) -> None:
         """Keep one block."""
@@ -131,3 +131,8 @@ def _empty_file(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDA
         return mapped
     np.save(path, np.zeros(shape, dtype))
     return np.zeros(shape, dtype)
+
+
+def _is_whole(path: Path) -> bool:
+    with np.load(path) as stored:
+        return set(COLUMNS) <= set(stored.files)

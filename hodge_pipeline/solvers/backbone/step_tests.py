@@ -1,4 +1,4 @@
-"""What short cycles say of the steps of a backbone: which they test, and which they refute."""
+"""What short cycles say of a backbone: whether they test its steps, which they contradict, which loops agree."""
 
 from __future__ import annotations
 
@@ -23,26 +23,14 @@ seldom does.
 
 
 def is_tested(chain: Chain) -> bool:
-    """Whether short cycles test so many of the steps that none needs to be trusted."""
-    return bool(tested_steps(chain, chain.poses).sum() > TESTED * (chain.step_edge >= 0).sum())
-
-
-def tested_steps(chain: Chain, poses: Floats) -> Bools:
-    """Steps (n,) that lie in a cycle with one loop that closes to less than a step."""
-    out = np.zeros(chain.size, bool)
-    short, closes = closing(chain, poses)
-    low, high = chain.ends[short[closes]].T
-    for ahead in range(1, LONGEST + 1):
-        out[low[high - low >= ahead] + ahead] = True
-    return out
-
-
-def closing(chain: Chain, poses: Floats) -> tuple[Ints, Bools]:
-    """The loops (K,) over few steps, and which of them close to less than a step."""
-    low, high = chain.ends.T
+    """Whether cycles of one loop that close to less than a step test so many steps that none needs to be trusted."""
+    (low, high), poses, tested = chain.ends.T, chain.poses, np.zeros(chain.size, bool)
     short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST))
-    closes = _closes(chain.motion[short], _between(poses, low[short], high[short]), _gate(chain))
-    return short, closes
+    closes = short[_closes(chain.motion[short], _between(poses, low[short], high[short]), _gate(chain))]
+    for ahead in range(1, LONGEST + 1):
+        over = closes[high[closes] - low[closes] >= ahead]
+        tested[low[over] + ahead] = True
+    return bool(tested.sum() > TESTED * (chain.step_edge >= 0).sum())
 
 
 def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> tuple[int, int, int]:
@@ -64,11 +52,11 @@ def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> tuple[int, int, int
     return int((out & (chain.over(np.concatenate(near)) == 0)).sum()), int(out.sum()), int(inner.sum())
 
 
-def agreeing_loops(chain: Chain, poses: Floats, among: Bools) -> int:
-    """How many of these loops (M,) close a cycle with another of them and the steps between their neighbouring ends,
-    which lead from pose to pose: to less than a step, or within what the cycle's edges state.
+def agreeing_loops(chain: Chain, among: Bools) -> int:
+    """How many of these loops (M,) close a cycle with another of them and the steps between their neighbouring ends: to
+    less than a step, or within what the cycle's edges state.
     """
-    rows = np.flatnonzero(among)
+    rows, poses = np.flatnonzero(among), chain.poses
     low, high = chain.ends[rows].T
     keys, gate, out = low * chain.size + high, _gate(chain), np.zeros(len(rows), bool)
     order, path = np.argsort(keys, kind="stable"), chain.path

@@ -120,10 +120,9 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     if inferred is None:
         return None
     chain, found = inferred
+    broken = (chain.bridged & (chain.step_edge >= 0)).sum() >= FEW_BREAKS
     doubted = trust == AUTO and many_loops
-    broken = int((chain.bridged & (chain.step_edge >= 0)).sum())
-    agreeing = agreeing_loops(chain, chain.poses, ~found.used) if doubted and broken < FEW_BREAKS else 0
-    doubted = doubted and (broken >= FEW_BREAKS or agreeing > AGREEING * steps.sum())
+    doubted = doubted and bool(broken or agreeing_loops(chain, ~found.used) > AGREEING * steps.sum())
     return _backbone(graph, chain, found, steps, doubted)
 
 
