@@ -28,6 +28,7 @@ from hodge_pipeline.diagnosis.result import (
 )
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
+from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.resistance import Network
@@ -38,6 +39,7 @@ DEFAULTS = DiagnosisOptions()
 LIKELIER_RIGHT = 0.5
 
 
+@one_blas_thread
 def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosis:
     """Every edge judged by the cycles it lies in and by the scene that most edges agree on; see `Diagnosis`.
 

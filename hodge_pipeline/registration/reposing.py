@@ -35,10 +35,13 @@ class PosedBlock:
 
 @dataclass(frozen=True)
 class Reposed:
-    """Rows (R,) of the frames that were posed anew, their poses (R, 4, 4), and the rows of those that fit nothing."""
+    """Rows (R,) of the frames that were posed anew, their poses (R, 4, 4) and the information (R, 6, 6) on these, over
+    `world_from_cam exp(ξ)`, and the rows of those that fit nothing.
+    """
 
     rows: Ints
     world_from_cam: Floats
+    information: Floats
     misfits: Ints
 
 
@@ -47,7 +50,7 @@ def repose(block: PosedBlock) -> Reposed:
     sightings, at = block.sightings, {int(row): place for place, row in enumerate(block.rows)}
     seen = _at_stamps(block, at)
     corners = _solved_corners(block, at, seen)
-    rows, poses, misfits = [], [], []
+    rows, poses, information, misfits = [], [], [], []
     for row, own in groups(sightings.frame):
         place = at[row]
         if block.is_key[place]:
@@ -59,7 +62,9 @@ def repose(block: PosedBlock) -> Reposed:
         else:
             rows.append(row)
             poses.append(found.known_from_cam)
-    return Reposed(np.array(rows, np.int64), np.array(poses).reshape(-1, 4, 4), np.array(misfits, np.int64))
+            information.append(found.information)
+    motions, known = np.array(poses).reshape(-1, 4, 4), np.array(information).reshape(-1, 6, 6)
+    return Reposed(np.array(rows, np.int64), motions, known, np.array(misfits, np.int64))
 
 
 def groups(labels: Ints) -> list[tuple[int, Ints]]:

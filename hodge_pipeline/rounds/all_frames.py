@@ -9,8 +9,9 @@ import numpy as np
 from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.registration.readout import with_readout
 from hodge_pipeline.registration.reposing import PosedBlock, repose
-from hodge_pipeline.registration.shutter import velocities
+from hodge_pipeline.registration.shutter import LONGEST_SPAN_S, velocities
 from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.registration.smoothing import VIDEO_STEP_S, smoothed
 from hodge_pipeline.scene import KeyFrames, Scene, stamps_of, vertex_ids
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.store import artifacts
@@ -39,11 +40,13 @@ def pose_frames(
     workers: Workers,
     step: Step,
 ) -> Floats:
-    """Step: each frame posed anew by what it saw of its key frame; one that fits nothing keeps its pose (N, 4, 4)."""
+    """Step: each frame posed anew by what it saw of its key frame; one that fits nothing keeps its pose (N, 4, 4). The
+    path is then smoothed.
+    """
     twists = velocities(world_from_cam, stamps_of(source), key_frames.sequence, key_frames.found)
     is_key = np.zeros(len(world_from_cam), bool)
     is_key[key_frames.rows] = True
-    poses, misfits = world_from_cam.copy(), list[int]()
+    poses, information, misfits = world_from_cam.copy(), np.zeros((len(world_from_cam), 6, 6)), list[int]()
 
     def block(path: Path) -> PosedBlock:
         own = artifacts.load(path, Sightings)
@@ -57,9 +60,28 @@ def pose_frames(
     paths = sorted(sightings.glob("*.npz"))
     for _, found in workers.map(repose, [block(path) for path in paths]):
         poses[found.rows] = found.world_from_cam
+        information[found.rows] = found.information
         misfits.extend(found.misfits.tolist())
         step.advance(len(found.rows) + len(found.misfits))
     if misfits:
         names = in_runs(np.array(sorted(misfits)), vertex_ids(source))
         step.note(Note("misfits", len(misfits), names))
-    return poses
+    return _smooth(poses, information, stamps_of(source), key_frames)
+
+
+def _smooth(world_from_cam: Floats, information: Floats, stamps_s: Floats, key_frames: KeyFrames) -> Floats:
+    """Every unbroken run of frames that were found, smoothed; one that was not posed anew errs as is usual.
+
+    A path whose stamps are no video's stays as it is: a hand turns back between two of them.
+    """
+    posed = np.asarray(information.any(axis=(1, 2)))
+    rows, out = np.flatnonzero(key_frames.found), world_from_cam.copy()
+    step_s = np.diff(stamps_s[rows])
+    if not posed.any() or not len(step_s) or np.median(step_s) > VIDEO_STEP_S:
+        return out
+    information = np.where(posed[:, None, None], information, np.median(information[posed], axis=0))
+    joined = (np.diff(key_frames.part[rows]) == 0) & (np.diff(key_frames.sequence[rows]) == 0)
+    broken = ~joined | (step_s <= 0) | (step_s > LONGEST_SPAN_S)
+    for run in np.split(rows, np.flatnonzero(broken) + 1):
+        out[run] = smoothed(world_from_cam[run], information[run], stamps_s[run])
+    return out

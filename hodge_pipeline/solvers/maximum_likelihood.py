@@ -15,6 +15,7 @@ from hodge_pipeline.complex.checks import NO_EDGES, check_rows
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.errors import GraphError
+from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
@@ -31,6 +32,7 @@ WILD_NUMBERS = "the edges' lengths or weights differ too much for more: look for
 SEVERAL_FIXED = "not certified: with several fixed vertices to a component the dual is another one"
 
 
+@one_blas_thread
 def solve(
     graph: ViewGraph,
     *,

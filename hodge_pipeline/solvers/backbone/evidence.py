@@ -181,11 +181,11 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     Decoys, motions of loops between other places, tell what as many would explain by chance at each scale.
     """
     alone = _learned_from(chain.path, np.arange(len(chain.ends)), chain.ends)
-    rows, ends = (np.concatenate(each) for each in zip(alone, _learned_from(chain.path, *_decoys(chain)), strict=True))
+    of_decoys = _learned_from(chain.path, *decoys(chain, DECOYS))
+    rows, ends = (np.concatenate(each) for each in zip(alone, of_decoys, strict=True))
     models = _Model.of(chain.with_loops(rows, ends), poses, wrong)
-    own, decoys = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
-    share = len(own.residual) / max(len(decoys.residual), 1)
-
+    own, elsewhere = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
+    share = len(own.residual) / max(len(elsewhere.residual), 1)
     most = _most(chain)
 
     def value(logs: Floats, unit: float) -> float:
@@ -194,7 +194,7 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
         if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
             return -np.inf
         prior = -0.5 * float((logs - unit) @ (logs - unit)) / FOLD**2
-        return float(own.value(logs)[0] - share * max(decoys.value(logs)[0], 0.0) + prior)
+        return float(own.value(logs)[0] - share * max(elsewhere.value(logs)[0], 0.0) + prior)
 
     found = _likeliest(value, 0.0)
     units = UNITS[np.abs(UNITS) >= FARTHEST] if chain.stated else UNITS
@@ -239,10 +239,10 @@ def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Fl
     return best, top
 
 
-def _decoys(chain: Chain) -> tuple[Ints, Ints]:
-    """Each loop (K,), `DECOYS` times, and two other places (K, 2) of one path, at random."""
+def decoys(chain: Chain, times: int) -> tuple[Ints, Ints]:
+    """Each loop (K,), so many times, and two other places (K, 2) of one path, at random."""
     rng = np.random.default_rng(1)
-    loop = np.repeat(np.arange(len(chain.loop_edge)), DECOYS)
+    loop = np.repeat(np.arange(len(chain.loop_edge)), times)
     first = rng.integers(0, chain.size, len(loop))
     begin = np.searchsorted(chain.path, chain.path[first])
     length = np.searchsorted(chain.path, chain.path[first], side="right") - begin

@@ -100,7 +100,8 @@ def _inferred(
     """The loops judged, at first at the poses that those which are `used (M,)` lead to."""
     chain, linear, begun = start.chain, start, 0
     broken = int((chain.bridged & (chain.step_edge >= 0)).sum())  # any other step might have been the one
-    enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0) + broken * np.log(chain.size)
+    fold = broken * float(np.log(chain.size))
+    enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0) + fold
     for _ in range(REARRANGED):
         found = _agreed(start, linear, alone, used | always, shares, wrong, always, thin, begun)
         if found is None:
@@ -111,6 +112,7 @@ def _inferred(
             break
         places = Places.of(start, alone, agreed, wrong)
         best, confirmed = places.best(linear, enough, max(scales.step_turn, scales.step_shift))
+        confirmed = confirmed and places.chance(best.right) + fold < -BY_CHANCE
         used = np.append(best.right, False)[places.members]
         if (used == agreed).all() or not confirmed:
             break

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import gammaln
+from scipy.stats import poisson
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import loops_at_place, one_of_each_place
-from hodge_pipeline.solvers.backbone.evidence import EVEN, FREEDOM, Wrong, student
+from hodge_pipeline.solvers.backbone.evidence import EVEN, FREEDOM, Wrong, decoys, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, settled, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge, left_out
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -47,6 +48,10 @@ FEW_UNUSED = 0.1
 """Of the loops: with fewer, mistaken corridors are not reckoned with, and each place counts. Looked at on a walk all of
 whose loops are right, and on graphs of which four fifths or half are wrong, not between.
 """
+PAIRED = 2
+"""Loops that random ones agree with at one place: three among thousands are rare."""
+CHANCES = 4000
+"""Loops between other places, at least, that say how often chance favours one so much."""
 MOST_PAIRS = 200_000
 """Of loops that are compared: a limit on memory and time. All of 6000 at a few places took 2 GB and 22 CPU s."""
 
@@ -119,6 +124,23 @@ class Places:
         others = np.where(self.used, self.size / ALIKE, self.size)[~right]
         sizes = np.sort(np.concatenate([self.unused, others]))
         return np.asarray(np.log(len(sizes) - np.searchsorted(sizes, self.size) + MISTAKEN_PLACES))
+
+    def chance(self, right: Bools) -> float:
+        """The logarithm of how probable it is that of all places as large, joined at random, as many as these (K,) say
+        as much by themselves: of the k of them that say most, for the k that is least probable. Impossible where more
+        than `PAIRED` loops agree at one: what these are mistaken for is among the rivals.
+        """
+        if self.size[right].max() > PAIRED:
+            return -np.inf
+        chain = self.start.chain
+        loop, ends = decoys(chain, -(-CHANCES // len(chain.ends)))
+        others = judge(linearise(chain.with_loops(loop, ends), self.start.poses), None, EVEN, self.wrong).factor
+        strongest = np.flatnonzero(right)[np.argsort(-self.bare[right], kind="stable")]
+        stronger = len(others) - np.searchsorted(np.sort(others), self.bare[strongest]) + 0.5
+        sizes = np.sort(np.concatenate([self.size, self.unused]))
+        as_large = len(sizes) - np.searchsorted(sizes, np.minimum.accumulate(self.size[strongest]))
+        tail = poisson.logsf(np.arange(len(strongest)), as_large * stronger / len(others))
+        return float(tail.min() + np.log(len(strongest)))
 
     def arranged(self, right: Bools, linear: Linear) -> Arrangement:
         """These places (K,) taken for right, at the poses that are reached from some others."""
