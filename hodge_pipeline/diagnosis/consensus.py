@@ -28,9 +28,6 @@ PRIOR_SHARE = 0.25
 edges of 90 simulated rings, corridors and streets and 16 rooms, and of nine graphs of real fragments.
 """
 EXTREME = 0.01
-UNVOUCHED = 0.9
-MOST_GROWTHS, WORTH = 3, 1e-3
-"""Times that pieces grow again, while more than this share of the edges is to be won by it."""
 
 
 def find_consensus(evidence: Evidence) -> tuple[Fit, Floats]:
@@ -39,7 +36,7 @@ def find_consensus(evidence: Evidence) -> tuple[Fit, Floats]:
     best = best_arrangement(evidence, fit(evidence, grown, TWICE)) if evidence.exhaustive else _mended(evidence, grown)
     best = _one_of_each_series(best, evidence)
     agreeing = np.sqrt(np.maximum(0.0, 1 - best.chi2 / GATE))
-    return best, _unvouched(_with_prior(agreeing, evidence.prior), best, evidence)
+    return best, _with_prior(agreeing, evidence.prior)
 
 
 def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
@@ -73,7 +70,7 @@ def _one_of_each_series(best: Fit, evidence: Evidence) -> Fit:
 
 def _mended(evidence: Evidence, grown: Alignment) -> Fit:
     """The solution that grown pieces lead to where the order tells nothing of pairs that were tried."""
-    graph, best = evidence.graph, _regrown(evidence, fit(evidence, grown, ANNEALED, rough=True))
+    graph, best = evidence.graph, fit(evidence, grown, ANNEALED, rough=True)
     # a ring of many edges hides a whole turn, which no descent undoes and chordal rotations have not
     best = min((fit(evidence, best, (GATE,), initial=name) for name in ("given", "chordal")), key=_misfit)
     if graph.edge_count > LARGE:  # one exact solve is all that there is time for
@@ -101,33 +98,6 @@ def _in_order(evidence: Evidence) -> Alignment | None:
 def _misfit(found: Fit) -> float:
     """χ² of all edges, of each no more than the gate."""
     return float(np.minimum(found.chi2, GATE).sum())
-
-
-def _used(found: Fit) -> int:
-    return int(found.used.sum())
-
-
-def _regrown(evidence: Evidence, best: Fit) -> Fit:
-    """The solution whose pieces, as the edges hold them, no longer grow into any that more edges agree on."""
-    worth = WORTH * len(evidence.graph.edges)
-    for _ in range(MOST_GROWTHS):
-        ends = best.piece[evidence.graph.edges]
-        if (ends[:, 0] != ends[:, 1]).sum() < worth:
-            break
-        found = fit(evidence, align(evidence, best), ANNEALED, rough=True)
-        won = _used(found) - _used(best)
-        best = found if won > 0 else best
-        if won < worth:
-            break
-    return best
-
-
-def _unvouched(probability: Floats, fit: Fit, evidence: Evidence) -> Floats:
-    """The probabilities, no larger than the prior for a used edge that is the only connection between two parts which
-    edges left out connect otherwise: no cycle of edges that agree confirms it.
-    """
-    bridge = fit.bridge & ~evidence.in_no_listed_cycle
-    return np.where(bridge, np.minimum(probability, UNVOUCHED * evidence.prior), probability)
 
 
 def _with_prior(agreeing: Floats, prior: Floats) -> Floats:

@@ -1,7 +1,7 @@
 """Align a scene from its edges: pieces are merged greedily, those with the largest log-evidence first.
 
-Each round every piece picks the neighbour with the largest log-evidence and is merged with it, unless that neighbour
-has much better merges of its own to come (Borůvka's scheme for trees, with patience). Edges between two
+Each round every piece picks the neighbour with the largest log-evidence and is merged with it (Borůvka's scheme for
+trees). Edges between two
 pieces are votes on where one lies in the other. Once joined, all edges of both vote together, so that long cycles are
 tested without ever being listed. No edge is trusted: one that agrees with no other is left out.
 """
@@ -18,10 +18,6 @@ from hodge_pipeline.diagnosis.cycles import GATE
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.types import Bools, Floats, Ints
 
-SINGLE_VOTE_FROM = 0.3
-"""The weight from which one edge, which no other confirms, may join two pieces."""
-PATIENCE = 0.7
-"""Of the best score that a piece has: weaker merges wait, since more edges may then vote on their placement."""
 HYPOTHESES = 24
 """Votes of a pair of pieces, the weightiest, that are tried as the answer."""
 MOST_PAIRS_TO_A_VOTE = 400
@@ -65,29 +61,25 @@ def align(evidence: Evidence, start: Alignment | None = None) -> Alignment:
 
 def _gains(evidence: Evidence, votes: Votes) -> Floats:
     """Log-evidence (nats) for each hypothesis (N,): the weights of the edges that agree, and a term that grows with
-    the logarithm of their number. 0 for a vote that is no hypothesis, or may not join two pieces on its own.
+    the logarithm of their number. 0 for a vote that is no hypothesis.
     """
     size, weight = len(votes.edge), evidence.weight
     strength = votes.agreement * weight[votes.edge[votes.vote]]
     counted = votes.agreement * np.minimum(1.0, 0.5 + weight[votes.edge[votes.vote]])
-    gain: Floats = np.bincount(votes.hypothesis, strength, size).astype(np.float64)
-    gain += CLUSTER_GAIN * np.log1p(np.bincount(votes.hypothesis, counted, size))
-    agreeing = np.bincount(votes.hypothesis, votes.agreement > 0, size)
-    suffices: Bools = evidence.in_no_listed_cycle[votes.edge] | (weight[votes.edge] > SINGLE_VOTE_FROM)
-    return np.where((agreeing >= 2) | ((agreeing == 1) & suffices), gain, 0.0)
+    gain = np.bincount(votes.hypothesis, strength, size)
+    return np.asarray(gain + CLUSTER_GAIN * np.log1p(np.bincount(votes.hypothesis, counted, size)))
 
 
 def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
     """The hypotheses to join by, and whether it is the lower of the two pieces that moves.
 
-    A piece moves to the one with the largest log-evidence, if that one stays where it is in this round and has no much
-    better join of its own to wait for.
+    A piece moves to the one with the largest log-evidence, if that one stays where it is in this round.
     """
     order = np.lexsort((-gain, votes.pair))
     best = order[votes.start]
     real = np.flatnonzero(gain[best] > 0)
     real = real[np.lexsort((real, -gain[best][real]))]
-    low, high, score = votes.low[real], votes.high[real], gain[best][real]
+    low, high = votes.low[real], votes.high[real]
     first = np.full(count, len(real))
     np.minimum.at(first, low, np.arange(len(real)))
     np.minimum.at(first, high, np.arange(len(real)))
@@ -95,7 +87,7 @@ def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
     has_moved, base = np.zeros(count, bool), np.zeros(count, bool)
     for row in np.unique(first[first < len(real)]).tolist():
         for mover, other, lower in ((high[row], low[row], False), (low[row], high[row], True)):
-            wanted = first[mover] == row and score[row] >= PATIENCE * score[first[other]]
+            wanted = first[mover] == row
             if wanted and not (has_moved[mover] or base[mover] or has_moved[other]):
                 has_moved[mover] = base[other] = True
                 chosen.append(real[row])

@@ -157,8 +157,8 @@ def _cut(here: Placements, then: Floats, held: Floats, movable: Bools, through: 
     return np.asarray(inside[:count] & movable)
 
 
-DRIFTED_RAD, SIGMAS_APART = 0.1, 12.0
-"""Motions are compared where they turn alike but for this, and for so many standard deviations."""
+SIGMAS_APART = 12.0
+"""Motions are compared where they turn alike but for so many standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +209,6 @@ def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints
     """Pairs of motions whose rotations may agree."""
     quat = se3.to_quat_xyzw(motion).astype(np.float32)
     likeness = np.abs(quat @ quat.T)
-    widest = min(DRIFTED_RAD + SIGMAS_APART * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
+    widest = min(SIGMAS_APART * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
     first, second = np.nonzero(likeness >= np.cos(widest / 2))
     return first, second
